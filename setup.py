@@ -194,8 +194,9 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     openmp = ["-fopenmp"] if sys.platform != "darwin" else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
     includes = [f"-I{SOURCES}", f"-isystem{pybind11_headers()}", f"-isystem{sysconfig.get_path('include')}"]
     # After CXXFLAGS: results are defined by separate roundings (csrc/geometry/nearest_centre_math.h), fused ones are
-    # named, and NaN and infinity are distinguished from numbers.
-    extra = [*shlex.split(os.environ.get("CXXFLAGS", "")), "-fno-fast-math", "-ffp-contract=off"]
+    # named, and NaN and infinity are distinguished from numbers. A root that may set errno is a call, which keeps its
+    # loop from becoming vectors.
+    extra = [*shlex.split(os.environ.get("CXXFLAGS", "")), "-fno-fast-math", "-ffp-contract=off", "-fno-math-errno"]
     # libgomp is left out of the link: voronerf/native/__init__.py binds the module to the copy that torch has loaded.
     if cuda.nvcc is not None:
         # nvcc knows where its static runtime is. With that, the module loads on a machine without CUDA.

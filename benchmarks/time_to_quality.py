@@ -126,6 +126,7 @@ def make_training(
         evaluations=options.evaluations,
         eval_views=options.eval_views,
         final_views=options.eval_views,
+        evaluation_share=0.0,
         lpips=Path("off"),
         checkpoint_every=1e9,
     )

@@ -187,7 +187,7 @@ def training(out: Path, data: str, again: Again, device: str = "cuda", seconds: 
     # Lego at 100 x 100 and at 400 x 400; the built-in scene has one size.
     scenes = {size: load_scene(data, downscale=by) for size, by in ([("", 1)] if data == "builtin" else SIZES)}
     common: dict[str, Any] = {"data": data, "device": device, "budget": seconds, "cells": (12,), "rays": 4096}
-    common |= {"evaluations": 4, "eval_views": 2, "final_views": 5, "panels": 0}
+    common |= {"evaluations": 4, "eval_views": 2, "final_views": 5, "evaluation_share": 0.0, "panels": 0}
 
     def train(name: str, size: str, options: dict[str, Any]) -> str:
         settings = {**common, **options}

@@ -35,6 +35,7 @@ Row = dict[str, Any]
 PUBLISHED_SIZE = 400
 #: The method as published.
 AS_PUBLISHED = {"field": "nerf", "occupancy": False, "contraction": "none", "average": 0.0, "centres": "balanced"}
+AS_PUBLISHED |= {"evaluation_share": 0.0}  # equal times of training
 #: Settings and the least that they may be; a table with two passes needs a sample in each.
 LEAST = {"downscale": 1, "seeds": 1, "rays": 1, "samples": 2, "evaluations": 1, "eval_views": 1, "cells": 2}
 

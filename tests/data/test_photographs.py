@@ -90,6 +90,7 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     config = resolve_config(TrainConfig(), scene)
     space = make_renderer(config, scene, make_routers(config, "cpu")).sampler.space
     assert (config.sightings, space.full_gradient) == (0.003, 1.0)
+    assert (config.occupancy, config.occupancy_resolution, config.samples) == (True, 128, 128)
     batch = RayBatches(scene, torch.device("cpu"), sightings=True).draw(400, torch.Generator().manual_seed(0))
     assert len(batch.rays) == 400 and len(batch.seen) == 100
     rays = batch.rays[300:]
@@ -104,7 +105,7 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     assert len(scene.train.sightings.pixels) == seen > 100
     without = replace(scene, train=replace(scene.train, sightings=None))
     assert resolve_config(TrainConfig(), without).sightings == 0
-    with pytest.raises(ConfigError, match="--sightings needs a COLMAP model with points, and --no-occupancy"):
+    with pytest.raises(ConfigError, match="--sightings needs a COLMAP model with points"):
         resolve_config(TrainConfig(sightings=0.1), without)
 
 

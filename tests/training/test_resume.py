@@ -118,7 +118,7 @@ def without(prefix):
         ("'draws'", without("generator.draws")),
         ("another architecture", without("router.module.density")),
         ("step must be an integer, got 'x'", lambda c: c.values.update(step="x")),
-        ("step, seconds and stages must be counts, got -1", lambda c: c.values.update(step=-1)),
+        ("step, times and stages must be counts, got -1", lambda c: c.values.update(step=-1)),
         ("stage 1: cells must be an integer, got 4.5", lambda c: c.values["stages"][1].update(cells=4.5)),
         ("stage 0: split_cells missing", lambda c: c.values["stages"][0].pop("split_cells")),
         ("rays must lie in 64 to 64 by its settings, got 65", lambda c: c.values.update(rays=65)),

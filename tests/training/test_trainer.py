@@ -1,5 +1,6 @@
 """The training loop on a tiny built-in scene: stages, files, resume, ablations, and that it never dies."""
 
+import itertools
 import json
 import math
 import sys
@@ -341,3 +342,18 @@ def test_training_on_a_gpu(tmp_path, scene):
     config = small(tmp_path, device="cuda", assignment="stochastic")
     assert Trainer(config, scene).run()["cells"] == 4
     assert len(open_run(tmp_path, scene=scene, device="cpu").evaluate(views=1)["views"]) == 1
+
+
+@pytest.mark.parametrize(("final_views", "views"), [(None, 3), (2, 2)])
+def test_evaluations_are_part_of_the_budget(tmp_path, scene, final_views, views):
+    """A second for each step and for each evaluation, whatever its views: a tenth of 40 is four evaluations."""
+    seconds = itertools.count()
+    limits = {"steps": None, "budget": 40.0, "eval_views": 5, "final_views": final_views, "evaluations": 4}
+    trainer = Trainer(small(tmp_path, **limits), scene, clock=lambda: float(next(seconds)))
+    summary = trainer.run()
+    assert summary["complete"] and summary["views"] == views
+    assert trainer.scoring <= 2 and 36 <= trainer.seconds + trainer.scoring <= 42
+    uncounted = small(tmp_path / "uncounted", **limits, evaluation_share=0.0)
+    trainer = Trainer(uncounted, scene, clock=lambda: float(next(seconds)))
+    assert 40 <= trainer.run()["seconds"] <= 44
+    assert [line["views"] for line in trainer.metrics] == [5, 5, 5, final_views or len(scene.test.names)]

@@ -22,8 +22,9 @@ from voronerf.router import VoronoiRouter
 from voronerf.step.ray_loss import Found
 from voronerf.step.schedule import PlannedSplit
 
-#: Steps between evaluations of random voxels of the occupancy grid, and the share of all that are evaluated.
-REVISIT_EVERY, REVISITED = 16, 1 / 8
+#: Steps between evaluations of random voxels of the occupancy grid, the share of all that are evaluated, and how many
+#: at most: as many as a few steps have samples.
+REVISIT_EVERY, REVISITED, MOST_REVISITED = 16, 1 / 8, 32_768
 #: The factor on what a voxel remembers for each sample of a batch in it.
 DECAY = 0.8
 #: Steps between tries to split the worst cell.
@@ -148,7 +149,7 @@ class Cells:
             return
         self.routers["field"].eval()
         every = grid.occupied.numel()
-        count = max(1, int(every * REVISITED))
+        count = min(max(1, int(every * REVISITED)), MOST_REVISITED)
         voxels = torch.randint(every, (count,), generator=self.generator, device=self.generator.device)
         given: dict[str, Any] = {"decay": 1.0, "generator": self.generator, "backend": self.renderer.backend}
         grid.update(self.renderer.field, voxels.to(grid.occupied.device), **given)

@@ -7,6 +7,7 @@ several territories.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -20,7 +21,7 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.occupancy import HIDDEN
 from voronerf.rendering.renderer import Renderer
 from voronerf.rendering.samplers import Occupancy
-from voronerf.rendering.sampling import colour_loss, seen_there, sighting_loss
+from voronerf.rendering.sampling import colour_loss, seen_there, sighting_gradient, sighting_loss
 from voronerf.rendering.volume import Samples, gradient_shares
 from voronerf.router import VoronoiRouter
 
@@ -134,10 +135,11 @@ class Fused:
 
     Args:
         renderer: For which :func:`why_not_fused` is None.
+        sightings: Factor of the `sighting_loss`; 0 is off.
     """
 
-    def __init__(self, renderer: Renderer) -> None:
-        self.renderer = renderer
+    def __init__(self, renderer: Renderer, sightings: float = 0.0) -> None:
+        self.renderer, self.sightings = renderer, sightings
 
     def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
         """As of :class:`RayLoss`."""
@@ -145,11 +147,15 @@ class Fused:
         field = cast(VoronoiRouter, renderer.field)
         samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, jitter=True, generator=generator)
         all_rays = len(samples.ray_offsets) - 1
+        seen = None
+        if self.sightings and batch.seen is not None:
+            seen = torch.nn.functional.pad(batch.seen, (len(batch.rays) - len(batch.seen), 0), value=math.nan)
         if field.frozen_cells is not None:
             rays = _rays_to_learn(field, samples)
             samples, directions, target = samples.of_rays(rays), directions[rays], target[rays]
             if background is not None and background.dim() == 2:
                 background = background[rays]
+            seen = None if seen is None else seen[rays]
         shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
         found: list[RenderLoss] = []
 
@@ -166,6 +172,10 @@ class Fused:
             )
             found.append(result)
             total = result.loss
+            if seen is not None and batch.seen is not None:
+                # As the mean over rays, a part of them has its share of this taken afterwards.
+                factor = self.sightings / len(batch.seen) * len(batch.rays) / max(len(target), 1)
+                total = total + self._learn_sightings(gradient, result, samples, seen, factor)
             if shares is not None:
                 gradient = gradient * shares[:, None]
             if len(target) < all_rays:  # the others count, but learn nothing
@@ -176,6 +186,27 @@ class Fused:
         assert network is not None
         total = learn_outputs(network, loss, backward=backward, backend=renderer.backend)
         return Found(total, found[0].error, found[0].weights, found[0].density, samples)
+
+    def _learn_sightings(
+        self, gradient: Tensor, found: RenderLoss, samples: Samples, seen: Tensor, factor: float
+    ) -> Tensor:
+        """The loss of the rays whose point is known, times a factor; its gradient is added to that of the outputs.
+
+        Args:
+            gradient: [m, 4].
+            found: Of the rays.
+            samples: Of the rays.
+            seen: [r], the distances of the points, NaN before the last rays.
+            factor: Of the sum over rays.
+        """
+        first = int(seen.isnan().sum())
+        begin, scale = int(samples.ray_offsets[first]), density_scale(cast(VoronoiRouter, self.renderer.field))
+        density = found.density[begin:]
+        rest = samples.depths[begin:], samples.deltas[begin:], found.weights[begin:]
+        loss, slope = sighting_gradient(density, rest, samples.ray_offsets[first:], seen[first:])
+        # The density is a softplus of the output, whose derivative is 1 - exp(-density / scale) times the scale.
+        gradient[begin:, 3] -= factor * scale * slope * torch.expm1(-density / scale)
+        return factor * loss
 
     def explain(self) -> str:
         """As of :class:`RayLoss`."""
@@ -209,12 +240,14 @@ class Composed:
         given: dict[str, Any] = {"background": batch.background, "jitter": True, "generator": generator}
         *before, last = self.renderer.render(batch.rays, batch.near, batch.far, **given)
         loss, samples = colour_loss(last.colour, batch.target), last.samples
-        if self.sightings and batch.seen is not None and samples.edges is not None:
-            depths, deltas, weights = (
-                samples.by_ray(values)[-len(batch.seen) :] for values in (samples.depths, samples.deltas, last.weights)
-            )
-            light = (weights * seen_there(depths, deltas, batch.seen[:, None])).sum(1)
-            loss = loss + self.sightings * sighting_loss(light)
+        if self.sightings and batch.seen is not None:
+            others = len(batch.rays) - len(batch.seen)
+            begin = int(samples.ray_offsets[others])
+            depths, deltas, weights = (values[begin:] for values in (samples.depths, samples.deltas, last.weights))
+            ray = samples.ray_index[begin:].long() - others
+            there = weights * seen_there(depths, deltas, batch.seen[ray])
+            light = torch.zeros_like(batch.seen).index_add(0, ray, there)
+            loss = loss + self.sightings * sighting_loss(light).mean()
         for first in before:
             loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
         error = (last.colour.detach() - batch.target).square().sum(-1)

@@ -434,7 +434,7 @@ def _put_together(sums: Tensor, batch: Batch, sightings: float) -> tuple[Tensor,
     colour = (whole.colour + whole.through[:, None] * behind).detach().requires_grad_()
     loss = colour_loss(colour[:, :3], target)
     if batch.seen is not None and len(batch.seen):
-        loss = loss + sightings * sighting_loss(colour[len(target) - len(batch.seen) :, 3])
+        loss = loss + sightings * sighting_loss(colour[len(target) - len(batch.seen) :, 3]).mean()
     (slopes,) = torch.autograd.grad(loss, colour)
     error = (colour[:, :3].detach() - target).square().sum(-1)
     blocked = whole.behind(part, ray, slopes, behind)

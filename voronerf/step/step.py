@@ -39,7 +39,7 @@ class Step:
     def way(self) -> RayLoss:
         """The fastest way to the loss; here alone it is chosen."""
         if why_not_fused(self.renderer) is None:
-            return Fused(self.renderer)
+            return Fused(self.renderer, self.sightings)
         return Composed(self.renderer, self.sightings)
 
     def run(self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False) -> Found:

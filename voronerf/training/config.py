@@ -71,7 +71,7 @@ class TrainConfig:
     """Backend of the operations: auto, native, warp or reference (see `voronerf info`)."""
 
     budget: float | None = None
-    """Training time in seconds, without evaluation; default 480, unless --steps is given."""
+    """Time in seconds for training and evaluation; default 480, unless --steps is given."""
     steps: int | None = None
     """Number of training steps, instead of a time."""
 
@@ -136,20 +136,19 @@ class TrainConfig:
     """Rays per training step; where empty space is skipped, of the first steps."""
     ray_growth: float | None = None
     """Where empty space is skipped, few samples of a ray are left. A step then takes more rays, up to this multiple of
-    --rays, so that it has a quarter of the samples of the first steps, or half with 128 samples a ray, and so on; 1 is
-    off. Default 8 for hashgrid, else 1."""
+    --rays, so that it has a quarter of the samples of the first steps, or in a box half with 128 samples a ray, and so
+    on; 1 is off. Default 8 for hashgrid, else 1."""
     sampling: str = "stratified"
     """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something
     (nerf: a coarse and a fine network); or proposal, where a small density network places the samples."""
     samples: int | None = None
     """Samples per ray of the first pass, one in each stratum; default 32 for two passes, for one 64, and where empty
-    space is skipped more for larger images: 64 at 100 pixels across the object, 128 at 400."""
+    space is skipped 128, or for an object more for larger images: 64 at 100 pixels across it, 128 at 400."""
     fine_samples: int = 32
     """Samples per ray of the second pass; the fine network of nerf evaluates those of the first pass too."""
     sightings: float | None = None
     """Factor of a loss on light that does not come from where the points of a sparse model were seen (Deng et al. 2022,
-    "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points or where empty
-    space is skipped."""
+    "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points."""
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
     """Space as the networks see it: unchanged; with all points outside a sphere mapped into a shell of twice its
     radius; or in normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for
@@ -158,7 +157,7 @@ class TrainConfig:
     """Skip samples in empty space, in training and in pictures, wherever that works: for points in a single pass, in a
     scene with a box or with a contraction, without --cuda-graph."""
     occupancy_resolution: int | None = None
-    """Cells of the occupancy grid along each axis; default 64, and no grid with a contraction."""
+    """Cells of the occupancy grid along each axis; default 64 in a box, and 128 with a contraction."""
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
     """Products of the networks while training: float32, bfloat16, or float16 with a scaled loss. Sums, parameters and
     moments are float32. A CPU multiplies in float32 and rounds only the outputs of the networks."""
@@ -183,7 +182,11 @@ class TrainConfig:
     eval_views: int = 20
     """Test views of an evaluation during training, evenly spread; the final evaluation uses --final-views."""
     final_views: int | None = None
-    """Test views of the final evaluation; default all."""
+    """Test views of the final evaluation; default all, or as many as --evaluation-share allows."""
+    evaluation_share: float = 0.1
+    """Share of --budget for evaluations, half of it for the final one. Where that is too short for all their views,
+    evenly spread ones are scored. 0, and always with several territories: evaluations take the time that they need,
+    beside the budget."""
     checkpoint_every: float = 30.0
     """Seconds of training between checkpoints, which are written while it goes on."""
     keep_checkpoints: int = 3

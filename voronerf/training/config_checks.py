@@ -107,6 +107,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     for name in ("panels", "min_cell_samples"):
         need((getattr(config, name) or 0) >= 0, name, "not be negative")
     need(config.eval_views >= 1, "eval_views", "be at least 1")
+    need(0 <= config.evaluation_share <= 0.5, "evaluation_share", "lie in 0..0.5")
     need(config.final_views is None or config.final_views >= 1, "final_views", "be at least 1")
     need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be positive")
     need(config.lr_hold is not None and 0 <= config.lr_hold < 1, "lr_hold", "lie in [0, 1)")

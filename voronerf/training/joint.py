@@ -24,7 +24,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.data import Scene
-from voronerf.data.record import write_scene
+from voronerf.data.record import within, write_scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.distributed.group import Group
 from voronerf.distributed.territories import cut_space
@@ -117,6 +117,8 @@ class JointTrainer:
     ) -> None:
         if config.out is None:
             raise ValueError("JointTrainer: config.out must name the run directory, got None")
+        if config.resume:  # the space is that of the run, whatever the views
+            scene = within(scene, config.out)
         self.out, self.scene, self.config = config.out, scene, config
         self.on_step, self.on_event, self.clock = on_step, on_event, clock or time.perf_counter
         self.device = torch.device(config.device)
@@ -221,7 +223,9 @@ class JointTrainer:
 
     def _trainer(self, number: int, checkpoint: Checkpoint | None) -> Trainer:
         seed = (self.config.seed + 1_000_003 * number) % 2**63
-        config = replace(self.config, seed=seed, lpips=Path("off"), resume=False, territories=None)
+        config = replace(
+            self.config, seed=seed, lpips=Path("off"), resume=False, territories=None, evaluation_share=0.0
+        )
         scene, views = self.territories.scene(self.scene, number), self.territories.views(number)
         batches = RayBatches(
             self.scene,

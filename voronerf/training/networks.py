@@ -32,8 +32,10 @@ from voronerf.training.streaming import Pages
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
 #: Factor of the loss on the sightings of points.
 SIGHTINGS = 0.003
-#: Cells of the occupancy grid along each axis.
-OCCUPANCY_RESOLUTION = 64
+#: Cells of the occupancy grid along each axis, of a box and of contracted space, which is all the world.
+OCCUPANCY_RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
+#: Samples of a ray through contracted space whose empty part is skipped.
+CONTRACTED_SAMPLES = 128
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
 SAMPLE_BYTES = 64
 
@@ -113,23 +115,24 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
             forward = isinstance(scene.contraction, Perspective)
             config = replace(config, contraction="ndc" if forward else "sphere")
     boxed = scene.box is not None and config.contraction == "none"
-    asked = config.contraction != "none" and config.occupancy_resolution is not None
-    if config.occupancy and (not (boxed or asked) or why_no_occupancy(config) is not None):
+    contracted = config.contraction != "none"
+    if config.occupancy and (not (boxed or contracted) or why_no_occupancy(config) is not None):
         config = replace(config, occupancy=False)
     if config.occupancy and config.occupancy_resolution is None:
-        config = replace(config, occupancy_resolution=OCCUPANCY_RESOLUTION)
-    seen = scene.train.sightings is not None and not config.occupancy
+        config = replace(config, occupancy_resolution=CONTRACTED_RESOLUTION if contracted else OCCUPANCY_RESOLUTION)
+    seen = scene.train.sightings is not None
     if config.sightings and not seen:
-        raise ConfigError("--sightings needs a COLMAP model with points, and --no-occupancy")
+        raise ConfigError(f"--sightings needs a COLMAP model with points, got {config.sightings:g} without")
     if config.sightings is None:
         config = replace(config, sightings=SIGHTINGS if seen else 0.0)
-    if config.samples is None:
-        config = replace(config, samples=samples_for(scene) if config.occupancy and boxed else 64)
+    if config.samples is None and config.occupancy:
+        config = replace(config, samples=CONTRACTED_SAMPLES if contracted else samples_for(scene))
+    elif config.samples is None:
+        config = replace(config, samples=64)
     if "position_octaves" in kind.options and "position_octaves" not in config.network_options:
         octaves = kind.octaves(octaves_for(scene, config.contraction))
         config = replace(config, field_options=(*config.field_options, f"position_octaves={octaves}"))
     if kind.scene_options is not None:
-        contracted = config.contraction != "none"
         found = kind.scene_options(pixel_at_the_middle(scene, config.contraction), space_of(config, scene), contracted)
         more = [f"{name}={value}" for name, value in found.items() if name not in config.network_options]
         config = replace(config, field_options=(*config.field_options, *more))

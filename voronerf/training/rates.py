@@ -12,7 +12,8 @@ WARMUP_STEPS = 100
 #: The fraction of the run that it rises for, at most.
 WARMUP = 0.02
 #: The share of a step's samples that are to be left once empty space is known, if more rays can bring them, and the
-#: samples of a ray beyond which it grows with them: large images need larger tables, which larger steps keep cheap.
+#: samples of a ray beyond which it grows with them: large images of an object need larger tables, which larger steps
+#: keep cheap.
 FILL, FILL_SAMPLES = 0.25, 64
 
 
@@ -30,6 +31,6 @@ def learning_rate(config: TrainConfig, done: float, step: int) -> float:
 def next_rays(config: TrainConfig, rays: int, samples: int) -> int:
     """Rays of the next step, after one whose ``rays`` had so many samples in occupied space; see ``ray_growth``."""
     assert config.samples is not None and config.ray_growth is not None
-    share = FILL * max(config.samples / FILL_SAMPLES, 1.0)
+    share = FILL * max(config.samples / FILL_SAMPLES, 1.0) if config.contraction == "none" else FILL
     wanted = rays * share * config.rays * config.samples / max(samples, 1)
     return int(min(max(wanted, config.rays), config.rays * config.ray_growth))

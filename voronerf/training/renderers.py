@@ -10,7 +10,6 @@ from dataclasses import replace
 import torch
 
 from voronerf.data import Scene
-from voronerf.fields.radiance import INITIAL_DENSITY
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import DirectionPerSample, Field
 from voronerf.rendering.occupancy import OccupancyGrid
@@ -28,10 +27,11 @@ PICTURE_SAMPLES = 2
 #: pictures of a field that was trained without a grid, and in training with one. Most of what a young field has spread
 #: through empty space lies between the two, and would keep a third of the samples.
 LEAST_OPACITY, TRAINING_OPACITY = 0.02, 0.05
-#: Density of an empty cell of contracted space, a quarter of that of an untrained field.
-FOG = INITIAL_DENSITY / 4
-#: How many samples in a row empty a new cell: about thirty steps, until which the field has said nothing about most.
-OCCUPANCY_PATIENCE = 8
+#: The same of a cell of contracted space, for the light on its way through the whole cell.
+CONTRACTED_OPACITY = 0.1
+#: How many samples in a row empty a new cell: about thirty steps, until which the field has said nothing about most. In
+#: contracted space, cells near the cameras meet several samples in each step.
+OCCUPANCY_PATIENCE, CONTRACTED_PATIENCE = 8, 30
 #: Of a grid made for pictures alone: cells along each axis, and points evaluated in each.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 
@@ -126,22 +126,22 @@ def make_grid(
     """A grid over the scene's box, or over the cube of its contraction, that is occupied everywhere.
 
     A cell is empty below the density with which an average stratum, the box's diagonal divided by the samples of a ray,
-    takes `least_opacity` of the light; with a contraction below `FOG`, since the thin fog that a young field fills
-    space with is at first all that it has of the scene.
+    takes `least_opacity` of the light; in contracted space, with which the cell takes `CONTRACTED_OPACITY`.
 
     Raises:
         ConfigError: When the scene has no box and is not contracted.
     """
     contraction = None if config.contraction == "none" else make_contraction(scene, config.contraction, device)
+    size, patience = resolution or int(config.occupancy_resolution or 0), OCCUPANCY_PATIENCE
     if contraction is not None:
-        box, threshold = contraction.cube, FOG
+        box, patience = contraction.cube, CONTRACTED_PATIENCE
+        threshold = -math.log1p(-CONTRACTED_OPACITY) * size / float(box[1, 0] - box[0, 0])
     elif scene.box is not None:
         box = scene.box
         threshold = -math.log1p(-least_opacity) * int(config.samples or 0) / float((box[1] - box[0]).norm())
     else:
         raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
-    size = resolution or int(config.occupancy_resolution or 0)
-    remembered = DECAY**-OCCUPANCY_PATIENCE
+    remembered = DECAY**-patience
     return OccupancyGrid(box, size, threshold=threshold, remembered=remembered, contraction=contraction, device=device)
 
 

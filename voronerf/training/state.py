@@ -40,6 +40,8 @@ class Stored:
     skipped: int
     rate_factor: float
     threads: int
+    scoring: float = 0.0
+    view_seconds: float = 0.0
 
 
 def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
@@ -56,9 +58,10 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
         check_types(source, Stored, values)
         for number, stage in enumerate(values["stages"]):
             check_types(f"{source}: stage {number}", Stage, stage)
-        if not (values["step"] >= 0 and 0 <= values["seconds"] < math.inf and values["stages"]):
-            step, seconds, count = values["step"], values["seconds"], len(values["stages"])
-            raise ValueError(f"{source}: step, seconds and stages must be counts, got {step}, {seconds} and {count}")
+        times = [values.get(name, 0.0) for name in ("seconds", "scoring", "view_seconds")]
+        if not (values["step"] >= 0 and all(0 <= each < math.inf for each in times) and values["stages"]):
+            step, count = values["step"], len(values["stages"])
+            raise ValueError(f"{source}: step, times and stages must be counts, got {step}, {times} and {count}")
     except ValueError as error:
         raise CheckpointError(str(error)) from None
     stored = Stored(**values)

@@ -1,6 +1,6 @@
 """The training loop: coarse stage, splits, local stages; evaluations and checkpoints on the way.
 
-Time means training time: steps and splits count, evaluations and checkpoints do not.
+Time means training time: steps and splits. Evaluations take a share of the budget, checkpoints are written meanwhile.
 """
 
 from __future__ import annotations
@@ -144,6 +144,8 @@ class Trainer:
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
         self.step, self.seconds = 0, 0.0
+        #: Seconds of all evaluations but the last, and of a view in the latest.
+        self.scoring, self.view_seconds = 0.0, 0.0
         #: Rays of the next step, and of all steps so far.
         self.rays, self.rays_done = config.rays, 0
         self.stages = [Stage(1, 0.0, 0, None, None, 0)]
@@ -192,7 +194,24 @@ class Trainer:
         """How much of the run is done, 0..1."""
         if self.config.steps is not None:
             return min(1.0, self.step / self.config.steps)
-        return min(1.0, self.seconds / float(self.config.budget or 1.0))
+        return min(1.0, self.seconds / self._training_time)
+
+    @property
+    def _training_time(self) -> float:
+        """Seconds of the budget for training: what evaluations have taken, and the last one will take, is less."""
+        budget = float(self.config.budget or 1.0)
+        if not self._counts_evaluation:
+            return budget
+        views = len(self.scene.test.names)
+        last = self.view_seconds * min(views, self.config.final_views or views)
+        if self.config.final_views is None:
+            last = min(last, self.config.evaluation_share * budget / 2)
+        return max(budget - self.scoring - last, 1e-9)
+
+    @property
+    def _counts_evaluation(self) -> bool:
+        """Whether evaluations are part of the budget."""
+        return self.config.budget is not None and self.config.evaluation_share > 0
 
     @property
     def level(self) -> int:
@@ -236,7 +255,7 @@ class Trainer:
                 self.say(f"Run ended before {left} of {len(self.plan)} planned splits.")
             for router in self.routers.values():
                 router.blend = self.config.blend
-            self._evaluate(self.config.final_views, self.lpips)
+            self._evaluate(self.config.final_views, self.lpips, last=True)
         return self._summarise()
 
     def advance(self, until: float = math.inf) -> None:
@@ -442,14 +461,38 @@ class Trainer:
         """Number of evaluations that are due by now."""
         return int(self.fraction * self.config.evaluations + 1e-9)
 
-    def _evaluate(self, views: int | None, lpips: Lpips | None = None) -> None:
+    def _evaluate(self, views: int | None, lpips: Lpips | None = None, *, last: bool = False) -> None:
         """Scores test views; where a stop is asked for meanwhile, not all of them, and without a trace."""
-        with self.averaged():
-            scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips, stop=lambda: self.stopped)
+        count = self._affordable(views, lpips, last) if self._counts_evaluation else views
+        scores = [] if count == 0 else self._score(count, lpips, last)[0]
         if self.stopped:
             return
         self.evaluated = self._due()
-        self._record(scores)
+        if scores:
+            self._record(scores)
+
+    def _affordable(self, views: int | None, lpips: Lpips | None, last: bool) -> int:
+        """How many of the views the share of the budget allows, from what one takes; 0 to leave out an evaluation."""
+        every, share = len(self.scene.test.names), self.config.evaluation_share
+        wanted, budget = every if views is None else min(views, every), float(self.config.budget or 0.0)
+        if last and self.config.final_views is not None:
+            return wanted
+        one, probed = self.view_seconds, 0.0
+        if one == 0 or lpips is not None:
+            one = probed = self._score(1, lpips, last)[1]
+        left = share * budget - self.scoring - probed if last else share / 2 * self.seconds - self.scoring
+        return min(wanted, max(int(left / max(one, 1e-9)), int(last)))
+
+    def _score(self, views: int | None, lpips: Lpips | None, last: bool) -> tuple[list[ViewScore], float]:
+        """Scores of test views, and the seconds that they took, which are counted before the last evaluation."""
+        started = self.clock()
+        with self.averaged():
+            scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips, stop=lambda: self.stopped)
+        passed = self.clock() - started
+        if not last:
+            self.scoring += passed
+            self.view_seconds = passed / max(len(scores), 1)
+        return scores, passed
 
     def _record(self, scores: list[ViewScore]) -> None:
         """Adds an evaluation to ``metrics.jsonl`` and tells it, with what makes it poor."""
@@ -515,6 +558,8 @@ class Trainer:
             rays_done=self.rays_done,
             stages=tuple(asdict(stage) for stage in self.stages),
             evaluated=self.evaluated,
+            scoring=self.scoring,
+            view_seconds=self.view_seconds,
             skipped=self.skipped,
             rate_factor=self.rate_factor,
             threads=torch.get_num_threads(),
@@ -561,6 +606,7 @@ class Trainer:
                 ", and torch computes these networks"
             )
         self.step, self.seconds = stored.step, stored.seconds
+        self.scoring, self.view_seconds = stored.scoring, stored.view_seconds
         self.rays, self.rays_done = stored.rays, stored.rays_done
         self.stages = [Stage(**stage) for stage in stored.stages]
         self.cells.splits = len(self.stages) - 1
