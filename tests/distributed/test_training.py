@@ -15,7 +15,7 @@ from voronerf.data.scene import Sightings
 from voronerf.distributed.group import joined
 from voronerf.training.checkpoint import CheckpointError, checkpoint_path, load_checkpoint
 from voronerf.training.config import TrainConfig
-from voronerf.training.joint import JointTrainer
+from voronerf.training.joint import JointTrainer, balanced
 
 CONFIGS = {
     "nerf": {"field": "nerf", "samples": 24, "depth": 2, "cells": (3, 3), "min_cell_samples": 4},
@@ -49,21 +49,20 @@ def scene():
     return replace(found, kind="unbounded", train=replace(found.train, sightings=sightings))
 
 
-def stop_at(trainer, step, progress):
-    if progress.step == step:
+def after_step(trainer, stop, moves, progress):
+    if progress.step == stop:
         trainer.request_stop()
+    if progress.step in moves:
+        trainer._move(*moves[progress.step])
 
 
-def train(folder, configs, stop=None, balance=None):
+def train(folder, configs, stop=None, moves={}):  # noqa: B006
     """Trains configurations one after the other; writes what each rank held and sent."""
-    with joined(torch.device("cpu")) as group, pytest.MonkeyPatch.context() as patch:
-        if balance is not None:
-            patch.setattr("voronerf.training.joint.BALANCE_EVERY", balance)
-            patch.setattr("voronerf.training.joint.HEAVIEST", 1.0)
+    with joined(torch.device("cpu")) as group:
         for name, config in configs.items():
             group.sent.clear()
             trainer = JointTrainer(config, scene(), group=group)
-            trainer.on_step = functools.partial(stop_at, trainer, stop)
+            trainer.on_step = functools.partial(after_step, trainer, stop, moves)
             trainer.run()
             held = [p for each in trainer.trainers.values() for p in each.router.parameters()]
             found = {"own": list(trainer.trainers), "held": sum(v.numel() for v in held), "sent": group.sent}
@@ -119,11 +118,12 @@ def test_territories_move_and_ranks_change(runs, tmp_path):
     """Moved territories, other numbers of ranks, and a restart in one process go on to the bit."""
     expected = joint_tensors(runs / "1-nerf")
     moving = settings(tmp_path / "moving", "nerf")
-    codes, _ = on_ranks(train, tmp_path, {"moving": moving}, None, 3, folder=tmp_path)
+    moves = {5: ([1, 2], [0, 1, 0, 1]), 11: ([0, 1, 3], [1, 0, 0, 0])}
+    codes, _ = on_ranks(train, tmp_path, {"moving": moving}, None, moves, folder=tmp_path)
     assert codes == [0, 0]
     assert_same(expected, joint_tensors(moving.out))
     own = [json.loads((tmp_path / f"moving-{rank}.json").read_text())["own"] for rank in range(2)]
-    assert sorted(own[0] + own[1]) == [0, 1, 2, 3] and own != [[0, 1], [2, 3]]
+    assert own == [[1, 2, 3], [0]]
 
     half = settings(tmp_path / "half", "nerf")
     assert on_ranks(train, tmp_path, {"half": half}, 11, folder=tmp_path)[0] == [0, 0]
@@ -138,3 +138,12 @@ def test_territories_move_and_ranks_change(runs, tmp_path):
         assert_same(expected, joint_tensors(config.out))
     other = replace(half, resume=True, territories=2)
     refuses("--territories 4 -> 2", JointTrainer, other, scene(), error=CheckpointError)
+
+
+def test_the_heaviest_rank_gives_territories_away():
+    assert balanced([0, 0, 1, 1], [1.0, 1.1, 1.0, 1.0], 2) == [0, 0, 1, 1], "within bounds"
+    assert balanced([0, 0, 0, 1], [1.0, 2.0, 3.0, 1.0], 2) == [0, 1, 0, 1]
+    assert balanced([0, 1], [9.0, 1.0], 2) == [0, 1], "a rank keeps one"
+    assert balanced([0, 0, 1], [5.0, 0.1, 5.0], 2) == [0, 0, 1], "no move would help"
+    many = balanced([0] * 6 + [1, 2], [1.0] * 8, 3)
+    assert sorted(many.count(rank) for rank in range(3)) == [2, 3, 3]

@@ -279,17 +279,7 @@ class JointTrainer:
         own = [float(self.work[number]) if number in self.trainers else 0.0 for number in range(len(self.owner))]
         work = self.group.total(torch.tensor(own, dtype=torch.float64, device=self.group.device)).tolist()
         self.work = dict.fromkeys(self.work, 0)
-        owner = list(self.owner)
-        for _ in owner:
-            loads = [sum(w for w, rank in zip(work, owner, strict=True) if rank == r) for r in range(self.group.size)]
-            heaviest, lightest = loads.index(max(loads)), loads.index(min(loads))
-            some = [number for number, rank in enumerate(owner) if rank == heaviest]
-            if max(loads) <= HEAVIEST * sum(loads) / len(loads) or len(some) < 2:
-                break
-            best = min(some, key=lambda n: (max(loads[heaviest] - work[n], loads[lightest] + work[n]), n))
-            if loads[lightest] + work[best] >= loads[heaviest]:
-                break
-            owner[best] = lightest
+        owner = balanced(self.owner, work, self.group.size)
         moved = [n for n, (old, new) in enumerate(zip(self.owner, owner, strict=True)) if old != new]
         if moved:
             self._move(moved, owner)
@@ -592,6 +582,33 @@ class JointTrainer:
         self.cells_now, self.rate_factor, self.skipped = self.stages[-1].cells, stored.rate_factor, stored.skipped
         self.evaluated = min(stored.evaluated, self._due())
         self.metrics = [m for m in read_metrics(self.out) if m["step"] <= self.step]
+
+
+def balanced(owner: Sequence[int], work: Sequence[float], ranks: int) -> list[int]:
+    """The rank of each territory, after the heaviest ranks have given some away.
+
+    Args:
+        owner: The rank of each territory now.
+        work: Of each territory.
+        ranks: How many there are.
+
+    Examples:
+        >>> from voronerf.training.joint import balanced
+        >>> balanced([0, 0, 0, 1], [1.0, 2.0, 3.0, 1.0], 2)
+        [0, 1, 0, 1]
+    """
+    owner = list(owner)
+    for _ in owner:
+        loads = [sum(w for w, rank in zip(work, owner, strict=True) if rank == each) for each in range(ranks)]
+        heaviest, lightest = loads.index(max(loads)), loads.index(min(loads))
+        some = [number for number, rank in enumerate(owner) if rank == heaviest]
+        if max(loads) <= HEAVIEST * sum(loads) / ranks or len(some) < 2:
+            break
+        best = min(some, key=lambda n: (max(loads[heaviest] - work[n], loads[lightest] + work[n]), n))
+        if loads[lightest] + work[best] >= loads[heaviest]:
+            break
+        owner[best] = lightest
+    return owner
 
 
 def _whole_grid(like: OccupancyGrid, grids: Sequence[dict[str, Tensor]]) -> OccupancyGrid:
