@@ -25,6 +25,7 @@ def _place(x: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) -> 
 @wp.kernel
 def _find_kernel(
     positions: wp.array2d(dtype=wp.float32),
+    deltas: wp.array(dtype=wp.float32),
     box: wp.array2d(dtype=wp.float32),
     x: wp.int32,
     y: wp.int32,
@@ -37,7 +38,11 @@ def _find_kernel(
     cell = _place(positions[i, 0], box[0, 0], box[1, 0], x)
     cell = cell * y + _place(positions[i, 1], box[0, 1], box[1, 1], y)
     cell = cell * z + _place(positions[i, 2], box[0, 2], box[1, 2], z)
+    if deltas[i] == 0.0:
+        cell = -1
     cells[i] = cell
+    if cell < 0:
+        return
     before[i] = density[cell]
 
 
@@ -49,6 +54,8 @@ def _fade_kernel(
     density: wp.array(dtype=wp.float32),
 ) -> None:
     i = wp.tid()
+    if cells[i] < 0:
+        return
     # From the old density: all samples of a cell write the same.
     density[cells[i]] = before[i] * decay
 
@@ -63,6 +70,8 @@ def _raise_kernel(
     density: wp.array(dtype=wp.float32),
 ) -> None:
     i = wp.tid()
+    if cells[i] < 0:
+        return
     found = sigma[i]
     if wp.isnan(found):
         found = _INFINITY
@@ -83,6 +92,8 @@ def _compare_kernel(
     occupied: wp.array(dtype=wp.uint8),
 ) -> None:
     i = wp.tid()
+    if cells[i] < 0:
+        return
     occupied[cells[i]] = wp.where(density[cells[i]] >= threshold, wp.uint8(1), wp.uint8(0))
 
 
@@ -92,7 +103,7 @@ def observe_occupancy(given: Observed) -> None:
     cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
     flat, rows, faded = (array(tensor, density) for tensor in (density.view(-1), cells, before))
     samples = [array(tensor, density) for tensor in (given.sigma, given.deltas, given.weights)]
-    places = [array(given.positions, density), array(given.box, density), *density.shape]
+    places = [array(given.positions, density), samples[1], array(given.box, density), *density.shape]
     launch(_find_kernel, m, [*places, flat, rows, faded], density)
     launch(_fade_kernel, m, [rows, faded, given.decay, flat], density)
     launch(_raise_kernel, m, [rows, *samples, given.hidden, flat], density)

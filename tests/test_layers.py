@@ -22,6 +22,7 @@ LAYERS = (
     {"step"},
     {"training"},
     {"editing"},
+    {"updating"},
     {"run"},
     {"export"},
     {"cli", "viewer"},

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from voronerf import editing
+from voronerf import editing, updating
 from voronerf.data import Scene, load_scene
-from voronerf.data.record import read_scene, within
+from voronerf.data.record import placed, read_scene, within
 from voronerf.diagram import VoronoiDiagram
+from voronerf.editing import check_out
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import score_views
 from voronerf.rendering.cameras import Cameras
@@ -178,6 +180,55 @@ class Run:
         source = thing.source
         frames = [Similarity(), editing.standing(source, at, degrees, scale)]
         return self._made(self, out, editing.join([self.source, source], frames, on_top=[False, True]))
+
+    def update(
+        self,
+        scene: Scene,
+        out: Path | str,
+        *,
+        seconds: float | None = None,
+        data: str | None = None,
+        old: bool = True,
+        seed: int = 0,
+        clock: Callable[[], float] = time.perf_counter,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> Run:
+        """This run brought up to date with new pictures, in new files.
+
+        Cells whose error has grown learn; the networks of all others, and the tables that these share, are the same
+        bits afterwards.
+
+        Args:
+            scene: The new pictures. Photographs that were moved as they were read are moved to where the run has them.
+            out: A new directory.
+            seconds: To train for; None for a tenth of the time that the run was trained for, and 10 at least.
+            data: Where the new pictures were loaded from, for the settings of the new run.
+            old: Also learn from the pictures of this run's scene, where they agree with the new ones.
+            seed: Of the rays that are drawn.
+            clock: Counts seconds.
+            say: Told a line for what is found.
+
+        Raises:
+            ConfigError: For pictures that show nothing new, nothing of the scene, or another scene.
+            SceneError: For pictures with another background, or in another frame.
+            OSError: When it cannot be written; nothing is left then.
+        """
+        check_out(Path(out))
+        source = editing.join([self.source], [Similarity()])
+        checkpoint = last_checkpoint(self.path, keep=lambda name: name.startswith("errors."))
+        usual = checkpoint.group("errors").get("usual")
+        if self.renderer.sampler.passes > 1 or (usual is not None and len(usual) != source.parts.num_cells + 1):
+            usual = None  # of other samples, or cells
+        if seconds is None:
+            seconds = max(10.0, float(checkpoint.values["seconds"]) / 10)
+        if not 0 < seconds < math.inf:
+            raise ConfigError(f"--budget must be positive, got {seconds}")
+        new = placed(scene, self.scene)
+        before = self.scene if old and len(self.scene.train.images) else None
+        found = updating.update(source, new, before, usual, seconds=seconds, seed=seed, clock=clock, say=say)
+        config = replace(found.source.config, data=data or self.config.data)
+        editing.write(replace(found.source, config=config, scene=new), Path(out))
+        return open_run(out, scene=new, backend=self.renderer.backend)
 
     @classmethod
     def _made(cls, first: Run, out: Path | str, source: editing.Source, blend: float | None = None) -> Run:

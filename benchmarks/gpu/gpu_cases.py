@@ -1,4 +1,4 @@
-"""What ``gpu_parts.py`` tries: every operation once against float64, and the steps that it captures."""
+"""What ``gpu_parts.py`` tries: every operation once beside its reference, and the steps that it captures."""
 
 from __future__ import annotations
 
@@ -17,6 +17,14 @@ STEPS: dict[str, tuple[int, str, bool, int]] = {
 }
 """Steps to capture: the width, beyond 256 layer by layer, the type of the weights, whether there are directions, and
 the number of cells."""
+
+
+MORE: dict[str, list[dict[str, Any]]] = {
+    "nearest_centre": [{"k": 700}, {"points": "lattice"}],
+    "hash_encode": [{"features": features} for features in (1, 4, 8)],
+    "pixel_rays": [{"models": None}],
+}
+"""Calls beside the kinds of an op's case."""
 
 
 def has_wgmma(device: str) -> bool:
@@ -43,29 +51,38 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         check,
         check_forward,
     )
+    from torch.utils._pytree import tree_leaves, tree_map_only
 
     import voronerf
+    from voronerf import backends
     from voronerf.fields import NeRF
     from voronerf.layers import MLP, POSITIONS, Layer
+    from voronerf.ops.cases import Draw
+    from voronerf.ops.cases import cases as every_case
     from voronerf.ops.cell_sort.native import sort as sort_cells
     from voronerf.ops.cell_sort.reference import cell_sort as specified
     from voronerf.ops.grouped_mlp.native import using_way
 
-    where = torch.device(device)
+    where, cases_of_ops = torch.device(device), every_case()
 
-    def lookup(op: str, n: int, k: int, dtype: Any) -> None:
-        points = torch.randint(-3, 4, (n, 3), device=where).to(dtype)
-        centres = torch.randint(-3, 4, (k, 3), device=where).to(dtype)
-        if op == "nearest_centre":
-            found, expected = (voronerf.nearest_centre(points, centres, backend=b) for b in ("native", "reference"))
-        else:
-            diagram = voronerf.VoronoiDiagram(torch.rand(4, 3)).refine({1: torch.rand(k, 3)})[0]
-            tables = [x.to(where) for x in (diagram.centres, diagram.child_offsets, diagram.child)]
-            points = points.float() / 8 + 0.5
-            found, expected = (
-                voronerf.locate_cell(points, *tables, depth=diagram.depth, backend=b) for b in ("native", "reference")
-            )
-        assert torch.equal(found, expected)
+    def of_case(op: str, pins: dict[str, Any]) -> None:
+        """Results and gradients of the native kernels beside the reference, of a call that the op's case makes."""
+        case, outcomes = cases_of_ops[op], []
+        made = case.make(Draw(1, **pins), 200)
+        for backend in ("native", "reference"):
+            given = tree_map_only(torch.Tensor, lambda x: x.to(where, copy=True), made)
+            leaves = [x for x in tree_leaves(given) if isinstance(x, torch.Tensor) and x.is_floating_point()]
+            for leaf in leaves if case.differentiable else ():
+                leaf.requires_grad_()
+            out = getattr(voronerf.ops, case.call or op)(**given, backend=backend)
+            found = [x for x in tree_leaves(given if case.in_place else out) if isinstance(x, torch.Tensor)]
+            smooth = [x for x in found if x.requires_grad]
+            if smooth:
+                total = sum((x * torch.linspace(0.5, 1.5, x.numel(), device=where).view_as(x)).sum() for x in smooth)
+                found += torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+            outcomes.append(found)
+        for one, other in zip(*outcomes, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5, equal_nan=True)
 
     def sort(n: int, k: int, way: str) -> None:
         # Some numbers that are not cells: they go to the ends.
@@ -91,75 +108,6 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
                 list(part.shape),
                 part.isfinite().all(),
             )
-
-    def hashes(features: int) -> None:
-        grid = voronerf.HashGrid(levels=4, features=features, log2_entries=11, finest=60, interpolation="smoothstep")
-        cells = torch.randint(0, 3, (300,), dtype=torch.int32, device=where)
-        table = torch.randn(3, *grid.table_shape)
-        close(lambda x, b: voronerf.hash_encode(x[0], x[1], grid, cells=cells, backend=b), [torch.rand(300, 3), table])
-
-    def composite() -> None:
-        offsets = torch.tensor([0, 0, 1, 71, 180], dtype=torch.int32, device=where)
-        close(
-            lambda x, b: tuple(voronerf.composite(*x, ray_offsets=offsets, backend=b)),
-            [torch.rand(180), torch.rand(180, 3), torch.rand(180).cumsum(0), torch.rand(180)],
-        )
-
-    def agree(run: Callable[..., Any], tensors: list[Any], tolerance: float) -> None:
-        """Results of the native kernels there and of the reference here."""
-        found, expected = run("native", *(x.to(where, copy=True) for x in tensors)), run("reference", *tensors)
-        for one, other in zip(found, expected, strict=True):
-            torch.testing.assert_close(one.cpu(), other, rtol=tolerance, atol=tolerance)
-
-    def loss() -> None:
-        offsets = torch.tensor([2, 2, 3, 73, 140, 178], dtype=torch.int32, device=where)
-
-        def run(x: list[Any], backend: str) -> Any:
-            given = {"background": x[2], "density_scale": 10.0, "backend": backend}
-            return voronerf.ops.render_loss(x[0], x[1].detach(), offsets, x[2].detach(), **given).loss
-
-        close(run, [3 * torch.randn(180, 4), torch.rand(180) / 10, torch.rand(5, 3)])
-
-    def pixels(mixed: bool) -> None:
-        poses, lenses = torch.eye(4).repeat(3, 1, 1), torch.tensor([[15.0, 16.0, 8.2, 6.1]]).repeat(3, 1)
-        bent, images = torch.rand(3, 8) / 100, torch.randint(0, 256, (3, 12, 17, 4), dtype=torch.uint8)
-        box, colours, index = (
-            torch.tensor([[-1.0, -1, -3], [1, 1, -2]]),
-            torch.rand(300, 3),
-            torch.randint(0, 612, (300,)),
-        )
-
-        def run(
-            backend: str, poses: Any, lenses: Any, bent: Any, images: Any, box: Any, colours: Any, index: Any
-        ) -> Any:
-            models = torch.arange(3, dtype=torch.int32, device=poses.device) if mixed else None
-            rest: dict[str, Any] = {"box": box, "distortion": bent, "models": models, "background": colours}
-            return voronerf.ops.pixel_rays(poses, lenses, images, index, near=1.0, far=4.0, backend=backend, **rest)
-
-        agree(run, [poses, lenses, bent, images, box, colours, index], 2e-6)
-
-    def observe() -> None:
-        def run(backend: str, density: Any, occupied: Any, box: Any, *samples: Any) -> Any:
-            rule = {"decay": 0.9, "threshold": 0.8, "hidden": 1e-3}
-            voronerf.ops.observe_occupancy(density, occupied, box, *samples, **rule, backend=backend)
-            return density, occupied
-
-        density, box = torch.rand(4, 5, 6), torch.tensor([[0.0, 0, 0], [1, 1, 1]])
-        samples = [torch.rand(3000, 3), torch.rand(3000), torch.rand(3000), (torch.rand(3000) - 0.3).clamp(min=0)]
-        agree(run, [density, density >= 0.8, box, *samples], 1e-6)
-
-    def adam() -> None:
-        def run(backend: str, *tensors: Any) -> Any:
-            voronerf.ops.sparse_adam(*tensors, step=3, learning_rate=0.01, backend=backend)
-            return tensors
-
-        gradient = torch.randn(5000) * (torch.rand(5000) < 0.2)
-        agree(run, [torch.randn(5000), gradient, torch.randn(5000), torch.rand(5000)], 1e-6)
-
-    def resample() -> None:
-        weights, edges = torch.rand(6, 45), torch.rand(6, 46).cumsum(1)
-        found = voronerf.resample(weights.to(where), edges.to(where), 70, backend="native")
-        torch.testing.assert_close(found.cpu(), voronerf.resample(weights, edges, 70, backend="reference"))
 
     def shifted(tensor: Any) -> Any:
         """The same numbers, beginning four bytes (eight in float64) into their memory: nothing wider is aligned."""
@@ -238,10 +186,11 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     networks |= {"harmonics": (HARMONICS, 3)}
     cases: list[tuple[str, Callable[[], None]]] = [
         *(
-            (f"nearest_centre {k} {d}", functools.partial(lookup, "nearest_centre", 300, k, d))
-            for k, d in ((17, torch.float32), (700, torch.float32), (17, torch.float64))
+            (f"{op} {', '.join(map(str, pins.values()))}".strip(), functools.partial(of_case, op, pins))
+            for op in backends.ops("native", "cuda")
+            if cases_of_ops[op].comparable
+            for pins in (*cases_of_ops[op].kinds.values(), *MORE.get(op, ()))
         ),
-        ("locate_cell", functools.partial(lookup, "locate_cell", 300, 3, torch.float32)),
         *(
             (f"cell_sort {n} {k} by {way}", functools.partial(sort, n, k, way))
             for n, k, way in (
@@ -253,28 +202,6 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
                 (0, 4096, "automatic"),
             )
         ),
-        (
-            "frequency_encode",
-            lambda: close(lambda x, b: voronerf.frequency_encode(x[0], 10, backend=b), [torch.rand(90, 3)]),
-        ),
-        *((f"hash_encode {features} features", functools.partial(hashes, features)) for features in (1, 2, 4, 8)),
-        (
-            "spherical_harmonics",
-            lambda: close(lambda x, b: voronerf.spherical_harmonics(x[0], 4, backend=b), [torch.rand(300, 3)]),
-        ),
-        (
-            "integrated_encode",
-            lambda: close(
-                lambda x, b: voronerf.integrated_encode(x[0], x[1], 4, backend=b),
-                [torch.rand(90, 3), torch.rand(90, 3)],
-            ),
-        ),
-        ("composite", composite),
-        ("render_loss", loss),
-        *((f"pixel_rays{' of all lenses' * mixed}", functools.partial(pixels, mixed)) for mixed in (False, True)),
-        ("observe_occupancy", observe),
-        ("sparse_adam", adam),
-        ("resample", resample),
         *(
             (f"grouped_mlp {name} {precision}", functools.partial(network, layers, [70, 0, 1, 40], d, precision))
             for name, (layers, d) in networks.items()

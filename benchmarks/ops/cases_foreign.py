@@ -1,9 +1,9 @@
 """Cases of VoronoiRouter around fields of other codebases (``foreign_fields.py``). n samples, k cells.
 
-A row's own time is that of the router as it comes, whose forward runs on grouped layers. Beside it: the fused router,
-the loop over boolean masks with a module for each cell, that loop with its modules compiled, and one module for all
-samples. The loop over masks is also what results and gradients are compared with. The lookup of the cells is given to
-the loop as the library's own.
+A row's own time is that of the router as it comes, without ``fuse``. Beside it: the router with ``fuse=True``, which
+takes the fastest way, and with ``way="fused"``; the loop over boolean masks with a module for each cell; and one module
+for all samples. The loop over masks is also what results and gradients are compared with. The lookup of the cells is
+given to the loop as the library's own.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import torch
 from torch import Tensor, nn
 
 from ops import foreign_fields as fields
-from ops.alternatives import compile_now
 from ops.case import BACKWARD, FORWARD, Case, Contender, NotApplicable, Work, generator, relative_error, uniform_points
 from voronerf import VoronoiRouter, ops
 
@@ -28,8 +27,6 @@ Call = Callable[..., Tensor]
 TOLERANCE = 1e-2
 """Largest error against the loop over masks: units of ReLU that rounding turns change gradients by some per mille."""
 SMALL, MIDDLE, LARGE = 1 << 10, 1 << 16, 1 << 18
-COMPILED = (MIDDLE, 16)
-"""(n, k) at which the loop is compiled as well, which may take a minute."""
 
 
 def positions(x: Tensor) -> Arguments:
@@ -226,15 +223,13 @@ class Batch:
         parts = [list(itertools.islice(gradients, count)) for count in counts]
         return [*results, *[part[0] if len(part) < self.k else torch.stack(part) for part in parts]]
 
-    def masks(self, compiled: bool = False, encoded: bool = False) -> Contender:
+    def masks(self, encoded: bool = False) -> Contender:
         """The loop that one would write: each cell's module on its samples, results put back where they belong.
 
         Where cells share their encoding, it can also be computed before the loop, for all samples at once.
         """
         parameters = [leaf for leaves in self.leaves for leaf in leaves]
         calls: Sequence[Call] = self.modules
-        if compiled:
-            calls = self._compiled()
         if encoded and not self.field.share:
             raise NotApplicable("cells do not share an encoding")
         if encoded:
@@ -254,26 +249,6 @@ class Batch:
             return torch.empty_like(together).index_copy(0, torch.cat(rows), together)
 
         return Contender(lambda number: self.step(call, parameters, number), self.stacked)
-
-    def _compiled(self) -> list[Call]:
-        """One program for all cells, with the parameters as arguments."""
-        if (self.n, self.k) != COMPILED:
-            raise NotApplicable(f"compiled at n={COMPILED[0]}, k={COMPILED[1]} alone, which takes up to a minute")
-        torch.compiler.reset()
-        template = self.modules[0]
-
-        def call(parameters: dict[str, Tensor], *arguments: Tensor) -> Tensor:
-            result: Tensor = torch.func.functional_call(template, parameters, arguments)
-            return result
-
-        program = torch.compile(call, dynamic=True)
-        return [functools.partial(program, dict(module.named_parameters())) for module in self.modules]
-
-    def compiled(self) -> Contender:
-        """The loop over masks with compiled modules."""
-        contender = self.masks(compiled=True)
-        compile_now(lambda: contender.run(1))
-        return contender
 
     def routed(self, **options: Any) -> Contender:
         """The router."""
@@ -309,10 +284,10 @@ def foreign_work(field: Field, n: int, k: int, direction: str, device: torch.dev
     return Work(
         ours=lambda backend: batch.routed(backend=backend),
         alternatives={
+            "fuse=True": lambda: batch.routed(fuse=True),
             "fused": lambda: batch.routed(fuse=True, way="fused"),
             "masks": batch.masks,
             "masks behind one encoding": lambda: batch.masks(encoded=True),
-            "torch.compile of masks": batch.compiled,
             "one module": batch.single,
         },
         error=batch.error,

@@ -38,9 +38,14 @@ template <typename T>
 __global__ void __launch_bounds__(kThreads)
     locate_cell_kernel(const T* __restrict__ points, const T* __restrict__ centres, const T* __restrict__ weights,
                        const int32_t* __restrict__ child_offsets, const int32_t* __restrict__ child,
-                       int32_t* __restrict__ leaves, int64_t n, int64_t m, int64_t g, int depth) {
+                       const int32_t* __restrict__ rows, int32_t* __restrict__ leaves, int64_t n, int64_t m, int64_t g,
+                       int depth) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= n) return;
+  if (rows != nullptr && i >= *rows) {
+    leaves[i] = -1;
+    return;
+  }
   int32_t state = 0;  // the diagram the point is in, or (negative) the leaf it has reached
   for (int d = 0; d < depth && state >= 0; ++d) {
     if (state >= g) break;
@@ -58,16 +63,17 @@ __global__ void __launch_bounds__(kThreads)
 
 template <typename T>
 void locate_cell_cuda(const T* points, const T* centres, const T* weights, const int32_t* child_offsets,
-                      const int32_t* child, int32_t* leaves, int64_t n, int64_t m, int64_t g, int depth, void* stream) {
+                      const int32_t* child, const int32_t* rows, int32_t* leaves, int64_t n, int64_t m, int64_t g,
+                      int depth, void* stream) {
   if (n == 0) return;
   const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(n, kThreads));
-  VN_LAUNCH((locate_cell_kernel<T>), blocks, kThreads, 0, stream, points, centres, weights, child_offsets, child,
+  VN_LAUNCH((locate_cell_kernel<T>), blocks, kThreads, 0, stream, points, centres, weights, child_offsets, child, rows,
             leaves, n, m, g, depth);
 }
 
-template void locate_cell_cuda(const float*, const float*, const float*, const int32_t*, const int32_t*, int32_t*,
-                               int64_t, int64_t, int64_t, int, void*);
-template void locate_cell_cuda(const double*, const double*, const double*, const int32_t*, const int32_t*, int32_t*,
-                               int64_t, int64_t, int64_t, int, void*);
+template void locate_cell_cuda(const float*, const float*, const float*, const int32_t*, const int32_t*, const int32_t*,
+                               int32_t*, int64_t, int64_t, int64_t, int, void*);
+template void locate_cell_cuda(const double*, const double*, const double*, const int32_t*, const int32_t*,
+                               const int32_t*, int32_t*, int64_t, int64_t, int64_t, int, void*);
 
 }  // namespace voronerf

@@ -25,9 +25,10 @@ bool locate_cell_cpu(const T* points, const T* centres, const T* weights, const 
 
 // g diagrams. Unsound tables (locate_cell_fault) cannot be refused without a host read: a walk ends where they lead out
 // of them, nothing outside is read, and a point that has reached no leaf by then, or in `depth` levels, gets a negative
-// number.
+// number. rows: [1], how many points count, the others get -1; null for all.
 template <typename T>
 void locate_cell_cuda(const T* points, const T* centres, const T* weights, const int32_t* child_offsets,
-                      const int32_t* child, int32_t* leaves, int64_t n, int64_t m, int64_t g, int depth, void* stream);
+                      const int32_t* child, const int32_t* rows, int32_t* leaves, int64_t n, int64_t m, int64_t g,
+                      int depth, void* stream);
 
 }  // namespace voronerf

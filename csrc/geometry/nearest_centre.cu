@@ -16,10 +16,12 @@ constexpr int kPoints = 2;  // of a thread
 template <bool kWeighted>
 __global__ void __launch_bounds__(kThreads, 4)
     nearest_screened_kernel(const float* __restrict__ points, const float* __restrict__ centres,
-                            const float* __restrict__ weights, int32_t* __restrict__ cells, int64_t n, int64_t k) {
+                            const float* __restrict__ weights, const int32_t* __restrict__ rows,
+                            int32_t* __restrict__ cells, int64_t n, int64_t k) {
   VN_SHARED(tile, float4[kTile]);
   VN_SHARED(bounds, float[kThreads / 32]);
   const int64_t first = static_cast<int64_t>(blockIdx.x) * kPoints * kThreads + threadIdx.x;
+  const int64_t counted = rows == nullptr ? n : *rows;
   float at[kPoints][3], best[kPoints], second[kPoints];
   int32_t cell[kPoints];
 #pragma unroll
@@ -70,15 +72,17 @@ __global__ void __launch_bounds__(kThreads, 4)
     if (i >= n) return;
     // Beyond 1e30 a value can overflow while its difference from the weight does not; see nearest_centre_weight_bound.
     const bool screened = weight_bound <= 1e30f && nearest_is_certain(best[p], second[p], weight_bound);
-    cells[i] = screened ? cell[p] : nearest_by_definition(points + 3 * i, centres, weights, k);
+    const int32_t found = screened ? cell[p] : nearest_by_definition(points + 3 * i, centres, weights, k);
+    cells[i] = i < counted ? found : -1;
   }
 }
 
 __global__ void __launch_bounds__(kThreads)
     nearest_centre_kernel(const double* __restrict__ points, const double* __restrict__ centres,
-                          const double* __restrict__ weights, int32_t* __restrict__ cells, int64_t n, int64_t k) {
+                          const double* __restrict__ weights, const int32_t* __restrict__ rows,
+                          int32_t* __restrict__ cells, int64_t n, int64_t k) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < n) cells[i] = nearest_by_definition(points + 3 * i, centres, weights, k);
+  if (i < n) cells[i] = rows == nullptr || i < *rows ? nearest_by_definition(points + 3 * i, centres, weights, k) : -1;
 }
 
 unsigned blocks_of(int64_t n, int64_t points) {
@@ -88,22 +92,22 @@ unsigned blocks_of(int64_t n, int64_t points) {
 }  // namespace
 
 template <>
-void nearest_centre_cuda(const float* points, const float* centres, const float* weights, int32_t* cells, int64_t n,
-                         int64_t k, void* stream) {
+void nearest_centre_cuda(const float* points, const float* centres, const float* weights, const int32_t* rows,
+                         int32_t* cells, int64_t n, int64_t k, void* stream) {
   if (n == 0) return;
   const unsigned blocks = blocks_of(n, kPoints);
   if (weights == nullptr) {
-    VN_LAUNCH(nearest_screened_kernel<false>, blocks, kThreads, 0, stream, points, centres, weights, cells, n, k);
+    VN_LAUNCH(nearest_screened_kernel<false>, blocks, kThreads, 0, stream, points, centres, weights, rows, cells, n, k);
   } else {
-    VN_LAUNCH(nearest_screened_kernel<true>, blocks, kThreads, 0, stream, points, centres, weights, cells, n, k);
+    VN_LAUNCH(nearest_screened_kernel<true>, blocks, kThreads, 0, stream, points, centres, weights, rows, cells, n, k);
   }
 }
 
 template <>
-void nearest_centre_cuda(const double* points, const double* centres, const double* weights, int32_t* cells, int64_t n,
-                         int64_t k, void* stream) {
+void nearest_centre_cuda(const double* points, const double* centres, const double* weights, const int32_t* rows,
+                         int32_t* cells, int64_t n, int64_t k, void* stream) {
   if (n == 0) return;
-  VN_LAUNCH(nearest_centre_kernel, blocks_of(n, 1), kThreads, 0, stream, points, centres, weights, cells, n, k);
+  VN_LAUNCH(nearest_centre_kernel, blocks_of(n, 1), kThreads, 0, stream, points, centres, weights, rows, cells, n, k);
 }
 
 }  // namespace voronerf

@@ -11,9 +11,10 @@ namespace voronerf {
 template <typename T>
 void nearest_centre_cpu(const T* points, const T* centres, const T* weights, int32_t* cells, int64_t n, int64_t k,
                         Isa isa, int threads);
+// rows: [1], how many points count, the others get -1; null for all.
 template <typename T>
-void nearest_centre_cuda(const T* points, const T* centres, const T* weights, int32_t* cells, int64_t n, int64_t k,
-                         void* stream);
+void nearest_centre_cuda(const T* points, const T* centres, const T* weights, const int32_t* rows, int32_t* cells,
+                         int64_t n, int64_t k, void* stream);
 
 // The same on the calling thread. `weight_bound` is nearest_centre_weight_bound(weights, k).
 template <typename T>

@@ -24,11 +24,12 @@ void observe_told_cpu(const ObservedSamples& in, const float* told, int64_t c, c
     const int64_t begin = run * kRun, end = std::min(in.m, begin + kRun);
     for (int64_t i = begin; i < end; ++i) {
       const int64_t cell = observed_cell(in, i);
-      cells[i] = static_cast<int32_t>(cell);
+      cells[i] = observes(in, i) ? static_cast<int32_t>(cell) : -1;
       __builtin_prefetch(density + cell, 1);
       __builtin_prefetch(occupied + cell, 1);
     }
     for (int64_t i = begin; i < end; ++i) {
+      if (cells[i] < 0) continue;
       values[i] = std::max(density[cells[i]] * in.decay, observed_density(in, i));
     }
   });
@@ -43,8 +44,11 @@ void observe_told_cpu(const ObservedSamples& in, const float* told, int64_t c, c
     cells[count] = cell;
     values[count++] = std::max(density[cell] * in.decay, told[2 * i + 1]);
   }
-  for (int64_t i = 0; i < count; ++i) density[cells[i]] = values[i];
   for (int64_t i = 0; i < count; ++i) {
+    if (cells[i] >= 0) density[cells[i]] = values[i];
+  }
+  for (int64_t i = 0; i < count; ++i) {
+    if (cells[i] < 0) continue;
     float& kept = density[cells[i]];
     kept = std::max(kept, values[i]);
     occupied[cells[i]] = kept >= in.threshold;
@@ -55,7 +59,7 @@ int64_t tell_observed_cpu(const ObservedSamples& in, const uint8_t* several, flo
   int64_t count = 0;
   for (int64_t i = 0; i < in.m; ++i) {
     const int32_t cell = static_cast<int32_t>(observed_cell(in, i));
-    if (several != nullptr && !several[cell]) continue;
+    if (!observes(in, i) || (several != nullptr && !several[cell])) continue;
     std::memcpy(told + 2 * count, &cell, sizeof(cell));
     told[2 * count++ + 1] = observed_density(in, i);
   }

@@ -20,7 +20,7 @@ __device__ __forceinline__ int64_t this_sample() {
 __global__ void __launch_bounds__(kThreads)
     claim_kernel(ObservedSamples in, unsigned* density, int32_t* __restrict__ cells, float* __restrict__ before) {
   const int64_t i = this_sample();
-  if (i >= in.m) return;
+  if (i >= in.m || !observes(in, i)) return;
   const int64_t cell = observed_cell(in, i);
   const unsigned bits = atomicOr(density + cell, kSign);
   float kept;
@@ -33,7 +33,7 @@ __global__ void __launch_bounds__(kThreads)
     fade_kernel(ObservedSamples in, const int32_t* __restrict__ cells, const float* __restrict__ before,
                 float* __restrict__ density, uint8_t* __restrict__ occupied) {
   const int64_t i = this_sample();
-  if (i >= in.m || before[i] < 0.0f) return;
+  if (i >= in.m || !observes(in, i) || before[i] < 0.0f) return;
   const float faded = before[i] * in.decay;
   density[cells[i]] = faded;
   occupied[cells[i]] = faded >= in.threshold;
@@ -42,7 +42,7 @@ __global__ void __launch_bounds__(kThreads)
 __global__ void __launch_bounds__(kThreads)
     raise_kernel(ObservedSamples in, const int32_t* __restrict__ cells, int* density, uint8_t* __restrict__ occupied) {
   const int64_t i = this_sample();
-  if (i >= in.m) return;
+  if (i >= in.m || !observes(in, i)) return;
   const float seen = observed_density(in, i);
   int bits;
   memcpy(&bits, &seen, sizeof bits);

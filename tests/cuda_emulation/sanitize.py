@@ -65,14 +65,14 @@ def nearest_centre(module):
         points, centres = floats(300, 3, dtype=dtype), floats(530, 3, dtype=dtype)
         for weights in (None, floats(530, dtype=dtype)):
             cells = unwritten(300, dtype=np.int32)
-            module.nearest_centre(*every((points, centres, weights, cells)), 300, 530, module.Cuda(0, 0))
+            module.nearest_centre(*every((points, centres, weights, None, cells)), 300, 530, module.Cuda(0, 0))
             written(cells)
 
 
 def locate_cell(module):
     points, centres, leaves = floats(300, 3), floats(5, 3), unwritten(300, dtype=np.int32)
     tables = integers(0, 3, 5), integers(-1, 1, -4, -2, -3)
-    module.locate_cell(*every((points, centres, None, *tables, leaves)), 300, 5, 2, 2, module.Cuda(0, 0))
+    module.locate_cell(*every((points, centres, None, *tables, None, leaves)), 300, 5, 2, 2, module.Cuda(0, 0))
     written(leaves)
 
 
@@ -336,7 +336,7 @@ def hostile(module):
     trees = [([0, 3, 5], [-1, 1, 2, -2, most]), ([0, 3, 5], [0, 1, 1, 0, 1]), ([-4, 9, 5], [1] * 5)]
     for child_offsets, child in [*trees, ([3, 3, 0], [-1] * 5), ([0, most, least], [1, 1, 1, 0, 0])]:
         tables, leaves = [integers(*child_offsets), integers(*child)], unwritten(300, dtype=np.int32)
-        module.locate_cell(*every((points, centres, None, *tables, leaves)), 300, 5, 2, 3, gpu)
+        module.locate_cell(*every((points, centres, None, *tables, None, leaves)), 300, 5, 2, 3, gpu)
         written(leaves)
 
     m, r, c = 180, 5, 3

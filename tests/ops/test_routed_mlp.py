@@ -373,3 +373,30 @@ def test_same_bits_as_the_separate_operations_on_any_number_of_threads(name, dty
 
     found = on_any_number_of_threads(lambda: results(lambda leaves: case.run(leaves, backend="native")[0]))
     assert same(found, results(separate))
+
+
+@pytest.mark.parametrize("rows", [0, 1, 23, 40])
+@pytest.mark.parametrize("k", [1, 3])
+def test_rows_beyond_those_that_count_are_in_no_cell(device, backend, rows, k):
+    """Whatever they hold: such a tail is what a march with a capacity leaves."""
+    table = MLP((Layer(("positions",), 8, "relu"), Layer((0,), 2)), outputs=(1,))
+    torch.manual_seed(0)
+    results = []
+    for count in (rows, 40):
+        weights = [
+            torch.ones(k, 8, 3, device=device).mul_(0.1),
+            torch.linspace(-1, 1, 16 * k, device=device).view(k, 2, 8),
+        ]
+        weights = [weight.requires_grad_() for weight in weights]
+        positions = torch.linspace(0, 1, 120, device=device).view(40, 3)[:count]
+        given = {"layers": table, "centres": positions.new_tensor([[0.1] * 3, [0.5] * 3, [0.9] * 3]) if k > 1 else None}
+        if count == 40:
+            given["rows"] = torch.tensor([rows], dtype=torch.int32, device=device)
+        out, cells = routed_mlp(positions, weights, [None, None], **given, backend=backend)
+        out.square().sum().backward()
+        results.append((out, cells, [weight.grad for weight in weights]))
+    (out, cells, gradients), (all_out, all_cells, all_gradients) = results
+    torch.testing.assert_close(all_out[:rows], out)
+    assert torch.equal(all_cells[:rows], cells) and not all_out[rows:].any()
+    assert bool((all_cells[rows:] == -1).all())
+    torch.testing.assert_close(all_gradients, gradients)

@@ -79,7 +79,9 @@ def test_distinct_cells_equal_a_loop_over_masks(case: Case, dtype: torch.dtype, 
     ours = gradients(router, scalar(found), inputs, create_graph=True)
     close(ours, slopes, rtol=rtol, atol=10 * atol)
     bent = gradients(router, scalar({name: ours[name] for name in compared}), inputs)
-    close(bent, curves, rtol=rtol, atol=100 * atol)
+    # The second derivatives of a fine grid are large, and entries that cancel have the rounding of the largest.
+    largest = max(float(curve.detach().abs().max()) for curve in curves.values() if curve.numel())
+    close(bent, curves, rtol=rtol, atol=atol * max(100, 0.5 * largest))
 
 
 @every_case

@@ -194,10 +194,11 @@ class Timed(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.time, self.a, self.b = nn.Linear(1, 4), nn.Linear(7, 8), nn.Linear(8, 2)
+        self.time, self.a, self.b = nn.ModuleList([nn.Linear(1, 6), nn.Linear(6, 4)]), nn.Linear(7, 8), nn.Linear(8, 2)
 
     def forward(self, x: Tensor, t: Tensor) -> Tensor:
-        h = torch.cat([x, self.time(t).repeat(len(x), 1)], -1)
+        code = self.time[1](F.relu(self.time[0](t), inplace=True))
+        h = torch.cat([x, code.repeat(len(x), 1)], -1)
         return self.b(F.relu(self.a(h))) * t
 
 

@@ -137,15 +137,14 @@ def test_widths_count_all_networks(scene):
 
 
 def test_empty_space_is_skipped_wherever_that_works(scene):
-    for settings in (HIERARCHICAL, CONES, {"cuda_graph": True, "device": "cuda"}):
+    for settings in (HIERARCHICAL, CONES):
         assert not resolve_config(TrainConfig(**settings), scene).occupancy
-    assert not resolve_config(TrainConfig(**CONTRACTION), scene).occupancy  # but where it is asked for
-    grid = {"occupancy_resolution": 8}
-    for settings in ({}, KILO, {"field": "nerf"}, CONTRACTION | grid, CONTRACTION | KILO | grid):
+    graph = {"cuda_graph": True, "device": "cuda"}
+    for settings in ({}, KILO, {"field": "nerf"}, graph, CONTRACTION, CONTRACTION | KILO):
         assert resolve_config(TrainConfig(**settings), scene).occupancy
         assert not resolve_config(TrainConfig(occupancy=False, **settings), scene).occupancy
         resolved = resolve_config(TrainConfig(**settings), replace(scene, box=None))
-        assert resolved.occupancy == ("contraction" in settings)
+        assert resolved.occupancy == (resolved.contraction != "none")
 
 
 def test_a_hash_grid_in_a_scene_without_bounds_is_contracted(scene):

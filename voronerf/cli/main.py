@@ -21,7 +21,7 @@ import tyro
 from rich.console import Console
 
 from voronerf.backends import BackendUnavailable
-from voronerf.cli import commands, compare, demo, editing, export, info, view
+from voronerf.cli import commands, compare, demo, editing, export, info, update, view
 from voronerf.cli.display import one_line
 from voronerf.distributed.group import RankLost, may_tell, own_rank
 from voronerf.training.config import ConfigError, TrainConfig
@@ -58,6 +58,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "join": editing.join,
     "cut": editing.cut,
     "place": editing.place,
+    "update": update.update,
     "view": view.view,
     "compare": compare.compare,
     "info": info.info,

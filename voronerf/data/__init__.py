@@ -71,9 +71,10 @@ def load_scene(
     """Loads a scene.
 
     Args:
-        source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of
-            16, or a folder with `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp,
-            nerfstudio), a COLMAP model in `sparse/0`, or LLFF's `poses_bounds.npy`.
+        source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of 16, with
+            "builtin-city:4x4,rebuilt=5" for other buildings on block 5, or a folder with `transforms_train.json`
+            (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, or LLFF's
+            `poses_bounds.npy`.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,
             and for photographs the least factor that leaves at most 512 pixels a side.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path

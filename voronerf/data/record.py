@@ -51,8 +51,31 @@ def within(scene: Scene, run: Path) -> Scene:
     path = run / "scene.json"
     if not path.is_file():
         return scene
-    known = read_scene(path)
-    return replace(scene, box=known.box, near=known.near, far=known.far, background=known.background)
+    return placed(scene, read_scene(path))
+
+
+def placed(scene: Scene, known: Scene) -> Scene:
+    """The views of a scene in the space of another one of the same place.
+
+    Photographs are moved, turned and scaled as they are read, by what the cameras of their folder say. They are moved
+    here to where the other scene's would be.
+
+    Raises:
+        SceneError: they cannot be of one place: one has a background that the other has not, or only one was moved.
+    """
+    if scene.background != known.background:
+        ours, theirs = (each.background or "none" for each in (known, scene))
+        raise SceneError(f"{scene.name}: background must be that of {known.name}, {ours}, got {theirs}")
+    train, test = scene.train, scene.test
+    if known.transform is not None and scene.transform is not None:
+        move = known.transform @ torch.linalg.inv(scene.transform)
+        if not torch.allclose(move, torch.eye(4, dtype=move.dtype), atol=1e-6):
+            train, test = (replace(part, cameras=part.cameras.moved(move)) for part in (train, test))
+    elif known.transform is not None or scene.transform is not None:
+        which = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
+        raise SceneError(f"{scene.name}: must be in the frame of {known.name}, got one that is {which} (--normalise)")
+    names = ("near", "far", "box", "spacing", "kind", "contraction", "transform")
+    return replace(scene, train=train, test=test, **{name: getattr(known, name) for name in names})
 
 
 def read_scene(path: Path) -> Scene:

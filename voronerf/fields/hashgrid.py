@@ -17,6 +17,9 @@ from voronerf.layers import MLP, Layer
 #: be at the kink of its ReLU, and the first steps could switch off a whole layer: one seed in seven lost its colours.
 HIDDEN_BIAS = 0.3
 
+#: The logarithm of the entries of a level in contracted space.
+CONTRACTED_ENTRIES = 17
+
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
@@ -118,13 +121,16 @@ class HashGridField(RadianceField):
 
         Half a pixel is the width of the finest cells. A surface meets as many cells as the square of the resolution;
         the entries grow more slowly, since larger tables take longer to read and to learn: 2^15 for an object of 88
-        pixels, 2^18 for 353. In a contracted scene, seen from within, larger tables were worse.
+        pixels, 2^18 for 353. In contracted space, most of what is seen is farther away than the middle, by which a
+        pixel is measured: the finest cells are as wide as that pixel, and there are 2^17 entries.
         """
         pixels = max(high - low for low, high in zip(*box)) / pixel
-        found: dict[str, Any] = {"box": box, "finest": max(round(2 * pixels), 32)}
-        if not contracted:
-            found["log2_entries"] = min(max(round(1.5 * math.log2(pixels) + 5.3), 14), 19)
-        return found
+        finest, entries = round((1 if contracted else 2) * pixels), round(1.5 * math.log2(pixels) + 5.3)
+        return {
+            "box": box,
+            "finest": max(finest, 32),
+            "log2_entries": CONTRACTED_ENTRIES if contracted else min(max(entries, 14), 19),
+        }
 
     def reset_parameters(self) -> None:
         """Features near zero, as published; the layers as in :func:`voronerf.fields.radiance.reset_layers`."""

@@ -124,6 +124,13 @@ class Cameras:
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Cameras: width and height must be >= 1, got {self.width} x {self.height}")
 
+    def moved(self, move: Tensor) -> Cameras:
+        """The cameras after a similarity [4, 4] of the world, such as the change from one frame to another."""
+        scale = torch.linalg.det(move[:3, :3]).abs() ** (1 / 3)
+        poses = (move @ self.poses.to(move)).clone()
+        poses[:, :3, :3] /= scale
+        return replace(self, poses=poses.to(self.poses))
+
     @classmethod
     def of_images(
         cls,

@@ -218,6 +218,7 @@ class OccupancyGrid:
         spacing: str = "linear",
         start: Tensor | None = None,
         most: int | None = None,
+        capacity: int | None = None,
         backend: str = "auto",
     ) -> March:
         """The samples of rays that lie in occupied cells; see `voronerf.ops.march_rays`."""
@@ -233,6 +234,7 @@ class OccupancyGrid:
             spacing=spacing,
             start=start,
             most=most,
+            capacity=capacity,
             contraction=self._numbers,
             backend=backend,
         )

@@ -208,8 +208,12 @@ class Occupancy(Stratified):
         """
         samples = self.picture_samples if picture else self.samples
         walk: dict[str, Any] = {"seed": seed, "start": start, "most": most, "backend": self.backend}
+        if seed is not None and start is None and not _on_host(near):  # a training step waits for no device
+            walk["capacity"] = max(1, len(near) * samples)
         found = self.grid.march(rays, near, far, samples, spacing=self.space.spacing, **walk)
-        return Samples(found.positions, found.ray_index, found.ray_offsets, found.depths, found.deltas), found.stop
+        rows = found.ray_offsets[-1:] if "capacity" in walk else None
+        parts = found.positions, found.ray_index, found.ray_offsets, found.depths, found.deltas
+        return Samples(*parts, rows=rows), found.stop
 
 
 class Hierarchical(Stratified):
@@ -313,6 +317,10 @@ class Proposal(Hierarchical):
         assert last.samples.edges is not None and before.samples.edges is not None
         seen, proposed = (each.samples.by_ray(each.weights) for each in (last, before))
         return interlevel_loss(last.samples.edges, seen, before.samples.edges, proposed)
+
+
+def _on_host(tensor: Tensor) -> bool:
+    return tensor.is_cpu
 
 
 #: By the names of ``--sampling``. An `Occupancy` takes the place of a sampler that ``skips``, where there is a grid.

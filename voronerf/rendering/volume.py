@@ -30,6 +30,7 @@ class Samples(NamedTuple):
         depths: [m], their distances.
         deltas: [m], the lengths of the parts of the ray that they stand for.
         edges: [r, s + 1], the ends of these parts, where all rays have s samples; else None.
+        rows: int32 [1], how many of the samples belong to rays, where no host has read it; None for all.
 
     Examples:
         >>> import torch
@@ -46,11 +47,21 @@ class Samples(NamedTuple):
     depths: Tensor
     deltas: Tensor
     edges: Tensor | None = None
+    rows: Tensor | None = None
 
     @property
     def positions(self) -> Tensor:
         """[m, 3], the points or the means of the Gaussians."""
         return self.inputs if self.inputs.shape[1] == 3 else self.inputs[:, :3]
+
+    def counted(self) -> Samples:
+        """Without the rows that belong to no ray; the host waits for their number."""
+        if self.rows is None:
+            return self
+        known = int(self.rows)
+        parts = (values[:known] for values in (self.inputs, self.ray_index, self.depths, self.deltas))
+        inputs, index, depths, deltas = parts
+        return Samples(inputs, index, self.ray_offsets, depths, deltas)
 
     def of_rays(self, rays: Tensor) -> Samples:
         """The samples of some rays, int64 [q] in ascending order, which become rays 0 to q - 1."""
@@ -63,6 +74,13 @@ class Samples(NamedTuple):
         inputs, index, depths, deltas = packed
         edges = None if self.edges is None else self.edges[rays]
         return Samples(inputs, number.index_select(0, index), offsets, depths, deltas, edges)
+
+    def part(self, rows: Tensor) -> Samples:
+        """Some of the samples, bool [m]; all rays stay."""
+        counts = torch.zeros_like(self.ray_offsets).index_add(0, self.ray_index[rows].long() + 1, rows[rows].int())
+        packed = (values[rows] for values in (self.inputs, self.ray_index, self.depths, self.deltas))
+        inputs, index, depths, deltas = packed
+        return Samples(inputs, index, counts.cumsum(0, dtype=torch.int32), depths, deltas)
 
     def by_ray(self, values: Tensor) -> Tensor:
         """Values [m, ...] as [r, s, ...], where all rays have as many samples; else as they are."""

@@ -10,7 +10,6 @@ Letters: n samples, k cells, w columns.
 from __future__ import annotations
 
 import contextlib
-import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,16 +20,11 @@ from torch.fx.node import map_arg
 
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.program import VALUE, Builder, Columns, Program, Step
-from voronerf.router.grouped import GroupedRun, PerCell, for_all_cells, name_of
+from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable, name_of
 from voronerf.router.grouping import Grouping, owned_parameters
-from voronerf.router.layout import Call, Results, map_tensors, map_tree, tensors_of
+from voronerf.router.layout import Call, Results, map_tensors, tensors_of
 from voronerf.router.lower import Entries, Lowering, NotAStep
 from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiable
-
-
-def fuse(call: Call, given: list[Tensor], assume: Mapping[str, bool] = {}) -> Fused:
-    """The fused way of a call, traced for the first cell on some rows of its arguments, or raises Unfusable."""
-    return Fused(call, given, assume)
 
 
 class Taken:
@@ -107,7 +101,7 @@ class Fused:
         if not any(step.op == "linear" for run in self._runs.values() for step in run.program.steps):
             first = next(iter(self._why.values()), "nothing that is returned comes from a layer")
             raise Unfusable(f"no layer can be part of a run: {first}")
-        self._sorted = any(self._meets_cells(node) for node in self._between)
+        self._sorted = any(_meets_cells(node) for node in self._between)
         lines: dict[str, dict[str, None]] = {}  # of the module, with the functions that are no steps
         for node in self._between:
             if node in self._why and node.target is not differentiable:
@@ -245,9 +239,6 @@ class Fused:
         numbers = lowering.order(self._entries[node].codes)[1].tolist()
         return all(lowering.columns[i][0] in lowering.sources for i in numbers)
 
-    def _meets_cells(self, node: fx.Node) -> bool:
-        return any(source.meta["on"] == CELLS for source in node.all_input_nodes)
-
     def _cut(self) -> dict[int, Run]:
         """The steps in runs, by their level."""
         lowering, steps = self._lowering, self._lowering.builder.steps
@@ -290,8 +281,10 @@ class Fused:
         return Results(self._result, found, grouping if sort else None)
 
     def _compute(self, values: dict[Any, Any], grouping: Grouping, sort: bool) -> None:
-        self._compute_weights(values)
-        grouped = GroupedRun(grouping, {}) if self._sorted else None
+        grouped = GroupedRun(grouping, {})
+        for node in self._weights:
+            if node not in values:
+                _compute(node, values, grouped)
         last = max(self._runs, default=-1)
         for number in range(last + 2):
             for node in self._between:
@@ -320,24 +313,6 @@ class Fused:
                 half = of.meta["dtype"] in (torch.bfloat16, torch.float16)
                 tensor = tensor.to(of.meta["dtype"]) if half else tensor
             values[of] = tensor
-
-    def _compute_weights(self, values: dict[Any, Any]) -> None:
-        """What is made of parameters alone."""
-        for node in self._weights:
-            if node in values:
-                continue
-            if node.meta["on"] != CELLS:
-                _compute(node, values, None)
-                continue
-
-            def of_cells(source: fx.Node) -> Any:
-                value = values[source]
-                return map_tensors(value, PerCell) if source.meta["on"] == CELLS else value
-
-            args, kwargs = map_arg((node.args, node.kwargs), of_cells)
-            single = node.target is operator.getitem and not isinstance(values[node.args[0]], Tensor)
-            made = args[0][args[1]] if single else for_all_cells(node.target, args, kwargs)
-            values[node] = map_tree(made, lambda _, own, nested: own.stacked if isinstance(own, PerCell) else own)
 
 
 def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outputs: list[Any]) -> Run:
@@ -369,23 +344,32 @@ def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outp
     return run
 
 
-def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun | None) -> None:
+def _meets_cells(node: fx.Node) -> bool:
+    return any(source.meta["on"] == CELLS for source in node.all_input_nodes)
+
+
+def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun) -> None:
     """Calls the function of a node, for all cells at once where it meets their parameters."""
+    meets = _meets_cells(node)
 
     def given(source: fx.Node) -> Any:
-        value = values[source]
-        if grouped is not None and source.meta["on"] == CELLS:
-            return map_tensors(value, PerCell)
-        if grouped is not None and source.meta["on"] == SAMPLES:
-            for tensor in tensors_of(value):
+        if meets and source.meta["on"] == CELLS:
+            return map_tensors(values[source], PerCell)
+        if meets and source.meta["on"] == SAMPLES:
+            for tensor in tensors_of(values[source]):
                 grouped.mark(tensor)
-        return value
+        return values[source]
 
     args, kwargs = map_arg((node.args, node.kwargs), given)
     recorded = torch.is_grad_enabled() and node.meta.get("grad", True)
-    with grouped or contextlib.nullcontext(), torch.set_grad_enabled(recorded):
-        result = node.target(*args, **kwargs)  # type: ignore[operator]
-    values[node] = args[0] if node.meta.get("inplace") else result
+    try:
+        with grouped if meets else contextlib.nullcontext(), torch.set_grad_enabled(recorded):
+            result = node.target(*args, **kwargs)  # type: ignore[operator]
+    except Ungroupable:
+        says = f"{name_of(node.target)}{node.meta['line']} meets parameters and has no rule for all cells at once"
+        raise Unfusable(says) from None
+    made = args[0] if node.meta.get("inplace") else result
+    values[node] = map_tensors(made, lambda own: own.stacked if isinstance(own, PerCell) else own)
 
 
 def _flat(value: Tensor, n: int) -> Tensor:

@@ -27,7 +27,7 @@ from voronerf.diagram.blending import Mixture
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.cells import clone_module
 from voronerf.router.double import Double, Forbidden
-from voronerf.router.fused import fuse
+from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters
 from voronerf.router.layout import RAY, Call, Results, map_tensors, rebuild, tensors_of
@@ -416,7 +416,7 @@ class Trial:
         with NoRandomness():
             module, given = self.made_of[0].module, self.call.arranged(self.entries)
             count = rows_for(module, given)
-            way = fuse(replace(self.call, module=module), [rows[:count] for rows in given], assume)
+            way = Fused(replace(self.call, module=module), [rows[:count] for rows in given], assume)
         if not self.agrees(way, loop, expected):
             raise Unfusable("the traced network gives other results than its forward")
         return way

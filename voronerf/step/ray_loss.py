@@ -150,6 +150,8 @@ class Fused:
         seen = None
         if self.sightings and batch.seen is not None:
             seen = torch.nn.functional.pad(batch.seen, (len(batch.rays) - len(batch.seen), 0), value=math.nan)
+        if seen is not None or field.frozen_cells is not None:
+            samples = samples.counted()
         if field.frozen_cells is not None:
             rays = _rays_to_learn(field, samples)
             samples, directions, target = samples.of_rays(rays), directions[rays], target[rays]
@@ -184,6 +186,7 @@ class Fused:
 
         network = field.table_arguments(samples.inputs, directions, samples.ray_index)
         assert network is not None
+        network["rows"] = samples.rows
         total = learn_outputs(network, loss, backward=backward, backend=renderer.backend)
         return Found(total, found[0].error, found[0].weights, found[0].density, samples)
 
@@ -242,9 +245,9 @@ class Composed:
         loss, samples = colour_loss(last.colour, batch.target), last.samples
         if self.sightings and batch.seen is not None:
             others = len(batch.rays) - len(batch.seen)
-            begin = int(samples.ray_offsets[others])
-            depths, deltas, weights = (values[begin:] for values in (samples.depths, samples.deltas, last.weights))
-            ray = samples.ray_index[begin:].long() - others
+            begin, end = (int(samples.ray_offsets[ray]) for ray in (others, -1))
+            depths, deltas, weights = (values[begin:end] for values in (samples.depths, samples.deltas, last.weights))
+            ray = samples.ray_index[begin:end].long() - others
             there = weights * seen_there(depths, deltas, batch.seen[ray])
             light = torch.zeros_like(batch.seen).index_add(0, ray, there)
             loss = loss + self.sightings * sighting_loss(light).mean()

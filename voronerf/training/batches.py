@@ -34,6 +34,7 @@ class RayBatches:
         cones: Whether the rays have radii.
         sightings: Whether a share of the rays, `SEEN`, are through sightings of points.
         views: int64, the training views to draw from; None for all.
+        through: [2, 3], a box in that of the scene that rays must meet; None for all of it.
         backend: Of the ops.
     """
 
@@ -45,6 +46,7 @@ class RayBatches:
         cones: bool = False,
         sightings: bool = False,
         views: Tensor | None = None,
+        through: Tensor | None = None,
         backend: str = "auto",
     ) -> None:
         self.scene, self.views, self.backend = scene, views, backend
@@ -56,7 +58,7 @@ class RayBatches:
         self.pages = Pages(self.images) if scene.train.on_disk else None
         self.background = scene.background_colour(self.place)
         self.box = None if scene.box is None else scene.box.to(self.place)
-        self.useful = self._useful_pixels()
+        self.useful = self._useful_pixels(self.box if through is None else through.to(self.place))
         self.sightings = None
         if sightings and scene.train.sightings is not None:
             self.sightings = Sightings(*(tensor.to(self.place) for tensor in scene.train.sightings))
@@ -66,10 +68,10 @@ class RayBatches:
                 self.sightings = Sightings(*(tensor[own] for tensor in self.sightings))
                 self.sightings = self.sightings if own.any() else None
 
-    def _useful_pixels(self) -> Runs | None:
+    def _useful_pixels(self, box: Tensor | None) -> Runs | None:
         """The pixels to draw from; None when that is all of them."""
         cameras, masks = self.cameras, self.scene.train.masks
-        if self.box is None and masks is None and cameras.sizes is None and self.views is None:
+        if box is None and masks is None and cameras.sizes is None and self.views is None:
             return None
         found = []
         for image in range(len(cameras)) if self.views is None else self.views.tolist():
@@ -77,9 +79,9 @@ class RayBatches:
             chosen = torch.ones(height, width, dtype=torch.bool, device=self.place)
             if masks is not None:
                 chosen &= masks[image, :height, :width].to(self.place)
-            if self.box is not None:
+            if box is not None:
                 rays = cameras.image_rays(image)
-                _, _, hit = intersect_box(rays.origins, rays.directions, self.box, self.scene.near, self.scene.far)
+                _, _, hit = intersect_box(rays.origins, rays.directions, box, self.scene.near, self.scene.far)
                 chosen &= hit.reshape(height, width)
             edges = torch.nn.functional.pad(chosen.to(torch.int8), (1, 1)).diff(dim=1)
             row, column = (edges == 1).nonzero(as_tuple=True)

@@ -155,7 +155,7 @@ class TrainConfig:
     fields without a grid, else ndc where the cameras face forward and the sphere elsewhere."""
     occupancy: bool = True
     """Skip samples in empty space, in training and in pictures, wherever that works: for points in a single pass, in a
-    scene with a box or with a contraction, without --cuda-graph."""
+    scene with a box or with a contraction."""
     occupancy_resolution: int | None = None
     """Cells of the occupancy grid along each axis; default 64 in a box, and 128 with a contraction."""
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"

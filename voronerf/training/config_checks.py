@@ -135,7 +135,6 @@ def why_no_occupancy(config: TrainConfig) -> str | None:
     obstacles = {
         f"--field {config.field}, which takes cones": config.field_type.cones,
         f"--sampling {config.sampling}": not SAMPLERS[config.sampling].skips,
-        "--cuda-graph": config.cuda_graph,
     }
     return next((name for name, there in obstacles.items() if there), None)
 

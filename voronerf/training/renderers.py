@@ -29,9 +29,8 @@ PICTURE_SAMPLES = 2
 LEAST_OPACITY, TRAINING_OPACITY = 0.02, 0.05
 #: The same of a cell of contracted space, for the light on its way through the whole cell.
 CONTRACTED_OPACITY = 0.1
-#: How many samples in a row empty a new cell: about thirty steps, until which the field has said nothing about most. In
-#: contracted space, cells near the cameras meet several samples in each step.
-OCCUPANCY_PATIENCE, CONTRACTED_PATIENCE = 8, 30
+#: How many samples in a row empty a new cell: about thirty steps, until which the field has said nothing about most.
+OCCUPANCY_PATIENCE = 8
 #: Of a grid made for pictures alone: cells along each axis, and points evaluated in each.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 
@@ -132,16 +131,16 @@ def make_grid(
         ConfigError: When the scene has no box and is not contracted.
     """
     contraction = None if config.contraction == "none" else make_contraction(scene, config.contraction, device)
-    size, patience = resolution or int(config.occupancy_resolution or 0), OCCUPANCY_PATIENCE
+    size = resolution or int(config.occupancy_resolution or 0)
     if contraction is not None:
-        box, patience = contraction.cube, CONTRACTED_PATIENCE
+        box = contraction.cube
         threshold = -math.log1p(-CONTRACTED_OPACITY) * size / float(box[1, 0] - box[0, 0])
     elif scene.box is not None:
         box = scene.box
         threshold = -math.log1p(-least_opacity) * int(config.samples or 0) / float((box[1] - box[0]).norm())
     else:
         raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
-    remembered = DECAY**-patience
+    remembered = DECAY**-OCCUPANCY_PATIENCE
     return OccupancyGrid(box, size, threshold=threshold, remembered=remembered, contraction=contraction, device=device)
 
 

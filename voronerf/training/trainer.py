@@ -48,6 +48,7 @@ from voronerf.training.divergence import (
     one_colour_psnr,
     why_scores_are_poor,
 )
+from voronerf.training.errors import usual_errors
 from voronerf.training.networks import (
     check_backend,
     check_memory,
@@ -144,6 +145,7 @@ class Trainer:
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
         self.step, self.seconds = 0, 0.0
+        self._rows: Tensor | None = None  # how many samples the last step had, where no host has read it
         #: Seconds of all evaluations but the last, and of a view in the latest.
         self.scoring, self.view_seconds = 0.0, 0.0
         #: Rays of the next step, and of all steps so far.
@@ -153,6 +155,7 @@ class Trainer:
         self.metrics: list[dict[str, Any]] = []
         self.stopped = self.described = False
         self.loss = math.nan
+        self.errors: Tensor | None = None  # of each cell, see `usual_errors`
         self.writer = CheckpointWriter(self.out, config.keep_checkpoints)
         if checkpoint is not None:
             self._resume(checkpoint)
@@ -247,6 +250,7 @@ class Trainer:
         self.advance()
         while not self._check_moments():
             self.advance()
+        self._find_errors()
         self.save()
         if self.fraction >= 1:
             self.stopped = False  # a stop that came in the last step has nothing to end
@@ -304,7 +308,17 @@ class Trainer:
             TrainingError: When steps are skipped again and again, see :meth:`_go_back`.
         """
         started = self.clock()
-        self.loss, in_a_row = torch.stack((loss.float(), self.guard.in_a_row)).tolist()
+        figures = [loss.float(), self.guard.in_a_row]
+        if self._rows is not None:
+            figures.append(self._rows[0].float())
+        self.loss, in_a_row, *samples = torch.stack(figures).tolist()
+        if samples and self.occupancy is not None:
+            rays = next_rays(self.config, self.rays, int(samples[0]))
+            if self.config.cuda_graph:  # which is captured anew for other numbers of rays
+                rays -= rays % self.config.rays
+            if rays != self.rays:
+                self.rays = rays
+                self._begin_stage()
         self._count(started)
         if in_a_row >= PATIENCE:
             self._go_back(f"gradients of {int(in_a_row)} steps in a row not finite")
@@ -381,8 +395,9 @@ class Trainer:
         if found.loss.requires_grad:
             self.scaler.scale(found.loss).backward()
         loss = found.loss.detach()
+        self._rows = found.samples.rows
         self.cells.observe(found)
-        if self.occupancy is not None:
+        if self.occupancy is not None and self._rows is None:
             self.rays = next_rays(self.config, self.rays, len(found.weights))
         # Nothing is read on the host: the optimiser leaves out a step by what is found on the device.
         if self.scaler.is_enabled():
@@ -548,6 +563,12 @@ class Trainer:
         if wait:
             self.writer.wait()
 
+    def _find_errors(self) -> None:
+        """Finds the errors that an update compares new pictures with."""
+        if self.step:
+            with self.averaged():
+                self.errors = usual_errors(self.renderer, self.router, self.batches)
+
     def state(self) -> Checkpoint:
         """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
         stored = state.Stored(
@@ -568,6 +589,8 @@ class Trainer:
             "reservoir": self.cells.reservoir.state_dict(),
             "generator": {"state": self.generator.get_state(), "draws": self.draws.get_state()},
         }
+        if self.errors is not None:
+            parts["errors"] = {"usual": self.errors}
         if self.occupancy is not None:
             parts["occupancy"] = self.occupancy.state_dict()
         if self.scaler.is_enabled():

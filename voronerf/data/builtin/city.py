@@ -41,6 +41,7 @@ def city_scene(
     blocks: int | tuple[int, int] = 1,
     train_views: int = TRAIN_VIEWS,
     test_views: int = TEST_VIEWS,
+    rebuilt: int | None = None,
     images: str = "memory",
 ) -> Scene:
     """Computes the city.
@@ -50,11 +51,14 @@ def city_scene(
         blocks: on each side, or along x and along y, 1 to 32.
         train_views: of each block, every other one from its streets and the rest from above.
         test_views: of each block, at other places than the training views.
+        rebuilt: the block that has other buildings, trees and cars, 0 to blocks**2 - 1, row by row; or None. The views
+            and all other blocks are the same: for what happens when a scene changes.
         images: "memory"; "cached", which also keeps them in a store of the cache, where a next call finds them; or
             "disk", which maps them from there.
 
     Raises:
-        ValueError: a size or number of views below 1, too many blocks, or another place for the images.
+        ValueError: a size or number of views below 1, too many blocks, a block that there is not, or another place for
+            the images.
         SceneError: the store cannot be written.
 
     Examples:
@@ -69,9 +73,12 @@ def city_scene(
     sides = (blocks, blocks) if isinstance(blocks, int) else tuple(blocks)
     if len(sides) != 2 or not 1 <= min(sides) <= max(sides) <= MOST:
         raise ValueError(f"city_scene: blocks must be 1 to {MOST}, got {blocks}")
+    if rebuilt is not None and not 0 <= rebuilt < sides[0] * sides[1]:
+        raise ValueError(f"city_scene: rebuilt must be a block of 0 to {sides[0] * sides[1] - 1}, got {rebuilt}")
     if images not in ("memory", "cached", "disk"):
         raise ValueError(f"city_scene: images must be memory, cached or disk, got {images!r:.60}")
-    groups, name = city(sides), f"builtin-city-{sides[0]}x{sides[1]}"
+    groups, name = city(sides, rebuilt), f"builtin-city-{sides[0]}x{sides[1]}"
+    name += "" if rebuilt is None else f"-rebuilt-{rebuilt}"
     made_of = sides[0] if sides[0] == sides[1] else list(sides)
     solids = [solid for group in groups for solid in group]
     box = bounds(solids)
@@ -93,17 +100,22 @@ def city_scene(
     return Scene(name, train, test, NEAR, far, torch.from_numpy(box), "linear", "white")
 
 
-def city_of(size: int, blocks: str, images: str) -> Scene:
-    """The city of blocks such as "4x4" or "4x8"; in the cache if it is larger than one block.
+def city_of(size: int, text: str, images: str) -> Scene:
+    """The city of blocks such as "4x4", "4x8" or "4x4,rebuilt=5"; in the cache if it is larger than one block.
 
     Raises:
         SceneError: other blocks than these.
     """
-    found = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", blocks)
+    blocks, comma, rest = text.partition(",")
+    found, number = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", blocks), re.fullmatch(r"rebuilt=(\d{1,4})", rest)
     if found is None or max(int(found[1]), int(found[2])) > MOST:
         raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, 2x4, ... or {MOST}x{MOST}, got {blocks!r:.60}")
+    sides = int(found[1]), int(found[2])
+    most = sides[0] * sides[1] - 1
+    if comma and (number is None or int(number[1]) > most):
+        raise SceneError(f"builtin-city: after the blocks must come rebuilt=0 to rebuilt={most}, got {rest!r:.60}")
     where = "disk" if images == "disk" else "memory" if blocks == "1x1" else "cached"
-    return city_scene(size, blocks=(int(found[1]), int(found[2])), images=where)
+    return city_scene(size, blocks=sides, rebuilt=None if number is None else int(number[1]), images=where)
 
 
 def city_cameras(size: int, blocks: tuple[int, int], views: int, seed: int) -> Cameras:

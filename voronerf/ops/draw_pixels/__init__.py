@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.backends import Implementation
+from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import INDEX, Checked, check_integer, check_same_device
 from voronerf.ops.draw_pixels.reference import Runs
 
-_OP = backends.declare("draw_pixels", native=Implementation(("cpu",), (torch.int32,)))
+_OP = backends.declare("draw_pixels", native=Implementation(EVERYWHERE, (torch.int32,)))
 
 
 def draw_pixels(

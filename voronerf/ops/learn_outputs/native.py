@@ -1,4 +1,4 @@
-"""``learn_outputs`` of the compiled module: one node of autograd on the CPU in float32.
+"""``learn_outputs`` of the compiled module: one node of autograd in float32.
 
 Checks and nodes of ``routed_mlp``, a loss and their backward passes take a tenth of a step of a few thousand samples.
 Here the gradients of the parameters are computed with the loss, and the backward pass hands them over; or they are
@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf import native
 from voronerf.ops.grouped_mlp import native as grouped_mlp
 from voronerf.ops.learn_outputs import reference
 from voronerf.ops.learn_outputs.reference import Loss
@@ -23,8 +24,8 @@ from voronerf.ops.routed_mlp import of_samples
 def learn_outputs(network: Mapping[str, Any], loss: Loss, backward: bool) -> Tensor:
     """The loss, with gradients, once differentiable; see ``voronerf.ops.learn_outputs``."""
     floats = (network["positions"], *network["weights"], *network["biases"], network.get("features"))
-    plain = all(tensor is None or (tensor.is_cpu and tensor.dtype == torch.float32) for tensor in floats)
-    if not plain or torch.is_autocast_enabled("cpu") or not torch.is_grad_enabled():
+    plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in floats)
+    if not plain or torch.is_autocast_enabled(network["positions"].device.type) or not torch.is_grad_enabled():
         return reference.learn_outputs(network, loss, backward, routed_mlp.routed_mlp)
     frozen = network.get("frozen")
     names = routed_mlp.Where._fields
@@ -60,9 +61,12 @@ def _learn(
 ) -> tuple[Tensor, list[Tensor]]:
     """The loss, and gradients of weights, biases and features where any is needed."""
     out, cells, order, offsets, encoded = routed_mlp.forward.inside(*call)
+    rows = None if native.on_cuda(out) else call.where.rows  # CUDA has left out the others
+    out, cells = routed_mlp.first_rows(out, cells if call.where.cells is None else call.where.cells, rows)
     total, gradient = loss(out)
+    if rows is not None:
+        gradient, _ = routed_mlp.first_rows(gradient, cells, rows)
     if frozen is not None:  # rows of zeros leave the backward pass
-        cells = cells if call.where.cells is None else call.where.cells
         gradient = gradient.masked_fill(of_samples(frozen, cells), 0)
     *of_layers, of_features = needs
     if not any(needs):
@@ -86,7 +90,7 @@ class _Learn(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, of_loss: Tensor) -> tuple[Tensor | None, ...]:
         found, ctx.gradients = ctx.gradients, None  # to be taken as they are, not copied
-        needs, factor = ctx.needs_input_grad[3:], float(of_loss)
-        if factor != 1:
-            found = [gradient * factor for gradient in found]
+        needs = ctx.needs_input_grad[3:]
+        if not of_loss.is_cpu or float(of_loss) != 1:  # nothing is read of a device
+            found = [gradient * of_loss for gradient in found]
         return (None, None, None, *(gradient if need else None for gradient, need in zip(found, needs, strict=True)))

@@ -30,17 +30,19 @@ def find(
     depth: int,
     weights: Tensor | None,
     caller: str,
+    rows: Tensor | None = None,
 ) -> None:
-    """Fills ``leaves``, int32 [n]; coordinates and weights are of one dtype. ``caller``: whom errors name."""
+    """Fills ``leaves``, int32 [n], on CUDA with -1 from ``rows`` on; coordinates and weights are of one dtype.
+    ``caller``: whom errors name."""
     compiled, machine = native.compiled, native.machine(points)
     n, m, g = points.shape[0], centres.shape[0], child_offsets.shape[0] - 1
-    given = points, centres, weights, child_offsets, child, leaves
+    given = points, centres, weights, child_offsets, child
     if isinstance(machine, compiled.Cuda):
-        compiled.locate_cell(*given, n, m, g, depth, machine)
+        compiled.locate_cell(*given, rows, leaves, n, m, g, depth, machine)
         return
     check_tree(child_offsets, child, m, caller)
     workspace = leaves.new_empty(compiled.locate_cell_workspace(m, machine))
-    if not compiled.locate_cell(*given, workspace, n, m, depth, machine):
+    if not compiled.locate_cell(*given, leaves, workspace, n, m, depth, machine):
         raise too_shallow(depth, caller)
 
 

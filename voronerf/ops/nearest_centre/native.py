@@ -19,7 +19,11 @@ def nearest_centre(points: Tensor, centres: Tensor, weights: Tensor | None) -> I
     find(cells, points, centres, weights)
 
 
-def find(cells: Tensor, points: Tensor, centres: Tensor, weights: Tensor | None) -> None:
-    """Fills ``cells``, int32 [n]; coordinates and weights are of one dtype."""
+def find(cells: Tensor, points: Tensor, centres: Tensor, weights: Tensor | None, rows: Tensor | None = None) -> None:
+    """Fills ``cells``, int32 [n]; coordinates and weights are of one dtype. On CUDA with -1 from ``rows`` on."""
+    compiled, machine = native.compiled, native.machine(points)
     n, k = points.shape[0], centres.shape[0]
-    native.compiled.nearest_centre(points, centres, weights, cells, n, k, native.machine(points))
+    if isinstance(machine, compiled.Cuda):
+        compiled.nearest_centre(points, centres, weights, rows, cells, n, k, machine)
+    else:
+        compiled.nearest_centre(points, centres, weights, cells, n, k, machine)

@@ -43,7 +43,7 @@ def observe_occupancy(
         box: float32 [2, 3], lowest and highest corner.
         positions: float32 [m, 3]; a position outside the box counts for the nearest cell at its border.
         sigma: float32 [m], densities of the samples; NaN counts as infinite.
-        deltas: float32 [m], lengths of their strata.
+        deltas: float32 [m], lengths of their strata; a sample of length 0 says nothing.
         weights: float32 [m], their contributions to their rays.
         decay: 0 to 1.
         threshold: density from which a cell counts as occupied.

@@ -30,11 +30,15 @@ def observe_occupancy(given: Observed) -> None:
     # weight = light that arrives * share of it that is taken
     seen = given.weights > given.hidden * -torch.expm1(-found * given.deltas)
     rows = cells_of(given.positions, given.box, given.density.shape).long()
-    flat = given.density.view(-1)
+    count = given.density.numel()
+    rows = torch.where(given.deltas != 0, rows, count)  # one cell more, for samples that say nothing
+    density, occupied = (torch.nn.functional.pad(table.view(-1), (0, 1)) for table in (given.density, given.occupied))
     # A cell decays once, however often it occurs.
-    faded = flat.scatter(0, rows, flat[rows] * given.decay)
-    flat.copy_(faded.scatter_reduce(0, rows, torch.where(seen, found, 0), "amax"))
-    given.occupied.view(-1)[rows] = flat[rows] >= given.threshold
+    faded = density.scatter(0, rows, density[rows] * given.decay)
+    raised = faded.scatter_reduce(0, rows, torch.where(seen, found, 0), "amax")
+    occupied[rows] = raised[rows] >= given.threshold
+    given.density.view(-1).copy_(raised[:count])
+    given.occupied.view(-1).copy_(occupied[:count])
 
 
 def cells_of(points: Tensor, box: Tensor, shape: torch.Size) -> Tensor:

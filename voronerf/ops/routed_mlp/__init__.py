@@ -45,6 +45,7 @@ _DEFAULTS: dict[str, Any] = {
     "direction_index": None,
     "features": None,
     "frozen": None,
+    "rows": None,
 }
 
 
@@ -65,6 +66,7 @@ def routed_mlp(
     direction_index: Tensor | None = None,
     features: Tensor | None = None,
     frozen: Tensor | None = None,
+    rows: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """Evaluates every sample by the network of the cell it lies in; results are in the order of the samples.
@@ -96,6 +98,8 @@ def routed_mlp(
         features: the table of the hash encoding, as in ``grouped_mlp``; None without a grid.
         frozen: bool [k], the cells whose samples have no gradient to anything, or None. On the CPU they take no part in
             the backward pass, unless positions or directions have gradients.
+        rows: int32 [1], how many of the samples count; None for all. Those behind them have outputs of 0, no gradient
+            and no cell: -1. On CUDA the host does not wait for the number, which `march_rays` with a capacity gives.
         backend: "auto", "reference" or "native". If there is no fused implementation, "auto" calls the separate
             operations, each on the backend it chooses.
 
@@ -140,6 +144,7 @@ def routed_mlp(
         direction_index=direction_index,
         features=features,
         frozen=frozen,
+        rows=rows,
     )
     device, dtype = positions.device, weights[0].dtype
     run: Callable[..., tuple[Tensor, Tensor]]
@@ -153,8 +158,8 @@ def routed_mlp(
 
 
 def of_samples(frozen: Tensor, cells: Tensor) -> Tensor:
-    """bool [n, 1], whether the cell of each sample is frozen."""
-    return frozen.index_select(0, cells)[:, None]
+    """bool [n, 1], whether the cell of each sample is frozen; a sample in no cell, -1, is as the first."""
+    return frozen.index_select(0, cells.clamp(min=0))[:, None]
 
 
 def hold(out: Tensor, rows: Tensor) -> Tensor:
@@ -196,6 +201,10 @@ def check_routed(
     if frozen is not None:
         check_shape(op, "frozen", frozen, ("k",), sizes)
         check_dtype(op, "frozen", frozen, (torch.bool,))
+    rows = network["rows"]
+    if rows is not None:
+        check_shape(op, "rows", rows, (1,))
+        check_dtype(op, "rows", rows, INDEX)
     if coords is not None:
         if centres is None:
             raise ValueError(f"{op}: coords must come with centres, got none to compare them with")
@@ -203,7 +212,8 @@ def check_routed(
         check_dtype(op, "coords", coords)
     elif centres is not None and sizes["p"] < 3:
         raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {sizes['p']}")
-    every, device = (positions, coords, frozen, *tables.values(), *read.values(), *weights, *biases), positions.device
+    device, tables["rows"] = positions.device, rows
+    every = positions, coords, frozen, *tables.values(), *read.values(), *weights, *biases
     if torch.compiler.is_compiling() or any(t is not None and (t.device != device or t.is_inference()) for t in every):
         tensors = {  # named for an error alone
             "positions": positions,

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
+from voronerf import native
 from voronerf.custom_op import custom_op
 from voronerf.layers import MLP
 from voronerf.ops.cell_sort import native as cell_sort
@@ -22,6 +23,7 @@ from voronerf.ops.grouped_mlp import native as grouped_mlp
 from voronerf.ops.grouped_mlp.layer_table import Given, Network, network
 from voronerf.ops.locate_cell import native as locate_cell
 from voronerf.ops.nearest_centre import native as nearest_centre
+from voronerf.ops.routed_mlp.reference import first_rows
 
 
 def routed_mlp(
@@ -40,12 +42,16 @@ def routed_mlp(
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
     features: Tensor | None = None,
+    rows: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
-    where = Where(centres, child_offsets, child, depth, centre_weights, cells, coords)
+    where = Where(centres, child_offsets, child, depth, centre_weights, cells, coords, rows)
     call, dtype = prepared(positions, weights, biases, layers, where, directions, direction_index, features)
     out, found, *_ = forward(*call)
-    return out.to(dtype), found if call.where.cells is None else call.where.cells
+    if call.where.cells is not None:
+        found = call.where.cells
+    out = out.to(dtype)
+    return (out, found) if call.where.rows is None or native.on_cuda(out) else first_rows(out, found, call.where.rows)
 
 
 class Where(NamedTuple):
@@ -58,6 +64,7 @@ class Where(NamedTuple):
     centre_weights: Tensor | None = None
     cells: Tensor | None = None
     coords: Tensor | None = None
+    rows: Tensor | None = None
 
 
 class Call(NamedTuple):
@@ -79,7 +86,7 @@ def prepared(
     features: Tensor | None = None,
 ) -> tuple[Call, torch.dtype]:
     """The arguments of ``forward``, and the type of the result."""
-    centres, child_offsets, child, depth, centre_weights, cells, coords = where
+    centres, child_offsets, child, depth, centre_weights, cells, coords, rows = where
     own = features is not None and features.dim() == 3
     given = Given(positions, weights, biases, layers, directions, direction_index, features)
     before = grouped_mlp.hashes_before(given)
@@ -93,8 +100,10 @@ def prepared(
     if features is not None and own and weights[0].shape[0] == 1:
         given = given._replace(features=features[0])
     taken, dtype = network(given, cells, "routed_mlp", hashed_before=before)
+    if rows is not None and cells is not None and native.on_cuda(cells):
+        cells = torch.where(torch.arange(cells.shape[0], device=cells.device) < rows, cells, -1)
     if cells is None and weights[0].shape[0] == 1:
-        where = Where(depth=depth)
+        where = Where(depth=depth, rows=rows)
     elif cells is not where.cells:
         where = where._replace(centres=None, cells=cells)
     return Call(taken, where, grouped_mlp.keeps_encoded(taken)), dtype
@@ -106,7 +115,7 @@ def forward(network: Network, where: Where, keep: bool) -> Iterator[tuple[Tensor
 
     With neither cells nor centres there is one cell.
     """
-    centres, child_offsets, child, depth, centre_weights, cells, coords = where
+    centres, child_offsets, child, depth, centre_weights, cells, coords, rows = where
     positions = network.positions
     n, k = positions.shape[0], network.weights[0].shape[0]
     alone = cells is None and centres is None
@@ -118,13 +127,18 @@ def forward(network: Network, where: Where, keep: bool) -> Iterator[tuple[Tensor
     yield out, found, order, offsets, encoded
     if alone:
         found.zero_()
-        offsets[0], offsets[1] = 0, n
+        if rows is None or not native.on_cuda(positions):
+            offsets[0], offsets[1] = 0, n
+        else:
+            offsets[:1].zero_()
+            offsets[1:].copy_(rows)
     else:
         if coords is not None and centres is not None:
             if child_offsets is None or child is None:
-                nearest_centre.find(found, coords, centres, centre_weights)
+                nearest_centre.find(found, coords, centres, centre_weights, rows)
             else:
-                locate_cell.find(found, coords, centres, child_offsets, child, depth, centre_weights, "routed_mlp")
+                tree = child_offsets, child, depth, centre_weights
+                locate_cell.find(found, coords, centres, *tree, "routed_mlp", rows)
         cell_sort.sort(found if cells is None else cells, order, offsets, "routed_mlp")
     grouped_mlp.run(out, encoded, network, offsets, None if alone else order)
 

@@ -50,6 +50,7 @@ def routed_mlp(
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
     features: Tensor | None = None,
+    rows: Tensor | None = None,
     operations: Operations = REFERENCE,
 ) -> tuple[Tensor, Tensor]:
     """Output [n, out] in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
@@ -67,7 +68,7 @@ def routed_mlp(
             direction_index=direction_index,
             features=features,
         )
-        return out, torch.zeros(n, dtype=torch.int32, device=positions.device)
+        return first_rows(out, torch.zeros(n, dtype=torch.int32, device=positions.device), rows)
     if cells is None:
         assert coords is not None and centres is not None
         if child_offsets is None or child is None:
@@ -91,4 +92,12 @@ def routed_mlp(
         features=features,
     )
     # The backward of index_copy is a gather, where that of an index would be a scatter that adds.
-    return torch.zeros_like(out).index_copy(0, order.long(), out), cells
+    return first_rows(torch.zeros_like(out).index_copy(0, order.long(), out), cells, rows)
+
+
+def first_rows(out: Tensor, cells: Tensor, rows: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Outputs and cells of the first ``rows``, int32 [1] or None for all; the others are 0, and in no cell: -1."""
+    if rows is None:
+        return out, cells
+    beyond = torch.arange(cells.shape[0], device=cells.device) >= rows
+    return out.masked_fill(beyond[:, None], 0), cells.masked_fill(beyond, -1)

@@ -1,0 +1,220 @@
+"""A run brought up to date: what has changed learns, everything else keeps its bits, the source is never touched."""
+
+import functools
+import hashlib
+import itertools
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import refuses
+
+import voronerf
+from voronerf import updating
+from voronerf.cli.main import main
+from voronerf.data import SceneError, city_scene
+from voronerf.data.record import placed
+from voronerf.rendering import Cameras
+from voronerf.rendering.renderer import render_camera
+from voronerf.training.checkpoint import last_checkpoint
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.trainer import Trainer
+
+SIZE, VIEWS = 24, 16
+BLOCK = torch.tensor([[0.0, 0, 0], [1.0, 1, 0.7]])  # number 3 of 2 x 2
+
+
+@pytest.fixture(scope="module")
+def city():
+    return city_scene(SIZE, blocks=2, train_views=VIEWS, test_views=2)
+
+
+@pytest.fixture(scope="module")
+def rebuilt():
+    return city_scene(SIZE, blocks=2, train_views=VIEWS, test_views=2, rebuilt=3)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory, city):
+    """A run of the default field, and one of small networks without a table that cells share."""
+    folder = tmp_path_factory.mktemp("runs")
+    common = {"evaluations": 1, "final_views": 1, "panels": 0, "steps": 500, "cells": (8,), "rays": 256}
+    made = {}
+    for name, options in {"hashgrid": {}, "nerf": {"field": "nerf", "width": 16, "depth": 1, "steps": 300}}.items():
+        config = TrainConfig(out=folder / name, data="builtin-city:2x2", **{**common, **options})
+        Trainer(config, city).run()
+        made[name] = folder / name
+    return made
+
+
+def ticking(step=0.01):
+    """A clock that goes on by so many seconds whenever it is read."""
+    return functools.partial(next, itertools.count(0.0, step))
+
+
+def digest(folder):
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return [(path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files]
+
+
+def error_of(run, scene, before):
+    """Mean squared errors of the pixels of test views that have changed, and of the others."""
+    inside, outside, white = [], [], torch.ones(3)
+    for i in range(len(scene.test)):
+        truth = scene.test.truth(i, white)
+        changed = (truth - before.test.truth(i, white)).abs().amax(-1) > 0.05
+        image = render_camera(run.renderer, scene, scene.test.cameras, i, heaviest=False).colour
+        error = (image - truth).square().mean(-1)
+        inside.append(error[changed])
+        outside.append(error[~changed])
+    return float(torch.cat(inside).mean()), float(torch.cat(outside).mean())
+
+
+@pytest.mark.parametrize("kind", ["hashgrid", "nerf"])
+def test_what_has_changed_learns_and_the_rest_keeps_its_bits(tmp_path, runs, city, rebuilt, kind):
+    before, said = digest(runs[kind]), []
+    run = voronerf.open_run(runs[kind], scene=city)
+    made = run.update(
+        rebuilt, tmp_path / "made", seconds=3.0, clock=ticking(), say=said.append, data="builtin-city:2x2,rebuilt=3"
+    )
+    assert digest(runs[kind]) == before
+    part = made.router[0]
+    assert len(made.router) == 1 and len(part.routers) == 2 and "cells learn" in said[0]
+    # The cells that learnt lie on the block; all others have the parameters of the run, shared tables too.
+    new = part.diagram.leaf_centres[part.owner == 1]
+    assert 1 <= len(new) <= 4
+    assert ((new[:, :2] > BLOCK[0, :2] - 0.5) & (new[:, :2] < BLOCK[1, :2] + 0.5)).all(1).any()
+    kept = (part.owner == 0).nonzero()[:, 0]
+    other = dict(run.router.module.named_parameters())
+    for name, parameter in part[0].module.named_parameters():
+        whole = other[name].shape == parameter.shape and other[name].shape[0] != len(part.owner)
+        assert torch.equal(parameter, other[name] if whole else other[name][kept]), name
+    # Space outside of these cells is seen as before, bit for bit.
+    points = torch.rand(4000, 3) * (city.box[1] - city.box[0]) + city.box[0]
+    points = points[torch.isin(run.router.assign(points).long(), kept)]
+    directions, index = torch.tensor([[0.0, 0.6, -0.8]]), torch.zeros(len(points), dtype=torch.int32)
+    with torch.no_grad():
+        for ours, theirs in zip(made.router(points, directions, index), run.router(points, directions, index)):
+            assert torch.equal(ours, theirs)
+    grids = [r.renderer.occupancy for r in (run, made)]
+    every = grids[0].points(torch.arange(grids[0].occupied.numel()))
+    same = torch.isin(run.router.assign(every).long(), kept)
+    for name in ("density", "occupied"):
+        assert torch.equal(*(getattr(grid, name).view(-1)[same] for grid in grids))
+    (was, around), (now, after) = (error_of(r, rebuilt, city) for r in (run, made))
+    assert now < 0.7 * was and after < 1.1 * around, (was, now, around, after)
+    again = voronerf.open_run(tmp_path / "made", scene=rebuilt)
+    assert error_of(again, rebuilt, city) == (now, after)
+    # What was updated can be updated again.
+    third = again.update(city, tmp_path / "third", seconds=1.0, clock=ticking())
+    assert all(router.num_cells for router in third.router.routers)
+
+
+def test_training_keeps_the_errors_of_cells(runs, city):
+    run = voronerf.open_run(runs["hashgrid"], scene=city)
+    usual = last_checkpoint(runs["hashgrid"]).group("errors")["usual"]
+    assert usual.shape == (run.router.num_cells + 1,) and bool((usual > 0).all())
+
+
+def test_pictures_that_show_nothing_new_are_told(tmp_path, runs, city):
+    run = voronerf.open_run(runs["hashgrid"], scene=city)
+    refuses("--data shows nothing new", run.update, city, tmp_path / "made", seconds=2.0, error=ConfigError)
+    assert not (tmp_path / "made").exists()
+
+
+def turned(scene, pose):
+    cameras = replace(scene.train.cameras, poses=pose @ scene.train.cameras.poses)
+    return replace(scene, train=replace(scene.train, cameras=cameras))
+
+
+def test_bad_pictures_are_a_line(tmp_path, runs, city, rebuilt):
+    run, out = voronerf.open_run(runs["hashgrid"], scene=city), tmp_path / "made"
+    away = torch.eye(4)
+    away[2, 3] = 50.0
+    refuses("must show the scene of the run", run.update, turned(rebuilt, away), out, seconds=1.0, error=ConfigError)
+    mirrored = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
+    mirrored[:3, 3] = torch.tensor([0.3, 0.7, 0.2])
+    refuses(
+        "shows another scene, or this one in",
+        run.update,
+        turned(rebuilt, mirrored),
+        out,
+        seconds=1.0,
+        error=ConfigError,
+    )
+    black = replace(rebuilt, background=None)
+    refuses("background must be that of", run.update, black, out, seconds=1.0, error=SceneError)
+    moved = replace(rebuilt, transform=torch.eye(4, dtype=torch.float64))
+    refuses("must be in the frame of", run.update, moved, out, seconds=1.0, error=SceneError)
+    for seconds in (0.0, -1.0, math.nan, math.inf):
+        refuses("--budget must be positive", run.update, rebuilt, out, seconds=seconds, error=ConfigError)
+    refuses("--out must not hold a run already", run.update, rebuilt, runs["nerf"], seconds=1.0, error=ConfigError)
+    assert not out.exists() and not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_update_leaves_nothing(tmp_path, runs, city, rebuilt, monkeypatch):
+    run = voronerf.open_run(runs["hashgrid"], scene=city)
+
+    def interrupted(self, pool, number, done):
+        if number == 3:
+            raise KeyboardInterrupt
+        return step(self, pool, number, done)
+
+    step = updating.Session.step
+    monkeypatch.setattr(updating.Session, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run.update(rebuilt, tmp_path / "made", seconds=3.0, clock=ticking())
+    assert not list(tmp_path.iterdir())
+    monkeypatch.undo()
+    assert run.update(rebuilt, tmp_path / "made", seconds=0.3, clock=ticking()).path == tmp_path / "made"
+
+
+def test_a_ray_is_the_light_before_of_and_behind_the_cells_that_learn(tmp_path, runs, city, rebuilt):
+    run = voronerf.open_run(runs["hashgrid"], scene=city)
+    source = voronerf.editing.join([run.source], [voronerf.router.Similarity()])
+    cells = torch.zeros(run.router.num_cells, dtype=torch.bool)
+    cells[:3] = True
+    parts, learners = updating.split_off(source.parts, cells)
+    voxels = updating.space_voxels(city.box)
+    changes = updating.Changes(cells, voxels, 0.1, 1.0, torch.zeros(len(cells)))
+    session = updating.Session(replace(source, parts=parts), learners, changes, 0)
+    pool = session.pool(updating.RayBatches(city, torch.device("cpu")), 2000)
+    assert len(pool) > 100
+    sampler = session.renderer.sampler
+    samples = sampler.sample(pool.rays, pool.near, pool.far)
+    own = samples.part(session.learns(samples.positions))
+    with torch.no_grad():
+        seen = updating.render_samples(session.field, pool.rays, pool.far, own, sampler.space, background=pool.behind)
+        whole = updating.render_samples(source.parts, pool.rays, pool.far, samples, sampler.space)
+    colour = pool.before + pool.light * seen.colour
+    # The background is in `behind`: without it the two differ by what passes all samples.
+    through = (1 - whole.opacity)[:, None]
+    assert float(((colour - whole.colour) - through.clamp(max=1)).amax()) < 0.06
+    assert float((whole.colour - colour).amax()) < 0.06
+
+
+def test_cameras_move_from_one_frame_to_another(city):
+    angle = 0.3
+    move = torch.eye(4, dtype=torch.float64)
+    move[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    move[:3, :3] *= 2.0
+    move[:3, 3] = torch.tensor([1.0, 2, 3])
+    ours = replace(city, transform=move)
+    theirs = replace(city, transform=torch.eye(4, dtype=torch.float64))
+    found = placed(theirs, ours).train.cameras
+    points = city.train.cameras.origins.double() @ move[:3, :3].T + move[:3, 3]
+    torch.testing.assert_close(found.origins, points.float())
+    lengths = found.poses[:, :3, :3].norm(dim=1)
+    torch.testing.assert_close(lengths, torch.ones_like(lengths))
+    assert isinstance(found, Cameras) and placed(city, city).train.cameras is city.train.cameras
+
+
+def test_command(tmp_path, runs, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    run = str(runs["hashgrid"])
+    assert main(["update", run, "--data", "builtin-city:2x2", "--budget", "-1"]) != 0
+    assert "--budget must be positive" in capsys.readouterr().err
+    assert main(["update", run, "--data", "nowhere"]) != 0
+    assert main(["update", run, "--data", "builtin-city:2x2", "--old", "x", "--no-use-old"]) != 0
+    assert not list(tmp_path.iterdir())

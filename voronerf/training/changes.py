@@ -1,0 +1,151 @@
+"""Where a scene has changed: new pictures against what a run shows.
+
+r rays, k cells, q voxels.
+
+A ray of a new picture is off if its error is larger than that of nine of ten training rays of its cell. Space where a
+scene has changed is told from what lies behind it by all views together: most rays through it are off, where rays
+through what stands before or behind a change are off from some places only (Taneja et al. 2011, "Image based detection
+of geometric changes in urban environments"). So two things are found: voxels most of whose rays are off, and cells too
+many of whose rays are off for no such voxel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from voronerf.ops.observe_occupancy.reference import cells_of
+from voronerf.rendering.cameras import Rays
+from voronerf.rendering.contraction import Contraction, Perspective
+from voronerf.rendering.renderer import Renderer
+from voronerf.training.batches import RayBatches
+from voronerf.training.errors import Cells, see_errors
+
+#: Rays of the new pictures that are rendered.
+RAYS = 1 << 15
+#: The least squared error of a ray that is off, whatever is usual in its cell: a tone of 1 in 64.
+LEAST = 3 / 64**2
+#: Voxels along the longest side, and points on a ray that find them.
+VOXELS, STEPS = 40, 96
+#: A voxel has changed if it has so many rays, this share of them is off, and a neighbour has changed, too.
+VOXEL_RAYS, VOXEL_SHARE = 10, 0.6
+#: A cell has changed if it has so many voxels that have, and they are this share of those that enough rays pass, ...
+CELL_VOXELS, CELL_SPACE = 6, 0.02
+#: ... or so many rays that meet no such voxel, and this share of them is off, where 1 in 10 is expected.
+CELL_RAYS, CELL_SHARE = 32, 0.3
+#: Pictures show another scene if more of their rays are off than that, and none if fewer meet a cell.
+MOST_OFF, LEAST_MET = 0.6, 0.002
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """Some of the voxels of a box.
+
+    Attributes:
+        box: [2, 3], in the space of the contraction.
+        chosen: bool [x, y, z].
+        contraction: Of the space that the box is in, or None.
+    """
+
+    box: Tensor
+    chosen: Tensor
+    contraction: Contraction | Perspective | None = None
+
+    def numbers(self, positions: Tensor) -> Tensor:
+        """The voxel of each position [n, 3] of the world, int64 [n]; -1 outside of the box."""
+        points = positions if self.contraction is None else self.contraction.points(positions)
+        inside = ((points >= self.box[0]) & (points <= self.box[1])).all(-1)
+        return torch.where(inside, cells_of(points, self.box, self.chosen.shape).long(), -1)
+
+    def centres(self) -> Tensor:
+        """The middles of the chosen voxels in the world, [q, 3]."""
+        place = self.chosen.nonzero() + 0.5
+        points = torch.lerp(self.box[0], self.box[1], place / torch.tensor(self.chosen.shape, device=place.device))
+        return points if self.contraction is None else self.contraction.inverse(points)
+
+    def meet(self, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
+        """Which rays pass a chosen voxel between two depths, bool [r]."""
+        numbers = along(self, rays, near, far)
+        return (self.chosen.reshape(-1)[numbers.clamp(min=0)] & (numbers >= 0)).any(1)
+
+
+def along(voxels: Voxels, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
+    """The voxels at evenly spaced points of rays, int64 [r, STEPS]; -1 outside."""
+    place = (torch.arange(STEPS, device=near.device) + 0.5) / STEPS
+    depths = near[:, None] + (far - near)[:, None] * place
+    points = torch.addcmul(rays.origins[:, None], depths[..., None], rays.directions[:, None])
+    return voxels.numbers(points.reshape(-1, 3)).reshape(depths.shape)
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What new pictures show.
+
+    Attributes:
+        cells: bool [k], those that have changed, or are worse in the new pictures than they were in training.
+        voxels: The space that has changed.
+        off: The share of the new rays that are off.
+        met: The share of the new rays that meet a cell.
+        shares: [k], the share of each cell's rays that are off and meet no changed voxel.
+    """
+
+    cells: Tensor
+    voxels: Voxels
+    off: float
+    met: float
+    shares: Tensor
+
+
+@torch.no_grad()
+def find_changes(renderer: Renderer, cells: Cells, batches: RayBatches, usual: Tensor, space: Voxels) -> Changes:
+    """Compares the pictures of a changed scene with what a run shows.
+
+    Args:
+        renderer: Of the run.
+        cells: The cells of its field.
+        batches: Of the new pictures.
+        usual: [k + 1], see `usual_errors`.
+        space: All voxels; which are chosen does not matter.
+    """
+    renderer.train(False)
+    generator = torch.Generator(batches.device).manual_seed(1)
+    batch = batches.draw(RAYS, generator, random_background=False)
+    seen = see_errors(renderer, cells, batch)
+    off = seen.error > usual[seen.cell].clamp(min=LEAST)
+    # Past the surface by a step, so that its own voxel counts.
+    numbers = along(space, batch.rays, batch.near, torch.minimum(seen.depth * (1 + 1 / STEPS), batch.far))
+    first = torch.ones_like(numbers, dtype=torch.bool)
+    first[:, 1:] = numbers[:, 1:] != numbers[:, :-1]
+    first &= numbers >= 0  # each voxel counts once for a ray
+    size = space.chosen.numel()
+    passed = numbers[first].bincount(minlength=size)
+    wrong = numbers[first & off[:, None]].bincount(minlength=size)
+    changed = ((passed >= VOXEL_RAYS) & (wrong >= VOXEL_SHARE * passed)).reshape(space.chosen.shape)
+    changed &= near_by(changed) > 1
+    voxels = Voxels(space.box, changed, space.contraction)
+    changed = changed.reshape(-1)
+    explained = (changed[numbers.clamp(min=0)] & first).any(1)
+    k = cells.num_cells
+    rest, bad = (seen.cell[rows].bincount(minlength=k + 1)[:k] for rows in (~explained, ~explained & off))
+    shares = bad / rest.clamp(min=1)
+    found = (rest >= CELL_RAYS) & (shares > CELL_SHARE)
+    known = Voxels(space.box, (passed >= VOXEL_RAYS).reshape(voxels.chosen.shape), space.contraction)
+    counts = [
+        own[own >= 0].bincount(minlength=k) for own in (cells.assign(v.centres()).long() for v in (voxels, known))
+    ]
+    found |= (counts[0] >= CELL_VOXELS) & (counts[0] >= CELL_SPACE * counts[1])
+    return Changes(found, voxels, float(off.float().mean()), float((seen.cell < k).float().mean()), shares)
+
+
+def near_by(chosen: Tensor) -> Tensor:
+    """How many of the 27 voxels around each, itself included, are chosen: bool [x, y, z] -> float32 [x, y, z]."""
+    return torch.nn.functional.avg_pool3d(chosen[None].float(), 3, 1, 1, divisor_override=1)[0]
+
+
+def space_voxels(box: Tensor, contraction: Contraction | Perspective | None = None) -> Voxels:
+    """The voxels of a box [2, 3], near enough to cubes; none is chosen."""
+    sides = box[1] - box[0]
+    shape = (VOXELS * sides / sides.max()).ceil().long().clamp(min=4).tolist()
+    return Voxels(box, torch.zeros(shape, dtype=torch.bool, device=box.device), contraction)
