@@ -70,7 +70,10 @@ def test_names(scene):
     assert one.name == "builtin-city-1x1" and one.train.images.shape == (40, 2, 2, 4)
     again = city_scene(20, blocks=2, train_views=2, test_views=1)
     assert torch.equal(again.test.images, scene.test.images)
-    for name in ("builtin-city:4", "builtin-city:0x0", "builtin-city:2x3", "builtin-city:99x99"):
+    wide = city_scene(2, blocks=(1, 2), train_views=1, test_views=1)
+    assert wide.name == "builtin-city-1x2" and len(wide.train) == 2
+    assert torch.allclose(wide.box[1] - wide.box[0], torch.tensor([1.0, 2.0, 0.7]), atol=0.1)
+    for name in ("builtin-city:4", "builtin-city:0x0", "builtin-city:2x", "builtin-city:99x99"):
         refuses("builtin-city: blocks must be 1x1, 2x2, 2x4, ... or 32x32, got", load_scene, name, error=SceneError)
     refuses("city_scene: blocks must be 1 to 32, got 0", city_scene, blocks=0)
     refuses("city_scene: size must be >= 1, got 0", city_scene, 0)
