@@ -110,15 +110,15 @@ def city(out: Path, seconds: float, seeds: list[int]) -> None:
             runs[way] = replace(joined, scene=scene)
         for way, run in runs.items():
             row = {"way": way, "seed": seed, "cells": run.router.num_cells}
-            row["psnr"] = run.evaluate(lpips="off")["psnr"]
+            row["psnr"] = run.evaluate(views=16, lpips="off")["psnr"]
 
             def picture(view: int, run: Run = run):
                 return run.render(view)
 
-            row["seam"] = seam(run.router, scene, picture, views=8, margin=BLEND)
+            row["seam"] = seam(run.router, scene, picture, views=4, margin=BLEND)
             if hasattr(run.router, "parts"):
                 run.router.blend = BLEND
-                row["psnr blended"] = run.evaluate(lpips="off")["psnr"]
+                row["psnr blended"] = run.evaluate(views=16, lpips="off")["psnr"]
                 if seed == seeds[0] and way == "views by position":
                     blended = picture_of_colour(run.render(4).colour)
                 run.router.blend = 0.0
@@ -176,6 +176,7 @@ def stream(out: Path, seconds: float) -> None:
             blocks.append(block)
         frames = [Similarity.of((width * (i % side), width * (i // side), 0)) for i in range(side * side)]
         Run.join(blocks, joined, frames=frames)
+        del blocks, block
     values = {"blocks": side * side, "GiB": round(size(joined) / 1024, 2), "rows": []}
     for memory in ("512M", "none"):
         command = [sys.executable, __file__, "picture", "--out", str(out), "--memory", memory]
@@ -203,7 +204,7 @@ def picture(out: Path, memory: str) -> None:
     libc, most, ended = ctypes.CDLL(None), [0, 0, 0], threading.Event()
 
     def watch() -> None:
-        while not ended.wait(0.05):
+        while not ended.wait(0.5):
             anonymous, cached = anonymous_bytes(), sum(file.resident(libc) for file in files)
             most[:] = [max(old, new) for old, new in zip(most, (anonymous, cached, anonymous + cached), strict=True)]
 
@@ -216,7 +217,7 @@ def picture(out: Path, memory: str) -> None:
     above.poses[:, :3, 3] += middle
     street = cameras[[0]]
     pictures, times = [], []
-    for camera in (above, replace(above, intrinsics=above.intrinsics * 5, width=320, height=240), street):
+    for camera in (above, replace(above, intrinsics=above.intrinsics * 4, width=256, height=192), street):
         begun = time.perf_counter()
         pictures.append(run.render(camera, 0, heaviest=False).colour)
         times.append(round(time.perf_counter() - begun, 2))

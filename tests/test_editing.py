@@ -15,6 +15,7 @@ from voronerf import Run, editing, open_run
 from voronerf.cli.main import main
 from voronerf.data import builtin_scene
 from voronerf.router import Parts, Similarity, Solid
+from voronerf.step import Step
 from voronerf.training.checkpoint import CheckpointError
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.trainer import Trainer
@@ -85,6 +86,8 @@ def test_runs_of_different_fields_are_joined(opened, runs, tmp_path) -> None:
     for own, run in ((who < k, opened[0]), (who >= k, opened[1])):
         assert torch.allclose(density[own], run.router(*asked)[1][inside][own], rtol=1e-4, atol=1e-5)
     assert joined.evaluate(lpips="off")["psnr"] > 8
+    told = Step(joined.renderer).explain()
+    assert "the run has several parts" in told and "part 1: 4 of 4 cells, NeRF" in told
     assert [contents(run) for run in runs] == before
 
 

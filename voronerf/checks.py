@@ -17,6 +17,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import overload
 
 import torch
 from torch import Tensor
@@ -36,6 +37,15 @@ def check_tensor(op: str, name: str, value: object) -> None:
     if value.layout is not torch.strided or value.is_nested or value.is_quantized:
         kind = "nested" if value.is_nested else "quantized" if value.is_quantized else str(value.layout)
         raise TypeError(f"{op}: {name} must be a dense tensor, got a {kind.removeprefix('torch.')} one")
+
+
+@overload
+def detached(tensor: Tensor) -> Tensor: ...
+@overload
+def detached(tensor: None) -> None: ...
+def detached(tensor: Tensor | None) -> Tensor | None:
+    """A tensor without gradients, which is itself where it has none: `detach` takes half a microsecond. None stays."""
+    return tensor.detach() if tensor is not None and tensor.requires_grad else tensor
 
 
 def check_shape(

@@ -307,7 +307,7 @@ def cut(source: Source, kept: Solid | Tensor) -> Source:
             changed.append(part.changed(region=(*part.region, solid), contraction=seen))
         parts = Parts(changed, backend=parts.backend)
         if not kept.outside:
-            around = bounds_of(kept)
+            around = kept.bounds()
             box = around if box is None else torch.stack((box[0].maximum(around[0]), box[1].minimum(around[1])))
             if not bool((box[0] < box[1]).all()):
                 raise ConfigError(f"{source.name}: nothing is left, the cut is outside of the scene's box")
@@ -356,35 +356,12 @@ def keep_cells(parts: Parts, kept: Tensor) -> Parts:
     return Parts(found, backend=parts.backend)
 
 
-def bounds_of(solid: Solid) -> Tensor:
-    """The box [2, 3] around a solid.
-
-    Raises:
-        ConfigError: For one without bounds.
-    """
-    if solid.ball is not None:
-        centre, radius = torch.tensor(solid.ball[:3]), solid.ball[3]
-        return torch.stack((centre - radius, centre + radius))
-    planes = torch.tensor(solid.planes, dtype=torch.float64)
-    corners = []
-    for rows in itertools.combinations(range(len(planes)), 3):
-        normals, ends = planes[list(rows), :3], planes[list(rows), 3]
-        if abs(float(torch.linalg.det(normals))) > 1e-9:
-            corner = torch.linalg.solve(normals, ends)
-            if bool((planes[:, :3] @ corner <= planes[:, 3] + 1e-6 * (1 + planes[:, 3].abs())).all()):
-                corners.append(corner)
-    if not corners:
-        raise ConfigError("a solid must have bounds")
-    points = torch.stack(corners).float()
-    return torch.stack((points.amin(0), points.amax(0)))
-
-
 def _inside_ball(solid: Solid, contraction: Contraction) -> bool:
     """Whether a solid lies where a contraction leaves space as it is."""
     if solid.ball is not None:
         away = float((torch.tensor(solid.ball[:3]) - contraction.centre).norm()) + solid.ball[3]
     else:
-        away = float((_corners(bounds_of(solid)) - contraction.centre).norm(dim=-1).max())
+        away = float((_corners(solid.bounds()) - contraction.centre).norm(dim=-1).max())
     return away <= contraction.radius * (1 + 1e-4)
 
 

@@ -33,8 +33,9 @@ from voronerf.training.run_directory import check_folders, check_stored_paths
 from voronerf.training.state import stored_values
 from voronerf.training.streaming import Pages, bytes_of
 
-#: Rays of a picture of a run of parts that are rendered at a time.
-PARTS_RAYS = 16_384
+#: Pictures of a run of more parts than these are rendered in so many squares along their longer side: a square meets
+#: the networks of few of them, which fit into a bound on memory. It does not depend on a bound, so pictures do not.
+FEW_PARTS, TILES = 8, 8
 
 
 @dataclass(frozen=True)
@@ -375,8 +376,8 @@ def open_run(
     if several and (config.territories or 1) > 1:  # as it was trained: its parts know their own settings
         config = joint_config(config, scene)
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
-    if several:  # the networks of as few parts as possible at a time
-        renderer.most_rays = PARTS_RAYS
+    if isinstance(routers["field"], Parts) and len(routers["field"]) > FEW_PARTS:
+        renderer.tiles = TILES
     state = checkpoint.group("occupancy")
     grid = None
     if state:

@@ -42,7 +42,7 @@ from voronerf.training.renderers import as_field, make_contraction, make_rendere
 RAYS = 1
 #: Rays that are drawn at a time to find those that meet cells that learn, how many of these there are to be, and the
 #: share of an update that is spent on it before the first step at most, and the share that is left for steps at least.
-DRAWN, POOL, FINDING, LEARNING = 1 << 15, 1 << 17, 0.15, 0.25
+DRAWN, POOL, FINDING, LEARNING = 1 << 15, 1 << 17, 0.3, 0.25
 #: How often a ray is learnt from before others are found.
 AGAIN = 4
 #: Rays learn if this share of the light reaches the cells that learn, and no more than that optical depth of others
@@ -130,7 +130,7 @@ def update(
 
     def draw() -> Pool:
         """More rays to learn from, with those before; the oldest go."""
-        found = [session.pool(batches, count, agree=number > 0) for number, batches in enumerate(pictures)]
+        found = [session.pool(batches, count >> number, agree=number > 0) for number, batches in enumerate(pictures)]
         pools.append(found)
         while sum(len(pool) for pair in pools[1:] for pool in pair) >= POOL:
             pools.pop(0)

@@ -108,9 +108,9 @@ def test_it_trains_splits_evaluates_and_resumes(folder: Path, tmp_path: Path) ->
 def test_a_training_that_ends_before_the_split_makes_it_when_it_is_resumed(folder: Path, tmp_path: Path) -> None:
     trainer = trainer_of(folder, tmp_path, field_options=SMALL, split_at=(0.99,))
     trainer.train()
-    kept = len(trainer.pipeline.model.reservoir)
+    kept = len(trainer.pipeline.model.cells.reservoir)
     again = trainer_of(folder, tmp_path, load=trainer.checkpoint_dir, field_options=SMALL, split_at=(0.99,))
-    assert again.pipeline.model.num_cells == 1 and len(again.pipeline.model.reservoir) == kept > 0
+    assert again.pipeline.model.num_cells == 1 and len(again.pipeline.model.cells.reservoir) == kept > 0
     again.train()
     assert again.pipeline.model.num_cells == 4
 

@@ -215,6 +215,15 @@ def test_blending_leaves_no_step_between_parts(torch_seed) -> None:
     refuses("blend must be finite", lambda: setattr(parts, "blend", -1.0))
 
 
+def test_blending_changes_nothing_far_from_other_parts(torch_seed) -> None:
+    near, far = plain(5), plain(2, 50.0)
+    parts, asked = Parts([Part([near]), Part([far])]).eval(), queries(width=1.0)
+    parts.blend = 0.05
+    blended = near(*asked)  # whose own margin is the same
+    assert not close(blended[1], plain(5)(*asked)[1])
+    assert all(close(a, b) for a, b in zip(parts(*asked), blended, strict=True))
+
+
 def test_gradients_reach_all_parts(torch_seed) -> None:
     one, two = hashed(3), plain(2, 1.0)
     parts = Parts([Part([one]), Part([two], frame=Similarity.of(scale=1.1))])

@@ -51,6 +51,7 @@ def test_pictures_are_the_same_bits_while_networks_come_and_go(joined, scene, tm
     streamed = open_run(tmp_path / "run", scene=scene, memory="4G")
     pages = streamed.router.on_use.__self__
     dropped = []
+    monkeypatch.setattr(streaming, "EVERY", 0.0)
     drop = streaming._File.drop
     monkeypatch.setattr(streaming._File, "drop", lambda file: (dropped.append(file), drop(file)))
     largest = max(file.size for file in pages.files.values())

@@ -78,7 +78,7 @@ def train(
     if view and (config.territories or 1) > 1:
         raise ConfigError("--view must be off with several territories; `voronerf view` shows their last checkpoint")
     if explain:
-        unused = replace(config, out=config.out or Path("runs"), resume=False)
+        unused = replace(config, out=config.out or Path("runs"), resume=config.resume and config.out is not None)
         joint = (config.territories or 1) > 1
         text = JointTrainer(unused, scene).explain() if joint else Trainer(unused, scene).learner.explain()
         for line in text.splitlines():

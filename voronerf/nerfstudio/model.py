@@ -134,7 +134,8 @@ class VoronerfModel(Model):
             if self.cells.is_due(step / steps, step):
                 self._split(step, optimizer)
             self.cells.revisit(step)
-            self.renderer.train()
+            if not self.routers["field"].training:  # since the cells were looked at again, or a picture was made
+                self.renderer.train()
 
         def after(step: int) -> None:
             found, self._found = self._found, None

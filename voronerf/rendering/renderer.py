@@ -5,7 +5,8 @@ r rays, h x w pixels. Units as in `voronerf.rendering.volume`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -62,7 +63,8 @@ class Renderer:
         fields: By name.
         sampler: Can be set at any time.
         look: How pictures are made; None for this process alone, without randomness. Ranks have a way of their own.
-        most_rays: Rays of a picture that are rendered at a time, at the most.
+        tiles: Squares along the longer side of a picture that are rendered one after the other; 1 for rows, which is
+            faster. In a square, rays meet few parts of a scene.
 
     Args:
         fields: By the names of the sampler's networks; "field" has the colours.
@@ -90,7 +92,7 @@ class Renderer:
             raise ValueError(f"Renderer: fields must be {' and '.join(wanted)}, got {sorted(fields)}")
         self.fields, self.sampler, self.backend = dict(fields), sampler, backend
         self.look: Look | None = None
-        self.most_rays = 1 << 30
+        self.tiles = 1
 
     @property
     def field(self) -> Field:
@@ -179,6 +181,18 @@ class Renderer:
             places = positions[torch.arange(len(rays), device=places.device), weights.argmax(-1)]
         return Seen(last.colour, last.opacity, last.depth, places)
 
+    def _tiles(self, hit: Tensor, size: tuple[int, int], chunk: int) -> Iterator[Tensor]:
+        """The rays of a picture that are to be rendered, int64, in pieces: rows, or squares with `tiles`."""
+        if self.tiles == 1:
+            yield from hit.nonzero()[:, 0].split(chunk)
+            return
+        width, height = size
+        side = max(-(-max(size) // self.tiles), 1)
+        numbers = torch.arange(width * height, device=hit.device).reshape(height, width)
+        for top, left in itertools.product(range(0, height, side), range(0, width, side)):
+            rows = numbers[top : top + side, left : left + side].reshape(-1)
+            yield from (piece for piece in rows[hit[rows]].split(chunk) if len(piece))
+
     @torch.no_grad()
     def image(
         self,
@@ -207,7 +221,6 @@ class Renderer:
         """
         if chunk is None:
             chunk = 16_384 if self.look is not None else 4096 if self.occupancy is None else 131_072
-            chunk = min(chunk, self.most_rays)
         if chunk < 1:
             raise ValueError(f"Renderer.image: chunk must be >= 1, got {chunk}")
         rays = cameras.image_rays(index, cones=self.cones)
@@ -217,7 +230,7 @@ class Renderer:
         opacity, depth = torch.zeros_like(first), torch.full_like(first, far)
         places = rays.origins + far * rays.directions
         places = places if self.contraction is None else self.contraction.points(places)
-        for rows in hit.nonzero()[:, 0].split(chunk):
+        for rows in self._tiles(hit, cameras.size(index), chunk):
             seen = self.see(rays[rows], first[rows], last[rows], background, heaviest)
             for whole, part in zip((colour, opacity, depth), seen):
                 whole[rows] = part.to(whole.dtype)

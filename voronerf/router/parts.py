@@ -11,7 +11,9 @@ up, and their colours are mixed by density, as of two clouds in one place.
 from __future__ import annotations
 
 import copy
+import functools
 import inspect
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -101,13 +103,13 @@ class Similarity:
         scale = float(matrix[0, :3].norm())
         return cls(scale, matrix[:3, :3] / (scale or 1), matrix[:3, 3])
 
-    @property
+    @functools.cached_property
     def is_identity(self) -> bool:
         """Whether it moves nothing, but for rounding."""
         still = (self.rotation - _eye()).abs().max() < 1e-12 and self.translation.abs().max() < 1e-12
         return bool(still) and abs(self.scale - 1) < 1e-12
 
-    @property
+    @functools.cached_property
     def inverse(self) -> Similarity:
         """From the scene to the part."""
         return Similarity(1 / self.scale, self.rotation.T, -(self.translation @ self.rotation) / self.scale)
@@ -186,6 +188,28 @@ class Solid:
             planes = points.new_tensor(self.planes)
             inside = (points @ planes[:, :3].T <= planes[:, 3]).all(-1)
         return ~inside if self.outside else inside
+
+    def bounds(self) -> Tensor:
+        """float32 [2, 3], the box around the solid; for ``outside`` around what it leaves out.
+
+        Raises:
+            ValueError: For planes that leave a direction open.
+        """
+        if self.ball is not None:
+            centre, radius = torch.tensor(self.ball[:3]), self.ball[3]
+            return torch.stack((centre - radius, centre + radius))
+        planes = torch.tensor(self.planes, dtype=torch.float64)
+        normals, ends = planes[:, :3], planes[:, 3]
+        corners = []
+        for rows in itertools.combinations(range(len(planes)), 3):
+            if abs(float(torch.linalg.det(normals[list(rows)]))) > 1e-9:
+                corner = torch.linalg.solve(normals[list(rows)], ends[list(rows)])
+                if bool((normals @ corner <= ends + 1e-6 * (1 + ends.abs())).all()):
+                    corners.append(corner)
+        if not corners:
+            raise ValueError("Solid: must have bounds")
+        points = torch.stack(corners).float()
+        return torch.stack((points.amin(0), points.amax(0)))
 
     def moved(self, move: Similarity) -> Solid:
         """The same solid after a similarity."""
@@ -271,6 +295,13 @@ class Part(nn.Module):
         self.num_cells, self.whole = int(kept.sum()), bool(kept.all())
         self.frame, self.contraction, self.region = frame or Similarity(), contraction, tuple(region)
         self.layer = layer
+        boxes = [solid.moved(self.frame).bounds() for solid in self.region if not solid.outside]
+        #: A box [2, 3] of the scene outside of which the part does not speak; None for none.
+        self.bounds = None
+        if boxes:
+            low, high = (torch.stack([box[i] for box in boxes]) for i in (0, 1))
+            margin = 1e-4 * (high.amin(0) - low.amax(0)).abs()
+            self.bounds = torch.stack((low.amax(0) - margin, high.amin(0) + margin))
 
     def __iter__(self) -> Iterator[VoronoiRouter]:
         return iter(self.routers)  # type: ignore[arg-type]
@@ -288,6 +319,11 @@ class Part(nn.Module):
         """[l, 3], the centres of all leaves in the scene."""
         centres = self.diagram.leaf_centres
         return self.frame.points(centres if self.contraction is None else self.contraction.inverse(centres))
+
+    @functools.cached_property
+    def kept_centres(self) -> Tensor:
+        """[cells, 3], the centres of the cells in the scene."""
+        return self.centres[self.leaves]
 
     def changed(self, **changes: Any) -> Part:
         """A part with the same routers, and other values of the constructor's arguments."""
@@ -447,7 +483,7 @@ class Parts(nn.Module):
         if not parts or all(part.layer for part in parts):
             raise ValueError("Parts: parts must hold at least one in layer 0")
         self.parts = nn.ModuleList(parts)
-        kept = [part.centres[part.leaves] for part in parts]
+        kept = [part.kept_centres for part in parts]
         self.diagram = VoronoiDiagram(torch.cat(kept))
         self.num_cells = self.diagram.num_cells
         layers = sorted({part.layer for part in parts})
@@ -602,8 +638,14 @@ class Parts(nn.Module):
         least = positions.new_full((len(positions),), math.inf)
         found = []
         for index in of:
-            claim = self._claim(index, positions, rows, None)
-            taken, centres = claim[1], self[index].centres[self[index].leaves]
+            near, bounds = rows, self[index].bounds
+            if bounds is not None:
+                low, high = bounds.to(positions)
+                near = rows[((positions[rows] >= low) & (positions[rows] <= high)).all(-1)]
+            if not len(near):
+                continue
+            claim = self._claim(index, positions, near, None)
+            taken, centres = claim[1], self[index].kept_centres
             places = positions[taken]
             nearest = ops.nearest_centre(places, centres.to(places), backend=self.backend).long()
             away = (places - centres[nearest]).norm(dim=-1)
@@ -664,9 +706,9 @@ class Parts(nn.Module):
                 colour, density = colour * weights[:, None], density * weights
             pieces.append((rows, colour, density))
         rows, colour, density = (torch.cat(tensors) for tensors in zip(*pieces, strict=True))
-        if len(claims) == 1 and len(rows) == n:
+        if len(claims) == 1 and len(rows) == n and claims[0][4] is None:
             return None, colour, density
-        if len({id(w) for *_, w in claims}) > 1 or claims[0][4] is not None:  # blended: a row comes more than once
+        if claims[0][4] is not None:  # blended: rows come in any order, and more than once
             both = torch.cat((colour, density[:, None]), 1)
             both = both.new_zeros(n, 4).index_add(0, rows, both)
             return None, both[:, :3], both[:, 3]

@@ -23,7 +23,7 @@ from voronerf.rendering.renderer import Renderer
 from voronerf.rendering.samplers import Occupancy
 from voronerf.rendering.sampling import colour_loss, seen_there, sighting_gradient, sighting_loss
 from voronerf.rendering.volume import Samples, gradient_shares
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, VoronoiRouter
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,8 @@ def why_not_fused(renderer: Renderer) -> str | None:
     if not isinstance(renderer.sampler, Occupancy):
         return "empty space is not skipped"
     if not isinstance(field, VoronoiRouter):
-        return f"the field is a {type(field).__name__}, no router"
+        several = isinstance(field, Parts)
+        return "the run has several parts" if several else f"the field is a {type(field).__name__}, no router"
     if getattr(type(field.module), "activate", None) is not activate_radiance:
         return f"{type(field.module).__name__} does not say what its outputs mean (activate = activate_radiance)"
     if field.coords not in (None, "first3"):

@@ -7,7 +7,7 @@ import torch
 from voronerf import backends
 from voronerf.rendering.renderer import Renderer
 from voronerf.rendering.samplers import Occupancy
-from voronerf.router import VoronoiRouter
+from voronerf.router import Parts, VoronoiRouter
 from voronerf.step.ray_loss import Batch, Composed, Found, Fused, RayLoss, why_not_fused
 
 
@@ -71,6 +71,8 @@ class Step:
         if obstacle is not None:
             lines.append(f"not faster: {obstacle}")
         for name, field in renderer.fields.items():
-            if isinstance(field, VoronoiRouter) and not field.by_table:
+            if isinstance(field, Parts):
+                lines += field.explain().splitlines()
+            elif isinstance(field, VoronoiRouter) and not field.by_table:
                 lines.append(f"{name}: {field.explain()}")
         return "\n".join(lines)

@@ -29,8 +29,9 @@ PICTURE_SAMPLES = 2
 LEAST_OPACITY, TRAINING_OPACITY = 0.02, 0.05
 #: The same of a cell of contracted space, for the light on its way through the whole cell.
 CONTRACTED_OPACITY = 0.1
-#: How many samples in a row empty a new cell: about thirty steps, until which the field has said nothing about most.
-OCCUPANCY_PATIENCE = 8
+#: How many samples in a row empty a new cell: about thirty steps, until which the field has said nothing about most. In
+#: contracted space fewer: what stays there is fog before the cameras, which explains one view and spoils the others.
+OCCUPANCY_PATIENCE, CONTRACTED_PATIENCE = 8, 4
 #: Of a grid made for pictures alone: cells along each axis, and points evaluated in each.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 
@@ -131,16 +132,16 @@ def make_grid(
         ConfigError: When the scene has no box and is not contracted.
     """
     contraction = None if config.contraction == "none" else make_contraction(scene, config.contraction, device)
-    size = resolution or int(config.occupancy_resolution or 0)
+    size, patience = resolution or int(config.occupancy_resolution or 0), OCCUPANCY_PATIENCE
     if contraction is not None:
-        box = contraction.cube
+        box, patience = contraction.cube, CONTRACTED_PATIENCE
         threshold = -math.log1p(-CONTRACTED_OPACITY) * size / float(box[1, 0] - box[0, 0])
     elif scene.box is not None:
         box = scene.box
         threshold = -math.log1p(-least_opacity) * int(config.samples or 0) / float((box[1] - box[0]).norm())
     else:
         raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
-    remembered = DECAY**-OCCUPANCY_PATIENCE
+    remembered = DECAY**-patience
     return OccupancyGrid(box, size, threshold=threshold, remembered=remembered, contraction=contraction, device=device)
 
 

@@ -1,7 +1,7 @@
 """Networks as pages of files, of which no more than a bound stays in memory.
 
-A page is read when a sample meets it. After each part that was asked, what the process has for itself and what the
-files have in memory is counted, and the pages of the networks that were not used for longest are dropped.
+A page is read when a sample meets it. When a part was asked, but not all the time, what the process has for itself and
+what the files have in memory is counted, and the pages of the networks that were not used for longest are dropped.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import mmap
 import os
 import re
 import sys
+import time
 from collections import OrderedDict
 from math import prod
 from pathlib import Path
@@ -25,6 +26,8 @@ from voronerf.training.config import ConfigError
 
 #: Share of the bound that is left for what comes and goes within a picture.
 SPARE = 0.15
+#: Seconds between two counts of what is in memory.
+EVERY = 0.02
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30}
 _DTYPES = {"F32": torch.float32, "F64": torch.float64, "F16": torch.float16, "BF16": torch.bfloat16, "I32": torch.int32}
 
@@ -101,6 +104,8 @@ class Pages:
         self.folder, self.memory = folder, memory
         self.files: dict[str, _File] = {}
         self.of: dict[int, str] = {}
+        self.touched: set[str] = set()  # since memory was counted last
+        self.counted = 0.0
         self.recent: OrderedDict[str, int] = OrderedDict()  # bytes in memory, the file that was used last at the end
         self.libc = ctypes.CDLL(None, use_errno=True)
 
@@ -137,8 +142,15 @@ class Pages:
         """Counts what the routers of a part that was just asked have read, and drops what is too much."""
         for router in part:
             name = self.of[id(router)]
-            self.recent[name] = self.files[name].resident(self.libc)
+            self.recent.setdefault(name, 0)
             self.recent.move_to_end(name)
+            self.touched.add(name)
+        if time.monotonic() - self.counted < EVERY:
+            return
+        for name in self.touched & self.recent.keys():
+            self.recent[name] = self.files[name].resident(self.libc)
+        self.touched.clear()
+        self.counted = time.monotonic()
         room = self.memory * (1 - SPARE) - anonymous_bytes()
         while sum(self.recent.values()) > room and len(self.recent) > 1:
             oldest, _ = self.recent.popitem(last=False)

@@ -131,8 +131,8 @@ struct ProgramTile {
         const Rows* by = step.count > 1 ? &times : nullptr;
         const float* numbers = call.constants + step.constants;
         switch (step.name) {
-#define VN_CASE(NUMBER, NAME) \
-  case NUMBER:                \
+#define VN_CASE(NAME, ...) \
+  case kFunction_##NAME:   \
     return apply_function<NAME##_function>(step.order, to, stride, rows, x, by, numbers);
           VN_FUNCTIONS(VN_CASE)
 #undef VN_CASE

@@ -176,8 +176,8 @@ struct Tile {
       case kProgramFunction: {
         const float a = tensors.constants[step.constants], b = tensors.constants[step.constants + 1];
         switch (step.name) {
-#define VN_CASE(NUMBER, NAME) \
-  case NUMBER:                \
+#define VN_CASE(NAME, ...)       \
+  case device::kFunction_##NAME: \
     return apply<device::NAME##_function>(step, to, rows, x, step.count > 1 ? &y : nullptr, a, b);
           VN_FUNCTIONS(VN_CASE)
 #undef VN_CASE

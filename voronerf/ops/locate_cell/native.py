@@ -18,22 +18,21 @@ def locate_cell(
     """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
     leaves = points.new_empty(points.shape[0], dtype=torch.int32)
     yield leaves
-    find(leaves, points, centres, child_offsets, child, depth, weights, "locate_cell")
+    find(leaves, points, centres, (child_offsets, child, depth), weights, "locate_cell")
 
 
 def find(
     leaves: Tensor,
     points: Tensor,
     centres: Tensor,
-    child_offsets: Tensor,
-    child: Tensor,
-    depth: int,
+    tree: tuple[Tensor, Tensor, int],
     weights: Tensor | None,
     caller: str,
     rows: Tensor | None = None,
 ) -> None:
     """Fills ``leaves``, int32 [n], on CUDA with -1 from ``rows`` on; coordinates and weights are of one dtype.
-    ``caller``: whom errors name."""
+    ``tree``: child_offsets, child and depth. ``caller``: whom errors name."""
+    child_offsets, child, depth = tree
     compiled, machine = native.compiled, native.machine(points)
     n, m, g = points.shape[0], centres.shape[0], child_offsets.shape[0] - 1
     given = points, centres, weights, child_offsets, child

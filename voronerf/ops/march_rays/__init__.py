@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_choice, check_count, check_integer
+from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_choice, check_count, check_integer, detached
 from voronerf.ops.march_rays.reference import March, Rays
 
 _OP = backends.declare(
@@ -121,16 +121,16 @@ def march_rays(
         raise ValueError(f"{_OP}: occupied must have at least one cell, got {list(occupied.shape)}")
     run = backends.resolve(_OP, backend=backend, device=origins.device, dtype=origins.dtype)
     rays = Rays(
-        origins=origins.detach(),
-        directions=directions.detach(),
-        near=near.detach(),
-        far=far.detach(),
+        origins=detached(origins),
+        directions=detached(directions),
+        near=detached(near),
+        far=detached(far),
         occupied=occupied,
-        box=box.detach(),
-        uniforms=None if uniforms is None else uniforms.detach(),
+        box=detached(box),
+        uniforms=detached(uniforms),
         seed=seed,
         start=start,
-        contraction=None if contraction is None else contraction.detach(),
+        contraction=detached(contraction),
         samples=samples,
         disparity=spacing == "disparity",
         most=samples if most is None else most,

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import LIKE_FIRST, Checked, check_count, check_number, check_writable
+from voronerf.checks import LIKE_FIRST, Checked, check_count, check_number, check_writable, detached
 from voronerf.ops.observe_occupancy.reference import Observed
 
 _OP = backends.declare(
@@ -82,6 +82,6 @@ def observe_occupancy(
         check_number(_OP, name, number)
     if not 0 <= decay <= 1:
         raise ValueError(f"{_OP}: decay must lie in 0 to 1, got {decay}")
-    tensors = (tensor.detach() for tensor in (density, occupied, box, positions, sigma, deltas, weights))
+    tensors = [detached(tensor) for tensor in (density, occupied, box, positions, sigma, deltas, weights)]
     observed = Observed._make([*tensors, float(decay), float(threshold), float(hidden)])
     backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)(observed)

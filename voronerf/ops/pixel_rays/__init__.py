@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import LIKE_FIRST, Checked, check_number
+from voronerf.checks import LIKE_FIRST, Checked, check_number, detached
 from voronerf.ops.camera_rays import check_lenses
 from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
 
@@ -88,7 +88,7 @@ def pixel_rays(
     if torch.finfo(torch.float32).max < far < float("inf"):
         raise ValueError(f"{_OP}: far must be at most 3.4e+38 or infinite, got {far}")
     run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
-    constant = (None if tensor is None else tensor.detach() for tensor in (box, distortion, background))
+    constant = (detached(tensor) for tensor in (box, distortion, background))
     box, distortion, background = constant
-    views = poses.detach(), intrinsics.detach(), images
+    views = detached(poses), detached(intrinsics), images
     return PixelRays(*run(Pixels(*views, index, box, distortion, models, background, float(near), float(far))))

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import FLOATING, INDEX, Checked, check_count, check_number
+from voronerf.checks import FLOATING, INDEX, Checked, check_count, check_number, detached
 from voronerf.ops.render_loss.reference import Rendered, RenderLoss
 
 _OP = backends.declare(
@@ -149,6 +149,5 @@ def _checked(
     check_number(op, "hidden", hidden)
     if not 0 <= hidden < 1:
         raise ValueError(f"{op}: hidden must lie in [0, 1), got {hidden}")
-    background = None if background is None else background.detach()
-    constant = deltas.detach(), ray_offsets, target.detach(), background
+    constant = detached(deltas), ray_offsets, detached(target), detached(background)
     return Rendered(raw, *constant, float(density_scale), float(hidden))

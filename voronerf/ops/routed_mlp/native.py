@@ -137,8 +137,8 @@ def forward(network: Network, where: Where, keep: bool) -> Iterator[tuple[Tensor
             if child_offsets is None or child is None:
                 nearest_centre.find(found, coords, centres, centre_weights, rows)
             else:
-                tree = child_offsets, child, depth, centre_weights
-                locate_cell.find(found, coords, centres, *tree, "routed_mlp", rows)
+                tree = child_offsets, child, depth
+                locate_cell.find(found, coords, centres, tree, centre_weights, "routed_mlp", rows)
         cell_sort.sort(found if cells is None else cells, order, offsets, "routed_mlp")
     grouped_mlp.run(out, encoded, network, offsets, None if alone else order)
 
