@@ -27,23 +27,18 @@ def _find_kernel(
     positions: wp.array2d(dtype=wp.float32),
     deltas: wp.array(dtype=wp.float32),
     box: wp.array2d(dtype=wp.float32),
-    x: wp.int32,
-    y: wp.int32,
-    z: wp.int32,
-    density: wp.array(dtype=wp.float32),
+    density: wp.array3d(dtype=wp.float32),
     cells: wp.array(dtype=wp.int32),
     before: wp.array(dtype=wp.float32),
 ) -> None:
     i = wp.tid()
-    cell = _place(positions[i, 0], box[0, 0], box[1, 0], x)
-    cell = cell * y + _place(positions[i, 1], box[0, 1], box[1, 1], y)
-    cell = cell * z + _place(positions[i, 2], box[0, 2], box[1, 2], z)
-    if deltas[i] == 0.0:
-        cell = -1
-    cells[i] = cell
-    if cell < 0:
-        return
-    before[i] = density[cell]
+    x = _place(positions[i, 0], box[0, 0], box[1, 0], density.shape[0])
+    y = _place(positions[i, 1], box[0, 1], box[1, 1], density.shape[1])
+    z = _place(positions[i, 2], box[0, 2], box[1, 2], density.shape[2])
+    cells[i] = -1
+    if deltas[i] != 0.0:
+        cells[i] = (x * density.shape[1] + y) * density.shape[2] + z
+        before[i] = density[x, y, z]
 
 
 @wp.kernel
@@ -103,8 +98,8 @@ def observe_occupancy(given: Observed) -> None:
     cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
     flat, rows, faded = (array(tensor, density) for tensor in (density.view(-1), cells, before))
     samples = [array(tensor, density) for tensor in (given.sigma, given.deltas, given.weights)]
-    places = [array(given.positions, density), samples[1], array(given.box, density), *density.shape]
-    launch(_find_kernel, m, [*places, flat, rows, faded], density)
+    grid = [array(given.box, density), array(density, density)]
+    launch(_find_kernel, m, [array(given.positions, density), samples[1], *grid, rows, faded], density)
     launch(_fade_kernel, m, [rows, faded, given.decay, flat], density)
     launch(_raise_kernel, m, [rows, *samples, given.hidden, flat], density)
     launch(_compare_kernel, m, [rows, flat, given.threshold, array(given.occupied.view(-1), density)], density)
