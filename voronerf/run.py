@@ -26,6 +26,7 @@ from voronerf.training.average import load_averages
 from voronerf.training.checkpoint import NETWORKS, checkpoint_path, last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device
+from voronerf.training.joint import joint_config
 from voronerf.training.networks import check_shapes, open_routers, parameter_groups, restore_routers
 from voronerf.training.renderers import make_picture_grid, make_renderer, through_grid
 from voronerf.training.run_directory import check_folders, check_stored_paths
@@ -372,6 +373,8 @@ def open_run(
     scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
     several = "parts" in checkpoint.values
     scene = within(scene, path) if several else scene
+    if several and (config.territories or 1) > 1:  # as it was trained: its parts know their own settings
+        config = joint_config(config, scene)
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
     if isinstance(routers["field"], Parts) and len(routers["field"]) > FEW_PARTS:
         renderer.tiles = TILES

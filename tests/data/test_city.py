@@ -19,7 +19,7 @@ def scene():
 
 def street_rays(blocks, count):
     random = np.random.default_rng(0)
-    cameras = city_cameras(8, blocks, 2, 0)
+    cameras = city_cameras(8, (blocks, blocks), 2, 0)
     origins = cameras.origins.numpy()[random.integers(len(cameras), size=count)]
     targets = random.uniform((-1, -1, 0), (1, 1, 0.5), size=(count, 3)).astype(np.float32)
     return origins, normalised(targets - origins)
@@ -29,7 +29,7 @@ def street_rays(blocks, count):
 def test_rays_see_the_first_of_all_solids(way, monkeypatch):
     if way == "numpy":
         monkeypatch.setattr(backends, "missing", lambda backend, device: "left out")
-    groups = city(2)
+    groups = city((2, 2))
     origins, directions = street_rays(2, 1500)
     depth, which = first_hits([solid for group in groups for solid in group], origins, directions)
     found, number = block_caster(groups)(origins, directions)
@@ -39,11 +39,11 @@ def test_rays_see_the_first_of_all_solids(way, monkeypatch):
 
 
 def test_a_larger_city_holds_the_smaller_one():
-    small, large = city(1)[1], city(3)[1]
+    small, large = city((1, 1))[1], city((3, 3))[1]
     assert [type(solid) for solid in small] == [type(solid) for solid in large]
     away = np.array([s.centre for s in large]) - np.array([s.centre for s in small])
     np.testing.assert_allclose(away, np.broadcast_to((-1, -1, 0), away.shape), atol=1e-6)
-    assert len({len(group) for group in city(3)[1:]}) > 1, "blocks differ"
+    assert len({len(group) for group in city((3, 3))[1:]}) > 1, "blocks differ"
 
 
 def test_views_are_from_streets_and_from_above(scene):
@@ -58,9 +58,9 @@ def test_views_are_from_streets_and_from_above(scene):
 
 
 def test_no_camera_is_in_a_solid():
-    cameras = city_cameras(8, 3, 40, 1)
+    cameras = city_cameras(8, (3, 3), 40, 1)
     points = cameras.origins.numpy()
-    for solid in (solid for group in city(3) for solid in group):
+    for solid in (solid for group in city((3, 3)) for solid in group):
         low, high = solid.bounds()
         assert isinstance(solid, Sphere) or not ((points > low) & (points < high)).all(-1).any()
 
@@ -70,14 +70,17 @@ def test_names(scene):
     assert one.name == "builtin-city-1x1" and one.train.images.shape == (40, 2, 2, 4)
     again = city_scene(20, blocks=2, train_views=2, test_views=1)
     assert torch.equal(again.test.images, scene.test.images)
-    for name in ("builtin-city:4", "builtin-city:0x0", "builtin-city:2x3", "builtin-city:99x99"):
-        refuses("builtin-city: blocks must be 1x1, 2x2, ... or 32x32, got", load_scene, name, error=SceneError)
+    wide = city_scene(2, blocks=(1, 2), train_views=1, test_views=1)
+    assert wide.name == "builtin-city-1x2" and len(wide.train) == 2
+    assert torch.allclose(wide.box[1] - wide.box[0], torch.tensor([1.0, 2.0, 0.7]), atol=0.1)
+    for name in ("builtin-city:4", "builtin-city:0x0", "builtin-city:2x", "builtin-city:99x99"):
+        refuses("builtin-city: blocks must be 1x1, 2x2, 2x4, ... or 32x32, got", load_scene, name, error=SceneError)
     refuses("city_scene: blocks must be 1 to 32, got 0", city_scene, blocks=0)
     refuses("city_scene: size must be >= 1, got 0", city_scene, 0)
 
 
 def test_a_rebuilt_block_changes_nothing_else(scene):
-    before, after = city(2), city(2, rebuilt=2)
+    before, after = city((2, 2)), city((2, 2), rebuilt=2)
     changed = [
         index for index, (a, b) in enumerate(zip(before, after)) if [s.centre for s in a] != [s.centre for s in b]
     ]

@@ -11,6 +11,8 @@ from pathlib import Path
 import torch
 from torch.distributed import TCPStore
 
+from voronerf.training.checkpoint import checkpoint_path, load_checkpoint, network_files
+
 #: Seconds until ranks that hang are ended.
 LIMIT = 300
 
@@ -62,3 +64,11 @@ def on_ranks(function, *args, folder, size=2, each=None, restarts=0, store=None)
     texts = [path.read_text() if path.is_file() else "" for path in said]
     print(*texts, sep="\n", file=sys.stderr)  # where a test fails
     return [rank.exitcode for rank in ranks], texts
+
+
+def joint_tensors(run):
+    """The tensors of the files of all territories, from the last checkpoint of a run."""
+    path = checkpoint_path(run)
+    files = network_files(load_checkpoint(path, keep=lambda name: not name.startswith("part-")).values)
+    found = [load_checkpoint(path.with_name(file)).tensors for file in files]
+    return {f"{number}.{name}": tensor for number, part in enumerate(found) for name, tensor in part.items()}

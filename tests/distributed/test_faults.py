@@ -5,14 +5,15 @@ import os
 import signal
 from unittest import mock
 
-from ranks import new_store, on_ranks
+import pytest
+from ranks import joint_tensors, new_store, on_ranks
 
 from voronerf.cli import main
-from voronerf.training.checkpoint import checkpoint_path, load_checkpoint
-from voronerf.training.trainer import Trainer
+from voronerf.training.checkpoint import checkpoint_path, load_checkpoint, network_files
+from voronerf.training.joint import JointTrainer
 
 ARGUMENTS = """
-train --data builtin --downscale 8 --field nerf --no-occupancy --samples 8 --width 8 --depth 2 --rays 32 --cells 4
+train --data builtin --downscale 8 --field nerf --no-occupancy --samples 8 --width 8 --depth 2 --rays 16 --cells 2
 --split-at-steps 6 --steps 12 --reservoir-batches 5 --evaluations 1 --final-views 1 --panels 0
 """
 
@@ -23,14 +24,14 @@ def command(out, *more):
 
 def dies(args, step):
     """Ends rank 1 by SIGKILL in a step."""
-    real = Trainer.train_step
+    real = JointTrainer.train_step
 
     def train_step(self):
         if self.step == step and os.environ["RANK"] == "1":
             os.kill(os.getpid(), signal.SIGKILL)
         return real(self)
 
-    with mock.patch.object(Trainer, "train_step", train_step):
+    with mock.patch.object(JointTrainer, "train_step", train_step):
         return main(args)
 
 
@@ -48,7 +49,8 @@ def complaints(texts):
 def test_settings_that_ranks_cannot_use(tmp_path):
     """One says so at every start: what ranks of an earlier start have left in torchrun's store is not theirs."""
     expected, store = (
-        "voronerf: error: --sampling must take one pass, as stratified: no rank sees whole rays, got 'proposal'",
+        "voronerf: error: --sampling must take one pass with several territories, as stratified: no territory sees "
+        "whole rays, where a second looks, got 'proposal'",
         new_store(),
     )
     for restarts in range(2):
@@ -71,11 +73,10 @@ def test_ranks_that_differ(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_more_ranks_than_cells(tmp_path):
-    codes, texts = on_ranks(main, command(tmp_path / "run", "--cells", "2"), folder=tmp_path, size=3)
+def test_more_ranks_than_territories(tmp_path):
+    codes, texts = on_ranks(main, command(tmp_path / "run", "--territories", "2"), folder=tmp_path, size=3)
     assert codes == [1] * 3
-    expected = "voronerf: error: --cells must be at least the 3 ranks on the first level, got (2,)"
-    assert complaints(texts) == [expected]
+    assert complaints(texts) == ["voronerf: error: --territories must be at least the 3 ranks, got 2"]
 
 
 def test_a_full_disk(tmp_path):
@@ -86,14 +87,38 @@ def test_a_full_disk(tmp_path):
 
 def test_a_rank_that_is_killed(tmp_path):
     """The other says so; started again as by torchrun, the run ends bit for bit as one that nothing happened to."""
-    whole, out = command(tmp_path / "whole"), command(tmp_path / "run", "--checkpoint-every", "1e-6")
+    whole = command(tmp_path / "whole", "--steps", "36")
+    out = command(tmp_path / "run", "--checkpoint-every", "1e-6", "--steps", "36")
     assert on_ranks(main, whole, folder=tmp_path)[0] == [0, 0]
-    codes, texts = on_ranks(dies, out, 9, folder=tmp_path)
+    codes, texts = on_ranks(dies, out, 27, folder=tmp_path)
     assert codes == [1, -signal.SIGKILL] and len(complaints(texts)) == 1
     assert "another rank has ended" in complaints(texts)[0]
-    assert 0 < load_checkpoint(checkpoint_path(tmp_path / "run")).values["step"] <= 9
+    assert load_checkpoint(checkpoint_path(tmp_path / "run")).values["step"] in (8, 16)
     assert on_ranks(main, out, folder=tmp_path, restarts=1)[0] == [0, 0]
-    first, second = (load_checkpoint(checkpoint_path(tmp_path / run)).tensors for run in ("whole", "run"))
+    first, second = (joint_tensors(tmp_path / run) for run in ("whole", "run"))
     assert first.keys() == second.keys() and all(first[name].equal(second[name]) for name in first)
     metrics = [json.loads((tmp_path / run / "summary.json").read_text())["psnr"] for run in ("whole", "run")]
     assert metrics[0] == metrics[1]
+
+
+@pytest.mark.parametrize("harm", ["cut short", "changed", "missing"])
+def test_a_damaged_part(tmp_path, harm):
+    """All ranks take the checkpoint before, and say which file was no good."""
+    out = command(tmp_path / "run")
+    assert on_ranks(main, out, folder=tmp_path)[0] == [0, 0]
+    assert on_ranks(main, [*out, "--resume", "--steps", "20"], folder=tmp_path)[0] == [0, 0]
+    last = checkpoint_path(tmp_path / "run")
+    part = last.with_name(network_files(load_checkpoint(last).values)[1])
+    data = bytearray(part.read_bytes())
+    if harm == "missing":
+        part.unlink()
+    else:
+        data[-5] ^= 1
+        part.write_bytes(data[: len(data) // (1 if harm == "changed" else 2)])
+    codes, texts = on_ranks(main, [*out, "--resume", "--steps", "24"], folder=tmp_path)
+    assert codes == [0, 0]
+    assert "takes its place" in texts[0]
+    for file in last.parent.glob("*"):
+        file.write_bytes(b"")
+    codes, texts = on_ranks(main, [*out, "--resume", "--steps", "28"], folder=tmp_path)
+    assert codes == [1, 1] and len(complaints(texts)) == 1 and "not a readable checkpoint" in complaints(texts)[0]

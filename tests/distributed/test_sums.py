@@ -1,11 +1,10 @@
-"""Partial sums of rays put together, against one composite of all samples; which voxels cells reach."""
+"""Partial sums of rays put together, against one composite of all samples."""
 
 import pytest
 import torch
-from helpers import refuses, seeded
+from helpers import seeded
 
-from voronerf import OccupancyGrid, VoronoiDiagram, backends, composite
-from voronerf.distributed.sharing import assign_cells, voxels_of_ranks
+from voronerf import backends, composite
 from voronerf.ops import compose_runs, render_loss, run_gradients, run_sums
 from voronerf.ops import own_samples as keep_own
 from voronerf.ops.ray_runs.reference import along_rays, compose, own_samples, sum_runs
@@ -99,42 +98,3 @@ def test_a_gap_that_another_rank_may_fill_ends_a_run():
     assert own_samples(*given, cells, own, bent=False).run_offsets.tolist() == [0, 2, 4]
     assert own_samples(*given, cells, own, bent=False, hidden=False).run_offsets.tolist() == [0, 4]
     assert own_samples(*given, cells, own * 0 - 1, bent=False, hidden=False).run_offsets.tolist() == [0]
-
-
-@pytest.mark.parametrize("power", [False, True])
-def test_voxels_that_cells_reach(power):
-    """All voxels with a point of a rank's cells are among its own, and few others, in a nested diagram."""
-    generator = seeded()
-    centres = torch.rand(6, 3, generator=generator)
-    weights = torch.rand(6, generator=generator) * 0.1 if power else None
-    diagram, _ = VoronoiDiagram(centres, weights=weights).refine({2: torch.rand(4, 3, generator=generator)})
-    owner = assign_cells(diagram.leaf_centres, torch.ones(9), 3)
-    grid = OccupancyGrid(torch.tensor([[0.0, 0, 0], [1.0, 1, 1]]), (8, 6, 10), threshold=1.0)
-    points = torch.rand(200_000, 3, generator=generator)
-    inside = torch.zeros(3, 480, dtype=torch.bool)
-    inside[owner[diagram.locate(points)], grid.cells(points)] = True
-    reached = voxels_of_ranks(diagram, owner, grid, 3)
-    assert not (inside & ~reached).any()
-    assert reached.sum() < 1.3 * inside.sum()
-
-
-@pytest.mark.parametrize(("cells", "ranks"), [(16, 4), (7, 3), (5, 5)])
-def test_cells_are_shared_evenly(cells, ranks):
-    generator = seeded()
-    weights = torch.rand(cells, generator=generator) + 0.5
-    owner = assign_cells(torch.rand(cells, 3, generator=generator), weights, ranks)
-    loads = torch.bincount(owner, weights=weights, minlength=ranks)
-    assert (loads > 0).all() and loads.max() - loads.min() <= 2 * weights.max()
-
-
-def test_a_part_of_a_diagram_locates_its_own_points():
-    generator = seeded()
-    coarse = VoronoiDiagram(torch.rand(5, 3, generator=generator))
-    diagram, _ = coarse.refine({i: torch.rand(3, 3, generator=generator) for i in (0, 3)})
-    cells = torch.tensor([1, 3, 6, 8])
-    part, points = diagram.part(cells), torch.rand(2000, 3, generator=generator)
-    found = diagram.locate(points)
-    for new, old in enumerate(cells.tolist()):
-        assert (part.locate(points[found == old]) == new).all()
-    for wrong in ([], [3, 1], [9]):
-        refuses("ascending numbers of 0..8", diagram.part, torch.tensor(wrong, dtype=torch.int64))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from voronerf.training.joint import JointTrainer
 from voronerf.training.progress import Progress
 from voronerf.training.trainer import Trainer
 
@@ -23,7 +24,7 @@ class Board:
         ImportError: TensorBoard is not installed.
     """
 
-    def __init__(self, folder: Path, trainer: Trainer) -> None:
+    def __init__(self, folder: Path, trainer: Trainer | JointTrainer) -> None:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:

@@ -32,10 +32,12 @@ from voronerf.evaluation.video import check_video, write_video
 from voronerf.files import json_text, write_text
 from voronerf.rendering.cameras import turntable_cameras
 from voronerf.rendering.paths import CameraPath, read_camera_path, spiral_cameras
-from voronerf.run import Run
+from voronerf.run import Run, open_run
 from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.config_checks import check_device, check_ranks, why_no_occupancy
+from voronerf.training.config_checks import check_device, check_joint, why_no_occupancy
+from voronerf.training.joint import JointTrainer
+from voronerf.training.networks import resolve_config
 from voronerf.training.progress import Progress
 from voronerf.training.run_directory import choose_directory, held, is_outside, write_curve
 from voronerf.training.trainer import Trainer
@@ -73,9 +75,13 @@ def train(
     if view:
         import_viewer().check_address(host, port)
     scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
+    if view and (config.territories or 1) > 1:
+        raise ConfigError("--view must be off with several territories; `voronerf view` shows their last checkpoint")
     if explain:
         unused = replace(config, out=config.out or Path("runs"), resume=config.resume and config.out is not None)
-        for line in Trainer(unused, scene).learner.explain().splitlines():
+        joint = (config.territories or 1) > 1
+        text = JointTrainer(unused, scene).explain() if joint else Trainer(unused, scene).learner.explain()
+        for line in text.splitlines():
             say(line)
         return 0
     chosen = choose_directory(config, scene)
@@ -103,11 +109,13 @@ def train_on_ranks(config: TrainConfig, *, view: bool) -> int:
     device = torch.device(f"cuda:{local_rank()}" if config.device == "cuda" else config.device)
     config = replace(config, device=str(device))
     check_device(config.device)
+    if config.territories is None:
+        config = replace(config, territories=1 << (world_size() - 1).bit_length())
     with joined(device) as group:
         check_same(group, config)
         if view:
-            raise ConfigError("--view must be off with several ranks")
-        check_ranks(config, world_size())
+            raise ConfigError("--view must be off with several ranks; `voronerf view` shows their last checkpoint")
+        check_joint(config, world_size())
         assert config.out is not None
         scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
         check_same_scene(group, scene)
@@ -116,7 +124,18 @@ def train_on_ranks(config: TrainConfig, *, view: bool) -> int:
             config = choose_directory(replace(config, resume=config.resume or again), scene)
         config = replace(config, resume=group.from_first(config.resume))
         summary = run_training(config, scene, group=group)
+        first = group.rank == 0
+    if first and summary["complete"]:  # not before the others have left: they would wait for the pictures
+        _draw_joint(config, scene)
     return 0 if summary["complete"] else 130
+
+
+def _draw_joint(config: TrainConfig, scene: Scene) -> None:
+    """Draws the panels of a joint run from its files."""
+    assert config.out is not None
+    if config.panels:
+        opened = open_run(config.out, scene=scene, backend=config.backend)
+        write_panels(opened.renderer, opened.diagram, scene, config.out / "images", views=config.panels)
 
 
 def run_training(
@@ -146,17 +165,22 @@ def _train_and_draw(
             for note in scene.notes:
                 display.on_event(f"{scene.name}: {note}")
             told: dict[str, Any] = {"on_step": display.on_step, "on_event": display.on_event}
-            trainer = Trainer(config, scene, group=group, **told)
+            trainer: Trainer | JointTrainer
+            if (config.territories or 1) > 1:
+                trainer = JointTrainer(config, scene, group=group, **told)
+            else:
+                trainer = Trainer(config, scene, **told)
             if trainer.lpips is None:
                 display.on_event(trainer.lpips_source)
             if config.occupancy and trainer.occupancy is None:
-                bare = trainer.config.contraction == "none"
+                resolved = resolve_config(config, scene)
+                bare = resolved.contraction == "none"
                 other = "a scene without a box" if bare else "a contraction, unless by --occupancy-resolution 64"
-                obstacle = why_no_occupancy(trainer.config) or other
+                obstacle = why_no_occupancy(resolved) or other
                 display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
             viewer = None
             board = Board(out / "tensorboard", trainer) if config.tensorboard and trainer.writes else None
-            if view is not None:
+            if view is not None and isinstance(trainer, Trainer):
                 viewer = import_viewer().TrainingViewer(trainer, host=view[0], port=view[1])
                 stack.callback(viewer.close)
                 display.on_event(viewer.audience)
@@ -176,10 +200,11 @@ def _train_and_draw(
             again = f" --data {shlex.quote(config.data)}" if is_outside(out, config.data) else ""
             say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}{again}")
             return summary
-        if config.panels:
+        if config.panels and isinstance(trainer, Trainer):
             with trainer.averaged():
-                folder = out / "images" if trainer.writes else None
-                write_panels(trainer.renderer, trainer.diagram, scene, folder, views=config.panels)
+                write_panels(trainer.renderer, trainer.diagram, scene, out / "images", views=config.panels)
+        elif group is None:
+            _draw_joint(config, scene)
         if trainer.writes:
             write_curve(out)
         say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
@@ -189,7 +214,7 @@ def _train_and_draw(
         return summary
 
 
-def _train(trainer: Trainer) -> dict[str, Any]:
+def _train(trainer: Trainer | JointTrainer) -> dict[str, Any]:
     """Runs a trainer that the signals of ``STOPPING`` stop; returns the summary."""
     # One that is ignored stays so, as under nohup or where a shell started it in the background.
     before = {number: signal.getsignal(number) for number in STOPPING}
@@ -208,7 +233,7 @@ def _train(trainer: Trainer) -> dict[str, Any]:
     try:
         return trainer.run()
     except SceneError:  # of images on disk that were cut short: what was learnt stays
-        if type(trainer) is Trainer:
+        if isinstance(trainer, Trainer):  # ranks could not save together
             trainer.save()
         raise
     finally:

@@ -12,7 +12,7 @@ import re
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import timedelta
 from typing import Any
 
@@ -57,6 +57,7 @@ class Group:
         size: How many there are.
         device: Where the tensors are that are sent.
         sent: Bytes that this rank has sent to others, for each kind of message.
+        messages: How many these were.
 
     Args:
         device: Where the tensors are that are sent.
@@ -65,7 +66,8 @@ class Group:
     def __init__(self, device: torch.device) -> None:
         self.rank, self.size, self.device = 0, 1, device
         self.sent: Counter[str] = Counter()
-        self._rooms: dict[str, tuple[list[int], list[int]]] = {}  # rows of a message of each kind, to and from ranks
+        self.messages: Counter[str] = Counter()
+        self._rooms: dict[tuple[str, str, int], int] = {}  # rows of a message of each kind, to and from each rank
         self.store: dist.Store | None = None
 
     def join(self) -> None:
@@ -110,79 +112,75 @@ class Group:
                     )
 
     def total(self, values: Tensor) -> Tensor:
-        """The sum over all ranks, in place."""
-        self.begin_total(values)()
-        return values
+        """The sum over all ranks, in place: up a tree of ranks and down again, at most six messages for each."""
+        return self._reduce(values, Tensor.add_)
 
     def largest(self, values: Tensor) -> Tensor:
-        """The largest of all ranks, in place."""
-        if self.size > 1:
-            with self._waiting():
-                dist.all_reduce(values, dist.ReduceOp.MAX)
+        """The largest of all ranks, in place; as :meth:`total`."""
+        return self._reduce(values, lambda whole, part: whole.copy_(torch.maximum(whole, part)))
+
+    def _reduce(self, values: Tensor, add: Callable[[Tensor, Tensor], Any]) -> Tensor:
+        if self.size == 1:
+            return values
+        children = [rank for rank in (2 * self.rank + 1, 2 * self.rank + 2) if rank < self.size]
+        parts = self.swap("agreement", {}, {child: torch.empty_like(values) for child in children})
+        for child in children:
+            add(values, parts[child])
+        if self.rank:
+            parent = (self.rank - 1) // 2
+            whole = self.swap("agreement", {parent: values}, {parent: torch.empty_like(values)})
+            values.copy_(whole[parent])
+        self.swap("agreement", dict.fromkeys(children, values), {})
         return values
 
-    def begin_total(self, values: Tensor) -> Callable[[], None]:
-        """Begins to sum values over all ranks, in place; what it returns waits for the end."""
-        with self._waiting():
-            work = dist.all_reduce(values, async_op=True)
-
-        def wait() -> None:
-            with self._waiting():
-                work.wait()
-
-        return wait
-
-    def share(self, kind: str, rows: Tensor) -> list[Tensor]:
-        """The rows of every rank, as many as each has; see :meth:`exchange`."""
-        return self.exchange(kind, [rows] * self.size)
-
-    def exchange(self, kind: str, parts: Sequence[Tensor]) -> list[Tensor]:
-        """Sends each rank its part, and gets one of each; how many rows these have need not be known.
+    def exchange(self, kind: str, width: int, parts: Mapping[int, Tensor], sources: Iterable[int]) -> dict[int, Tensor]:
+        """Sends some ranks their parts, and gets those of others; how many rows these have need not be known.
 
         A message has room for some more rows than the one of its kind before it to the same rank, and says how many
         there are. What does not fit follows in another.
 
         Args:
             kind: What they are.
-            parts: [n, c] of 4 bytes each for each rank; the own one stays.
-        """
-        there, came = self._rooms.get(kind, ([0] * self.size, [0] * self.size))
-        messages = [
-            part if rank == self.rank else _message(part, room)
-            for rank, (part, room) in enumerate(zip(parts, there, strict=True))
-        ]
-        found = self.swap(kind, messages, [1 + room for room in came])
-        counts = [
-            len(message) if rank == self.rank else int(message[0, :1].view(torch.int32))
-            for rank, message in enumerate(found)
-        ]
-        rests = [part[room:] for part, room in zip(parts, there, strict=True)]
-        more = self.swap(kind, rests, [max(n - room, 0) for n, room in zip(counts, came, strict=True)])
-        self._rooms[kind] = [len(part) * 9 // 8 + 8 for part in parts], [n * 9 // 8 + 8 for n in counts]
-        result = [
-            torch.cat((message[1:], rest)) if len(rest) else message[1 : 1 + n]
-            for message, rest, n in zip(found, more, counts, strict=True)
-        ]
-        result[self.rank] = parts[self.rank]
-        return result
+            width: c, the columns of all parts of a kind.
+            parts: float32 [n, c] for each rank that gets one.
+            sources: The ranks that send this one a part.
 
-    def swap(self, kind: str, parts: Sequence[Tensor], came: Sequence[int]) -> list[Tensor]:
-        """Sends each rank its part [n, c], and gets ``came`` rows of each; the own part stays."""
-        found = list(parts)
-        messages = []
-        for rank, (part, n) in enumerate(zip(parts, came, strict=True)):
-            if rank == self.rank:
-                continue
-            found[rank] = part.new_empty(n, part.shape[1])
-            if n:
-                messages.append(dist.P2POp(dist.irecv, found[rank], rank))
-            if len(part):
-                messages.append(dist.P2POp(dist.isend, part, rank))
-                self.sent[kind] += part.numel() * part.element_size()
+        Returns:
+            The parts that came, by rank.
+        """
+        there = {rank: self._rooms.get((kind, "to", rank), 0) for rank in parts}
+        room = {rank: self._rooms.get((kind, "from", rank), 0) for rank in sources}
+        empty = torch.empty(0, width, device=self.device)
+        messages = {rank: _message(part, there[rank]) for rank, part in parts.items()}
+        came = self.swap(kind, messages, {rank: empty.new_empty(1 + n, width) for rank, n in room.items()})
+        counts = {rank: int(message[0, :1].view(torch.int32)) for rank, message in came.items()}
+        rests = {rank: part[there[rank] :] for rank, part in parts.items() if len(part) > there[rank]}
+        more = {rank: empty.new_empty(n - room[rank], width) for rank, n in counts.items() if n > room[rank]}
+        more = self.swap(kind, rests, more)
+        for way, sizes in (("to", {rank: len(part) for rank, part in parts.items()}), ("from", counts)):
+            for rank, n in sizes.items():
+                self._rooms[kind, way, rank] = n * 9 // 8 + 8
+        return {
+            rank: torch.cat((message[1:], more[rank])) if rank in more else message[1 : 1 + counts[rank]]
+            for rank, message in came.items()
+        }
+
+    def swap(self, kind: str, parts: Mapping[int, Tensor], came: Mapping[int, Tensor]) -> dict[int, Tensor]:
+        """Sends some ranks a tensor each, and fills the tensors for what comes of others; returns these.
+
+        Args:
+            kind: What they are.
+            parts: Contiguous, by rank.
+            came: Of the sizes of what comes, by rank.
+        """
+        messages = [dist.P2POp(dist.irecv, tensor, rank) for rank, tensor in came.items()]
+        messages += [dist.P2POp(dist.isend, tensor, rank) for rank, tensor in parts.items()]
+        self.sent[kind] += sum(tensor.numel() * tensor.element_size() for tensor in parts.values())
+        self.messages[kind] += len(parts)
         with self._waiting():  # gloo takes half as long for these as for its collectives
             for work in dist.batch_isend_irecv(messages) if messages else []:
                 work.wait()
-        return found
+        return dict(came)
 
     def from_first(self, value: Any) -> Any:
         """What rank 0 has, for all."""

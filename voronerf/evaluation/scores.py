@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -47,11 +47,13 @@ def evaluate(
     renderer: Renderer,
     scene: Scene,
     *,
-    views: int | None = None,
+    views: int | Sequence[int] | None = None,
     lpips: Lpips | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> list[ViewScore]:
-    """PSNR, SSIM and, where given, LPIPS of ``views`` evenly spread test views (None: all), until ``stop`` is true.
+    """PSNR, SSIM and, where given, LPIPS of test views, until ``stop`` is true.
+
+    ``views`` are so many, evenly spread, or these, by their numbers; None is all.
 
     PSNR leaves out the pixels that a mask leaves out. For SSIM and LPIPS these pixels have the colour of the truth.
 
@@ -66,7 +68,8 @@ def evaluate(
         ['test_000', 'test_012']
     """
     scores = []
-    for view in view_numbers(len(scene.test.names), views):
+    chosen = views if isinstance(views, Sequence) else view_numbers(len(scene.test.names), views)
+    for view in chosen:
         if stop is not None and stop():
             break
         image = render_view(renderer, scene, view, heaviest=False)

@@ -15,8 +15,6 @@ from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
-from voronerf.distributed.group import Group
-from voronerf.distributed.sharing import Sharing
 from voronerf.evaluation.panels import palette
 from voronerf.nerfstudio.scene import scene_of, seen_from_inside
 from voronerf.rendering import Rays, intersect_box
@@ -111,7 +109,6 @@ class VoronerfModel(Model):
             self.settings.planned_splits,
             self.settings.split_rule,
             generator=torch.Generator().manual_seed(self.settings.seed),
-            sharing=Sharing(Group(torch.device(device))),
         )
         self._found: Found | None = None
 

@@ -26,7 +26,7 @@ from voronerf.ops.learn_outputs import learn_outputs
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
-from voronerf.ops.observe_occupancy import observe_occupancy, observe_told, tell_observed
+from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
 from voronerf.ops.ray_runs.reference import OwnSamples
@@ -36,7 +36,6 @@ from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.select_heaviest import select_heaviest
 from voronerf.ops.sparse_adam import Guard, Rule, adam, sparse_adam
 from voronerf.ops.spherical_harmonics import spherical_harmonics
-from voronerf.ops.touched_entries import add_entries, pack_entries
 from voronerf.ops.update_occupancy import update_occupancy
 
 __all__ = [
@@ -53,7 +52,6 @@ __all__ = [
     "Rule",
     "Runs",
     "adam",
-    "add_entries",
     "balance_centres",
     "camera_rays",
     "cast_solids",
@@ -74,9 +72,7 @@ __all__ = [
     "march_rays",
     "nearest_centre",
     "observe_occupancy",
-    "observe_told",
     "own_samples",
-    "pack_entries",
     "pixel_rays",
     "render_loss",
     "render_loss_gradient",
@@ -87,6 +83,5 @@ __all__ = [
     "select_heaviest",
     "sparse_adam",
     "spherical_harmonics",
-    "tell_observed",
     "update_occupancy",
 ]

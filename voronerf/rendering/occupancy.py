@@ -18,7 +18,7 @@ from torch import Tensor
 from voronerf.checks import MAX_COUNT
 from voronerf.fields.radiance import activate_density, activate_radiance
 from voronerf.ops.march_rays import March, march_rays
-from voronerf.ops.observe_occupancy import observe_occupancy, observe_told, tell_observed
+from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.observe_occupancy.reference import cells_of
 from voronerf.ops.update_occupancy import update_occupancy
 from voronerf.rendering.cameras import Rays
@@ -166,8 +166,6 @@ class OccupancyGrid:
         weights: Tensor,
         *,
         decay: float,
-        told: Tensor | None = None,
-        reached: Tensor | None = None,
         backend: str = "auto",
     ) -> None:
         """Updates cells, in place, from samples that were rendered anyway.
@@ -182,9 +180,7 @@ class OccupancyGrid:
             deltas: [m], lengths of the strata of the samples.
             weights: [m], contributions of the samples to their rays, from `composite`.
             decay: factor on the old densities of the cells of these samples, 0..1.
-            told: float32 [c, 2], what other ranks :meth:`tell` of theirs, or None.
-            reached: bool [cells], those that this rank has; None for all.
-            backend: "auto", "reference", "native", or without ``told`` "warp".
+            backend: "auto", "reference", "native" or "warp".
 
         Raises:
             ValueError: a decay out of range.
@@ -193,41 +189,7 @@ class OccupancyGrid:
             raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
         samples = self._samples(positions, density, deltas, weights)
         rule: dict[str, Any] = {"decay": decay, "threshold": self.threshold, "hidden": HIDDEN, "backend": backend}
-        if told is None:
-            observe_occupancy(*self._tables, *samples, **rule)
-        else:
-            observe_told(self._tables, samples, told, reached=reached, **rule)
-
-    @torch.no_grad()
-    def tell(
-        self,
-        positions: Tensor,
-        density: Tensor,
-        deltas: Tensor,
-        weights: Tensor,
-        *,
-        several: Tensor | None = None,
-        backend: str = "auto",
-    ) -> Tensor:
-        """What other ranks should know of the samples that this one observes, for their :meth:`observe`.
-
-        Args:
-            positions: as in :meth:`observe`.
-            density: [m].
-            deltas: [m].
-            weights: [m].
-            several: bool [cells], those that several ranks have; None for all.
-            backend: of the op.
-
-        Returns:
-            float32 [c, 2], see `voronerf.ops.tell_observed`.
-        """
-        samples = self._samples(positions, density, deltas, weights)
-        return tell_observed(self._tables, samples, several=several, hidden=HIDDEN, backend=backend)
-
-    @property
-    def _tables(self) -> tuple[Tensor, Tensor, Tensor]:
-        return self.density, self.occupied, self.box
+        observe_occupancy(self.density, self.occupied, self.box, *samples, **rule)
 
     def _samples(
         self, positions: Tensor, density: Tensor, deltas: Tensor, weights: Tensor

@@ -35,7 +35,8 @@ class Stratified:
     """One sample in each of s strata of a ray (NeRF, section 4), and what all samplers have in common.
 
     Attributes:
-        passes: How often a ray is sampled, each time with a number of samples of its own. Ranks need a single pass.
+        passes: How often a ray is sampled, each time with a number of samples of its own. Several territories need a
+            single pass.
         skips: Whether an occupancy grid can leave out samples.
 
     Args:
@@ -73,7 +74,6 @@ class Stratified:
         *,
         jitter: bool = False,
         generator: torch.Generator | None = None,
-        kept: slice = slice(None),
     ) -> Samples:
         """The samples of the first pass.
 
@@ -83,7 +83,6 @@ class Stratified:
             far: [r], where they end.
             jitter: Random samples, for training; else the same each time.
             generator: Of the jitter.
-            kept: The rays to sample, which get the random numbers that they have among all.
         """
         space = self.space
         given: dict[str, Any] = {"jitter": jitter, "spacing": space.spacing, "generator": generator}
@@ -92,7 +91,7 @@ class Stratified:
             depths = (edges[:, 1:] + edges[:, :-1]) / 2
         else:
             depths, _, edges = stratified_depths(near, far, self.samples, **given)
-        return space.samples(rays[kept], depths[kept], edges[kept])
+        return space.samples(rays, depths, edges)
 
     def draw(
         self,
@@ -179,14 +178,10 @@ class Occupancy(Stratified):
         *,
         jitter: bool = False,
         generator: torch.Generator | None = None,
-        kept: slice = slice(None),
     ) -> Samples:
         """As that of `Stratified`."""
         # A ray's jitter follows from the sum of the seed and of its number.
         seed = draw_seed(near.device, generator) if jitter else None
-        if kept != slice(None):
-            rays, near, far = rays[kept], near[kept], far[kept]
-            seed = None if seed is None else seed + (kept.start or 0)
         return self.march(rays, near, far, seed=seed)[0]
 
     def march(

@@ -1,7 +1,8 @@
 """The loss of a batch of rays, with gradients: one contract, and the ways to it in one process.
 
 r rays, m samples of all rays. A way takes a :class:`Batch`, samples its rays, asks the field and gives a
-:class:`Found`; ``why_not`` says what keeps a renderer from it. :mod:`voronerf.step.ray_runs` has the way over ranks.
+:class:`Found`; ``why_not`` says what keeps a renderer from it. :mod:`voronerf.step.ray_runs` has the way through
+several territories.
 """
 
 from __future__ import annotations
@@ -60,9 +61,8 @@ class Found(NamedTuple):
     ``error`` are then those of the rays of ``samples``.
 
     Attributes:
-        loss: []; over ranks the part of the rays that this one puts together.
-        error: [r], the squared error of the colour of each ray, summed over the channels; over ranks 0 for rays without
-            samples of this one.
+        loss: [].
+        error: [r], the squared error of the colour of each ray, summed over the channels.
         weights: [m], contributions of the samples to their rays.
         density: [m].
         samples: Those of the last pass.
@@ -142,22 +142,15 @@ class Fused:
     def __init__(self, renderer: Renderer, sightings: float = 0.0) -> None:
         self.renderer, self.sightings = renderer, sightings
 
-    def __call__(
-        self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False, kept: slice = slice(None)
-    ) -> Found:
-        """As of :class:`RayLoss`, for the rays ``kept`` alone, which have the samples that they have among all."""
+    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
+        """As of :class:`RayLoss`."""
         renderer, directions, target, background = self.renderer, batch.rays.directions, batch.target, batch.background
         field = cast(VoronoiRouter, renderer.field)
-        given: dict[str, Any] = {"jitter": True, "generator": generator, "kept": kept}
-        samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, **given)
-        if kept != slice(None):
-            directions, target = directions[kept], target[kept]
-            if background is not None and background.dim() == 2:
-                background = background[kept]
+        samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, jitter=True, generator=generator)
         all_rays = len(samples.ray_offsets) - 1
         seen = None
         if self.sightings and batch.seen is not None:
-            seen = torch.nn.functional.pad(batch.seen, (len(batch.rays) - len(batch.seen), 0), value=math.nan)[kept]
+            seen = torch.nn.functional.pad(batch.seen, (len(batch.rays) - len(batch.seen), 0), value=math.nan)
         if seen is not None or field.frozen_cells is not None:
             samples = samples.counted()
         if field.frozen_cells is not None:

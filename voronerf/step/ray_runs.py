@@ -1,186 +1,399 @@
-"""The loss of rays that pass through the cells of several ranks. Only partial sums of rays travel.
+"""The loss of rays that pass through several territories, each with networks of its own: only partial sums travel.
 
-Each rank puts a slice of the rays together: it gets a partial sum of each run from those that evaluated it, 24 bytes,
-and answers with what its gradients follow from (Li et al. 2024, NeRF-XL). r rays, m own samples, q runs, c colours.
+Every territory draws rays from its own views, and evaluates its own part of them first. A ray that has not ended by
+then goes to the other territories that it meets. Each answers with a partial sum, 24 bytes; the territory that drew the
+ray puts it together, and answers with what the gradients of the sum follow from, 24 bytes (Li et al. 2024, NeRF-XL).
+What a territory computes does not depend on which rank has it. r rays, m samples, q runs, c colours, T territories.
 """
 
 from __future__ import annotations
 
 import functools
-import itertools
-from collections.abc import Callable
-from dataclasses import replace
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from voronerf.distributed.sharing import Sharing
+from voronerf.distributed.group import Group
+from voronerf.distributed.mail import Route, send
+from voronerf.distributed.territories import Place
 from voronerf.ops.composite import composite
 from voronerf.ops.learn_outputs import learn_outputs
 from voronerf.ops.learn_outputs.reference import with_gradients
 from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
 from voronerf.ops.ray_runs.reference import OwnSamples, along_rays, answer, compose, sum_runs
+from voronerf.ops.ray_runs.reference import own_samples as keep_own
+from voronerf.rendering.cameras import Rays
+from voronerf.rendering.marching import OPAQUE, Seen
 from voronerf.rendering.occupancy import HIDDEN
+from voronerf.rendering.rays import intersect_box
 from voronerf.rendering.renderer import Renderer
 from voronerf.rendering.samplers import Occupancy
 from voronerf.rendering.sampling import colour_loss, seen_there, sighting_loss
-from voronerf.rendering.volume import Samples, ask, gradient_shares
+from voronerf.rendering.volume import Samples, ask, gradient_shares, normalised
 from voronerf.router import VoronoiRouter
-from voronerf.router.table import parameters_of_table
-from voronerf.step.ray_loss import Batch, Found, Fused, density_scale, why_not_fused
+from voronerf.step.ray_loss import Batch, Found, density_scale, why_not_fused
 
-#: Answers to sums [q, c + 3] of runs, and the part [] of the loss, see `compose_runs`.
-_Compose = Callable[[Tensor], tuple[Tensor, Tensor]]
+#: Most territories that the rays of one go to, and the share of its rays that has to meet one of them.
+LINKS, LEAST = 32, 1 / 500
+#: Steps after which territories tell all others what of them is not empty, and where their rays go; sooner at first.
+SURVEY_EVERY = 64
 
 
-class OverRanks:
-    """The loss of a batch that all ranks have, each with the samples in its own cells.
+@dataclass(frozen=True)
+class Territory:
+    """A territory of this rank.
 
-    Gradients of parameters that several ranks have are sums over the samples of this one.
+    Attributes:
+        place: Where it is.
+        renderer: Its networks and its grid.
+        generator: Of its samples.
+    """
+
+    place: Place
+    renderer: Renderer
+    generator: torch.Generator
+
+
+@dataclass
+class Map:
+    """What all ranks know of all territories, 280 bytes of each.
+
+    Attributes:
+        bounds: [T, 2, 3], around what is not empty.
+        links: int64 [T, LINKS], the territories that rays of each go to, and -1.
+    """
+
+    bounds: Tensor
+    links: Tensor
+
+    @staticmethod
+    def of(boxes: Tensor, centres: Tensor) -> Map:
+        """Of territories of which nothing is known but their boxes [T, 2, 3] and centres [T, 3]."""
+        nearest = torch.cdist(centres, centres).argsort(dim=1, stable=True)[:, 1 : LINKS + 1]
+        links = torch.full((len(centres), LINKS), -1)
+        links[:, : nearest.shape[1]] = nearest
+        return Map(boxes.clone(), links)
+
+    def met(self, rays: Rays, near: Tensor, far: Tensor, chosen: Tensor | None = None) -> Tensor:
+        """Which territories rays [r] may meet between near and far, bool [r, T]."""
+        bounds = (self.bounds if chosen is None else self.bounds[chosen]).to(near.device)
+        inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
+        ends = (bounds[None] - rays.origins[:, None, None]) * inverse[:, None, None]
+        first, last = ends.amin(2).amax(2), ends.amax(2).amin(2)
+        whole = bounds.isinf().any(2).any(1) & (bounds[:, 0, 0] < 0)  # known to be anywhere
+        empty = bounds[:, 0, 0] > bounds[:, 1, 0]
+        crosses = torch.maximum(first, near[:, None]) < torch.minimum(last, far[:, None])
+        return (crosses | whole) & ~empty & (far > near)[:, None]
+
+
+class JointLoss:
+    """The loss of the batches of all territories, of which this rank has some.
 
     Args:
-        renderer: Of a single pass over points.
-        sharing: Which cells are own ones.
+        group: The ranks.
+        territories: Of this rank, by their numbers.
+        owner: The rank of each territory, [T].
+        known: What is known of all of them.
         sightings: Factor of the `sighting_loss`; 0 is off.
     """
 
-    def __init__(self, renderer: Renderer, sharing: Sharing, sightings: float) -> None:
-        self.renderer, self.sharing, self.sightings = renderer, sharing, sightings
+    def __init__(
+        self, group: Group, territories: Mapping[int, Territory], owner: Sequence[int], known: Map, sightings: float
+    ) -> None:
+        self.group, self.territories, self.owner = group, dict(territories), list(owner)
+        self.map, self.sightings = known, sightings
+        #: For each own territory how many of its rays met each, and had not ended, and last the rays that it drew.
+        self.wanted = {number: torch.zeros(len(owner) + 1, dtype=torch.int64) for number in territories}
 
-    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
-        """As of `RayLoss`; the generator is in the same state on all ranks."""
-        found = self._found(batch, generator)
-        if backward:
-            found.loss.backward()
-            found = found._replace(loss=found.loss.detach())
-        return found
+    def survey(self, step: int) -> None:
+        """At some steps, all territories tell what of them is not empty, and where their rays go."""
+        if step % SURVEY_EVERY and (step > SURVEY_EVERY or step & (step - 1)):
+            return
+        record = torch.zeros(len(self.owner), 6 + LINKS, dtype=torch.float64, device=self.group.device)
+        for number, territory in self.territories.items():
+            *counts, rays = self.wanted[number].tolist()
+            links = self.map.links[number].tolist()
+            if rays:
+                many = [other for other, n in enumerate(counts) if n > LEAST * rays and other != number]
+                links = sorted(sorted(many, key=lambda other: -counts[other])[:LINKS])
+            record[number, :6] = territory.place.bounds(territory.renderer.occupancy).reshape(-1)
+            record[number, 6:] = torch.tensor((links + [-1] * LINKS)[:LINKS])
+            self.wanted[number].zero_()
+        record = self.group.total(record).cpu()
+        self.map = Map(record[:, :6].reshape(-1, 2, 3).float(), record[:, 6:].long())
 
-    def _found(self, batch: Batch, generator: torch.Generator | None) -> Found:
-        if batch.background is not None:
-            batch = replace(batch, background=batch.background.expand_as(batch.target))
-        if why_not_fused(self.renderer) is not None:
-            return self._composed(batch, generator)
-        if self.sharing.diagram is None:
-            return self._whole_rays(batch, generator)
-        seen = self.sightings and batch.seen is not None
-        return self._composed(batch, generator) if seen else self._fused(batch, generator)
+    def run(self, batches: Mapping[int, Batch], *, backward: bool = False) -> dict[int, Found]:
+        """The loss and what was found, for each own territory.
 
-    def explain(self) -> str:
-        """As of `RayLoss`."""
-        rest = "one operation" if why_not_fused(self.renderer) is None else "separate operations"
-        return f"partial sums of rays travel between {self.sharing.group.size} ranks; networks and gradients are {rest}"
+        Args:
+            batches: The rays that each own territory draws; not all need to draw some.
+            backward: Whether gradients may be added to those of the parameters at once; a loss that has none then.
+        """
+        given: dict[str, Any] = {"sightings": self.sightings, "backward": backward}
+        homes = {n: _Pass(self.territories[n], batch, **given) for n, batch in batches.items()}
+        guests: dict[int, _Pass] = {}
 
-    def _whole_rays(self, batch: Batch, generator: torch.Generator | None) -> Found:
-        """Where all ranks have the same network no ray is split."""
-        kept = self.sharing.slice(len(batch.rays))
-        found = Fused(self.renderer, self.sightings)(batch, generator, kept=kept)
-        return found._replace(loss=found.loss * (len(found.error) / len(batch.rays)))
+        def travel() -> None:
+            parts, rows, learnt = self._leave(homes, batches)
+            routes = self._routes()
+            came = send(self.group, "rays", 8 + (self.sightings > 0), parts, routes)
+            sizes: dict[int, list[tuple[Any, int]]] = {n: [] for n in self.territories}
+            for key, table in came.items():
+                sizes[key[1]].append((key, len(table)))
+            for number, territory in self.territories.items():
+                if sizes[number]:
+                    table = torch.cat([came[key] for key, _ in sizes[number]])
+                    seen = table[:, 8] if self.sightings else None
+                    guests[number] = _Pass(territory, _batch(table, seen), **given)
+            _nest(list(guests.values()), lambda: compose_all(sizes, rows, learnt, routes))
 
-    def _fused(self, batch: Batch, generator: torch.Generator | None) -> Found:
+        def compose_all(sizes: Any, rows: Any, learnt: Any, routes: list[Route]) -> None:
+            width = 6 + int(self.sightings > 0)
+            sums: dict[Any, Tensor] = {}
+            for number, own in sizes.items():
+                if own:
+                    sums.update(guests[number].parted(own))
+            back = [route.back() for route in routes]
+            answers: dict[Any, Tensor] = {}
+            came = send(self.group, "sums", width, sums, back)
+            for number, home in homes.items():
+                keys = [key for key in came if key[0] == number]
+                answers.update(self._compose(home, batches[number], {k: came[k] for k in keys}, rows, learnt[number]))
+            told = send(self.group, "answers", width, answers, routes)
+            for number, own in sizes.items():
+                if own:
+                    guests[number].answers = torch.cat([told[key] for key, _ in own])
+
+        _nest(list(homes.values()), travel)
+        return {n: _together(homes.get(n), guests.get(n)) for n in self.territories if n in homes or n in guests}
+
+    def _routes(self) -> list[Route]:
+        """From each territory to those that its rays go to, where one of the two is here."""
+        here = self.group.rank
+        return [
+            Route(self.owner[number], self.owner[other], (number, other))
+            for number, links in enumerate(self.map.links.tolist())
+            for other in links
+            if other >= 0 and here in (self.owner[number], self.owner[other])
+        ]
+
+    def _leave(self, homes: Mapping[int, _Pass], batches: Mapping[int, Batch]) -> tuple[Any, Any, Any]:
+        """The rays that go on: their tables and numbers by (from, to); and for each batch the rays that are learnt."""
+        parts, rows, learnt = {}, {}, {}
+        for number, home in homes.items():
+            batch = batches[number]
+            met = self.map.met(batch.rays, batch.near, torch.minimum(batch.far, home.end))
+            met[:, number] = False
+            self.wanted[number][:-1] += met.sum(0).cpu()
+            self.wanted[number][-1] += len(met)
+            links = [other for other in self.map.links[number].tolist() if other >= 0]
+            strange = met.sum(1) > met[:, links].sum(1)  # where few of the rays go, they are not learnt from
+            learnt[number] = ~strange
+            table = self._table(batch)
+            for other in links:
+                chosen = (met[:, other] & ~strange).nonzero()[:, 0]
+                rows[number, other] = chosen
+                parts[number, other] = table[chosen]
+        return parts, rows, learnt
+
+    def _table(self, batch: Batch) -> Tensor:
+        """Rays as rows of numbers."""
+        rays = batch.rays
+        columns = [rays.origins, rays.directions, batch.near[:, None], batch.far[:, None]]
+        if self.sightings:
+            columns.append(_points(batch)[:, None])
+        return torch.cat(columns, 1)
+
+    def _compose(
+        self, home: _Pass, batch: Batch, came: Mapping[Any, Tensor], rows: Mapping[Any, Tensor], learnt: Tensor
+    ) -> dict[Any, Tensor]:
+        """Puts the rays of a territory together; returns the answers to the others."""
+        own = home.sums.clone()
+        own[:, -1] = home.ids[own[:, -1].long()].to(own.dtype)
+        parts = [own]
+        for key, sums in came.items():
+            sums = sums.clone()
+            sums[:, -1] = rows[key][sums[:, -1].long()].to(sums.dtype)
+            parts.append(sums)
+        every = torch.cat(parts)
+        known = learnt[every[:, -1].long()]
+        sums = every if bool(known.all()) else every[known]
+        target, background = batch.target, batch.background
+        if every.shape[1] == 6:
+            given: dict[str, Any] = {"background": background, "first": 0, "rays": len(target)}
+            answers, loss = compose_runs(sums, target, **given, backend=home.renderer.backend)
+        else:
+            answers, loss = _put_together(sums, batch, self.sightings)
+        if len(sums) < len(every):
+            told = answers.new_zeros(every.shape)
+            told[known] = answers
+            answers = told
+        home.loss = loss
+        mine, *others = answers.split([len(part) for part in parts])
+        home.answers = mine
+        return dict(zip(came, others, strict=True))
+
+
+class _Pass:
+    """Rays [r] in one territory: its sums of them, and from the answers to these its gradients.
+
+    Attributes:
+        ids: int64, the numbers of the rays that meet the territory's box.
+        sums: [q, c + 3] of its runs; the last column is a number in ``ids``.
+        answers: [q, c + 3], to be set before the gradients.
+        loss: [], to be set where the rays are put together here.
+        end: [r], the depth at which a ray has ended, or infinity.
+        found: What was found, for these rays.
+    """
+
+    def __init__(self, territory: Territory, batch: Batch, *, sightings: float = 0.0, backward: bool = False) -> None:
+        self.territory, self.renderer, self.backward = territory, territory.renderer, backward
+        near, far, device = batch.near, batch.far, batch.near.device
+        hit = torch.ones_like(near, dtype=torch.bool)
+        if self.renderer.contraction is None:
+            box = territory.place.box.to(device)
+            first, last, _ = intersect_box(batch.rays.origins, batch.rays.directions, box, 0.0, math.inf)
+            near, far = torch.maximum(near, first), torch.minimum(far, last)
+            hit = far > near
+        self.count, self.ids = len(hit), hit.nonzero()[:, 0]
+        self.rays, self.near, self.far = batch.rays[self.ids], near[self.ids], far[self.ids]
+        self.points = _points(batch)[self.ids] if sightings else None
+        self.width = 6 + int(sightings > 0)
+        self.sums = near.new_empty(0, self.width)
+        self.answers, self.loss, self.end = self.sums, near.new_zeros(()), torch.full_like(near, math.inf)
+        self.total: Tensor | None = None
+        self.found: Found | None = None
+
+    @torch.enable_grad()
+    def evaluate(self, then: Callable[[], None]) -> None:
+        """Makes the sums, calls ``then``, which is to set the answers, and learns from these."""
+        if not len(self.ids):
+            then()
+            return
+        renderer, place = self.renderer, self.territory.place
+        given: dict[str, Any] = {"jitter": True, "generator": self.territory.generator}
+        known = renderer.sampler.sample(self.rays, self.near, self.far, **given)
+        cells = place.cells(known.positions, renderer.backend)
+        along = known.ray_index, known.depths, known.deltas, cells, place.own.to(cells.device)
+        bent = renderer.contraction is not None
+        if why_not_fused(renderer) is None and self.points is None:
+            self._fused(own_samples(known.positions, *along, bent=bent, backend=renderer.backend), then)
+        else:
+            self._composed(keep_own(known.positions, *along, bent=bent), then)
+
+    def _fused(self, own: OwnSamples, then: Callable[[], None]) -> None:
         """From what the networks put out."""
-        renderer, rays = self.renderer, batch.rays
-        field, space, backend = cast(VoronoiRouter, renderer.field), renderer.sampler.space, renderer.backend
-        known = renderer.sampler.sample(rays, batch.near, batch.far, jitter=True, generator=generator)
-        cells, numbers = self.sharing.owned(known.positions, backend)
-        along = known.positions, known.ray_index, known.depths, known.deltas
-        own = own_samples(*along, cells, numbers, bent=space.contraction is not None, backend=backend)
-        shares, scale = gradient_shares(space.full_gradient, own.depths), density_scale(field)
-        slice_ = self.sharing.slice(len(rays))
-        behind = None if batch.background is None else batch.background[slice_]
-        found: list[Tensor] = []
-
-        def put_together(sums: Tensor) -> tuple[Tensor, Tensor]:
-            given: dict[str, Any] = {"first": slice_.start, "rays": len(rays), "backend": backend}
-            return compose_runs(sums, batch.target[slice_], background=behind, **given)
+        renderer, backend = self.renderer, self.renderer.backend
+        field = cast(VoronoiRouter, renderer.field)
+        shares, scale = gradient_shares(renderer.sampler.space.full_gradient, own.depths), density_scale(field)
 
         def loss(raw: Tensor) -> tuple[Tensor, Tensor]:
             sums, density = run_sums(raw, own, density_scale=scale, backend=backend)
-            answers, total = self._ask_others(sums, len(rays), put_together)
+            self._told(sums, own)
+            then()
             rule: dict[str, Any] = {"density_scale": scale, "hidden": HIDDEN, "backend": backend}
-            gradient, weights = run_gradients(raw, own, answers, **rule)
-            found.extend((_errors(own, answers, len(rays)), weights, density))
-            return total, gradient if shares is None else gradient * shares[:, None]
+            gradient, weights = run_gradients(raw, own, self.answers, **rule)
+            self._finds(own, weights, density)
+            return self.loss, gradient if shares is None else gradient * shares[:, None]
 
-        network = {**parameters_of_table(field.field, field.num_cells), "cells": own.cells}
-        if field.field.layers.uses_directions:
-            network.update(directions=rays.directions, direction_index=own.ray_index)
-        total = learn_outputs({"positions": own.positions, **network}, loss, backend=backend)
-        errors, weights, density = found
-        return Found(total, errors, weights, density, _samples(own))
+        if not len(own.depths):
+            then()
+            return
+        network = field.table_arguments(own.positions, self.rays.directions, own.ray_index)
+        assert network is not None
+        self.total = learn_outputs(network, loss, backward=self.backward, backend=backend)
 
-    def _composed(self, batch: Batch, generator: torch.Generator | None) -> Found:
+    def _composed(self, own: OwnSamples, then: Callable[[], None]) -> None:
         """From colours and densities, which torch differentiates."""
-        renderer, rays, sampler = self.renderer, batch.rays, self.renderer.sampler
-        own = self.sharing.samples(sampler, rays, batch.near, batch.far, jitter=True, generator=generator)
-        samples = _samples(own)
-        colour, density = ask(renderer.field, rays, samples, sampler.space)
-        points = None
-        if batch.seen is not None and self.sightings:  # the light from where points were seen is a fourth colour
-            points = torch.full_like(batch.near, float("nan"))
-            points[len(rays) - len(batch.seen) :] = batch.seen
-            there = seen_there(own.depths, own.deltas, points[own.ray_index])
+        renderer = self.renderer
+        if not len(own.depths):
+            then()
+            return
+        colour, density = ask(renderer.field, self.rays, _samples(own), renderer.sampler.space)
+        if self.points is not None:  # the light from where points were seen is a fourth colour
+            there = seen_there(own.depths, own.deltas, self.points[own.ray_index])
             colour = torch.cat((colour, there[:, None].to(colour)), 1)
         blend = functools.partial(composite, backend=renderer.backend)
         runs, c = sum_runs(own, colour, density, blend), colour.shape[1]
-        sums = torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1).detach()
-        answers, total = self._ask_others(sums, len(rays), lambda sums: self._put_together(sums, batch, points))
+        columns = runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]
+        self._told(torch.cat(columns, 1).detach().to(self.near.dtype), own)
+        then()
+        answers = self.answers
         run, front = torch.repeat_interleave(own.run_offsets.diff()), torch.exp(-answers[:, c + 1])
         weights = runs.weights * front[run]
-        if isinstance(sampler, Occupancy):
+        if isinstance(renderer.sampler, Occupancy):
             hidden = weights <= HIDDEN * -torch.expm1(-density.detach() * own.deltas)
             colour.register_hook(lambda gradient: gradient.masked_fill(hidden[:, None], 0))
             density.register_hook(lambda gradient: gradient.masked_fill(hidden, 0))
-        total = with_gradients(total, [runs.colour, runs.optical], [front[:, None] * answers[:, :c], -answers[:, c]])
-        return Found(total, _errors(own, answers, len(rays)), weights, density.detach(), samples)
+        slopes = [front[:, None] * answers[:, :c], -answers[:, c]]
+        self.total = with_gradients(self.loss, [runs.colour, runs.optical], slopes)
+        self._finds(own, weights, density.detach())
 
-    def _ask_others(self, sums: Tensor, rays: int, put_together: _Compose) -> tuple[Tensor, Tensor]:
-        """Sends sums [q, c], by ascending rays, to the ranks that put these together; gets answers, and gives some.
+    def _told(self, sums: Tensor, own: OwnSamples) -> None:
+        """Keeps the sums, and finds the rays that end here."""
+        self.sums = sums
+        ray = sums[:, -1].long()
+        optical = torch.zeros_like(self.near).index_add_(0, ray, sums[:, -3])
+        last = torch.zeros_like(self.near)
+        last.scatter_reduce_(0, ray, own.depths[own.run_offsets[1:].long() - 1], "amax")
+        self.end[self.ids] = torch.where(optical > -math.log(OPAQUE), last, math.inf)
 
-        Args:
-            sums: Of own runs.
-            rays: How many all ranks have.
-            put_together: Answers the sums of the rays of this rank.
+    def _finds(self, own: OwnSamples, weights: Tensor, density: Tensor) -> None:
+        error = weights.new_zeros(len(self.ids))
+        ray = own.ray_index[own.run_offsets[:-1].long()].long()
+        error.index_copy_(0, ray, self.answers[:, -1].to(error.dtype))
+        self.found = Found(self.loss, error, weights, density, _samples(own))
 
-        Returns:
-            Answers to the own sums, and the part [] that the rays of this rank have in the loss.
-        """
-        bounds = torch.tensor(self.sharing.bounds(rays), dtype=sums.dtype, device=sums.device)
-        cuts = torch.searchsorted(sums[:, -1].contiguous(), bounds).tolist()
-        sizes = [end - begin for begin, end in itertools.pairwise(cuts)]
-        parts = self.sharing.group.exchange("sums", sums.split(sizes))
-        answers, loss = put_together(torch.cat(parts))
-        return torch.cat(self.sharing.group.swap("sums", answers.split(list(map(len, parts))), sizes)), loss
+    def parted(self, sizes: Sequence[tuple[Any, int]]) -> dict[Any, Tensor]:
+        """The sums of rays that came in parts of these sizes, by the keys of the parts, rays numbered in each."""
+        sums, found, first = self.sums.clone(), {}, 0
+        number = self.ids[sums[:, -1].long()]
+        for key, size in sizes:
+            begin, end = torch.searchsorted(number, torch.tensor((first, first + size), device=number.device)).tolist()
+            sums[begin:end, -1] = (number[begin:end] - first).to(sums.dtype)
+            found[key] = sums[begin:end]
+            first += size
+        return found
 
-    @torch.enable_grad()
-    def _put_together(self, sums: Tensor, batch: Batch, points: Tensor | None) -> tuple[Tensor, Tensor]:
-        """`compose_runs` with the loss of `Composed`, and c colours.
 
-        Args:
-            sums: [q, c + 3] of all ranks.
-            batch: All rays.
-            points: [r], the distance of the point at the end of each ray or NaN, or None.
-        """
-        c, rays, own = sums.shape[1] - 3, len(batch.rays), self.sharing.slice(len(batch.rays))
-        ray, start = sums[:, c + 2].long() - own.start, sums[:, c + 1]
-        order = along_rays(ray, start)
-        part, optical, ray = sums[order, :c], sums[order, c], ray[order]
-        target = batch.target[own]
-        whole = compose(part, optical, ray, len(target))
-        behind = whole.colour.new_zeros(len(target), c)
-        if batch.background is not None:
-            behind[:, :3] = batch.background[own]
-        colour = (whole.colour + whole.through[:, None] * behind).detach().requires_grad_()
-        loss = colour_loss(colour[:, :3], target) * (len(target) / rays) if len(target) else colour.sum()
-        if points is not None and batch.seen is not None:
-            ends = len(target) - max(own.start, rays - len(batch.seen)) + own.start  # of these rays, the last
-            if ends > 0:
-                light = colour[len(target) - ends :, 3]
-                loss = loss + self.sightings * sighting_loss(light).sum() / len(batch.seen)
-        (slopes,) = torch.autograd.grad(loss, colour)
-        error = (colour[:, :3].detach() - target).square().sum(-1)
-        blocked = whole.behind(part, ray, slopes, behind)
-        return answer(order, whole, blocked, slopes[ray], error[ray]), loss.detach()
+def _nest(passes: Sequence[_Pass], last: Callable[[], None]) -> None:
+    """Makes the sums of all passes, calls ``last``, and lets all of them learn."""
+
+    def go(index: int) -> None:
+        if index == len(passes):
+            last()
+        else:
+            passes[index].evaluate(lambda: go(index + 1))
+
+    go(0)
+
+
+def _together(home: _Pass | None, guest: _Pass | None) -> Found:
+    """What a territory has found on its own rays and on those of others."""
+    passes = [each for each in (home, guest) if each is not None]
+    found = [each.found for each in passes if each.found is not None]
+    totals = [each.total for each in passes if each.total is not None]
+    loss = functools.reduce(torch.add, totals) if totals else passes[0].loss
+    if home is not None and home.total is None:
+        loss = loss + home.loss
+    if len(found) == 1:
+        return found[0]._replace(loss=loss)
+    if not found:
+        none = passes[0].near.new_empty(0)
+        index = none.to(torch.int32)
+        samples = Samples(none.new_empty(0, 3), index, index.new_zeros(1), none, none)
+        return Found(loss, none, none, none, samples)
+    first, second = found
+    index = torch.cat((first.samples.ray_index, second.samples.ray_index + len(first.error)))
+    offsets = torch.cat((first.samples.ray_offsets, second.samples.ray_offsets[1:] + len(first.weights)))
+    values = (torch.cat((getattr(first.samples, n), getattr(second.samples, n))) for n in ("depths", "deltas"))
+    samples = Samples(torch.cat((first.samples.inputs, second.samples.inputs)), index, offsets, *values)
+    rest = {n: torch.cat((getattr(first, n), getattr(second, n))) for n in ("error", "weights", "density")}
+    return Found(loss, **rest, samples=samples)
 
 
 def _samples(own: OwnSamples) -> Samples:
@@ -188,7 +401,107 @@ def _samples(own: OwnSamples) -> Samples:
     return Samples(own.positions, own.ray_index, own.run_offsets, own.depths, own.deltas)
 
 
-def _errors(own: OwnSamples, answers: Tensor, rays: int) -> Tensor:
-    """The error [r] of each ray that has an own run."""
-    ray = own.ray_index[own.run_offsets[:-1].long()].long()
-    return answers.new_zeros(rays).index_copy(0, ray, answers[:, -1])
+def _batch(table: Tensor, seen: Tensor | None = None) -> Batch:
+    """Rays of a table [r, 8]; their colours are known elsewhere."""
+    rays = Rays(table[:, :3].contiguous(), table[:, 3:6].contiguous())
+    return Batch(rays, table[:, 6].contiguous(), table[:, 7].contiguous(), table[:, :0], None, seen)
+
+
+def _points(batch: Batch) -> Tensor:
+    """The distance of the point at the end of each ray, or NaN."""
+    points = torch.full_like(batch.near, math.nan)
+    if batch.seen is not None:
+        points[len(points) - len(batch.seen) :] = batch.seen
+    return points
+
+
+@torch.enable_grad()
+def _put_together(sums: Tensor, batch: Batch, sightings: float) -> tuple[Tensor, Tensor]:
+    """`compose_runs` with the loss of `Composed`, and four colours.
+
+    Args:
+        sums: [q, 7].
+        batch: All rays.
+        sightings: Factor of the `sighting_loss`.
+    """
+    c, target, ray, start = sums.shape[1] - 3, batch.target, sums[:, -1].long(), sums[:, -2]
+    order = along_rays(ray, start)
+    part, optical, ray = sums[order, :c], sums[order, c], ray[order]
+    whole = compose(part, optical, ray, len(target))
+    behind = whole.colour.new_zeros(len(target), c)
+    if batch.background is not None:
+        behind[:, :3] = batch.background
+    colour = (whole.colour + whole.through[:, None] * behind).detach().requires_grad_()
+    loss = colour_loss(colour[:, :3], target)
+    if batch.seen is not None and len(batch.seen):
+        loss = loss + sightings * sighting_loss(colour[len(target) - len(batch.seen) :, 3]).mean()
+    (slopes,) = torch.autograd.grad(loss, colour)
+    error = (colour[:, :3].detach() - target).square().sum(-1)
+    blocked = whole.behind(part, ray, slopes, behind)
+    return answer(order, whole, blocked, slopes[ray], error[ray]), loss.detach()
+
+
+def see_together(joint: JointLoss, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None) -> Seen:
+    """What rays of a picture see; all ranks call it at the same time, each with rays of its own or none.
+
+    Rays go to all territories that they may meet, and do not end at the first surface.
+
+    Args:
+        joint: The territories.
+        rays: r rays of this rank.
+        near: [r].
+        far: [r].
+        background: [3] or [r, 3], or None.
+    """
+    group, ranks = joint.group, range(joint.group.size)
+    met = joint.map.met(rays, near, far)
+    table = torch.cat((rays.origins, rays.directions, near[:, None], far[:, None]), 1)
+    rows = {(group.rank, number): met[:, number].nonzero()[:, 0] for number in range(len(joint.owner))}
+    routes = [
+        Route(rank, owner, (rank, number))
+        for rank in ranks
+        for number, owner in enumerate(joint.owner)
+        if group.rank in (rank, owner)
+    ]
+    parts = {key: table[chosen] for key, chosen in rows.items()}
+    came = send(group, "rays of pictures", 8, parts, routes)
+    sums = {key: _pictured(joint.territories[key[1]], part) for key, part in came.items()}
+    told = send(group, "sums of pictures", 7, sums, [route.back() for route in routes])
+    found = []
+    for key, part in told.items():
+        part = part.clone()
+        part[:, 5] = rows[key][part[:, 5].long()].to(part.dtype)
+        found.append(part)
+    whole = torch.cat(found)
+    whole = whole[along_rays(whole[:, 5].long(), whole[:, 4])]
+    ray = whole[:, 5].long()
+    made = compose(whole[:, :3], whole[:, 3], ray, len(rays))
+    seen, opacity = made.colour, 1 - made.through
+    if background is not None:
+        seen = seen + made.through[:, None] * background.to(seen)
+    depth = torch.zeros_like(near).index_add(0, ray, made.front * whole[:, 6])
+    return Seen(seen, opacity, normalised(depth, opacity, far), rays.origins)
+
+
+@torch.no_grad()
+def _pictured(territory: Territory, table: Tensor) -> Tensor:
+    """The partial sums [q, 7] of rays of pictures: colour, optical depth, start, ray and depth."""
+    found = _Pass(territory, _batch(table))
+    renderer, place, rays = found.renderer, territory.place, found.rays
+    if not len(found.ids):
+        return table.new_empty(0, 7)
+    sampler = renderer.train(False).sampler
+    if isinstance(sampler, Occupancy):
+        known, _ = sampler.march(rays, found.near, found.far, picture=True)
+    else:
+        known = sampler.sample(rays, found.near, found.far)
+    cells = place.cells(known.positions, renderer.backend)
+    along = known.ray_index, known.depths, known.deltas, cells, place.own.to(cells.device)
+    own = keep_own(known.positions, *along, bent=renderer.contraction is not None)
+    if not len(own.depths):
+        return table.new_empty(0, 7)
+    colour, density = (v.to(table.dtype) for v in ask(renderer.field, rays, _samples(own), sampler.space))
+    runs = sum_runs(own, colour, density, functools.partial(composite, backend=renderer.backend))
+    ray = found.ids[runs.ray].to(table.dtype)
+    columns = [runs.optical, runs.start, ray, runs.depth]
+    return torch.cat((runs.colour, torch.stack(columns, 1)), 1)

@@ -5,12 +5,10 @@ from __future__ import annotations
 import torch
 
 from voronerf import backends
-from voronerf.distributed.sharing import Sharing
 from voronerf.rendering.renderer import Renderer
 from voronerf.rendering.samplers import Occupancy
 from voronerf.router import Parts, VoronoiRouter
 from voronerf.step.ray_loss import Batch, Composed, Found, Fused, RayLoss, why_not_fused
-from voronerf.step.ray_runs import OverRanks
 
 
 class Step:
@@ -21,7 +19,6 @@ class Step:
     Args:
         renderer: Networks and sampler.
         sightings: Factor of the `sighting_loss`; 0 is off.
-        sharing: Which cells are on which rank; None for this process alone.
 
     Examples:
         >>> import torch
@@ -35,14 +32,12 @@ class Step:
         not faster: empty space is not skipped
     """
 
-    def __init__(self, renderer: Renderer, *, sightings: float = 0.0, sharing: Sharing | None = None) -> None:
-        self.renderer, self.sightings, self.sharing = renderer, sightings, sharing
+    def __init__(self, renderer: Renderer, *, sightings: float = 0.0) -> None:
+        self.renderer, self.sightings = renderer, sightings
 
     @property
     def way(self) -> RayLoss:
         """The fastest way to the loss; here alone it is chosen."""
-        if self.sharing is not None and self.sharing.group.size > 1:
-            return OverRanks(self.renderer, self.sharing, self.sightings)
         if why_not_fused(self.renderer) is None:
             return Fused(self.renderer, self.sightings)
         return Composed(self.renderer, self.sightings)
@@ -51,8 +46,8 @@ class Step:
         """The loss of a batch, with gradients, and what its samples have found.
 
         Args:
-            batch: The rays; over ranks the same on all of them.
-            generator: Of random samples; over ranks in the same state.
+            batch: The rays.
+            generator: Of random samples.
             backward: Whether gradients are added to those of the parameters at once, as ``loss.backward()`` does it,
                 in less time; the loss has none then.
         """

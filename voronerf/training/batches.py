@@ -33,6 +33,7 @@ class RayBatches:
         device: Where batches live, and images that are in memory.
         cones: Whether the rays have radii.
         sightings: Whether a share of the rays, `SEEN`, are through sightings of points.
+        views: int64, the training views to draw from; None for all.
         through: [2, 3], a box in that of the scene that rays must meet; None for all of it.
         backend: Of the ops.
     """
@@ -44,10 +45,11 @@ class RayBatches:
         *,
         cones: bool = False,
         sightings: bool = False,
+        views: Tensor | None = None,
         through: Tensor | None = None,
         backend: str = "auto",
     ) -> None:
-        self.scene, self.backend = scene, backend
+        self.scene, self.views, self.backend = scene, views, backend
         self.cones = cones
         self.device = device
         self.place = torch.device("cpu") if scene.train.on_disk else device
@@ -60,14 +62,19 @@ class RayBatches:
         self.sightings = None
         if sightings and scene.train.sightings is not None:
             self.sightings = Sightings(*(tensor.to(self.place) for tensor in scene.train.sightings))
+            if views is not None:
+                size = self.cameras.width * self.cameras.height
+                own = torch.isin(self.sightings.pixels // size, views.to(self.place))
+                self.sightings = Sightings(*(tensor[own] for tensor in self.sightings))
+                self.sightings = self.sightings if own.any() else None
 
     def _useful_pixels(self, box: Tensor | None) -> Runs | None:
         """The pixels to draw from; None when that is all of them."""
         cameras, masks = self.cameras, self.scene.train.masks
-        if box is None and masks is None and cameras.sizes is None:
+        if box is None and masks is None and cameras.sizes is None and self.views is None:
             return None
         found = []
-        for image in range(len(cameras)):
+        for image in range(len(cameras)) if self.views is None else self.views.tolist():
             width, height = cameras.size(image)
             chosen = torch.ones(height, width, dtype=torch.bool, device=self.place)
             if masks is not None:

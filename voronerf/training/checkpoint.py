@@ -4,11 +4,9 @@ The tensors are those of the routers with their diagrams, of the optimiser, of t
 generators. Everything else (configuration, counters, stages) is JSON in the metadata of the file, beside a checksum for
 each tensor and one for the JSON.
 
-A training on several processes writes a file for the cells of each, and then the checkpoint, whose JSON names these
-files as ``shards``. Whoever loads it gets the tensors of all cells.
-
-The networks of a run of several parts are in files of their own, whose names are hashes of what is in them: networks
-that did not change are not written again, and equal ones are stored once.
+A joint training writes a file for each territory, a checkpoint of its own, and then the checkpoint that names them. The
+networks of an edited run of several parts are in files whose names are hashes of what is in them: networks that did not
+change are not written again, and equal ones are stored once.
 """
 
 from __future__ import annotations
@@ -17,17 +15,14 @@ import functools
 import hashlib
 import json
 import re
-import secrets
-import tempfile
 import threading
 import warnings
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
@@ -43,8 +38,6 @@ _VALUES = "values"
 NETWORKS = "part-*.router-*"
 #: The file of the networks of one router of a part.
 _NETWORKS = re.compile(r"(networks|part)-[0-9a-z-]+\.safetensors")
-#: The tensor of a shard that has an entry for each voxel, not for each cell: 0 where others know better.
-VOXELS = "occupancy.density"
 
 
 class CheckpointError(ValueError):
@@ -92,28 +85,26 @@ def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
         else:
             path.unlink()
     rename(written, last)
-    _remove_shards(run)
+    _remove_parts(run)
 
 
-def shard_path(run: Path, token: str, rank: int) -> Path:
-    """Where one of several processes keeps its cells; the token is that of one checkpoint."""
-    return checkpoint_path(run).with_name(f"cells-{token}-{rank}.safetensors")
+def part_path(run: Path, token: str, number: int) -> Path:
+    """Where a territory keeps its part of one checkpoint, whose token is like no other."""
+    return checkpoint_path(run).with_name(f"part-{token}-{number}.safetensors")
 
 
-def _remove_shards(run: Path) -> None:
-    """Removes shards and networks that no checkpoint of a run names; none while it has a file that cannot be read."""
+def _remove_parts(run: Path) -> None:
+    """Removes parts and networks that no checkpoint of a run names; none while it has a file that cannot be read."""
     named: set[str] = set()
     for path in checkpoint_paths(run):
         try:
             with safe_open(path, framework="pt") as file:
-                values = parse_json(file.metadata()[_VALUES])
-                named |= {*values.get("shards", ()), *network_files(values)}
+                named |= set(network_files(parse_json(file.metadata()[_VALUES])))
         except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, OSError):
             return
-    for pattern in ("cells-*.safetensors", "networks-*.safetensors"):
-        for path in checkpoint_path(run).parent.glob(pattern):
-            if path.name not in named:
-                path.unlink(missing_ok=True)
+    for path in checkpoint_path(run).parent.glob("*.safetensors"):
+        if _NETWORKS.fullmatch(path.name) and path.name not in named:
+            path.unlink(missing_ok=True)
 
 
 def network_files(values: dict[str, Any]) -> list[str]:
@@ -124,64 +115,70 @@ def network_files(values: dict[str, Any]) -> list[str]:
 class CheckpointWriter:
     """Writes the checkpoints of a run one after the other, beside what the caller does.
 
-    Over several ranks, all of which call the same methods, each writes a file for its cells; when all are there, rank 0
-    writes the checkpoint that names them. A checkpoint counts from that moment on.
+    In a joint training all ranks call the same methods. Each writes the files of its territories; when all are there,
+    rank 0 writes the checkpoint that names them, which counts from that moment on.
 
     Args:
         run: The run directory.
         keep: How many checkpoints stay.
-        group: The ranks that write it.
+        group: The ranks of a joint training; None for this process alone.
     """
 
-    def __init__(self, run: Path, keep: int, group: Group) -> None:
+    def __init__(self, run: Path, keep: int, group: Group | None = None) -> None:
         self.run, self.keep, self.group = run, keep, group
         self._thread: threading.Thread | None = None
         self._error: BaseException | None = None
-        self._index: Checkpoint | None = None  # of a checkpoint whose shards are being written
+        self._index: Callable[[], Checkpoint] | None = None  # makes a checkpoint whose parts are being written
 
     @property
     def busy(self) -> bool:
         """Whether a checkpoint is being written; over ranks, where that differs, a new one waits for the one before."""
-        return self.group.size == 1 and self._writes
+        return self.group is None and self._writes
 
     @property
     def ready(self) -> bool:
-        """Whether this rank has written its cells, for a checkpoint that is not there yet."""
+        """Whether this rank has written its parts, for a checkpoint that is not there yet."""
         return self._index is not None and not self._writes and self._error is None
 
     @property
     def _writes(self) -> bool:
         return self._thread is not None and self._thread.is_alive()
 
-    def write(self, checkpoint: Checkpoint, shard: Checkpoint | None = None) -> None:
+    def write(self, checkpoint: Checkpoint) -> None:
         """Begins to write a checkpoint, after the one before; its tensors must not change.
-
-        Args:
-            checkpoint: What all ranks have.
-            shard: The cells of this rank; None before they are shared.
 
         Raises:
             OSError: When the one before could not be written.
+        """
+        self.wait()
+        self._begin(functools.partial(keep_checkpoint, self.run, checkpoint, self.keep))
+
+    def write_parts(self, parts: Mapping[Path, Checkpoint], index: Callable[[], Checkpoint]) -> None:
+        """Begins to write the parts of a checkpoint; :meth:`commit` writes the checkpoint itself.
+
+        Args:
+            parts: Those of this rank by their files; their tensors must not change.
+            index: Makes the checkpoint that names the parts of all ranks, which are written then; asked on rank 0.
+
+        Raises:
+            OSError: When the checkpoint before could not be written.
             RankLost: When that is so on another rank.
         """
         self.wait()
-        if self.group.size == 1:
-            self._begin(functools.partial(keep_checkpoint, self.run, checkpoint, self.keep))
-        elif shard is None:
-            self._index = checkpoint
-        else:
-            token = self.group.from_first(f"{checkpoint.values['step']}-{secrets.token_hex(4)}")
-            paths = [shard_path(self.run, token, rank) for rank in range(self.group.size)]
-            names = [path.name for path in paths]
-            self._index = replace(checkpoint, values={**checkpoint.values, "shards": names})
-            self._begin(functools.partial(save_checkpoint, paths[self.group.rank], shard))
+
+        def save_all() -> None:
+            for path, part in parts.items():
+                save_checkpoint(path, part)
+
+        self._index = index
+        self._begin(save_all)
 
     def commit(self) -> None:
         """Begins to write the checkpoint itself, when all ranks are :attr:`ready`."""
         self._join()
         index, self._index = self._index, None
-        if index is not None and self.group.rank == 0:
-            self._begin(functools.partial(keep_checkpoint, self.run, index, self.keep))
+        if index is not None and (self.group is None or self.group.rank == 0):
+            self._begin(lambda: keep_checkpoint(self.run, index(), self.keep))
 
     def wait(self) -> None:
         """Returns when the checkpoint is written, on all ranks.
@@ -224,8 +221,8 @@ class CheckpointWriter:
             self._join()
         except OSError as error:
             failure = error
-        failed = torch.tensor(float(failure is not None), device=self.group.device)
-        if self.group.largest(failed) > 0:
+        failed = torch.tensor(float(failure is not None), device="cpu" if self.group is None else self.group.device)
+        if (failed if self.group is None else self.group.largest(failed)) > 0:
             raise failure or RankLost("another rank could not write the checkpoint")
 
 
@@ -288,6 +285,9 @@ def _write_networks(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
             for name, tensor in own.items():
                 digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
                 digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+            if not own and "file" in router:  # of a joint training, which has written it
+                routers.append(router)
+                continue
             path = folder / f"networks-{digest.hexdigest()}.safetensors"
             if not path.is_file():
                 save_checkpoint(path, Checkpoint(own, kind))
@@ -320,7 +320,7 @@ def _read_networks(path: Path, values: dict[str, Any], keep: Callable[[str], boo
 def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
     """Reads a checkpoint onto the CPU.
 
-    Its tensors are pages of the file, or where it has shards of a temporary one: the system drops what is not in use.
+    Its tensors are pages of the file: the system drops what is not in use.
 
     Args:
         path: The file.
@@ -346,49 +346,11 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
                 raise CheckpointError(f"{path}: a damaged checkpoint, {name} {what}")
         values = parse_json(metadata["values"])
         tensors = {name: tensor for name, tensor in tensors.items() if keep(name)} | _read_networks(path, values, keep)
-        return Checkpoint(_join_shards(path, tensors, values.pop("shards", ()), keep), values, str(path))
+        return Checkpoint(tensors, values, str(path))
     except CheckpointError:
         raise
     except (SafetensorError, ValueError, KeyError, AttributeError, OSError) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint: {error}") from None
-
-
-def _join_shards(
-    path: Path, tensors: dict[str, Tensor], names: Sequence[str], keep: Callable[[str], bool]
-) -> dict[str, Tensor]:
-    """The tensors of a checkpoint and of its shards.
-
-    Raises:
-        CheckpointError: When one is missing or damaged, or they are not each cell once.
-    """
-    if not names:
-        return tensors
-    if any(Path(name).name != name for name in names):
-        raise CheckpointError(f"{path}: shards must be names of files beside it, got {', '.join(names):.200}")
-    shards = [load_checkpoint(path.with_name(name), keep=keep) for name in names]
-    cells = torch.cat([torch.tensor(shard.values["cells"], dtype=torch.int64) for shard in shards])
-    order = cells.argsort()
-    rows = [{name: t for name, t in shard.tensors.items() if name != VOXELS} for shard in shards]
-    fits = all(part.keys() == rows[0].keys() for part in rows) and torch.equal(cells[order], torch.arange(len(cells)))
-    counts = zip(rows, shards, strict=True)
-    if not fits or any(len(t) != len(shard.values["cells"]) for part, shard in counts for t in part.values()):
-        raise CheckpointError(f"{path}: shards must have all tensors of each cell once, {', '.join(names)} have not")
-    joined = {name: _join([part[name] for part in rows], order) for name in rows[0]}
-    if VOXELS in shards[0].tensors:
-        joined[VOXELS] = torch.stack([shard.tensors[VOXELS] for shard in shards]).amax(0)
-        joined["occupancy.occupied"] = joined[VOXELS] >= float(tensors["occupancy.threshold"])
-    return {**tensors, **joined}
-
-
-def _join(parts: list[Tensor], order: Tensor) -> Tensor:
-    """The rows of several tensors in an order, in a file that nobody else sees: it need not fit into memory."""
-    rows = [row for part in parts for row in part]
-    with tempfile.TemporaryFile() as file:
-        for number in order.tolist():
-            file.write(rows[number].reshape(-1).view(torch.uint8).numpy().data)
-        file.flush()
-        pages = torch.from_numpy(np.memmap(file, np.uint8, "c"))
-    return pages.view(rows[0].dtype).reshape(len(rows), *rows[0].shape)
 
 
 def _checksum(tensor: Tensor) -> int:

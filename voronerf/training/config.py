@@ -93,6 +93,10 @@ class TrainConfig:
     """Each cell has all parameters of its network for itself: with hashgrid a table of features too, which the cells
     share otherwise."""
 
+    territories: int | None = None
+    """Parts of space that are trained as scenes of their own, with cells, table, views and rays of their own; rays that
+    cross their borders are put together. All other settings are those of one of them. They are what processes share
+    out: default 1, with several processes the least power of two that gives each one."""
     cells: tuple[int, ...] = (16,)
     """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again, no number is one network."""
     split_at: tuple[float, ...] | None = None
@@ -181,7 +185,8 @@ class TrainConfig:
     """Test views of the final evaluation; default all, or as many as --evaluation-share allows."""
     evaluation_share: float = 0.1
     """Share of --budget for evaluations, half of it for the final one. Where that is too short for all their views,
-    evenly spread ones are scored. 0: evaluations take the time that they need, beside the budget."""
+    evenly spread ones are scored. 0, and always with several territories: evaluations take the time that they need,
+    beside the budget."""
     checkpoint_every: float = 30.0
     """Seconds of training between checkpoints, which are written while it goes on."""
     keep_checkpoints: int = 3

@@ -121,6 +121,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     largest = max(config.cells, default=0)
     need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")
     need(config.checkpoint_every > 0, "checkpoint_every", "be positive")
+    need(config.territories is None or config.territories >= 1, "territories", "be at least 1")
     need(config.device.startswith("cuda") or not config.cuda_graph, "cuda_graph", "come with --device cuda")
     need(all(k >= 2 for k in config.cells), "cells", "be at least 2 on every level (none for one network)")
     _check_splits(config, need)
@@ -161,31 +162,39 @@ def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -
         need(rising and inside, name, f"be rising {kind} {bound}")
 
 
-def check_ranks(config: TrainConfig, ranks: int) -> None:
-    """Rejects settings that multi-process training does not support; there are none for a single process.
+def check_joint(config: TrainConfig, ranks: int) -> None:
+    """Rejects settings that joint training does not support.
+
+    Args:
+        config: The settings.
+        ranks: The processes that train together.
 
     Raises:
         ConfigError: Names the setting.
     """
-    if ranks == 1:
-        return
     rules = {
         "out": (config.out is not None, "be given with torchrun: restarts resume from it"),
-        "sampling": (SAMPLERS[config.sampling].passes == 1, "take one pass, as stratified: no rank sees whole rays"),
+        "territories": ((config.territories or 1) >= ranks, f"be at least the {ranks} ranks"),
+        "sampling": (
+            SAMPLERS[config.sampling].passes == 1,
+            "take one pass with several territories, as stratified: no territory sees whole rays, where a second looks",
+        ),
         "field": (
             not config.field_type.cones,
-            "take points with several ranks: cones reach into other cells",
+            "take points with several territories: a run of parts asks its networks about points",
         ),
-        "assignment": (config.assignment == "nearest", "be nearest with several ranks, which have cells, not samples"),
-        "init": (config.init == "inherit", "be inherit with several ranks, which would draw other parameters"),
-        "blend": (config.blend == 0, "be 0 with several ranks, which do not have each other's cells"),
-        "precision": (config.precision != "fp16", "be fp32 or bf16 with several ranks, which have a scale each"),
+        "contraction": (
+            config.contraction != "ndc",
+            "be none or sphere with several territories: parts have no normalised device coordinates",
+        ),
+        "blend": (
+            config.blend == 0,
+            "be 0 with several territories, which train apart; `voronerf eval RUN --blend` blends the finished run",
+        ),
         "cuda_graph": (
             not config.cuda_graph,
-            "be off with several ranks: the host reads the sizes of their messages",
+            "be off with several territories: the host reads the sizes of their messages",
         ),
-        "cells": (not config.cells or config.cells[0] >= ranks, f"be at least the {ranks} ranks on the first level"),
-        "rays": (config.rays >= ranks, f"be at least the {ranks} ranks"),
     }
     for name, (fits, rule) in rules.items():
         if not fits:

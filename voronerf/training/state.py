@@ -1,4 +1,4 @@
-"""What a checkpoint keeps of a training, and what of it goes into the files of several ranks."""
+"""What a checkpoint keeps of a training."""
 
 from __future__ import annotations
 
@@ -10,15 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from voronerf.diagram import VoronoiDiagram
-from voronerf.distributed.sharing import assign_cells
 from voronerf.router import Parts, VoronoiRouter
-from voronerf.router.grouping import cell_parameters
-from voronerf.step import Cells
 from voronerf.training.checkpoint import (
-    VOXELS,
     Checkpoint,
     CheckpointError,
     last_checkpoint,
@@ -121,44 +115,3 @@ def load_moments(optimizer: torch.optim.Optimizer, checkpoint: Checkpoint, step:
     if step and not checkpoint.group("optimizer"):
         raise ValueError(f"no moments of the optimiser after {step} steps")
     load_optimizer_tensors(optimizer, checkpoint.group("optimizer"))
-
-
-# Several ranks --------------------------------------------------------------------------------------------------------
-
-
-def apart(checkpoint: Checkpoint, cells: Cells, optimizer: torch.optim.Optimizer) -> tuple[Checkpoint, Checkpoint]:
-    """Divides the checkpoint of a rank into what all ranks have, with the diagram of all cells, and its own cells."""
-    module, sharing = cells.routers["field"].module, cells.sharing
-    own = {id(parameter) for parameter in cell_parameters(module)}
-    names = {f"router.module.{name}" for name, p in module.named_parameters() if id(p) in own}
-    for number, parameter in enumerate(p for group in optimizer.param_groups for p in group["params"]):
-        moments = optimizer.state.get(parameter, {}) if id(parameter) in own else {}
-        names |= {f"optimizer.{number}.{key}" for key, value in moments.items() if value.dim() > 0}
-    if cells.grid is not None:
-        names.add(VOXELS)
-    kept = {n: t for n, t in checkpoint.tensors.items() if n not in names and not n.startswith("router.diagram.")}
-    for name, tensor in cells.diagram.state_dict().items():
-        kept[f"router.diagram.{name}"] = tensor.detach().to("cpu", copy=True)
-    kept |= {"sharing.owner": sharing.owner.cpu(), "sharing.weights": cells.weights}
-    shard = {name: tensor for name, tensor in checkpoint.tensors.items() if name in names}
-    return Checkpoint(kept, checkpoint.values), Checkpoint(shard, {"cells": sharing.cells().tolist()})
-
-
-def ownership(checkpoint: Checkpoint, diagram: VoronoiDiagram, ranks: int) -> tuple[Tensor, Tensor]:
-    """The rank of each cell and the weights of the cells, for a training that goes on.
-
-    With as many ranks as before they keep their cells; another number shares them anew, by the importance that they had
-    at the last split.
-
-    Raises:
-        CheckpointError: For more ranks than cells.
-    """
-    k, stored = diagram.num_cells, checkpoint.group("sharing")
-    if k < ranks:
-        raise CheckpointError(f"{checkpoint.source}: --nproc-per-node must be at most its {k} cells, got {ranks} ranks")
-    weights = stored.get("weights", torch.ones(k))
-    weights = weights if len(weights) == k else torch.ones(k)
-    owner = stored.get("owner", torch.zeros(0, dtype=torch.int64))
-    if len(owner) == k and torch.equal(owner.unique(), torch.arange(ranks)):
-        return owner, weights
-    return assign_cells(diagram.leaf_centres, weights, ranks), weights

@@ -1,9 +1,6 @@
 """The training loop: coarse stage, splits, local stages; evaluations and checkpoints on the way.
 
-Time means training time: steps and splits. Evaluations take a share of the budget, checkpoints are written
-meanwhile. Over several ranks every one of
-them runs this loop: they take the same steps, and each holds the networks of its own cells. A group of one rank is an
-ordinary training.
+Time means training time: steps and splits. Evaluations take a share of the budget, checkpoints are written meanwhile.
 """
 
 from __future__ import annotations
@@ -24,9 +21,6 @@ from voronerf import backends
 from voronerf.data import Scene
 from voronerf.data.record import within, write_scene
 from voronerf.diagram import VoronoiDiagram
-from voronerf.distributed.exchange import Exchange, Told
-from voronerf.distributed.group import Group
-from voronerf.distributed.sharing import Sharing
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
 from voronerf.files import json_text, write_bytes, write_text
@@ -34,8 +28,7 @@ from voronerf.ops import Guard
 from voronerf.ops.sparse_adam.reference import judge
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.router import Parts, VoronoiRouter
-from voronerf.router.grouping import cell_parameters
-from voronerf.step import Cells, Found, Step
+from voronerf.step import Batch, Cells, Found, Step
 from voronerf.training import state
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
@@ -46,15 +39,13 @@ from voronerf.training.checkpoint import (
     checkpoint_paths,
     last_checkpoint,
 )
-from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.config_checks import check_ranks
+from voronerf.training.config import TrainConfig
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.divergence import (
     PATIENCE,
     SETTLED,
     all_finite,
     one_colour_psnr,
-    sum_of_gradients,
     why_scores_are_poor,
 )
 from voronerf.training.errors import usual_errors
@@ -83,22 +74,17 @@ FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views")
 class Trainer:
     """Trains one scene by the whole method and keeps its run directory.
 
-    Over ranks, the one network of the coarse stage is data-parallel. From the first split on a rank holds the
-    parameters, the moments of Adam, the averages and the occupancy of its own cells. Random numbers are the same on all
-    ranks, so that samples are those of one process, and so are the parameters but for rounding. Time is that of rank 0,
-    which writes the files.
-
     Args:
         config: The settings; ``config.out`` names the run directory.
         scene: The scene that ``config.data`` names.
-        group: The ranks that train together, each with a trainer of the same settings; None for this process alone.
         on_step: Called after every step with a :class:`Progress`.
         on_event: Called with one line of text for each split and evaluation.
         clock: Counts the seconds of training; default ``time.perf_counter``.
+        batches: Draws the rays; default from all training views of the scene.
+        checkpoint: Of these settings, to go on from; default with ``config.resume`` the last one in ``config.out``.
 
     Raises:
         CheckpointError: With ``config.resume``, when there is no checkpoint or it is of another configuration.
-        ConfigError: For settings that training over ranks does not support.
     """
 
     def __init__(
@@ -106,10 +92,11 @@ class Trainer:
         config: TrainConfig,
         scene: Scene,
         *,
-        group: Group | None = None,
         on_step: Callable[[Progress], None] | None = None,
         on_event: Callable[[str], None] | None = None,
         clock: Callable[[], float] | None = None,
+        batches: RayBatches | None = None,
+        checkpoint: Checkpoint | None = None,
     ) -> None:
         if config.out is None:
             raise ValueError("Trainer: config.out must name the run directory, got None")
@@ -118,11 +105,10 @@ class Trainer:
         self.out, self.scene = config.out, scene
         self.on_step, self.on_event, self.clock = on_step, on_event, clock or time.perf_counter
         self.device = torch.device(config.device)
-        self.group = group or Group(self.device)
-        check_ranks(config, self.group.size)
         config = resolve_config(config, scene)
         check_memory(config)
-        checkpoint = state.resumed_checkpoint(config, self.out) if config.resume else None
+        if checkpoint is None and config.resume:
+            checkpoint = state.resumed_checkpoint(config, self.out)
         self.config, self.plan = config, config.planned_splits
         check_backend(config, self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -131,7 +117,7 @@ class Trainer:
         if self.device.type == "cuda":
             self.draws = torch.Generator(self.device).manual_seed(config.seed)
         self.lpips, self.lpips_source = find_lpips(config.lpips, config.data, scene.test.cameras.smallest[::-1])
-        self.batches = RayBatches(
+        self.batches = batches or RayBatches(
             scene,
             self.device,
             cones=config.field_type.cones,
@@ -139,8 +125,6 @@ class Trainer:
             backend=config.backend,
         )
         self.routers = open_routers(config, self.device, checkpoint)
-        if self.group.size > 1 and isinstance(self.routers["field"], Parts):
-            raise ConfigError(f"--resume of {self.out} must be one process: it is a run of several parts")
         for router in self.routers.values():
             router.generator = self.draws
         #: Whether native ops compute the networks: then steps are the same bit for bit on any number of threads.
@@ -149,16 +133,14 @@ class Trainer:
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=config.precision == "fp16")
         grid = make_grid(config, scene, self.device) if config.occupancy else None
         self.renderer = make_renderer(config, scene, self.routers, occupancy=grid)
-        self.sharing = Sharing(self.group)
         self.cells = Cells(
             self.renderer,
             cast(dict[str, VoronoiRouter], self.routers),  # of parts it asks for what they have alone
             self.plan,
             config.split_rule,
             generator=self.generator,
-            sharing=self.sharing,
         )
-        self.learner = Step(self.renderer, sightings=config.sightings or 0.0, sharing=self.sharing)
+        self.learner = Step(self.renderer, sightings=config.sightings or 0.0)
         self.guard = Guard.on(self.device)  # of steps whose loss or gradients are not finite
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
@@ -166,25 +148,22 @@ class Trainer:
         self._rows: Tensor | None = None  # how many samples the last step had, where no host has read it
         #: Seconds of all evaluations but the last, and of a view in the latest.
         self.scoring, self.view_seconds = 0.0, 0.0
-        self._passed = 0.0  # seconds that ranks have not been told of
         #: Rays of the next step, and of all steps so far.
         self.rays, self.rays_done = config.rays, 0
         self.stages = [Stage(1, 0.0, 0, None, None, 0)]
         self.evaluated = 0
         self.metrics: list[dict[str, Any]] = []
-        self.stopped = self._asked_to_stop = self.described = False
+        self.stopped = self.described = False
         self.loss = math.nan
         self.errors: Tensor | None = None  # of each cell, see `usual_errors`
-        self.writer = CheckpointWriter(self.out, config.keep_checkpoints, self.group)
+        self.writer = CheckpointWriter(self.out, config.keep_checkpoints)
         if checkpoint is not None:
             self._resume(checkpoint)
         self.saved_at = self.seconds
         self._begin_stage()
 
-    @property
-    def writes(self) -> bool:
-        """Whether this process writes the files of the run."""
-        return self.group.rank == 0
+    #: Whether this process writes the files of the run.
+    writes = True
 
     @property
     def skipped(self) -> int:
@@ -209,11 +188,7 @@ class Trainer:
     @property
     def parameter_count(self) -> int:
         """Parameters of all networks of all cells."""
-        everything = sum(p.numel() for router in self.routers.values() for p in router.parameters())
-        if isinstance(self.router, Parts):
-            return everything
-        of_cells = sum(p.numel() for p in cell_parameters(self.router.module))
-        return everything + of_cells // self.router.num_cells * (self.diagram.num_cells - self.router.num_cells)
+        return sum(p.numel() for router in self.routers.values() for p in router.parameters())
 
     # --- progress ------------------------------------------------------------------------------------------------
 
@@ -238,8 +213,8 @@ class Trainer:
 
     @property
     def _counts_evaluation(self) -> bool:
-        """Whether evaluations are part of the budget; over ranks they are not, whose clocks differ."""
-        return self.config.budget is not None and self.config.evaluation_share > 0 and self.group.size == 1
+        """Whether evaluations are part of the budget."""
+        return self.config.budget is not None and self.config.evaluation_share > 0
 
     @property
     def level(self) -> int:
@@ -255,17 +230,12 @@ class Trainer:
         return averages_in_place(self.optimizer)
 
     def request_stop(self) -> None:
-        """Ends training after the step or the view in hand, with a checkpoint, as Ctrl-C does; ranks stop together."""
-        self._asked_to_stop = True
-        self.stopped = self.group.size == 1
+        """Ends training after the step or the view in hand, with a checkpoint, as Ctrl-C does."""
+        self.stopped = True
 
     def _count(self, started: float) -> None:
-        """Counts the time since then; ranks learn with the next step what rank 0 has counted."""
-        passed = self.clock() - started
-        if self.group.size == 1:
-            self.seconds += passed
-        else:
-            self._passed += passed
+        """Counts the time since then."""
+        self.seconds += self.clock() - started
 
     # --- the loop ------------------------------------------------------------------------------------------------
 
@@ -349,15 +319,13 @@ class Trainer:
             if rays != self.rays:
                 self.rays = rays
                 self._begin_stage()
-        if self.group.size == 1:
-            self._count(started)
+        self._count(started)
         if in_a_row >= PATIENCE:
             self._go_back(f"gradients of {int(in_a_row)} steps in a row not finite")
 
     def _check_moments(self) -> bool:
         """Whether parameters and moments are finite; goes back to the last checkpoint where they are not."""
-        broken = torch.tensor(float(not all_finite(self.optimizer)), device=self.device)
-        finite = bool(self.group.largest(broken) == 0)
+        finite = all_finite(self.optimizer)
         if not finite:
             self._go_back("parameters or moments of Adam not finite")
         return finite
@@ -382,83 +350,70 @@ class Trainer:
         self.say(f"{reason} at step {at}: back to step {self.step}, with half the learning rate")
 
     def _begin_stage(self) -> None:
-        """After parameters have become others: finds what ranks share, and ends the CUDA graph of the old ones."""
-        whole, tables = self.cells.shared_parameters(self.optimizer)
-        self.exchange = Exchange(self.group, whole, tables)
+        """After parameters have become others: ends the CUDA graph of the old ones."""
         graphed = self.config.cuda_graph
         self._compute = GraphedStep(self._forward_backward, [self.draws]) if graphed else self._forward_backward
 
     def train_step(self) -> Tensor:
         """One step of :meth:`advance` without its count and clock; returns the loss, which may not be computed yet."""
         with backends.torch_on_one_thread() if self.any_threads else nullcontext():
-            set_learning_rate(self.optimizer, self.learning_rate())
-            self.cells.revisit(self.step)
-            if not self.router.training:
-                self.renderer.train()
+            self.prepare()
             loss, kept = self._compute()
-            if self.config.average:
-                update_averages(self.optimizer, self.config.average, self.step)
-            if len(kept):
-                self.cells.reservoir.add(kept[:, :3], kept[:, 3])
+            self.finish(kept)
             return loss
 
+    def prepare(self) -> None:
+        """What comes before the batch of a step."""
+        set_learning_rate(self.optimizer, self.learning_rate())
+        self.cells.revisit(self.step)
+        if not self.router.training:
+            self.renderer.train()
+
     def _forward_backward(self) -> tuple[Tensor, Tensor]:
-        """Updates the parameters; returns the loss, and the heaviest samples [n, 4], until the last split."""
-        config = self.config
-        batch = self.batches.draw(self.rays, self.draws, random_background=config.background == "random")
-        half = HALVES.get(config.precision)
+        """Draws a batch and learns from it; returns what :meth:`learn` does."""
+        batch = self.draw()
         self.optimizer.zero_grad(set_to_none=True)
-        with nullcontext() if half is None else torch.autocast(self.device.type, half, cache_enabled=False):
-            found = self.learner.run(batch, self.draws, backward=half is None)
-        if half is not None:
+        with self.precision():
+            found = self.learner.run(batch, self.draws, backward=self.config.precision == "fp32")
+        return self.learn(found)
+
+    def draw(self) -> Batch:
+        """The batch of a step."""
+        return self.batches.draw(self.rays, self.draws, random_background=self.config.background == "random")
+
+    def precision(self) -> AbstractContextManager[Any]:
+        """In which the networks are asked."""
+        half = HALVES.get(self.config.precision)
+        return nullcontext() if half is None else torch.autocast(self.device.type, half, cache_enabled=False)
+
+    def learn(self, found: Found) -> tuple[Tensor, Tensor]:
+        """Updates the parameters after gradients were dropped and a step has found these, or a loss that has them.
+
+        Returns:
+            The loss, and the heaviest samples [n, 4], until the last split.
+        """
+        if found.loss.requires_grad:
             self.scaler.scale(found.loss).backward()
-        if self.group.size > 1:
-            told = self._agree(found)
-            loss, kept, samples, seen = told.loss, told.kept, told.samples, told.seen
-            judge(self.guard, told.total, [])
-        else:
-            loss, kept, samples, seen = found.loss.detach(), self.cells.heaviest(found), len(found.weights), None
-            self._rows = found.samples.rows
-        self.cells.observe(found, seen)
+        loss = found.loss.detach()
+        self._rows = found.samples.rows
+        self.cells.observe(found)
         if self.occupancy is not None and self._rows is None:
-            self.rays = next_rays(config, self.rays, samples)
+            self.rays = next_rays(self.config, self.rays, len(found.weights))
         # Nothing is read on the host: the optimiser leaves out a step by what is found on the device.
         if self.scaler.is_enabled():
-            if self.group.size == 1:
-                judge(self.guard, loss, [])
+            judge(self.guard, loss, [])
             self.scaler.step(self.optimizer)
             self.scaler.update()
         else:
-            self.optimizer.update(self.guard, loss if self.group.size == 1 else None)
-        return loss, kept
+            self.optimizer.update(self.guard, loss)
+        return loss, self.cells.heaviest(found)
 
-    def _agree(self, found: Found) -> Told:
-        """Adds up gradients over all ranks, and lets them agree on time, stops, checkpoints and what was found."""
-        if self.group.size > 1:
-            for parameter in self.router.parameters():
-                if parameter.grad is None:  # no sample of this rank
-                    parameter.grad = torch.zeros_like(parameter)
-        summed = self.exchange.begin()
-        loss = found.loss.detach()
-        own = Told(
-            loss=loss,
-            total=sum_of_gradients(loss, self.optimizer, scaled=self.scaler.is_enabled()),
-            kept=self.cells.heaviest(found),
-            seen=self.cells.tell(found),
-            samples=len(found.weights),
-            passed=self._passed,
-            stop=self._asked_to_stop,
-            ready=self.writer.ready,
-        )
-        told = self.exchange.agree(own)
-        if self.group.size > 1:
-            self._passed = 0.0
-            self.seconds += told.passed
-            self.stopped |= told.stop
-            if told.ready:
-                self.writer.commit()
-        summed()
-        return told
+    def finish(self, kept: Tensor) -> None:
+        """What comes after a step that :meth:`learn` made."""
+        if self.config.average:
+            update_averages(self.optimizer, self.config.average, self.step)
+        if len(kept):
+            self.cells.reservoir.add(kept[:, :3], kept[:, 3])
 
     # --- cells -----------------------------------------------------------------------------------------------------
 
@@ -489,7 +444,7 @@ class Trainer:
                 f"{self.step} steps; in another --out, split later or keep more a batch (--reservoir, "
                 "--reservoir-batches)"
             )
-        split = cells.find_split(self._positions)
+        split = cells.find_split()
         balances = [] if split is None else list(split.balances.values())
         if self.plan[level].most is not None and not balances:
             return False
@@ -514,13 +469,6 @@ class Trainer:
             need = max(k, self.config.min_cell_samples)
             self.say(f"no cell split {when}: none holds {need} of the {len(points)} samples kept")
         return True
-
-    def _positions(self) -> Tensor:
-        """Positions of a step on this rank; of a batch drawn for this alone, so that a restart finds the same."""
-        generator = torch.Generator(self.draws.device).manual_seed(self.step)
-        batch = self.batches.draw(self.rays, generator)
-        given = self.renderer.sampler, batch.rays, batch.near, batch.far
-        return self.sharing.samples(*given, jitter=True, generator=generator).positions
 
     # --- evaluation and files --------------------------------------------------------------------------------------
 
@@ -610,22 +558,18 @@ class Trainer:
             write_text(self.out / "config.json", self.config.to_json())
             write_scene(self.out / "scene.json", self.scene)
             self.described = True
-        checkpoint = self._state()
-        if self.sharing.diagram is None:
-            self.writer.write(checkpoint)
-        else:
-            self.writer.write(*state.apart(checkpoint, self.cells, self.optimizer))
+        self.writer.write(self.state())
         self.saved_at = self.seconds
         if wait:
             self.writer.wait()
 
     def _find_errors(self) -> None:
-        """Finds the errors that an update compares new pictures with; over ranks it finds them itself."""
-        if self.group.size == 1 and self.step:
+        """Finds the errors that an update compares new pictures with."""
+        if self.step:
             with self.averaged():
                 self.errors = usual_errors(self.renderer, self.router, self.batches)
 
-    def _state(self) -> Checkpoint:
+    def state(self) -> Checkpoint:
         """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
         stored = state.Stored(
             config=self.config.to_values(),
@@ -660,7 +604,6 @@ class Trainer:
             CheckpointError: When something is missing or does not fit.
         """
         _, stored = state.stored_values(checkpoint)
-        self.sharing.forget()
         restore_routers(self.routers, checkpoint)
         self.optimizer = make_optimizer(self.routers, self.config)
         try:
@@ -695,11 +638,6 @@ class Trainer:
         self.evaluated = min(stored.evaluated, self._due())  # fewer where the run was made longer
         # Evaluations made after the checkpoint will be made again.
         self.metrics = [m for m in read_metrics(self.out) if m["step"] <= self.step]
-        whole = self.router.diagram
-        if self.group.size > 1 and whole.num_cells > 1:
-            owner, self.cells.weights = state.ownership(checkpoint, whole, self.group.size)
-            own = (owner == self.group.rank).nonzero()[:, 0]
-            self.cells.take(whole, owner, own, self.optimizer)
 
     def say(self, line: str) -> None:
         """Tells whoever listens, see ``on_event``."""

@@ -38,7 +38,7 @@ STREET_ANGLE, ABOVE_ANGLE = 1.2, 0.75  # fields of view, radians
 def city_scene(
     size: int = 100,
     *,
-    blocks: int = 1,
+    blocks: int | tuple[int, int] = 1,
     train_views: int = TRAIN_VIEWS,
     test_views: int = TEST_VIEWS,
     rebuilt: int | None = None,
@@ -48,7 +48,7 @@ def city_scene(
 
     Args:
         size: of the square images, pixels.
-        blocks: on each side, 1 to 32.
+        blocks: on each side, or along x and along y, 1 to 32.
         train_views: of each block, every other one from its streets and the rest from above.
         test_views: of each block, at other places than the training views.
         rebuilt: the block that has other buildings, trees and cars, 0 to blocks**2 - 1, row by row; or None. The views
@@ -70,23 +70,25 @@ def city_scene(
     for name, value in (("size", size), ("train_views", train_views), ("test_views", test_views)):
         if value < 1:
             raise ValueError(f"city_scene: {name} must be >= 1, got {value}")
-    if not 1 <= blocks <= MOST:
+    sides = (blocks, blocks) if isinstance(blocks, int) else tuple(blocks)
+    if len(sides) != 2 or not 1 <= min(sides) <= max(sides) <= MOST:
         raise ValueError(f"city_scene: blocks must be 1 to {MOST}, got {blocks}")
-    if rebuilt is not None and not 0 <= rebuilt < blocks**2:
-        raise ValueError(f"city_scene: rebuilt must be a block of 0 to {blocks**2 - 1}, got {rebuilt}")
+    if rebuilt is not None and not 0 <= rebuilt < sides[0] * sides[1]:
+        raise ValueError(f"city_scene: rebuilt must be a block of 0 to {sides[0] * sides[1] - 1}, got {rebuilt}")
     if images not in ("memory", "cached", "disk"):
         raise ValueError(f"city_scene: images must be memory, cached or disk, got {images!r:.60}")
-    groups, name = city(blocks, rebuilt), f"builtin-city-{blocks}x{blocks}"
+    groups, name = city(sides, rebuilt), f"builtin-city-{sides[0]}x{sides[1]}"
     name += "" if rebuilt is None else f"-rebuilt-{rebuilt}"
+    made_of = sides[0] if sides[0] == sides[1] else list(sides)
     solids = [solid for group in groups for solid in group]
     box = bounds(solids)
     look = functools.partial(see, solids=solids, hits=block_caster(groups))
 
     def views(part: str, seed: int, count: int) -> Split:
-        cameras = city_cameras(size, blocks, count, seed)
+        cameras = city_cameras(size, sides, count, seed)
 
         def keep(shape: tuple[int, int, int, int], make: Make) -> Tensor:
-            found = stored(f"{name}-{part}", [blocks, size, count, seed], FORMULA, shape, make, os.cpu_count() or 1)
+            found = stored(f"{name}-{part}", [made_of, size, count, seed], FORMULA, shape, make, os.cpu_count() or 1)
             return found if images == "disk" else found.clone()
 
         kept = None if images == "memory" else keep
@@ -94,34 +96,35 @@ def city_scene(
         return replace(found, on_disk=images == "disk")
 
     train, test = views("train", 0, train_views), views("test", 1, test_views)
-    far = math.hypot(blocks, blocks) + 3
+    far = math.hypot(*sides) + 3
     return Scene(name, train, test, NEAR, far, torch.from_numpy(box), "linear", "white")
 
 
 def city_of(size: int, text: str, images: str) -> Scene:
-    """The city of blocks such as "4x4", or "4x4,rebuilt=5"; in the cache if it is larger than one block.
+    """The city of blocks such as "4x4", "4x8" or "4x4,rebuilt=5"; in the cache if it is larger than one block.
 
     Raises:
         SceneError: other blocks than these.
     """
     blocks, comma, rest = text.partition(",")
-    found, number = re.fullmatch(r"([1-9]\d?)x\1", blocks), re.fullmatch(r"rebuilt=(\d{1,4})", rest)
-    if found is None or int(found[1]) > MOST:
-        raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, ... or {MOST}x{MOST}, got {blocks!r:.60}")
-    most = int(found[1]) ** 2 - 1
+    found, number = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", blocks), re.fullmatch(r"rebuilt=(\d{1,4})", rest)
+    if found is None or max(int(found[1]), int(found[2])) > MOST:
+        raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, 2x4, ... or {MOST}x{MOST}, got {blocks!r:.60}")
+    sides = int(found[1]), int(found[2])
+    most = sides[0] * sides[1] - 1
     if comma and (number is None or int(number[1]) > most):
         raise SceneError(f"builtin-city: after the blocks must come rebuilt=0 to rebuilt={most}, got {rest!r:.60}")
     where = "disk" if images == "disk" else "memory" if blocks == "1x1" else "cached"
-    return city_scene(size, blocks=int(found[1]), rebuilt=None if number is None else int(number[1]), images=where)
+    return city_scene(size, blocks=sides, rebuilt=None if number is None else int(number[1]), images=where)
 
 
-def city_cameras(size: int, blocks: int, views: int, seed: int) -> Cameras:
+def city_cameras(size: int, blocks: tuple[int, int], views: int, seed: int) -> Cameras:
     """The cameras of each block in turn: from the middle of a street beside it, and from above its roofs."""
     random = np.random.default_rng((seed, 2))
     eyes, aims, angles = [], [], []
-    for row in range(blocks):
-        for column in range(blocks):
-            middle = np.array((column + 0.5 - blocks / 2, row + 0.5 - blocks / 2, 0))
+    for row in range(blocks[1]):
+        for column in range(blocks[0]):
+            middle = np.array((column + 0.5 - blocks[0] / 2, row + 0.5 - blocks[1] / 2, 0))
             for view in range(views):
                 eye, aim = (_in_the_street if view % 2 == 0 else _above)(random)
                 eyes.append(middle + eye)

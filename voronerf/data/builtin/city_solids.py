@@ -233,19 +233,20 @@ def block(column: int, row: int, *, rebuilt: bool = False) -> list[Solid]:
     return parts
 
 
-def city(blocks: int, rebuilt: int | None = None) -> list[list[Solid]]:
-    """The solids of blocks x blocks blocks, the ground first and then block by block, one of which may be rebuilt."""
-    half = blocks / 2
-    groups: list[list[Solid]] = [[Box((0, 0, -DEPTH / 2), _ground_of(half), 0.03, 8, half=(half, half, DEPTH / 2))]]
-    for row in range(blocks):
-        for column in range(blocks):
-            x, y, number = column + 0.5 - half, row + 0.5 - half, row * blocks + column
+def city(blocks: tuple[int, int], rebuilt: int | None = None) -> list[list[Solid]]:
+    """The solids of so many blocks along x and y, the ground first and then block by block; one may be rebuilt."""
+    across, along = blocks[0] / 2, blocks[1] / 2
+    half = (across, along, DEPTH / 2)
+    groups: list[list[Solid]] = [[Box((0, 0, -DEPTH / 2), _ground_of(across, along), 0.03, 8, half=half)]]
+    for row in range(blocks[1]):
+        for column in range(blocks[0]):
+            x, y, number = column + 0.5 - across, row + 0.5 - along, row * blocks[0] + column
             groups.append([_moved(solid, x, y) for solid in block(column, row, rebuilt=rebuilt == number)])
     return groups
 
 
-def _ground_of(half: float) -> Texture:
-    corner = np.array((half, half, 0), dtype=np.float32)
+def _ground_of(across: float, along: float) -> Texture:
+    corner = np.array((across, along, 0), dtype=np.float32)
     return lambda points, normals: ground(points + corner, normals)
 
 

@@ -1,4 +1,4 @@
-"""The cases of ``observe_occupancy``, ``observe_told`` and ``tell_observed``."""
+"""The case of ``observe_occupancy``."""
 
 from __future__ import annotations
 
@@ -14,26 +14,4 @@ def _make(draw: Draw, n: int) -> Arguments:
     return {**call, "box": torch.tensor([[-1.0] * 3, [1.0] * 3]), "positions": draw.normal(n, 3)}
 
 
-def _make_told(draw: Draw, n: int) -> Arguments:
-    call = _make(draw, n)
-    cells = draw.integers(0, call["density"].numel(), 5).contiguous()
-    return {
-        "grid": tuple(call[name] for name in ("density", "occupied", "box")),
-        "samples": tuple(call[name] for name in ("positions", "sigma", "deltas", "weights")),
-        "told": torch.stack((cells.view(torch.float32), draw.uniform(5)), 1),
-        "reached": draw.among("reached", None, call["density"].reshape(-1) > 0.3),
-        **{name: call[name] for name in ("threshold", "decay", "hidden")},
-    }
-
-
-def _make_teller(draw: Draw, n: int) -> Arguments:
-    call = _make_told(draw, n)
-    return {name: call[name] for name in ("grid", "samples", "hidden")} | {"several": call["reached"]}
-
-
 CASE = Case(_make, in_place=True)
-CASES = {
-    "observe_occupancy": CASE,
-    "observe_told": Case(_make_told, in_place=True),
-    "tell_observed": Case(_make_teller, in_place=True),
-}

@@ -1,0 +1,85 @@
+"""What territories send each other: every part has a key, and a rank that sends it and one that gets it.
+
+n rows of a part, c columns. A part for the same rank is not sent. All parts for one other rank are one message.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.distributed.group import Group
+
+#: Of a part: the territory, or the rank, that it is from, and the territory that it is for.
+Key = tuple[int, int]
+
+
+class Route(NamedTuple):
+    """A way of a part.
+
+    Attributes:
+        source: The rank that sends it.
+        target: The rank that gets it.
+        key: What it is called.
+    """
+
+    source: int
+    target: int
+    key: Key
+
+    def back(self) -> Route:
+        """The way of the answer."""
+        return Route(self.target, self.source, self.key)
+
+
+def send(
+    group: Group, kind: str, width: int, parts: Mapping[Key, Tensor], routes: Sequence[Route]
+) -> dict[Key, Tensor]:
+    """Sends the parts of this rank, and returns those that others have sent it.
+
+    Args:
+        group: The ranks.
+        kind: What the parts are.
+        width: c.
+        parts: float32 [n, c] by key; none is an empty part.
+        routes: All that begin or end here, in an order that both ends have.
+
+    Returns:
+        For each key whose route ends here its part, in the order of the routes.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.distributed.group import Group
+        >>> from voronerf.distributed.mail import Route, send
+        >>> send(Group(torch.device("cpu")), "news", 1, {(0, 1): torch.ones(1, 1)}, [Route(0, 0, (0, 1))])
+        {(0, 1): tensor([[1.]])}
+    """
+    empty = torch.empty(0, width, device=group.device)
+    there: dict[int, list[Tensor]] = defaultdict(list)
+    here: dict[int, list[Key]] = defaultdict(list)
+    found: dict[Key, Tensor] = {}
+    for source, target, key in routes:
+        if source == target:
+            found[key] = parts.get(key, empty)
+        elif source == group.rank:
+            there[target].append(parts.get(key, empty))
+        else:
+            here[source].append(key)
+    came = group.exchange(kind, width, {rank: _packed(those, width) for rank, those in there.items()}, here)
+    for source, keys in here.items():
+        header = -(-len(keys) // width)
+        sizes = came[source][:header].reshape(-1)[: len(keys)].view(torch.int32).tolist()
+        found.update(zip(keys, came[source][header:].split(sizes), strict=True))
+    return {key: found[key] for _, target, key in routes if target == group.rank}  # in an order that no rank decides
+
+
+def _packed(parts: Sequence[Tensor], width: int) -> Tensor:
+    """Their numbers of rows, and the rows."""
+    header = torch.zeros(-(-len(parts) // width) * width, dtype=torch.int32)
+    header[: len(parts)] = torch.tensor([len(part) for part in parts])
+    device = parts[0].device
+    return torch.cat((header.view(torch.float32).reshape(-1, width).to(device), *parts))
