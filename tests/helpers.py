@@ -52,10 +52,12 @@ def seeded(seed=0):
 
 
 def same(first, second):
-    """Whether two sequences of tensors, or two dictionaries of them, are equal bit for bit."""
+    """Whether two sequences of tensors, or two dictionaries of them, are equal bit for bit. None equals None."""
     if isinstance(first, Mapping):
         return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
-    return all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    return all(
+        a is b or (a is not None and b is not None and torch.equal(a, b)) for a, b in zip(first, second, strict=True)
+    )
 
 
 def anonymous_memory():

@@ -362,9 +362,6 @@ def adam(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | No
 @overload
 def adam(_0: Sequence[AdamRule], _1: AdamGuard, _2: Sequence[Tensor | None] | None, _3: Sequence[Tensor | None] | None, _4: Sequence[Tensor | None] | None, _5: Sequence[Tensor | None] | None, _6: Sequence[int], _7: Tensor | None, _8: Cuda) -> None: ...
 
-# const float32*, int64, int64, float32*, Cpu
-def add_touched(_0: Tensor | None, _1: int, _2: int, _3: Tensor | None, _4: Cpu) -> None: ...
-
 # any*, int64
 def advise_huge_pages(_0: Tensor | None, _1: int) -> None: ...
 
@@ -552,14 +549,8 @@ def observe_occupancy(_0: ObservedSamples, _1: Tensor | None, _2: Tensor | None,
 @overload
 def observe_occupancy(_0: ObservedSamples, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cuda) -> None: ...
 
-# ObservedSamples, const float32*, int64, const uint8*, float32*, uint8*, int32*, float32*, Cpu
-def observe_told(_0: ObservedSamples, _1: Tensor | None, _2: int, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: Tensor | None, _8: Cpu) -> None: ...
-
 # KnownSamples, OwnSamples, Cpu
 def own_samples(_0: KnownSamples, _1: OwnSamples, _2: Cpu) -> int: ...
-
-# const float32*, int64, float32*, Cpu
-def pack_touched(_0: Tensor | None, _1: int, _2: Tensor | None, _3: Cpu) -> int: ...
 
 # PixelRaysInputs, PixelRaysOutputs, Cpu
 @overload
@@ -608,9 +599,6 @@ def spherical_harmonics_backward(_0: Tensor | None, _1: Tensor | None, _2: Tenso
 # const float32*, const float32*, float32*, int64, int64, Cuda
 @overload
 def spherical_harmonics_backward(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: int, _4: int, _5: Cuda) -> None: ...
-
-# ObservedSamples, const uint8*, float32*, Cpu
-def tell_observed(_0: ObservedSamples, _1: Tensor | None, _2: Tensor | None, _3: Cpu) -> int: ...
 
 # const float32*, const int32*, const float32*, float32*, uint8*, int64, int64, float32, float32, Cpu
 @overload

@@ -346,5 +346,5 @@ def step(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         inside = functools.partial(network_work, hashed, direction)
         for half in (False, True):
             name = f"hash + MLP n={hashed} {direction}{', bfloat16' * half}"
-            compare(name, inside, "native, encoded before", "torch, indexing, sort + loop", half=half)
+            compare(name, inside, "native, encoded before", half=half)
     return rows.measure()

@@ -8,8 +8,6 @@ VN_STRUCT(ObservedSamples, positions, sigma, deltas, weights, box, x, y, z, m, d
 
 VN_BINDINGS(module) {
   module.cpu("observe_occupancy", VN_CPU(observe_occupancy_cpu));
-  module.cpu("observe_told", VN_CPU(observe_told_cpu));
-  module.cpu("tell_observed", VN_CPU(tell_observed_cpu));
   module.cuda("observe_occupancy", VN_CUDA(observe_occupancy_cuda));
 }
 

@@ -4,8 +4,6 @@
 #include "rays/observe_occupancy.h"
 
 #include <algorithm>
-#include <cstring>
-#include <stdexcept>
 
 #include "common/parallel.h"
 #include "rays/observe_occupancy_math.h"
@@ -14,11 +12,6 @@ namespace voronerf {
 
 void observe_occupancy_cpu(const ObservedSamples& in, float* density, uint8_t* occupied, int32_t* cells, float* values,
                            int threads) {
-  observe_told_cpu(in, nullptr, 0, nullptr, density, occupied, cells, values, threads);
-}
-
-void observe_told_cpu(const ObservedSamples& in, const float* told, int64_t c, const uint8_t* reached, float* density,
-                      uint8_t* occupied, int32_t* cells, float* values, int threads) {
   constexpr int64_t kRun = 1024;
   parallel_for((in.m + kRun - 1) / kRun, 1, threads, [&](int64_t run) {
     const int64_t begin = run * kRun, end = std::min(in.m, begin + kRun);
@@ -33,37 +26,15 @@ void observe_told_cpu(const ObservedSamples& in, const float* told, int64_t c, c
       values[i] = std::max(density[cells[i]] * in.decay, observed_density(in, i));
     }
   });
-  int64_t count = in.m;
-  for (int64_t i = 0; i < c; ++i) {
-    int32_t cell;
-    std::memcpy(&cell, told + 2 * i, sizeof(cell));
-    if (cell < 0 || cell >= in.x * in.y * in.z) {
-      throw std::invalid_argument("observe_told: cells must be those of the grid");
-    }
-    if (!reached[cell]) continue;
-    cells[count] = cell;
-    values[count++] = std::max(density[cell] * in.decay, told[2 * i + 1]);
-  }
-  for (int64_t i = 0; i < count; ++i) {
+  for (int64_t i = 0; i < in.m; ++i) {
     if (cells[i] >= 0) density[cells[i]] = values[i];
   }
-  for (int64_t i = 0; i < count; ++i) {
+  for (int64_t i = 0; i < in.m; ++i) {
     if (cells[i] < 0) continue;
     float& kept = density[cells[i]];
     kept = std::max(kept, values[i]);
     occupied[cells[i]] = kept >= in.threshold;
   }
-}
-
-int64_t tell_observed_cpu(const ObservedSamples& in, const uint8_t* several, float* told, int) {
-  int64_t count = 0;
-  for (int64_t i = 0; i < in.m; ++i) {
-    const int32_t cell = static_cast<int32_t>(observed_cell(in, i));
-    if (!observes(in, i) || (several != nullptr && !several[cell])) continue;
-    std::memcpy(told + 2 * count, &cell, sizeof(cell));
-    told[2 * count++ + 1] = observed_density(in, i);
-  }
-  return count;
 }
 
 }  // namespace voronerf

@@ -19,11 +19,4 @@ void observe_occupancy_cpu(const ObservedSamples& in, float* density, uint8_t* o
 void observe_occupancy_cuda(const ObservedSamples& in, float* density, uint8_t* occupied, int32_t* cells, float* before,
                             void* stream);
 
-// The same over several ranks. A row of `told` [c,2] is a cell, as bits, and the density that a sample of another rank
-// gives it; cells out of `reached` [x,y,z] are left alone. cells, before: [m+c].
-void observe_told_cpu(const ObservedSamples& in, const float* told, int64_t c, const uint8_t* reached, float* density,
-                      uint8_t* occupied, int32_t* cells, float* before, int threads);
-// Writes such rows, of the samples in cells of `several` [x,y,z], or of all where that is null; returns how many.
-int64_t tell_observed_cpu(const ObservedSamples& in, const uint8_t* several, float* told, int threads);
-
 }  // namespace voronerf

@@ -11,7 +11,6 @@
 #include "encoding/encode.h"
 #include "encoding/sparse_adam.h"
 #include "encoding/spherical_harmonics.h"
-#include "encoding/touched_entries.h"
 #include "geometry/cell_sort.h"
 #include "geometry/centre_grid.h"
 #include "geometry/locate_cell.h"
@@ -390,12 +389,6 @@ void adam(Isa isa) {
     like_portable(parameter, "sparse_adam");
     like_portable(mean, "sparse_adam");
   }
-  Array<float> message(n + n / 32 + 33), total = start[0];
-  const int64_t length = voronerf::pack_touched_cpu(gradient.data(), n, message.data(), isa, 3);
-  message.resize(length);
-  message.shrink_to_fit();
-  voronerf::add_touched_cpu(message.data(), length, n, total.data(), isa, 3);
-  like_portable(total, "add_touched");
 }
 
 void resample() {

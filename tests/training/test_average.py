@@ -47,6 +47,8 @@ def test_training_is_the_same_with_and_without(tmp_path, scene):
     for name, decay in (("with", 0.98), ("without", 0.0)):
         Trainer(small(tmp_path / name, average=decay), scene).run()
     with_, without = tensors(tmp_path / "with"), tensors(tmp_path / "without")
+    # Errors are those of what pictures show, so of the averages.
+    assert not torch.equal(with_.pop("errors.usual"), without.pop("errors.usual"))
     assert same({name: with_[name] for name in without}, without)
     assert set(with_) - set(without) and all(name.endswith(".average") for name in set(with_) - set(without))
 

@@ -126,10 +126,11 @@ def forward(network: Network, where: Where, keep: bool) -> Iterator[tuple[Tensor
     encoded = grouped_mlp.new_encoded(network, keep)
     yield out, found, order, offsets, encoded
     if alone:
-        found.zero_()
         if rows is None or not native.on_cuda(positions):
+            found.zero_()
             offsets[0], offsets[1] = 0, n
         else:
+            found.copy_(torch.where(torch.arange(n, device=found.device) < rows, 0, -1))
             offsets[:1].zero_()
             offsets[1:].copy_(rows)
     else:
