@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,7 +13,9 @@ from torch.nn.utils import get_total_norm
 
 from voronerf.data import Scene
 from voronerf.evaluation.scores import view_numbers
+from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import TrainConfig
+from voronerf.training.progress import TrainingError
 
 #: Skipped steps in a row after which waiting is of no use.
 PATIENCE = 10
@@ -22,17 +25,16 @@ COLLAPSE = 5.0
 SETTLED = 100
 
 
-def sum_of_gradients(loss: Tensor, optimizer: torch.optim.Optimizer, *, scaled: bool) -> Tensor:
-    """The sum [] of a loss and of all gradients, which is finite only if they are.
+def check_can_go_back(out: Path, reason: str, step: int, rate_factor: float) -> None:
+    """A run goes back once, to a checkpoint.
 
-    Gradients of tables that are updated by entries are not read, which takes time: they are products of those of the
-    first layer, which are. Nor are scaled ones.
+    Raises:
+        TrainingError: Where it went back before, as its rate tells, or has no checkpoint.
     """
-    parts = [loss.detach().float()]
-    if not scaled:
-        dense = (p.grad for g in optimizer.param_groups if not g.get("sparse") for p in g["params"])
-        parts += [gradient.sum() for gradient in dense if gradient is not None]  # a norm takes five times as long
-    return torch.stack(parts).sum()
+    there = bool(checkpoint_paths(out))
+    if rate_factor < 1 or not there:
+        kept = "with half the rate again; the checkpoint is as it was" if there else "there is no checkpoint"
+        raise TrainingError(f"{out}: {reason} at step {step}, try a smaller --lr; {kept}")
 
 
 def all_finite(optimizer: torch.optim.Optimizer) -> bool:

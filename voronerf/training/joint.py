@@ -50,10 +50,17 @@ from voronerf.training.checkpoint import (
 )
 from voronerf.training.config import TrainConfig
 from voronerf.training.config_checks import ConfigError, check_joint
-from voronerf.training.divergence import PATIENCE, SETTLED, all_finite, one_colour_psnr, why_scores_are_poor
+from voronerf.training.divergence import (
+    PATIENCE,
+    SETTLED,
+    all_finite,
+    check_can_go_back,
+    one_colour_psnr,
+    why_scores_are_poor,
+)
 from voronerf.training.networks import check_shapes, resolve_config
 from voronerf.training.parts import recipe_of
-from voronerf.training.progress import Progress, Stage, TrainingError
+from voronerf.training.progress import Progress, Stage
 from voronerf.training.rates import learning_rate
 from voronerf.training.renderers import make_contraction, make_grid
 from voronerf.training.run_directory import read_metrics
@@ -383,10 +390,8 @@ class JointTrainer:
             TrainingError: The second time, or without a checkpoint.
         """
         self.writer.wait()
-        at, there = self.step, bool(checkpoint_paths(self.out))
-        if self.rate_factor < 1 or not there:
-            kept = "with half the rate again; the checkpoint is as it was" if there else "there is no checkpoint"
-            raise TrainingError(f"{self.out}: {reason} at step {at}, try a smaller --lr; {kept}")
+        at = self.step
+        check_can_go_back(self.out, reason, at, self.rate_factor)
         self._resume()
         self.rate_factor, self.saved_at = 0.5, self.seconds
         self.say(f"{reason} at step {at}: back to step {self.step}, with half the learning rate")

@@ -36,7 +36,6 @@ from voronerf.training.checkpoint import (
     Checkpoint,
     CheckpointError,
     CheckpointWriter,
-    checkpoint_paths,
     last_checkpoint,
 )
 from voronerf.training.config import TrainConfig
@@ -45,6 +44,7 @@ from voronerf.training.divergence import (
     PATIENCE,
     SETTLED,
     all_finite,
+    check_can_go_back,
     one_colour_psnr,
     why_scores_are_poor,
 )
@@ -337,10 +337,8 @@ class Trainer:
             TrainingError: The second time, or without a checkpoint.
         """
         self.writer.wait()
-        at, there = self.step, bool(checkpoint_paths(self.out))
-        if self.rate_factor < 1 or not there:
-            kept = "with half the rate again; the checkpoint is as it was" if there else "there is no checkpoint"
-            raise TrainingError(f"{self.out}: {reason} at step {at}, try a smaller --lr; {kept}")
+        at = self.step
+        check_can_go_back(self.out, reason, at, self.rate_factor)
         skipped = self.skipped
         self._resume(last_checkpoint(self.out))
         self.guard = Guard.on(self.device, skipped)
