@@ -1,6 +1,7 @@
 """What the emulation finds: every planted bug, by results, by its own checks, or by a sanitizer."""
 
 import os
+import pickle
 import random
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import pytest
 from bugs import group_error, verdict
 from emulated import module
 from emulation_build import build
+from recorded import recorded
 
 from voronerf import backends
 
@@ -82,10 +84,17 @@ def test_finds(bug, sanitizer, expected):
         assert found.splitlines()[-1].startswith(expected), found
 
 
+@pytest.fixture(scope="module")
+def calls(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recorded") / "calls"
+    path.write_bytes(pickle.dumps(recorded()))
+    return str(path)
+
+
 @pytest.mark.parametrize("given", [["address"], ["thread"], ["address", "hostile"]], ids=" ".join)
-def test_kernels_touch_nothing_outside_and_race_with_nobody(given):
-    """On sound arguments, and on hostile ones whatever the offsets say."""
-    found = script("sanitize.py", *given)
+def test_kernels_touch_nothing_outside_and_race_with_nobody(given, calls):
+    """On the arguments of the ops' cases, and on hostile ones whatever the offsets say."""
+    found = script("sanitize.py", given[0], calls, *given[1:])
     assert found.splitlines() == ["clean"], found
 
 

@@ -1,0 +1,116 @@
+"""The calls of kernels that the ops' cases lead to, as data that a process without torch can make again (sanitize.py).
+
+A call is the function's name, its arguments, and the arrays that these refer to, before and after it. An argument is
+a number, a text, None, a list, ("array", its number) or ("struct", name of the type, names and values of its fields).
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+from emulated import emulated
+from torch import Tensor
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+from voronerf import backends, ops
+from voronerf import native as _native
+from voronerf.ops.cases import Draw, cases
+from voronerf.ops.cell_sort.native import sort as sort_cells
+from voronerf.ops.grouped_mlp.native import using_way
+
+# Values in registers, with weights that stay or pass through; in shared memory, where that is asked for; what fits no
+# fused network: layer by layer; and in registers with products of four warps.
+NETWORKS = (
+    *(("float32", 227, "auto"), ("bfloat16", 40, "tiles"), ("bfloat16", 227, "auto"), ("bfloat16", 1, "auto")),
+    *(("bfloat16", 227, "wgmma"), ("float16", 30, "auto"), ("float16", 40, "wgmma")),
+)
+SIZES = dict.fromkeys(("nearest_centre", "locate_cell", "cell_sort", "observe_occupancy", "draw_pixels"), 260)
+"""Of calls with a thread for each row: more than a block. Others take more, of which ThreadSanitizer knows some
+thousand, and needs milliseconds for each."""
+PINS: dict[str, list[dict[str, Any]]] = {"nearest_centre": [{"k": 530}, {"dtype": torch.float64}]}
+"""Calls beside the kinds of an op's case."""
+
+
+class Recorder:
+    """The compiled module, whose calls of kernels are kept."""
+
+    def __init__(self, compiled: Any, kernels: Any) -> None:
+        self._compiled, self._kernels, self.calls = compiled, kernels, []
+
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self._compiled, name)
+        if isinstance(found, type) or not callable(found) or not hasattr(self._kernels, name):
+            return found
+
+        def call(*arguments: Any) -> Any:
+            tensors: dict[int, tuple[int, Tensor]] = {}
+            packed = [as_data(argument, tensors) for argument in arguments]
+            before = [as_array(tensor) for _, tensor in tensors.values()]
+            result = found(*arguments)
+            after = [as_array(tensor) for _, tensor in tensors.values()]
+            self.calls.append((name, packed, before, after))
+            return result
+
+        return call
+
+
+def as_data(value: Any, tensors: dict[int, tuple[int, Tensor]]) -> Any:
+    if isinstance(value, Tensor):
+        return "array", tensors.setdefault(id(value), (len(tensors), value))[0]
+    if hasattr(value, "_fields"):
+        fields = [as_data(part, tensors) for part in value]
+        return "struct", type(value).__name__, value._fields, fields
+    if isinstance(value, (list, tuple)):
+        return [as_data(part, tensors) for part in value]
+    assert value is None or isinstance(value, (bool, int, float, str)), value
+    return value
+
+
+def as_array(tensor: Tensor) -> np.ndarray:
+    tensor = tensor.detach().contiguous().clone()
+    return (tensor.view(torch.int16) if tensor.dtype in (torch.float16, torch.bfloat16) else tensor).numpy()
+
+
+def call_case(op: str, pins: dict[str, Any], n: int) -> None:
+    """A call as an op's case makes it, and its gradients."""
+    case = cases()[op]
+    given = tree_map_only(Tensor, Tensor.clone, case.make(Draw(1, **pins), n))
+    leaves = [x for x in tree_leaves(given) if isinstance(x, Tensor) and x.is_floating_point()]
+    for leaf in leaves if case.differentiable else ():
+        leaf.requires_grad_()
+    out = getattr(ops, case.call or op)(**given, backend="native")
+    smooth = [x for x in tree_leaves(out) if isinstance(x, Tensor) and x.requires_grad]
+    if smooth:
+        torch.autograd.grad(sum(x.square().sum() for x in smooth), leaves, allow_unused=True)
+
+
+def recorded() -> list[tuple[int, list[Any]]]:
+    """Bytes of shared memory, and the calls of a device that has them."""
+    found = []
+
+    def record(run: Any, *arguments: Any, shared: int = 227) -> None:
+        with emulated(shared_bytes=shared * 1024) as loaded:
+            recorder = Recorder(_native.compiled, loaded)
+            with mock.patch.object(_native, "compiled", recorder):
+                run(*arguments)
+        found.append((shared * 1024, recorder.calls))
+
+    for op in backends.ops("native", "cuda"):
+        for pins in (*cases()[op].kinds.values(), *PINS.get(op, ())):
+            record(call_case, op, pins, SIZES.get(op, 40))
+    for (precision, shared, way), kind in itertools.product(NETWORKS, ("", "hashed")):
+        if kind and (precision, way) not in (("float32", "auto"), ("bfloat16", "auto")):
+            continue
+        with using_way(way):
+            pins = {**cases()["grouped_mlp"].kinds[kind], "dtype": getattr(torch, precision)}
+            record(call_case, "grouped_mlp", pins, 64, shared=shared)
+    # By counting and by radix. Keys of 4 bytes would need 65,535 cells, each a thread: too many for a sanitizer.
+    for n, k, way in ((3000, 5, "automatic"), (9000, 2, "counting"), (600, 3, "radix"), (300, 1100, "automatic")):
+        cells = torch.randint(-1, k + 1, (n,), dtype=torch.int32)
+        memory = torch.full_like(cells, -7), cells.new_full((k + 1,), -7)
+        record(sort_cells, cells, *memory, "cell_sort", way)
+    return found
