@@ -1,7 +1,6 @@
 """Steps for CUDA graphs, on a machine that has none: what they may not do, and when they are captured and replayed."""
 
 import contextlib
-import importlib
 from dataclasses import replace
 from typing import Any
 
@@ -55,8 +54,6 @@ def test_what_reads_is_noticed():
 )
 def test_a_step_reads_nothing_on_the_host(tmp_path, scene, monkeypatch, settings):
     """In the coarse stage and after the split; the first step of either may look at the network once."""
-    draw_cell = importlib.import_module("voronerf.ops.draw_cell")  # the package has the function under this name
-    monkeypatch.setattr(draw_cell, "_on_host", lambda points: False)  # as for tensors of a GPU
     trainer = Trainer(small(tmp_path, **settings), scene)
     for cells in (1, 4):
         assert trainer.router.num_cells == cells

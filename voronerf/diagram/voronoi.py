@@ -23,6 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf import backends, ops
+from voronerf.diagram.drawing import draw_cell
 
 # A grid is faster than a search of all centres from this many centres on. Making it pays after this many points (see
 # ops.centre_grid).
@@ -31,7 +32,7 @@ _GRID_POINTS = 1 << 17
 
 
 class VoronoiDiagram(nn.Module):
-    """A Voronoi or power diagram of any depth, as flat tables that `ops.locate_cell` and `ops.draw_cell` read.
+    """A Voronoi or power diagram of any depth, as flat tables that `ops.locate_cell` reads.
 
     No method changes a diagram in place: `refine` returns a new one. Its buffers stay float32 when a module around it
     is converted to another dtype, because rounded centres would move samples to networks that never saw them.
@@ -231,7 +232,7 @@ class VoronoiDiagram(nn.Module):
         length in scene units, about the width of the band along the borders in which cells mix. With power weights,
         `d_i = sqrt(|x - v_i|^2 + max_j w_j - w_i)` over the siblings j. That is the plain distance if all weights are
         equal, and does not depend on a constant added to them. A temperature of 0 gives `locate`. One uniform number in
-        0 to 1 is drawn for each point and level (`ops.draw_cell`).
+        0 to 1 is drawn for each point and level (`diagram.drawing`).
 
         Args:
             points: floating [..., 3]; compared in float32.
@@ -253,17 +254,8 @@ class VoronoiDiagram(nn.Module):
         flat = self._flatten("sample_cell", points).to(torch.float32)
         drawn_on = flat.device if generator is None else generator.device
         uniforms = torch.rand(flat.shape[0], self.depth, generator=generator, device=drawn_on, dtype=torch.float32)
-        cells = ops.draw_cell(
-            flat,
-            self.centres,
-            self.child_offsets,
-            self.child,
-            uniforms.to(flat.device),
-            temperature=temperature,
-            depth=self.depth,
-            weights=self.power,
-            backend=backend,
-        )
+        tables = self.centres, self.child_offsets, self.child
+        cells = draw_cell(flat, *tables, uniforms.to(flat.device), temperature, self.power)
         return cells.reshape(points.shape[:-1])
 
     def refine(self, children: Mapping[int, "Tensor | VoronoiDiagram"]) -> tuple["VoronoiDiagram", Tensor]:

@@ -13,7 +13,6 @@ from voronerf.ops.cast_solids import cast_solids
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.centre_grid import CentreGrid, centre_grid
 from voronerf.ops.composite import Composite, composite
-from voronerf.ops.draw_cell import draw_cell
 from voronerf.ops.draw_pixels import draw_pixels
 from voronerf.ops.draw_pixels.reference import Runs
 from voronerf.ops.frequency_encode import frequency_encode
@@ -33,7 +32,6 @@ from voronerf.ops.ray_runs.reference import OwnSamples
 from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradient
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
-from voronerf.ops.select_heaviest import select_heaviest
 from voronerf.ops.sparse_adam import Guard, Rule, adam, sparse_adam
 from voronerf.ops.spherical_harmonics import spherical_harmonics
 from voronerf.ops.update_occupancy import update_occupancy
@@ -59,7 +57,6 @@ __all__ = [
     "centre_grid",
     "compose_runs",
     "composite",
-    "draw_cell",
     "draw_pixels",
     "frequency_encode",
     "grouped_linear",
@@ -80,7 +77,6 @@ __all__ = [
     "routed_mlp",
     "run_gradients",
     "run_sums",
-    "select_heaviest",
     "sparse_adam",
     "spherical_harmonics",
     "update_occupancy",

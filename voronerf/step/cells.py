@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from voronerf.diagram import VoronoiDiagram
-from voronerf.diagram.reservoir import SampleReservoir
+from voronerf.diagram.reservoir import SampleReservoir, select_heaviest
 from voronerf.diagram.subdivision import Split, split_diagram
-from voronerf.ops.select_heaviest import select_heaviest
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
 from voronerf.router import VoronoiRouter

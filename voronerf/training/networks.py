@@ -193,9 +193,8 @@ def check_backend(config: TrainConfig, device: torch.device) -> None:
     """
     marching = ("march_rays", "update_occupancy", "learn_outputs", "render_loss_gradient") if config.occupancy else ()
     drawing = () if SAMPLERS[config.sampling].passes == 1 else ("resample",)
-    assigning = ("draw_cell",) if config.assignment == "stochastic" else ()
     ops = ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite")
-    for op in (*ops, *marching, *drawing, *assigning):
+    for op in (*ops, *marching, *drawing):
         backends.resolve(op, backend=config.backend, device=device, dtype=torch.float32)
     backends.resolve("cell_sort", backend=config.backend, device=device, dtype=torch.int32)
 

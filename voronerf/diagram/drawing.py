@@ -1,4 +1,4 @@
-"""Leaves drawn by their distances. n points, m centres of all diagrams together, g diagrams."""
+"""Leaves of a tree of diagrams drawn by their distances. n points, m centres of all diagrams together, g diagrams."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ _LARGE_PIECE = 1 << 22
 """The same on other devices, where few launches count."""
 
 
+@torch.no_grad()
 def draw_cell(
     points: Tensor,
     centres: Tensor,
@@ -20,12 +21,26 @@ def draw_cell(
     child: Tensor,
     uniforms: Tensor,
     temperature: float,
-    depth: int,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """A leaf for every point, drawn from its distances; see ``voronerf.ops.draw_cell``.
+    """A leaf for every point, drawn at random by its distances to the centres, level by level.
 
-    Distances to all centres of the tree are taken once; at each level those of other diagrams have no mass.
+    On each level the first centre is drawn up to which the probabilities sum to at least 1 - u, where u is the uniform
+    number of the point for that level. A point that is not finite, or whose squared distances overflow, goes to the
+    first centre on every level. Distances to all centres of the tree are taken once; at each level those of other
+    diagrams have no mass.
+
+    Args:
+        points: float32 or float64 [n, 3].
+        centres: [m, 3], finite.
+        child_offsets: int32 [g + 1], and
+        child: int32 [m]: the tree, as in `ops.locate_cell`.
+        uniforms: [n, levels of the tree], in 0 to 1; other values are clamped, and NaN counts as 0.
+        temperature: above 0, finite, in scene units.
+        weights: [m] of power diagrams, or None.
+
+    Returns:
+        leaf int32 [n].
     """
     # Neither 0 nor infinite in float32: the nearest centre's mass is 1 at any temperature.
     temperature = min(max(temperature, 1e-37), 3e38)
@@ -42,7 +57,7 @@ def draw_cell(
         wanted = (1 - uniforms.nan_to_num(0.0)).clamp(torch.finfo(torch.float32).eps / 2, 1)
         # `state` is the diagram a point is in, or (negative) the leaf it has reached.
         state = torch.zeros(points.shape[0], dtype=torch.int32, device=points.device)
-        for level in range(depth):
+        for level in range(uniforms.shape[1]):
             elsewhere = owner[None, :] != state[:, None]
             nearest = distance.masked_fill(elsewhere, torch.inf).amin(1, keepdim=True)
             # Infinity and NaN have no mass.

@@ -1,4 +1,4 @@
-"""draw_cell: the law, level by level, the numbers that decide, every backend and instruction set."""
+"""Cells drawn by their distances: the law, level by level, and the numbers that decide."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ import math
 
 import pytest
 import torch
-from op_cases import refusals, strided
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.ops import draw_cell, nearest_centre
-
-pytestmark = pytest.mark.op("draw_cell")
+from voronerf.diagram.drawing import draw_cell
+from voronerf.ops import nearest_centre
 
 # Diagram 0 has three centres: the first a leaf, the second refined by diagram 1, the third by diagram 2, whose second
 # centre is refined by diagram 3. Leaves are numbered depth first.
@@ -30,10 +27,9 @@ def flat(k, device="cpu"):
     )
 
 
-def draw(points, centres, uniforms, temperature, **options):
+def draw(points, centres, uniforms, temperature):
     """In one diagram, by a number for each point."""
-    tables = flat(centres.shape[0], centres.device)
-    return draw_cell(points, centres, *tables, uniforms[:, None], temperature=temperature, depth=1, **options)
+    return draw_cell(points, centres, *flat(centres.shape[0], centres.device), uniforms[:, None], temperature)
 
 
 def slow(points, centres, tables, uniforms, temperature, depth, weights=None):
@@ -79,15 +75,13 @@ def chi_square(counts, probabilities):
 
 @pytest.mark.parametrize("n", [0, 1, 257])
 @pytest.mark.parametrize("weighted", [False, True])
-def test_uneven_tree_is_the_formula(device, backend, n, weighted):
+def test_uneven_tree_is_the_formula(device, n, weighted):
     points, centres, uniforms = torch.randn(n, 3), torch.randn(10, 3), torch.rand(n, DEPTH)
     weights = torch.rand(10) if weighted else None
     leaves = draw_cell(
         *(tensor.to(device) for tensor in (points, centres, CHILD_OFFSETS, CHILD, uniforms)),
         temperature=0.4,
-        depth=DEPTH,
         weights=None if weights is None else weights.to(device),
-        backend=backend,
     )
     expected = slow(points, centres, (CHILD_OFFSETS, CHILD), uniforms, 0.4, DEPTH, weights)
     agree(leaves.cpu(), *expected, tolerance=1e-5)
@@ -95,28 +89,26 @@ def test_uneven_tree_is_the_formula(device, backend, n, weighted):
 
 @pytest.mark.parametrize("k", [1, 2, 15, 17, 1000])
 @pytest.mark.parametrize("temperature", [0.05, 2.0])
-def test_many_cells(device, backend, k, temperature):
-    points, centres, uniforms = strided(torch.rand(301, 3)), torch.rand(k, 3), torch.rand(301)
-    leaves = draw(points.to(device), centres.to(device), uniforms.to(device), temperature, backend=backend)
+def test_many_cells(device, k, temperature):
+    points, centres, uniforms = torch.rand(301, 6)[:, ::2], torch.rand(k, 3), torch.rand(301)
+    leaves = draw(points.to(device), centres.to(device), uniforms.to(device), temperature)
     expected = slow(points, centres, flat(k), uniforms[:, None], temperature, 1)
     agree(leaves.cpu(), *expected, tolerance=1e-5)
 
 
-def test_frequencies_are_those_of_the_law(device, backend):
+def test_frequencies_are_those_of_the_law(device):
     """Chi square by degree of freedom, at each of some places: its mean is 1, and 3 is far beyond its spread."""
     n, k, temperature = 20_000, 12, 0.3
     centres, places = torch.rand(k, 3), torch.rand(4, 3)
     for place in places:
-        leaves = draw(
-            place.expand(n, 3).to(device), centres.to(device), torch.rand(n).to(device), temperature, backend=backend
-        )
+        leaves = draw(place.expand(n, 3).to(device), centres.to(device), torch.rand(n).to(device), temperature)
         law = torch.softmax(-(place - centres).double().norm(dim=1) / temperature, 0)
         assert chi_square(torch.bincount(leaves.cpu(), minlength=k), law) < 3.0
         wrong = torch.softmax(-(place - centres).double().norm(dim=1) / (1.3 * temperature), 0)
         assert chi_square(torch.bincount(leaves.cpu(), minlength=k), wrong) > 3.0
 
 
-def test_along_the_path_frequencies_multiply(device, backend):
+def test_along_the_path_frequencies_multiply(device):
     n, temperature = 30_000, 0.7
     centres, place = torch.randn(10, 3), torch.randn(3)
     tables = tuple(table.to(device) for table in (CHILD_OFFSETS, CHILD))
@@ -126,8 +118,6 @@ def test_along_the_path_frequencies_multiply(device, backend):
         *tables,
         torch.rand(n, DEPTH).to(device),
         temperature=temperature,
-        depth=DEPTH,
-        backend=backend,
     )
     level = [
         torch.softmax(-(place - centres[a:b]).double().norm(dim=1) / temperature, 0)
@@ -138,11 +128,11 @@ def test_along_the_path_frequencies_multiply(device, backend):
     assert chi_square(torch.bincount(leaves.cpu(), minlength=7), law) < 3.0
 
 
-def test_numbers_at_and_beyond_the_ends(device, backend):
+def test_numbers_at_and_beyond_the_ends(device):
     """0 is the last centre with any mass, what is nearly 1 the first; never one without mass."""
     centres = torch.tensor([[50.0, 0, 0], [0, 0, 0], [1, 0, 0], [60, 0, 0]], device=device)
     uniforms = torch.tensor([0.0, -3.0, math.nan, 1 - 2**-24, 1.0, 7.0], device=device)
-    leaves = draw(torch.zeros(6, 3, device=device), centres, uniforms, 0.5, backend=backend)
+    leaves = draw(torch.zeros(6, 3, device=device), centres, uniforms, 0.5)
     assert leaves.tolist() == [2, 2, 2, 1, 1, 1]
 
 
@@ -166,26 +156,26 @@ def test_the_reference_where_sums_do_not_rise(monkeypatch):
     padded = torch.cat([torch.zeros(5000, 2), mass, torch.zeros(5000, 23)], 1)
     sums = padded.cumsum(1)
     assert bool((sums[:, -1] > sums[:, 8]).any())
-    leaves = draw_cell(points, centres, offsets, child, uniforms, temperature=1.0, depth=2, backend="reference")
+    leaves = draw_cell(points, centres, offsets, child, uniforms, 1.0)
     # Of the seven the last, or by rounding the one before it.
     assert int(leaves.min()) >= 5 and int(leaves.max()) == 6
 
 
-def test_the_coldest_is_the_nearest_and_the_hottest_is_even(device, backend):
+def test_the_coldest_is_the_nearest_and_the_hottest_is_even(device):
     points, centres = 8 * torch.rand(500, 3, device=device), 8 * torch.rand(20, 3, device=device)
     uniforms = torch.rand(500, device=device)
     for temperature in (1e-300, 1e-44, 1e-30, 1e-6):
-        cold = draw(points, centres, uniforms, temperature, backend=backend)
+        cold = draw(points, centres, uniforms, temperature)
         assert int((cold != nearest_centre(points, centres)).sum()) <= 1
     for temperature in (1e30, 1e300):
-        hot = draw(points, centres, uniforms, temperature, backend=backend)
+        hot = draw(points, centres, uniforms, temperature)
         even = ((1 - uniforms.double()) * 20).ceil().long() - 1
         assert int((hot != even).sum()) <= 1
-    far = draw(points + 1e6, centres + 1e6, uniforms, 1e-3, backend=backend)  # the temperature is lost in rounding
+    far = draw(points + 1e6, centres + 1e6, uniforms, 1e-3)  # the temperature is lost in rounding
     assert bool(((far >= 0) & (far < 20)).all())
 
 
-def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device, backend):
+def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device):
     points = torch.tensor([[math.nan, 0, 0], [0, math.inf, 0], [1e30, 0, 0]], device=device)
     centres, uniforms = torch.rand(10, 3, device=device), torch.tensor([0.0, 0.5, 0.9], device=device)
     # Here the first centre of the root is refined too.
@@ -197,19 +187,17 @@ def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device,
         child,
         uniforms[:, None].expand(3, DEPTH),
         temperature=0.2,
-        depth=DEPTH,
-        backend=backend,
     )
     assert leaves.tolist() == [5, 5, 5]
 
 
-def test_many_points_cross_the_pieces_and_do_not_depend_on_their_neighbours(device, backend):
+def test_many_points_cross_the_pieces_and_do_not_depend_on_their_neighbours(device):
     centres, n = torch.rand(10, 3, device=device), 30_000
     points, uniforms = torch.rand(n, 3, device=device), torch.rand(n, DEPTH, device=device)
     tables = (CHILD_OFFSETS.to(device), CHILD.to(device))
 
     def run(rows):
-        return draw_cell(points[rows], centres, *tables, uniforms[rows], temperature=0.2, depth=DEPTH, backend=backend)
+        return draw_cell(points[rows], centres, *tables, uniforms[rows], temperature=0.2)
 
     leaves = run(slice(None))
     expected = slow(points[::97].cpu(), centres.cpu(), (CHILD_OFFSETS, CHILD), uniforms[::97].cpu(), 0.2, DEPTH)
@@ -218,22 +206,10 @@ def test_many_points_cross_the_pieces_and_do_not_depend_on_their_neighbours(devi
     assert int((run(slice(5, 4242)) != leaves[5:4242]).sum()) <= 1
 
 
-def test_half_types_and_float64():
-    points, centres, uniforms = torch.rand(40, 3).half(), torch.rand(6, 3), torch.rand(40)
-    assert torch.equal(draw(points, centres, uniforms, 0.2), draw(points.float(), centres, uniforms, 0.2))
-    expected = slow(points, centres, flat(6), uniforms[:, None], 0.2, 1)
-    agree(draw(points.double(), centres.double(), uniforms.double(), 0.2), *expected, tolerance=1e-12)
-    with pytest.raises(backends.BackendUnavailable, match="there is no native implementation of draw_cell"):
-        draw(points, centres, uniforms, 0.2, backend="native")
-
-
-def test_errors():
-    points, centres, uniforms = torch.rand(4, 3), torch.rand(10, 3), torch.rand(4, 3)
-    tree = {"child_offsets": CHILD_OFFSETS, "child": CHILD, "uniforms": uniforms, "depth": 3}
-    refuses = refusals(draw_cell, points=points, centres=centres, **tree, temperature=0.1)
-    refuses("child must have shape [m] with m = 9, got [10]", centres=centres[:9])
-    refuses("depth must be at least 1, got 0", uniforms=uniforms[:, :0], depth=0)
-    for temperature in (0.0, -1.0, math.inf, math.nan):
-        refuses(f"temperature must be positive and finite, got {temperature}", temperature=temperature)
-    refuses("centres must hold ... got 0 centres in 4 diagrams", centres=centres[:0], child=CHILD[:0])
-    refuses("child must have dtype int32, got int64", child=CHILD.long())
+def test_float64():
+    points, centres, uniforms = torch.rand(40, 3).double(), torch.rand(6, 3).double(), torch.rand(40).double()
+    agree(
+        draw(points, centres, uniforms, 0.2),
+        *slow(points, centres, flat(6), uniforms[:, None], 0.2, 1),
+        tolerance=1e-12,
+    )
