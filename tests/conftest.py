@@ -123,6 +123,20 @@ def _emulated_cuda(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Of the rows of a test that need a device that is not there, the first stays to say so."""
+    seen: set[str] = set()
+    rows: tuple[list[pytest.Item], list[pytest.Item]] = [], []
+    for item in items:
+        absent = any(part == "cuda" for part, _ in _absent(item))
+        name = item.nodeid.partition("[")[0]
+        rows[absent and name in seen].append(item)
+        if absent:
+            seen.add(name)
+    items[:] = rows[0]
+    config.hook.pytest_deselected(items=rows[1])
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     for part, reason in _absent(item):
