@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from paper.claims import Claim
 from paper.runs import Run, Settings, Variant, default_scenes, make_run
 from voronerf.diagram.balance import balance
 
@@ -49,8 +48,8 @@ def load_samples(path: Path) -> Samples:
 
 def measure(
     trained: Sequence[Run], backend: str, say: Callable[[str], None] = print, *, diagrams: int = DIAGRAMS
-) -> tuple[list[dict[str, Any]], list[Claim]]:
-    """Balances the diagrams of every source of samples, trainings and separate objects; returns (rows, claims)."""
+) -> list[dict[str, Any]]:
+    """Balances the diagrams of every source of samples, trainings and separate objects; returns the rows."""
     kept: dict[str, list[Samples]] = {}
     for run in trained:
         samples = load_samples(run.folder / "samples" / "level-1.npz")
@@ -59,7 +58,7 @@ def measure(
         name: lambda number, sets=sets: sets[number % len(sets)] for name, sets in kept.items()
     }
     sources["separate objects"] = separate_objects
-    rows, claims = [], []
+    rows = []
     for name, drawn in sources.items():
         results = [
             balance(*drawn(n), CELLS, generator=torch.Generator().manual_seed(n), backend=backend)
@@ -69,19 +68,5 @@ def measure(
         first, last = statistics.median(before), statistics.median(after)
         rows.append({"variant": name, "before": first, "after": last, "before_all": before, "after_all": after})
         text = f"std(W / max W) of {CELLS} cells, median of {diagrams} diagrams, {name}"
-        here = f"{first:.3f} -> {last:.4f}"
-        claims.append(Claim(text, f"{PUBLISHED[0]} -> {PUBLISHED[1]}", here, balance_verdict(first, last)))
-        say(f"{text}: {here}")
-    return rows, claims
-
-
-def balance_verdict(before: float, after: float) -> str:
-    """Whether balancing reaches the published figure, at least its factor, or neither."""
-    if after >= before:
-        return "does not hold"
-    if after <= PUBLISHED[1]:
-        return "holds"
-    factor, published = before / after, PUBLISHED[0] / PUBLISHED[1]
-    if factor >= published:
-        return f"the factor holds: {factor:.0f}, published {published:.0f}"
-    return f"evener by a factor of {factor:.0f}, published {published:.0f}"
+        say(f"{text}: {first:.3f} -> {last:.4f}, published {PUBLISHED[0]} -> {PUBLISHED[1]}")
+    return rows

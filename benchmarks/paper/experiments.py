@@ -1,4 +1,4 @@
-"""The paper's experiments that are trainings: which variants each compares, what it claims, what was published.
+"""The paper's experiments that are trainings: which variants each compares, and what was published.
 
 Both sides of every comparison have the same rays, samples, schedule and kernels; the learning rate follows from the
 width alone, by one rule for all (see ``voronerf train --lr``). Published figures are those of Elsner et al. 2023,
@@ -11,9 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from paper.claims import Claim, Rows, at_look, equal_claim, fewer_seams, gain_claim, growing_claim, order_claim
 from paper.runs import AS_PUBLISHED, Run, Settings, Variant, default_scenes, make_run, open_scene
-from paper.translucent import NAME as TRANSLUCENT
 from voronerf.training.config import TrainConfig
 from voronerf.training.networks import count_parameters, resolve_config
 
@@ -27,10 +25,7 @@ NEAREST, STOCHASTIC = "nearest cell", "stochastic assignment"
 KILO_FIRST_STEPS = 16
 KILO_START, KILO_LATE = f"512 uniform cells after {KILO_FIRST_STEPS} steps", "512 uniform cells, inherited"
 KILO_CELLS = "16 x 16 Voronoi cells"
-NEVER, TOO_EARLY, USUAL, LATE = "never split", "split at 2 %", "split at 20 %", "split at 50 %"
-EARLY = ("after", "at-25", "at-50")
-SOLID = "builtin"
-SPLIT_TIMES, TYPICAL = (0.05, 0.1, 0.2, 0.4, 0.6), 0.2
+SPLIT_TIMES = (0.05, 0.1, 0.2, 0.4, 0.6)
 COUNTS = (4, 8, 12, 16, 32)
 
 
@@ -58,8 +53,6 @@ PUBLISHED_CELLS = 12
 #: Published: the same networks for the same time, Lego: KiloNeRF's 512 uniform cells, 16 x 16 Voronoi cells.
 KILONERF = (Scores(27.080, 0.938, 0.098), Scores(27.765, 0.952, 0.078))
 
-Claims = Callable[[Rows, Settings], list[Claim]]
-
 
 @dataclass(frozen=True)
 class Experiment:
@@ -69,7 +62,6 @@ class Experiment:
         kind: "table" or "figure".
         about: what it compares, for the reader of its table.
         variants: for some settings and a scene.
-        claims: what the paper says, judged by the results.
         scenes: those to train if the settings name none.
         published: the published scores of a variant on a scene, or None.
     """
@@ -77,7 +69,6 @@ class Experiment:
     kind: str
     about: str
     variants: Callable[[Settings, str], list[Variant]]
-    claims: Claims = lambda rows, settings: []
     scenes: Callable[[], tuple[str, ...]] = default_scenes
     published: Callable[[str, str], Scores | None] = lambda variant, scene: None
 
@@ -89,11 +80,6 @@ class Experiment:
             for variant in self.variants(settings, scene)
             for seed in range(settings.seeds)
         ]
-
-
-def per_scene(judge: Callable[[Rows, Settings, str], list[Claim]]) -> Claims:
-    """Claims that are made of each scene alone."""
-    return lambda rows, settings: [claim for scene in rows.scenes for claim in judge(rows, settings, scene)]
 
 
 def cells_name(count: int) -> str:
@@ -147,31 +133,6 @@ def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant
     return variants
 
 
-def _crossed_claims(samplings: Sequence[str]) -> Claims:
-    def judge(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
-        found = []
-        for field in FIELDS:
-            for sampling in samplings:
-                cells, wide, narrow, uniform = (
-                    row_name(field, sampling, network)
-                    for network in (cells_name(settings.cells), WIDE, NARROW, uniform_name(settings.cells))
-                )
-                what = f"{scene}, {FIELDS[field]}, {sampling}: cells beat"
-                high, low = _published(cells, scene), _published(wide, scene)
-                gain = f"{high.psnr - low.psnr:+.2f} dB" if high and low else "-"
-                found += [
-                    gain_claim(f"{what} one network of width 256, by 2 dB", gain, rows.gains(cells, wide, scene), 2.0),
-                    gain_claim(
-                        f"{what} one network of width 64, by 0.5 dB", "-", rows.gains(cells, narrow, scene), 0.5
-                    ),
-                ]
-                if sampling == "stratified":
-                    found.append(gain_claim(f"{what} uniform cells", "-", rows.gains(cells, uniform, scene)))
-        return found
-
-    return per_scene(judge)
-
-
 def _published(variant: str, scene: str) -> Scores | None:
     for (field, sampling, where), scores in PUBLISHED.items():
         for network, score in zip((WIDE, cells_name(PUBLISHED_CELLS)), scores):
@@ -196,19 +157,6 @@ def _kilo_variants(settings: Settings, scene: str) -> list[Variant]:
     ]
 
 
-def _kilo_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
-    text = f"{KILONERF[1].psnr - KILONERF[0].psnr:+.3f} dB"
-    return [
-        gain_claim(
-            f"{scene}: 16 x 16 Voronoi cells beat {other}, by 0.5 dB",
-            text if scene == "lego" and other == KILO_START else "-",
-            rows.gains(KILO_CELLS, other, scene),
-            0.5,
-        )
-        for other in (KILO_START, KILO_LATE)
-    ]
-
-
 def _kilo_published(variant: str, scene: str) -> Scores | None:
     return {KILO_START: KILONERF[0], KILO_CELLS: KILONERF[1]}.get(variant) if scene == "lego" else None
 
@@ -221,41 +169,6 @@ def _changed(*variants: tuple[str, dict[str, Any]]) -> Callable[[Settings, str],
     return lambda settings, scene: [Variant(name, {"cells": (settings.cells,), **more}) for name, more in variants]
 
 
-def _convergence_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
-    cells = cells_name(settings.cells)
-    wide, narrow = rows.gains(cells, WIDE, scene), rows.gains(cells, NARROW, scene)
-    return [
-        gain_claim(f"{scene}: cells beat one network of width 256, by 2 dB", "-", wide, 2),
-        gain_claim(f"{scene}: cells beat one network of width 64, by 0.5 dB", "-", narrow, 0.5),
-        growing_claim(f"{scene}: the lead over width 64 grows with the time", "-", rows, cells, NARROW, scene),
-    ]
-
-
-def _initialisation_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
-    text = f"{scene}: inheritance beats random parameters on held-out views"
-    return [gain_claim(text, "order", rows.gains(INHERIT, FRESH, scene))]
-
-
-def _ghosting_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
-    return [
-        gain_claim(
-            f"{scene}: {when} inherited networks show a held-out view better",
-            "order",
-            rows.gains(INHERIT, FRESH, scene, lambda row, name=name: at_look(row, name, "psnr")),
-        )
-        for name, when in (("after", "soon after the split"), ("end", "at the end"))
-    ]
-
-
-def _split_kind_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
-    order = f"{scene}: balanced centres beat random, random beat uniform"
-    loose = f"{scene}: balanced centres beat a grid over twice the box"
-    return [
-        order_claim(order, "order", rows, (BALANCED, RANDOM, UNIFORM), scene),
-        gain_claim(loose, "-", rows.gains(BALANCED, LOOSE, scene)),
-    ]
-
-
 def _split_name(at: float) -> str:
     return f"split at {100 * at:.0f} %"
 
@@ -264,14 +177,6 @@ def _early_late_variants(settings: Settings, scene: str) -> list[Variant]:
     usual = TrainConfig(cells=(settings.cells,)).splits
     times = [(_split_name(at), {} if (at,) == usual else {"split_at": (at,)}) for at in SPLIT_TIMES]
     return _changed(*times)(settings, scene)
-
-
-def _early_late_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
-    early, usual, late = map(_split_name, (SPLIT_TIMES[0], TYPICAL, SPLIT_TIMES[-1]))
-    return [
-        gain_claim(f"{scene}: a {what} costs: {usual} beats {other}", "-", rows.gains(usual, other, scene))
-        for what, other in (("too early split", early), ("too late split", late))
-    ]
 
 
 def _cell_count_variants(settings: Settings, scene: str) -> list[Variant]:
@@ -285,55 +190,6 @@ def _cell_count_variants(settings: Settings, scene: str) -> list[Variant]:
     return own + [Variant(f"{levels_name(cells)}, matched", changes) for cells, changes in zip(levels, matched)]
 
 
-def _cell_count_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
-    names = [levels_name((count,)) for count in COUNTS]
-    most, fewest, alone = names[-1], names[0], levels_name(())
-    found = [
-        gain_claim(
-            f"{scene}: more cells are better at the same width: {most} beat {fewest}",
-            "-",
-            rows.gains(most, fewest, scene),
-        ),
-        order_claim(f"{scene}: each step to more cells is, from {fewest} to {most}", "-", rows, names[::-1], scene),
-    ]
-    for better, worse in ((levels_name((PUBLISHED_CELLS,)), alone), (most, fewest)):
-        what = f"{scene}: with as many parameters in total {better} beat {worse}"
-        found.append(gain_claim(what, "-", rows.gains(f"{better}, matched", f"{worse}, matched", scene)))
-    return found
-
-
-def _seam_claims(rows: Rows, settings: Settings, scene: str) -> list[Claim]:
-    early, late = (fewer_seams(rows, scene, NEAREST, STOCHASTIC, looks) for looks in (EARLY, ("end",)))
-    quality = rows.gains(STOCHASTIC, NEAREST, scene)
-    return [
-        gain_claim(f"{scene}: stochastic assignment: fewer seams in the first half", "order", early, unit="%"),
-        equal_claim(f"{scene}: as many seams at the end", "no difference", late, 10.0, "%"),
-        equal_claim(f"{scene}: the same quality at the end", "no difference", quality, 0.2),
-    ]
-
-
-def _limit_claims(rows: Rows, settings: Settings) -> list[Claim]:
-    found = []
-    for scene in rows.scenes:
-        name = f"{scene}, a control" if scene == SOLID else scene
-        text = "in translucent scenes" if scene == TRANSLUCENT else "-"
-        gains = rows.gains(USUAL, TOO_EARLY, scene)
-        found.append(gain_claim(f"{name}: a split before anything is known hurts", text, gains))
-    if {SOLID, TRANSLUCENT} <= set(rows.scenes):
-
-        def more(scene: str, than: str, worse: str) -> list[float]:
-            """By how much the usual split's gain over another variant is larger in a scene than in another."""
-            first, second = (
-                {seed: gain for (_, seed), gain in rows.paired(USUAL, worse, where).items()} for where in (scene, than)
-            )
-            return [first[seed] - second[seed] for seed in first if seed in second]
-
-        hurts, helps = more(TRANSLUCENT, SOLID, TOO_EARLY), more(SOLID, TRANSLUCENT, NEVER)
-        found.append(gain_claim("it hurts more where much is translucent than where all is solid", "order", hurts))
-        found.append(gain_claim("cells help less where much is translucent than where all is solid", "order", helps))
-    return found
-
-
 _INITIALISED = _changed((INHERIT, {}), (FRESH, {"init": "random"}))
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -341,13 +197,11 @@ EXPERIMENTS: dict[str, Experiment] = {
         "figure",
         "Test PSNR over training time: one wide network, one narrow network, cells of narrow networks.",
         one_or_cells,
-        per_scene(_convergence_claims),
     ),
     "sampling": Experiment(
         "table",
         "NeRF and mip-NeRF, each with stratified and with hierarchical sampling: one network against cells.",
         _crossed(SAMPLINGS),
-        _crossed_claims(SAMPLINGS),
         scenes=lambda: default_scenes(2),
         published=_published,
     ),
@@ -355,7 +209,6 @@ EXPERIMENTS: dict[str, Experiment] = {
         "table",
         "Hierarchical NeRF and mip-NeRF on several scenes: one network against cells.",
         _crossed(SAMPLINGS[1:]),
-        _crossed_claims(SAMPLINGS[1:]),
         scenes=lambda: default_scenes(3),
         published=_published,
     ),
@@ -364,20 +217,17 @@ EXPERIMENTS: dict[str, Experiment] = {
         "Networks of KiloNeRF's size for the same time: a uniform grid of cells against nested Voronoi cells. "
         "The grid is there after 16 steps, KiloNeRF's from the start, or it inherits when the Voronoi cells do.",
         _kilo_variants,
-        per_scene(_kilo_claims),
         published=_kilo_published,
     ),
     "initialisation": Experiment(
         "figure",
         "New cells start as copies of their parent, or from random parameters.",
         _INITIALISED,
-        per_scene(_initialisation_claims),
     ),
     "ghosting": Experiment(
         "figure",
         "A held-out view soon after the split and at the end: inherited networks and random ones.",
         _INITIALISED,
-        per_scene(_ghosting_claims),
     ),
     "density": Experiment(
         "figure", "Density on a horizontal slice: the coarse network, soon after the split, at the end.", _INITIALISED
@@ -392,22 +242,17 @@ EXPERIMENTS: dict[str, Experiment] = {
             (UNIFORM, {"centres": "uniform"}),
             (LOOSE, {"centres": "uniform", "uniform_scale": 2.0}),
         ),
-        per_scene(_split_kind_claims),
     ),
-    "early-late": Experiment(
-        "figure", "The time of the split, as a share of the run.", _early_late_variants, per_scene(_early_late_claims)
-    ),
+    "early-late": Experiment("figure", "The time of the split, as a share of the run.", _early_late_variants),
     "cell-count": Experiment(
         "figure",
         "The number of cells, with networks of one width, and with the parameters of 12 such networks in total.",
         _cell_count_variants,
-        per_scene(_cell_count_claims),
     ),
     "seams": Experiment(
         "figure",
         "Samples go to the nearest cell, or while training to one drawn from the distances: seams over time.",
         _changed((NEAREST, {}), (STOCHASTIC, {"assignment": "stochastic"})),
-        per_scene(_seam_claims),
     ),
     "title": Experiment(
         "figure",
@@ -415,12 +260,5 @@ EXPERIMENTS: dict[str, Experiment] = {
         lambda settings, scene: [
             Variant(levels_name(cells), {"cells": cells}) for cells in ((settings.cells,), (4, 4))
         ],
-    ),
-    "limits": Experiment(
-        "figure",
-        "A scene of fog and glass beside a solid one: no split, one before anything is known, the usual, a late one.",
-        _changed((NEVER, {"cells": ()}), (TOO_EARLY, {"split_at": (0.02,)}), (USUAL, {}), (LATE, {"split_at": (0.5,)})),
-        _limit_claims,
-        scenes=lambda: (TRANSLUCENT, SOLID),
     ),
 }

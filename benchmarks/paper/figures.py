@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from paper import looks as paper_looks
-from paper.claims import Rows
 from paper.slices import picture_of_density
 from voronerf.evaluation.panels import contact_sheet, picture_of_cells, picture_of_error, save_picture
 from voronerf.files import write_bytes
@@ -26,6 +25,28 @@ Row = dict[str, Any]
 Point = tuple[float, float]
 GRID = 200  # times at which the curves of several seeds are compared
 DPI = 100
+
+
+class Rows:
+    """Results by scene and variant, a value a seed.
+
+    Attributes:
+        scenes: in the order of the results.
+        variants: in the order of the results.
+    """
+
+    def __init__(self, rows: Sequence[Row]) -> None:
+        self.rows = list(rows)
+        self.scenes, self.variants = (list(dict.fromkeys(row[name] for row in rows)) for name in ("scene", "variant"))
+
+    def of(self, variant: str, scene: str) -> list[Row]:
+        """The rows of a variant on a scene, by seed."""
+        found = [row for row in self.rows if row["variant"] == variant and row["scene"] == scene]
+        return sorted(found, key=lambda row: int(row["seed"]))
+
+    def values(self, variant: str, scene: str) -> list[float]:
+        """PSNR of a variant on a scene, a value a seed; those that were not measured are left out."""
+        return [row["psnr"] for row in self.of(variant, scene) if row.get("psnr") is not None]
 
 
 def save(figure: Any, path: Path) -> Path:
@@ -227,7 +248,6 @@ SHEETS: dict[str, list[Column]] = {
     ],
     "title": _TITLE,
     "split-kinds": _TITLE,
-    "limits": [*_TITLE[:2], ("error", "end", _error), _TITLE[2]],
 }
 PLOTS: dict[str, Callable[[Path, Sequence[Row]], Path]] = {
     "sampling": bars,
@@ -239,7 +259,6 @@ PLOTS: dict[str, Callable[[Path, Sequence[Row]], Path]] = {
     "early-late": curves,
     "cell-count": counts,
     "seams": seams,
-    "limits": curves,
     "nested-2d": curves,
     "balance": balance,
 }

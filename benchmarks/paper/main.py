@@ -4,7 +4,7 @@
     python benchmarks/paper.py split-kinds title --scene builtin --budget 60
     python benchmarks/paper.py --budget 20 --downscale 8        # all of them: `make paper`
 
-All variants of an experiment train for the same time. Each experiment writes NAME.json ({metadata, results, claims})
+All variants of an experiment train for the same time. Each experiment writes NAME.json ({metadata, results})
 and pictures into --out, and report.md there has all of them. A training that was made before with the same settings is
 not made again, and an interrupted one is continued. Trainings that are started together take turns of a few seconds.
 """
@@ -14,14 +14,12 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import tyro
 from harness import metadata
 
 from paper import balance, nested
-from paper.claims import Rows
 from paper.experiments import EXPERIMENTS
 from paper.report import ABOUT, write_report
 from paper.runs import Run, Settings, default_scenes, failure, results, train_missing
@@ -42,27 +40,24 @@ def trainings(name: str, settings: Settings) -> list[Run]:
 
 
 def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]:
-    """Writes an experiment's JSON from its trainings; returns {metadata, results, claims}."""
+    """Writes an experiment's JSON from its trainings; returns {metadata, results}."""
     described = {"benchmark": "paper", "experiment": name, "budget_seconds": settings.budget, "seeds": settings.seeds}
     if name == "nested-2d":
         described["scenes"] = list(settings.scene or default_scenes())
-        rows, claims = nested.nested(settings, say)
+        rows = nested.nested(settings, say)
     elif name == "balance":
         described["scenes"] = list(settings.scene or default_scenes())
-        rows, claims = balance.measure(runs, settings.backend, say)
+        rows = balance.measure(runs, settings.backend, say)
     else:
         rows = results(runs)
-        claims = EXPERIMENTS[name].claims(Rows(rows), settings)
         described |= {
-            "scenes": Rows(rows).scenes,
+            "scenes": list(dict.fromkeys(row["scene"] for row in rows)),
             "size": rows[0]["size"] if rows else None,
             "rays": settings.rays,
             "samples": settings.samples,
             "failed": [why for run in runs if (why := failure(run))],
         }
-    outcome = {
-        "metadata": metadata(**described), "results": rows, "claims": [claim._asdict() for claim in claims]
-    }  # fmt: skip
+    outcome = {"metadata": metadata(**described), "results": rows}
     write_text(settings.out / f"{name}.json", json.dumps(outcome, indent=1) + "\n")
     return outcome
 
@@ -71,23 +66,18 @@ def repeat(settings: Settings, names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Repeat experiments of the paper.
 
     Args:
-        settings: How large they are. The experiment on limits has two scenes of its own.
+        settings: How large they are.
         names: Experiments, default all.
     """
     if unknown := [name for name in names if name not in ABOUT]:
         raise ConfigError(f"experiments are {', '.join(ABOUT)}, got {', '.join(unknown)}")
     started = time.perf_counter()
-    own = dict.fromkeys(names or ABOUT, settings)
-    if "limits" in own:
-        own["limits"] = replace(settings, scene=())
-    runs = {name: trainings(name, size) for name, size in own.items()}
+    runs = {name: trainings(name, settings) for name in names or ABOUT}
     # Together, so that all trainings of a scene and a seed take turns with each other.
     train_missing([run for group in runs.values() for run in group], settings, say)
-    for name, size in own.items():
-        outcome = finish(name, runs[name], size)
+    for name, group in runs.items():
+        finish(name, group, settings)
         say(f"{name}: done")
-        for claim in outcome["claims"]:
-            print("{verdict:40} {claim}: {here} (published: {published})".format(**claim))
     page = write_report(settings.out)
     say(f"wrote {page} after {(time.perf_counter() - started) / 60:.1f} minutes")
 

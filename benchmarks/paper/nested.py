@@ -18,7 +18,6 @@ import torch
 from torch import Tensor, nn
 from turns import take_turns
 
-from paper.claims import Claim, Rows, gain_claim
 from paper.figures import stacked
 from paper.looks import held_out_view
 from paper.runs import Settings, default_scenes, open_scene
@@ -186,8 +185,8 @@ def octaves_of(image: Tensor) -> int:
     return max(1, math.ceil(math.log2(math.pi * max(image.shape[:2]) / 2)))
 
 
-def nested(settings: Settings, say: Callable[[str], None] = print) -> tuple[list[dict[str, Any]], list[Claim]]:
-    """Fits a held-out view of each scene by the three contenders and draws the cells; returns (rows, claims)."""
+def nested(settings: Settings, say: Callable[[str], None] = print) -> list[dict[str, Any]]:
+    """Fits a held-out view of each scene by the three contenders and draws the cells; returns the rows."""
     rows, pictures = [], []
     scenes = settings.scene or default_scenes()
     for name in scenes:
@@ -195,13 +194,7 @@ def nested(settings: Settings, say: Callable[[str], None] = print) -> tuple[list
         rows += found
         pictures.append(picture)
     save_picture(settings.out / "nested-2d-pictures.png", stacked(pictures))
-    table = Rows(rows)
-    claims = [
-        gain_claim(f"a picture of {scene}: nested cells beat {other}", "-", table.gains(NESTED, other, scene))
-        for scene in table.scenes
-        for other in (ONE, MATCHED)
-    ]
-    return rows, claims
+    return rows
 
 
 def fitted_view(name: str, settings: Settings, say: Callable[[str], None]) -> tuple[list[dict[str, Any]], Tensor]:

@@ -22,7 +22,6 @@ ABOUT = {
 }
 PLACES = {"psnr": 2, "ssim": 4, "lpips": 4, "psnr_of_mean_error": 2}
 SIZES = ("cells", "width", "parameters", "steps")
-CLAIM = ("claim", "published", "here", "holds?")
 
 
 def grid(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
@@ -83,18 +82,6 @@ def table(name: str, outcome: Mapping[str, Any]) -> list[str]:
     return score_table(outcome["results"], published)
 
 
-def claims_table(outcomes: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The claims of several experiments, each with the training seconds and seeds that it was judged by."""
-    lines: dict[tuple[str, ...], None] = {}  # two experiments that share trainings may judge the same claim
-    for outcome in outcomes:
-        described = outcome["metadata"]
-        under = (f"{described['budget_seconds']:g}", str(described["seeds"]))
-        lines |= {
-            (c["claim"], c["published"], c["here"], c["verdict"], *under): None for c in outcome.get("claims", [])
-        }
-    return grid((*CLAIM, "seconds", "seeds"), list(lines))
-
-
 def conditions(described: Mapping[str, Any]) -> str:
     """Where and how large an experiment was, from its metadata."""
     size = described.get("size")
@@ -112,7 +99,7 @@ def conditions(described: Mapping[str, Any]) -> str:
 
 
 def write_report(out: Path) -> Path:
-    """Writes report.md: the claims, then the table and pictures of every experiment in the output folder.
+    """Writes report.md: the table and pictures of every experiment in the output folder.
 
     Raises:
         ValueError: The folder holds no experiment.
@@ -120,7 +107,7 @@ def write_report(out: Path) -> Path:
     outcomes = {n: json.loads((out / f"{n}.json").read_text()) for n in ABOUT if (out / f"{n}.json").is_file()}
     if not outcomes:
         raise ValueError(f"--out must hold results of experiments, got {out}")
-    lines = ["# The paper's experiments, repeated", "", *claims_table(list(outcomes.values()))]
+    lines = ["# The paper's experiments, repeated"]
     for name, outcome in outcomes.items():
         lines += [
             "",

@@ -21,8 +21,6 @@ from typing import Any
 from turns import take_turns
 
 from paper import looks
-from paper.translucent import NAME as TRANSLUCENT
-from paper.translucent import translucent_scene
 from voronerf.data import BUILTIN, BUILTIN_SIZE, Scene, load_scene
 from voronerf.evaluation.scores import evaluate, mean_scores
 from voronerf.files import write_text
@@ -122,7 +120,7 @@ def scene_source(name: str) -> str:
     Raises:
         ConfigError: There is no such scene.
     """
-    if name in (*BUILTIN, TRANSLUCENT):
+    if name in BUILTIN:
         return name
     for folder in (Path(name), data_folder() / name):
         if folder.is_dir():
@@ -138,7 +136,7 @@ def default_scenes(count: int = 1) -> tuple[str, ...]:
 
 def factor(name: str, settings: Settings) -> int:
     """The factor by which a scene's own images are made smaller."""
-    if name not in (*BUILTIN, TRANSLUCENT):
+    if name not in BUILTIN:
         return settings.downscale
     return max(1, settings.downscale * BUILTIN_SIZE // PUBLISHED_SIZE)
 
@@ -150,11 +148,7 @@ def open_scene(name: str, settings: Settings) -> Scene:
 
 @functools.lru_cache(maxsize=2)
 def _loaded(source: str, downscale: int) -> Scene:
-    return (
-        translucent_scene(BUILTIN_SIZE // downscale)
-        if source == TRANSLUCENT
-        else load_scene(source, downscale=downscale)
-    )
+    return load_scene(source, downscale=downscale)
 
 
 def make_run(variant: Variant, scene: str, seed: int, settings: Settings) -> Run:
