@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +168,13 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
     return rows.measure()
 
 
-def sizes(out: Path, again: Again, device: str = "cuda", most: int = N) -> int:
+def sizes(
+    out: Path,
+    again: Again,
+    device: str = "cuda",
+    samples: Sequence[int] = (1 << 13, 1 << 15, 1 << 18, 1 << 22),
+    cells: Sequence[int] = (1, 16, 256, 4096),
+) -> int:
     """A network of four layers of 64 at many sizes, in all precisions; beside it the same layers as torch's products
     over cells of one size, which need neither a sort nor offsets."""
     import torch
@@ -212,10 +218,8 @@ def sizes(out: Path, again: Again, device: str = "cuda", most: int = N) -> int:
 
         return run
 
-    for n in (1 << 13, 1 << 15, 1 << 18, 1 << 22):
-        if n > most:
-            break
-        for k in (1, 16, 256, 4096):
+    for n in samples:
+        for k in cells:
             for precision in ("bfloat16", "float16", "tf32", "float32") if k == 16 else ("bfloat16", "float32"):
                 limit = "float32" if precision == "float32" else "bfloat16"
                 for backward in (False, True):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 from unittest import mock
 
@@ -87,10 +88,10 @@ def test_a_full_disk(tmp_path):
 
 def test_a_rank_that_is_killed(tmp_path):
     """The other says so; started again as by torchrun, the run ends bit for bit as one that nothing happened to."""
-    whole = command(tmp_path / "whole", "--steps", "36")
-    out = command(tmp_path / "run", "--checkpoint-every", "1e-6", "--steps", "36")
+    whole = command(tmp_path / "whole", "--steps", "24")
+    out = command(tmp_path / "run", "--checkpoint-every", "1e-6", "--steps", "24")
     assert on_ranks(main, whole, folder=tmp_path)[0] == [0, 0]
-    codes, texts = on_ranks(dies, out, 27, folder=tmp_path)
+    codes, texts = on_ranks(dies, out, 19, folder=tmp_path)
     assert codes == [1, -signal.SIGKILL] and len(complaints(texts)) == 1
     assert "another rank has ended" in complaints(texts)[0]
     assert load_checkpoint(checkpoint_path(tmp_path / "run")).values["step"] in (8, 16)
@@ -101,12 +102,19 @@ def test_a_rank_that_is_killed(tmp_path):
     assert metrics[0] == metrics[1]
 
 
+@pytest.fixture(scope="module")
+def resumed(tmp_path_factory):
+    """A run that was resumed, so that it has two checkpoints."""
+    folder = tmp_path_factory.mktemp("resumed")
+    for more in ([], ["--resume", "--steps", "20"]):
+        assert on_ranks(main, command(folder / "run", *more), folder=folder)[0] == [0, 0]
+    return folder / "run"
+
+
 @pytest.mark.parametrize("harm", ["cut short", "changed", "missing"])
-def test_a_damaged_part(tmp_path, harm):
+def test_a_damaged_part(tmp_path, resumed, harm):
     """All ranks take the checkpoint before, and say which file was no good."""
-    out = command(tmp_path / "run")
-    assert on_ranks(main, out, folder=tmp_path)[0] == [0, 0]
-    assert on_ranks(main, [*out, "--resume", "--steps", "20"], folder=tmp_path)[0] == [0, 0]
+    shutil.copytree(resumed, tmp_path / "run")
     last = checkpoint_path(tmp_path / "run")
     part = last.with_name(network_files(load_checkpoint(last).values)[1])
     data = bytearray(part.read_bytes())
@@ -115,10 +123,15 @@ def test_a_damaged_part(tmp_path, harm):
     else:
         data[-5] ^= 1
         part.write_bytes(data[: len(data) // (1 if harm == "changed" else 2)])
-    codes, texts = on_ranks(main, [*out, "--resume", "--steps", "24"], folder=tmp_path)
+    again = command(tmp_path / "run", "--resume", "--steps", "22")
+    codes, texts = on_ranks(main, again, folder=tmp_path)
     assert codes == [0, 0]
     assert "takes its place" in texts[0]
-    for file in last.parent.glob("*"):
+
+
+def test_no_checkpoint_is_left(tmp_path, resumed):
+    shutil.copytree(resumed, tmp_path / "run")
+    for file in checkpoint_path(tmp_path / "run").parent.glob("*"):
         file.write_bytes(b"")
-    codes, texts = on_ranks(main, [*out, "--resume", "--steps", "28"], folder=tmp_path)
+    codes, texts = on_ranks(main, command(tmp_path / "run", "--resume", "--steps", "28"), folder=tmp_path)
     assert codes == [1, 1] and len(complaints(texts)) == 1 and "not a readable checkpoint" in complaints(texts)[0]
