@@ -3,6 +3,9 @@
 Letters used throughout: n samples or points, k cells, d features, r rays, s samples of a ray, m packed samples, L
 octaves. Index tensors are int32. ``offsets`` is always [k + 1]: cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``
 of arrays sorted by cell.
+
+Each raises ValueError for shapes, devices, numbers out of range and an unknown backend, TypeError for dtypes, and
+`BackendUnavailable` where the named backend cannot run; what else an operation refuses stands beside it.
 """
 
 from voronerf.grids import HashGrid

@@ -46,11 +46,6 @@ def balance_centres(
     Returns:
         (centres float32 [k, 3], weights float64 [k], the mass in each cell of the returned centres).
 
-    Raises:
-        ValueError: shapes, devices, counts or an unknown backend.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
-
     Examples:
         >>> import torch
         >>> from voronerf.ops import balance_centres

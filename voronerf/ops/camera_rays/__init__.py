@@ -48,9 +48,7 @@ def camera_rays(
         (origins float32 [b, 3], directions float32 [b, 3] of unit length).
 
     Raises:
-        ValueError: shapes, devices or an unknown backend; on the CPU also cameras out of range.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: on the CPU cameras out of range.
 
     Examples:
         >>> import torch

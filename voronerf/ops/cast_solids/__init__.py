@@ -38,11 +38,6 @@ def cast_solids(
         (depths float32 [r], infinite for a ray that hits nothing; solids int32 [r], -1 for such a ray). If several
         solids are hit at the same distance, the first counts.
 
-    Raises:
-        ValueError: shapes, devices or an unknown backend.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
-
     Examples:
         >>> import torch
         >>> from voronerf.ops import cast_solids

@@ -31,11 +31,9 @@ def cell_sort(cells: Tensor, k: int, *, backend: str = "auto") -> tuple[Tensor, 
         ``offsets[c]`` to ``offsets[c + 1]``.
 
     Raises:
-        ValueError: shape, k, an unknown backend; on the CPU also a cell outside 0 to k - 1. (On a GPU and in a compiled
-            graph the values are not read. Values below 0 are then sorted before ``offsets[0]`` and values above k - 1
-            after ``offsets[k]``, to rows that belong to no cell.)
-        TypeError: dtype.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: on the CPU a cell outside 0 to k - 1. (On a GPU and in a compiled graph the values are not
+            read. Values below 0 are then sorted before ``offsets[0]`` and values above k - 1 after ``offsets[k]``, to
+            rows that belong to no cell.)
 
     Examples:
         >>> import torch

@@ -34,7 +34,6 @@ class CentreGrid:
 
     Raises:
         ValueError: tables that are not those of a grid of these centres.
-        TypeError: dtypes.
 
     Examples:
         >>> import torch
@@ -135,9 +134,7 @@ def centre_grid(centres: Tensor, *, weights: Tensor | None = None, backend: str 
         backend: "auto", "native" (CPU) or "reference" (slow, for comparison).
 
     Raises:
-        ValueError: shapes, devices, an unknown backend, or a value that is not finite.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: a value that is not finite.
 
     Examples:
         >>> import torch

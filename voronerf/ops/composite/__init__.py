@@ -51,9 +51,7 @@ def composite(
         and is not divided by the opacity.
 
     Raises:
-        ValueError: shapes, devices or an unknown backend; on the CPU also offsets that fall or exceed m.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: on the CPU offsets that fall or exceed m.
 
     Examples:
         >>> import torch

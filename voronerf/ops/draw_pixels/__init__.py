@@ -30,11 +30,6 @@ def draw_pixels(
     Returns:
         int64 [b], and float32 [b, 3] in [0, 1).
 
-    Raises:
-        ValueError: Shapes, counts, devices, an unknown backend.
-        TypeError: dtypes.
-        BackendUnavailable: The named backend cannot run here.
-
     Examples:
         >>> import torch
         >>> from voronerf.ops import draw_pixels

@@ -30,11 +30,6 @@ def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True, bac
     Returns:
         [n, d + 2 d L], or [n, 2 d L] without the input, in the dtype of x.
 
-    Raises:
-        ValueError: shape, octaves or an unknown backend.
-        TypeError: dtype.
-        BackendUnavailable: the named backend cannot run here.
-
     Examples:
         >>> import torch
         >>> from voronerf import frequency_encode

@@ -43,9 +43,7 @@ def grouped_linear(
         [n, o] in the dtype of x (of autocast, where it is on).
 
     Raises:
-        ValueError: shapes, devices, an unknown activation or backend; on the CPU also offsets that fall or exceed n.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: on the CPU offsets that fall or exceed n.
 
     Examples:
         >>> import torch

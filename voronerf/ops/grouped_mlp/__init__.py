@@ -58,10 +58,7 @@ def grouped_mlp(
         [n, layers.out_features] in the dtype of the weights (of autocast, where it is on).
 
     Raises:
-        ValueError: shapes, devices, directions that are missing, an unknown backend; on the CPU also offsets that fall
-            or exceed n, and a direction_index outside 0 to r - 1.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: on the CPU offsets that fall or exceed n, and a direction_index outside 0 to r - 1.
 
     Examples:
         >>> import torch

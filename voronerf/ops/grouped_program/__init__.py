@@ -58,9 +58,7 @@ def grouped_program(
         [n, w] for each output of the program, then [k, ...] for each of its sums over the rows of a cell.
 
     Raises:
-        ValueError: shapes, devices, an unknown backend; on the CPU also offsets that fall or exceed n.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: on the CPU offsets that fall or exceed n.
 
     Examples:
         >>> import torch

@@ -41,9 +41,7 @@ def hash_encode(
         are float64.
 
     Raises:
-        ValueError: shapes, a table of another size than the grid's, cells without several tables, an unknown backend.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: a table of another size than the grid's, cells without several tables.
 
     Examples:
         >>> import torch

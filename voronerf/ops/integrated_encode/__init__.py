@@ -31,11 +31,6 @@ def integrated_encode(means: Tensor, variances: Tensor, octaves: int, *, backend
     Returns:
         [n, 6L] in the dtype of the means.
 
-    Raises:
-        ValueError: shapes, devices, octaves or an unknown backend.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
-
     Examples:
         >>> import torch
         >>> from voronerf import integrated_encode

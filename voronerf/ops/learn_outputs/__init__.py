@@ -36,9 +36,7 @@ def learn_outputs(network: Mapping[str, Any], loss: Loss, *, backward: bool = Fa
         The loss []; with ``backward`` without gradients.
 
     Raises:
-        ValueError: As `routed_mlp`; a loss or gradient of another shape.
-        TypeError: dtypes.
-        BackendUnavailable: The named backend cannot run here.
+        ValueError: a loss or gradient of another shape.
 
     Examples:
         >>> import torch

@@ -51,10 +51,7 @@ def locate_cell(
         leaf int32 [n].
 
     Raises:
-        ValueError: shapes, devices, depth or an unknown backend; with "native" on the CPU also tables that are not a
-            tree.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: with "native" on the CPU tables that are not a tree.
 
     Examples:
         >>> import torch

@@ -76,11 +76,6 @@ def march_rays(
         March(ray_offsets, ray_index, depths, deltas, positions, stop). Floating-point arguments share one dtype, which
         is that of depths, deltas and positions.
 
-    Raises:
-        ValueError: shapes, devices, counts, an unknown spacing or backend.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
-
     Examples:
         >>> import torch
         >>> from voronerf import march_rays

@@ -44,9 +44,7 @@ def nearest_centre(
         cells int32 [n], in 0 to k - 1.
 
     Raises:
-        ValueError: shapes, devices, an unknown backend, or a grid of other centres or weights.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: a grid of other centres or weights.
 
     Examples:
         >>> import torch

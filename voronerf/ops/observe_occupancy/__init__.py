@@ -51,9 +51,7 @@ def observe_occupancy(
         backend: "auto", "reference", "native" or "warp".
 
     Raises:
-        ValueError: shapes, devices, a grid that is not contiguous, a decay out of range, an unknown backend.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: a grid that is not contiguous.
 
     Examples:
         >>> import torch

@@ -55,9 +55,7 @@ def pixel_rays(
         PixelRays(origins, directions, near, far, colour). A ray that misses the box has far == near.
 
     Raises:
-        ValueError: shapes, devices, near and far, an unknown backend; on the CPU also pixels out of range.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: on the CPU pixels out of range.
 
     Examples:
         >>> import torch

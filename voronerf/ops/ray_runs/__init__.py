@@ -55,9 +55,7 @@ def own_samples(
         OwnSamples(positions, ray_index, depths, deltas, cells, run_offsets).
 
     Raises:
-        ValueError: Shapes, devices, on the CPU cells out of range.
-        TypeError: dtypes.
-        BackendUnavailable: The named backend cannot run here.
+        ValueError: on the CPU cells out of range.
 
     Examples:
         >>> import torch
@@ -95,11 +93,6 @@ def run_sums(raw: Tensor, samples: OwnSamples, *, density_scale: float, backend:
         Sums [q, 6]: colour as if nothing were in front, optical depth, depth of the first sample, number of the ray;
         and densities [m].
 
-    Raises:
-        ValueError: Shapes, devices.
-        TypeError: dtypes.
-        BackendUnavailable: The named backend cannot run here.
-
     Examples:
         >>> import torch
         >>> from voronerf.ops import own_samples, run_sums
@@ -132,9 +125,7 @@ def compose_runs(
         the optical depth in front, and the squared error of the ray; and the part [] that these rays have in the loss.
 
     Raises:
-        ValueError: Shapes, devices, on the CPU runs of other rays.
-        TypeError: dtypes.
-        BackendUnavailable: The named backend cannot run here.
+        ValueError: on the CPU runs of other rays.
 
     Examples:
         >>> import torch
@@ -176,11 +167,6 @@ def run_gradients(
 
     Returns:
         Gradient [m, 4], and the contributions [m] of the samples to their rays.
-
-    Raises:
-        ValueError: Shapes, devices, numbers.
-        TypeError: dtypes.
-        BackendUnavailable: The named backend cannot run here.
 
     Examples:
         >>> import torch

@@ -58,10 +58,7 @@ def render_loss(
         RenderLoss(loss [], colour [r, 3], weights [m], density [m], error [r]).
 
     Raises:
-        ValueError: shapes, devices, a density_scale that is not positive, an unknown backend; on the CPU also offsets
-            that fall or exceed m.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: on the CPU offsets that fall or exceed m.
 
     Examples:
         >>> import torch
@@ -107,8 +104,6 @@ def render_loss_gradient(
 
     Raises:
         ValueError: as `render_loss`.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
 
     Examples:
         >>> import torch

@@ -35,11 +35,6 @@ def resample(
     Returns:
         depths [r, count], rising along a ray, in the dtype of the edges.
 
-    Raises:
-        ValueError: shapes, devices, count or an unknown backend.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
-
     Examples:
         >>> import torch
         >>> from voronerf import resample

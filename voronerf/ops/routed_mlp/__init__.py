@@ -108,11 +108,8 @@ def routed_mlp(
         [n].
 
     Raises:
-        ValueError: shapes, devices, directions that are missing, both or neither of tables and cells, an unknown
-            backend; on the CPU also tables that are not a tree, cells outside 0 to k - 1 and a direction_index outside
-            0 to r - 1.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: on the CPU tables that are not a tree, cells outside 0 to k - 1 and a direction_index outside 0
+            to r - 1.
 
     Examples:
         >>> import torch

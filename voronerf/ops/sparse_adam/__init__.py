@@ -59,10 +59,7 @@ def adam(
         backend: "auto", "reference" or "native".
 
     Raises:
-        ValueError: shapes, devices, a tensor that is not contiguous, lists of other lengths, numbers out of range, a
-            loss without a guard.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: a tensor that is not contiguous, lists of other lengths, a loss without a guard.
 
     Examples:
         >>> import torch
@@ -148,9 +145,7 @@ def sparse_adam(
         backend: "auto", "reference", "native" or "warp".
 
     Raises:
-        ValueError: shapes, devices, a tensor that is not contiguous, numbers out of range, an unknown backend.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: a tensor that is not contiguous.
 
     Examples:
         >>> import torch

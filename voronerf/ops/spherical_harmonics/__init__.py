@@ -31,11 +31,6 @@ def spherical_harmonics(directions: Tensor, degree: int, *, backend: str = "auto
     Returns:
         [n, degree**2] in the dtype of the directions: 1, 4, 9 or 16 values, computed in float32 at least.
 
-    Raises:
-        ValueError: shape, degree or an unknown backend.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
-
     Examples:
         >>> import torch
         >>> from voronerf import spherical_harmonics

@@ -37,9 +37,7 @@ def update_occupancy(
         (density float32 [x, y, z], occupied bool [x, y, z]).
 
     Raises:
-        ValueError: shapes, devices, a decay out of range, an unknown backend; on the CPU also cells out of range.
-        TypeError: dtypes.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: on the CPU cells out of range.
 
     Examples:
         >>> import torch
