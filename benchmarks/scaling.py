@@ -1,6 +1,8 @@
 """Weak scaling of joint training: the city grows with the ranks, four blocks for each, in processes of this machine.
 
-    python benchmarks/scaling.py --ranks 4 8 16 32 --out benchmarks/results/scaling.json --plot docs/images/scaling.png
+    python benchmarks/scaling.py --out benchmarks/results/scaling.json --plot docs/images/scaling.png
+
+With ``--device cuda`` rank n has the n-th GPU of this machine, and nccl is measured.
 
 Each rank has one territory, with so many cells and rays whatever the number of ranks. Processor time is that of the
 whole process, its messages included; a rank that waits for others takes none. With ``--territories 2 --blocks 4 4``,
@@ -15,6 +17,7 @@ import multiprocessing
 import os
 import resource
 import statistics
+import subprocess
 import tempfile
 import time
 from pathlib import Path
@@ -39,10 +42,13 @@ def rank(number: int, size: int, port: int, folder: str, options: dict[str, Any]
     from voronerf.training.joint import JointTrainer
 
     blocks = tuple(options["blocks"] or CITIES[size])
-    scene = city_scene(options["size"], blocks=blocks, train_views=20, test_views=2, images="disk")
+    scene = city_scene(options["size"], blocks=blocks, train_views=20, test_views=2, images=options["images"])
+    device = torch.device(options["device"], number if options["device"] == "cuda" else None)
     steps, last = options["steps"], options["last"]
     config = TrainConfig(
         out=Path(folder) / "run",
+        device=str(device),
+        seed=options["seed"],
         data="builtin-city",
         steps=steps,
         territories=options["territories"] or size,
@@ -56,11 +62,11 @@ def rank(number: int, size: int, port: int, folder: str, options: dict[str, Any]
         eval_views=1,
         checkpoint_every=1e9,
     )
-    with joined(torch.device("cpu")) as group:
+    with joined(device) as group:
         trainer = JointTrainer(config, scene, group=group)
         found: list[dict[str, float]] = []
         for _ in range(steps):
-            began = time.perf_counter()
+            began, rays = time.perf_counter(), trainer.rays_done
             before = time.process_time(), sum(group.sent.values()), sum(group.messages.values())
             trainer._split()
             trainer.train_step()
@@ -75,6 +81,7 @@ def rank(number: int, size: int, port: int, folder: str, options: dict[str, Any]
                     "kb": (after[1] - before[1]) / 1e3,
                     "messages": after[2] - before[2],
                     "samples": sum(trainer.work.values()),
+                    "rays": trainer.rays_done - rays,
                 }
             )
             trainer.work = dict.fromkeys(trainer.work, 0)
@@ -117,6 +124,11 @@ def measure(size: int, options: dict[str, Any]) -> dict[str, Any]:
     return row
 
 
+def _commit() -> str:
+    command = ("git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD")
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
     """Draws what a rank takes over the number of ranks, each as a multiple of that of four."""
     import matplotlib.pyplot as plt
@@ -156,6 +168,9 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=8)
     parser.add_argument("--size", type=int, default=50)
     parser.add_argument("--field", default="hashgrid")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--images", choices=("memory", "disk"), default="disk")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--territories", type=int)
     parser.add_argument("--blocks", type=int, nargs=2)
@@ -167,8 +182,8 @@ def main() -> None:
     for size in sizes:
         rows.append(measure(size, arguments))
         print({key: round(value, 3) if isinstance(value, float) else value for key, value in rows[-1].items()})
-        load = [round(value, 1) for value in os.getloadavg()]
-        out.write_text(json.dumps({"metadata": metadata(**arguments, load=load), "results": rows}, indent=1) + "\n")
+        row = metadata(**arguments, load=[round(value, 1) for value in os.getloadavg()], commit=_commit())
+        out.write_text(json.dumps({"metadata": row, "results": rows}, indent=1) + "\n")
     if drawn is not None:
         plot(rows, drawn)
 

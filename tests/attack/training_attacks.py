@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import random
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -24,7 +21,7 @@ from given import FIELDS, TINY
 from hostile import NUMBERS, TEXTS
 
 from voronerf.files import read_json_lines
-from voronerf.training.checkpoint import checkpoint_path, checkpoint_paths, last_checkpoint
+from voronerf.training.checkpoint import Checkpoint, checkpoint_path, checkpoint_paths, last_checkpoint
 from voronerf.training.config import CHOICES, TrainConfig
 
 #: The networks of a chain of interrupted trainings.
@@ -35,16 +32,10 @@ VARIANTS = (
     [*FIELDS["nerf"], "--balance", "transport", "--assignment", "stochastic"],
     [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6", "--init", "random"],
 )
-#: Those of a joint training.
-RANK_VARIANTS = (*FIELDS.values(), [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6"])
 #: What ends a training; None is a full disk.
 SIGNALS = (*[signal.SIGKILL] * 6, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGINT, None)
 #: Interruptions of a chain.
 KILLS = 5
-#: Those of a joint training of two processes, and its command.
-RANK_KILLS = 10
-TORCHRUN = [*(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")]
-TORCHRUN += ["--max-restarts", str(3 * RANK_KILLS), "-m", "voronerf", "train"]
 
 
 def killed_training(rng: random.Random, folder: Path, given: Path) -> Counter[str]:
@@ -54,73 +45,23 @@ def killed_training(rng: random.Random, folder: Path, given: Path) -> Counter[st
     options += ["--steps", str(rng.choice((30, 60))), "--checkpoint-every", rng.choice(("1e-9", "0.02", "0.1"))]
     whole, part = folder / "whole", folder / "part"
     began = time.monotonic()
-    _ends_well(_train(whole, options))
+    ends_well(train(whole, options))
     length = time.monotonic() - began
     for _ in range(KILLS):
         number = rng.choice(SIGNALS)
         if number is None:  # a disk that is full after so many bytes of a file
-            pid = _train(part, options, rng.randrange(1, 200_000))
+            pid = train(part, options, rng.randrange(1, 200_000))
         else:
-            pid = _train(part, options)
+            pid = train(part, options)
             time.sleep(rng.uniform(0, length))
             os.kill(pid, number)
         _ends(pid, number)
-    _ends_well(_train(part, options))
-    _same_runs(whole, part)
+    ends_well(train(part, options))
+    same_runs(whole, part)
     return Counter({RIGHT: KILLS})
 
 
-def killed_ranks(rng: random.Random, folder: Path, given: Path) -> Counter[str]:
-    """A joint training whose ranks are killed at random moments ends, to the bit, as one that is left alone."""
-    os.chdir(given)
-    options = [*("--data", "blender"), *TINY, *rng.choice(RANK_VARIANTS)]
-    options += ["--steps", "600", "--checkpoint-every", rng.choice(("1e-9", "0.1"))]
-    whole, began, done, runs = folder / "whole", time.monotonic(), 0, 0
-    _ended_well(_train_on_ranks(whole, options))
-    length = time.monotonic() - began
-    while done < RANK_KILLS:  # a run may end before all of them
-        part, runs = folder / f"part-{runs}", runs + 1
-        torchrun = _train_on_ranks(part, options)
-        ranks = _new_ranks(torchrun, set())
-        while ranks and done < RANK_KILLS:
-            time.sleep(rng.uniform(0, length / 2))
-            try:
-                os.kill(rng.choice(sorted(ranks)), signal.SIGKILL)
-            except ProcessLookupError:  # they have ended, or given each other up on a busy machine
-                ranks = _new_ranks(torchrun, ranks)
-                continue
-            ranks = _new_ranks(torchrun, ranks)
-            done += bool(ranks)
-        _ended_well(torchrun)
-        _same_runs(whole, part)
-    return Counter({RIGHT: done})
-
-
-def _train_on_ranks(out: Path, options: list[str]) -> subprocess.Popen[bytes]:
-    with out.with_suffix(".txt").open("wb") as said:
-        return subprocess.Popen([*TORCHRUN, "--out", str(out), *options], stdout=said, stderr=said)
-
-
-def _new_ranks(torchrun: subprocess.Popen[bytes], old: set[int]) -> set[int]:
-    """The processes of both ranks when torchrun has started others than the old ones; none when it has ended."""
-    children = Path(f"/proc/{torchrun.pid}/task/{torchrun.pid}/children")
-    while torchrun.poll() is None:
-        with contextlib.suppress(OSError):
-            ranks = {int(number) for number in children.read_text().split()} - old
-            if len(ranks) == 2:
-                return ranks
-        time.sleep(0.05)
-    return set()
-
-
-def _ended_well(torchrun: subprocess.Popen[bytes]) -> None:
-    if torchrun.wait() != 0:
-        lines = Path(torchrun.args[len(TORCHRUN) + 1]).with_suffix(".txt").read_text().splitlines()
-        said = [line for line in lines if line.startswith("voronerf: ")]
-        raise Failed(f"torchrun ended with status {torchrun.returncode}: {said}")
-
-
-def _train(out: Path, options: list[str], file_size: int | None = None) -> int:
+def train(out: Path, options: list[str], file_size: int | None = None) -> int:
     """The number of a process that begins or continues a training; files may have so many bytes."""
 
     def begin() -> int:
@@ -143,19 +84,24 @@ def _ends(pid: int, number: int | None) -> None:
         raise Failed(f"a training that got {number or 'a full disk'} ended with status {status}")
 
 
-def _ends_well(pid: int) -> None:
+def ends_well(pid: int) -> None:
     status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     if status != 0:
         raise Failed(f"a training that was left alone ended with status {status}")
 
 
-def _same_runs(whole: Path, part: Path) -> None:
-    first, second = last_checkpoint(whole), last_checkpoint(part)
-    names = first.tensors.keys() | second.tensors.keys()
-    for name in sorted(names):
+def same_tensors(first: Checkpoint, second: Checkpoint, but: Container[str] = ()) -> None:
+    """Compares the tensors of two checkpoints, but those of some names."""
+    for name in sorted(first.tensors.keys() | second.tensors.keys()):
         a, b = first.tensors.get(name), second.tensors.get(name)
-        if a is None or b is None or not torch.equal(a.nan_to_num(), b.nan_to_num()):
+        if name not in but and (a is None or b is None or not torch.equal(a.nan_to_num(), b.nan_to_num())):
             raise Failed(f"{name} differs after a resume")
+
+
+def same_runs(whole: Path, part: Path, but: Container[str] = ()) -> None:
+    """Compares two runs, but the tensors of some names."""
+    first, second = last_checkpoint(whole), last_checkpoint(part)
+    same_tensors(first, second, but)
     for key in ("step", "evaluated", "skipped", "rate_factor"):
         if first.values[key] != second.values[key]:
             raise Failed(f"{key} differs after a resume: {first.values[key]} and {second.values[key]}")

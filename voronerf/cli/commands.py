@@ -23,7 +23,7 @@ from voronerf import backends
 from voronerf.cli.board import Board
 from voronerf.cli.display import StageDisplay, TrainingDisplay, printable
 from voronerf.cli.opening import AS_IN_TRAINING, Opening, check_counts
-from voronerf.data import Scene, SceneError, load_scene
+from voronerf.data import BUILTIN, Scene, SceneError, load_scene
 from voronerf.data.process import process as make_scene
 from voronerf.distributed.group import Group, joined, local_rank, restarts, world_size
 from voronerf.distributed.same import check_same, check_same_scene
@@ -117,7 +117,10 @@ def train_on_ranks(config: TrainConfig, *, view: bool) -> int:
             raise ConfigError("--view must be off with several ranks; `voronerf view` shows their last checkpoint")
         check_joint(config, world_size())
         assert config.out is not None
-        scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
+        reading = config.reading
+        if config.images == "auto" and config.data not in BUILTIN:  # each rank reads its own of one copy
+            reading["images"] = "disk"
+        scene = load_scene(config.data, allow_outside=config.allow_outside, **reading)
         check_same_scene(group, scene)
         if group.rank == 0:  # alone, for what it writes is there already when others look
             again = restarts() > 0 and bool(checkpoint_paths(config.out))

@@ -41,6 +41,10 @@ from voronerf.step.ray_loss import Batch, Found, density_scale, why_not_fused
 LINKS, LEAST = 32, 1 / 500
 #: Steps after which territories tell all others what of them is not empty, and where their rays go; sooner at first.
 SURVEY_EVERY = 64
+#: Boxes in a box of the tree of all bounds.
+FAN = 16
+#: The most that a territory's share of the rays is above, or below, the mean.
+UNEVEN = 2.0
 
 
 @dataclass(frozen=True)
@@ -60,15 +64,25 @@ class Territory:
 
 @dataclass
 class Map:
-    """What all ranks know of all territories, 280 bytes of each.
+    """What all ranks know of all territories, 312 bytes of each; and a tree of the bounds, 26 bytes of each.
 
     Attributes:
-        bounds: [T, 2, 3], around what is not empty.
+        bounds: float32 [T, 2, 3], around what is not empty.
         links: int64 [T, LINKS], the territories that rays of each go to, and -1.
+        shares: float64 [T], of how many rays each draws, 1 in the mean: fewer where it has many of others, so that all
+            evaluate as many samples.
     """
 
     bounds: Tensor
     links: Tensor
+    shares: Tensor
+
+    def __post_init__(self) -> None:
+        self._levels = [self.bounds]
+        while len(self._levels[0]) > FAN:
+            parts = self._levels[0].split(FAN)
+            box = (torch.stack((part[:, 0].amin(0), part[:, 1].amax(0))) for part in parts)
+            self._levels.insert(0, torch.stack(list(box)))
 
     @staticmethod
     def of(boxes: Tensor, centres: Tensor) -> Map:
@@ -76,18 +90,30 @@ class Map:
         nearest = torch.cdist(centres, centres).argsort(dim=1, stable=True)[:, 1 : LINKS + 1]
         links = torch.full((len(centres), LINKS), -1)
         links[:, : nearest.shape[1]] = nearest
-        return Map(boxes.clone(), links)
+        return Map(boxes.clone(), links, torch.ones(len(boxes), dtype=torch.float64))
 
-    def met(self, rays: Rays, near: Tensor, far: Tensor, chosen: Tensor | None = None) -> Tensor:
-        """Which territories rays [r] may meet between near and far, bool [r, T]."""
-        bounds = (self.bounds if chosen is None else self.bounds[chosen]).to(near.device)
+    def met(self, rays: Rays, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+        """Which territories rays [r] may meet between near and far.
+
+        Returns:
+            Rays and territories, int64 [p] each, by territories and then rays. What is asked grows with p, and with the
+            logarithm of T.
+        """
+        ray, device = (far > near).nonzero()[:, 0], near.device
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
-        ends = (bounds[None] - rays.origins[:, None, None]) * inverse[:, None, None]
-        first, last = ends.amin(2).amax(2), ends.amax(2).amin(2)
-        whole = bounds.isinf().any(2).any(1) & (bounds[:, 0, 0] < 0)  # known to be anywhere
-        empty = bounds[:, 0, 0] > bounds[:, 1, 0]
-        crosses = torch.maximum(first, near[:, None]) < torch.minimum(last, far[:, None])
-        return (crosses | whole) & ~empty & (far > near)[:, None]
+        node = torch.zeros_like(ray)
+        for boxes in self._levels:
+            boxes, ray = boxes.to(device), ray.repeat_interleave(FAN)
+            node = (FAN * node[:, None] + torch.arange(FAN, device=device)).reshape(-1)
+            ray, node = ray[node < len(boxes)], node[node < len(boxes)]
+            box = boxes[node]
+            ends = (box - rays.origins[ray, None]) * inverse[ray, None]
+            first, last = ends.amin(1).amax(1), ends.amax(1).amin(1)
+            meets = torch.maximum(first, near[ray]) < torch.minimum(last, far[ray])
+            meets &= box[:, 0, 0] <= box[:, 1, 0]  # not empty
+            ray, node = ray[meets], node[meets]
+        order = (node * len(near) + ray).argsort()
+        return ray[order], node[order]
 
 
 class JointLoss:
@@ -106,25 +132,32 @@ class JointLoss:
     ) -> None:
         self.group, self.territories, self.owner = group, dict(territories), list(owner)
         self.map, self.sightings = known, sightings
-        #: For each own territory how many of its rays met each, and had not ended, and last the rays that it drew.
-        self.wanted = {number: torch.zeros(len(owner) + 1, dtype=torch.int64) for number in territories}
+        #: For each own territory how many of its rays met each, and had not ended; last its rays, and its samples.
+        self.wanted = {number: torch.zeros(len(owner) + 2, dtype=torch.int64) for number in territories}
+        self.routes = self._routes()
 
     def survey(self, step: int) -> None:
         """At some steps, all territories tell what of them is not empty, and where their rays go."""
         if step % SURVEY_EVERY and (step > SURVEY_EVERY or step & (step - 1)):
             return
-        record = torch.zeros(len(self.owner), 6 + LINKS, dtype=torch.float64, device=self.group.device)
+        record = torch.zeros(len(self.owner), 7 + LINKS, dtype=torch.float64, device=self.group.device)
         for number, territory in self.territories.items():
-            *counts, rays = self.wanted[number].tolist()
+            *counts, rays, samples = self.wanted[number].tolist()
             links = self.map.links[number].tolist()
             if rays:
                 many = [other for other, n in enumerate(counts) if n > LEAST * rays and other != number]
                 links = sorted(sorted(many, key=lambda other: -counts[other])[:LINKS])
             record[number, :6] = territory.place.bounds(territory.renderer.occupancy).reshape(-1)
-            record[number, 6:] = torch.tensor((links + [-1] * LINKS)[:LINKS])
+            record[number, 6] = samples
+            record[number, 7:] = torch.tensor((links + [-1] * LINKS)[:LINKS])
             self.wanted[number].zero_()
         record = self.group.total(record).cpu()
-        self.map = Map(record[:, :6].reshape(-1, 2, 3).float(), record[:, 6:].long())
+        shares, samples = self.map.shares, record[:, 6]
+        if bool((samples > 0).all()):
+            shares = (shares * samples.mean() / samples).clamp(1 / UNEVEN, UNEVEN)
+            shares = shares / shares.mean()
+        self.map = Map(record[:, :6].reshape(-1, 2, 3).float(), record[:, 7:].long(), shares)
+        self.routes = self._routes()
 
     def run(self, batches: Mapping[int, Batch], *, backward: bool = False) -> dict[int, Found]:
         """The loss and what was found, for each own territory.
@@ -139,8 +172,7 @@ class JointLoss:
 
         def travel() -> None:
             parts, rows, learnt = self._leave(homes, batches)
-            routes = self._routes()
-            came = send(self.group, "rays", 8 + (self.sightings > 0), parts, routes)
+            came = send(self.group, "rays", 8 + (self.sightings > 0), parts, self.routes)
             sizes: dict[int, list[tuple[Any, int]]] = {n: [] for n in self.territories}
             for key, table in came.items():
                 sizes[key[1]].append((key, len(table)))
@@ -149,27 +181,30 @@ class JointLoss:
                     table = torch.cat([came[key] for key, _ in sizes[number]])
                     seen = table[:, 8] if self.sightings else None
                     guests[number] = _Pass(territory, _batch(table, seen), **given)
-            _nest(list(guests.values()), lambda: compose_all(sizes, rows, learnt, routes))
+            _nest(list(guests.values()), lambda: compose_all(sizes, rows, learnt))
 
-        def compose_all(sizes: Any, rows: Any, learnt: Any, routes: list[Route]) -> None:
+        def compose_all(sizes: Any, rows: Any, learnt: Any) -> None:
             width = 6 + int(self.sightings > 0)
             sums: dict[Any, Tensor] = {}
             for number, own in sizes.items():
                 if own:
                     sums.update(guests[number].parted(own))
-            back = [route.back() for route in routes]
+            back = [route.back() for route in self.routes]
             answers: dict[Any, Tensor] = {}
             came = send(self.group, "sums", width, sums, back)
             for number, home in homes.items():
                 keys = [key for key in came if key[0] == number]
                 answers.update(self._compose(home, batches[number], {k: came[k] for k in keys}, rows, learnt[number]))
-            told = send(self.group, "answers", width, answers, routes)
+            told = send(self.group, "answers", width, answers, self.routes)
             for number, own in sizes.items():
                 if own:
                     guests[number].answers = torch.cat([told[key] for key, _ in own])
 
         _nest(list(homes.values()), travel)
-        return {n: _together(homes.get(n), guests.get(n)) for n in self.territories if n in homes or n in guests}
+        found = {n: _together(homes.get(n), guests.get(n)) for n in self.territories if n in homes or n in guests}
+        for number, each in found.items():
+            self.wanted[number][-1] += len(each.weights)
+        return found
 
     def _routes(self) -> list[Route]:
         """From each territory to those that its rays go to, where one of the two is here."""
@@ -185,19 +220,22 @@ class JointLoss:
         """The rays that go on: their tables and numbers by (from, to); and for each batch the rays that are learnt."""
         parts, rows, learnt = {}, {}, {}
         for number, home in homes.items():
-            batch = batches[number]
-            met = self.map.met(batch.rays, batch.near, torch.minimum(batch.far, home.end))
-            met[:, number] = False
-            self.wanted[number][:-1] += met.sum(0).cpu()
-            self.wanted[number][-1] += len(met)
-            links = [other for other in self.map.links[number].tolist() if other >= 0]
-            strange = met.sum(1) > met[:, links].sum(1)  # where few of the rays go, they are not learnt from
-            learnt[number] = ~strange
-            table = self._table(batch)
-            for other in links:
-                chosen = (met[:, other] & ~strange).nonzero()[:, 0]
-                rows[number, other] = chosen
-                parts[number, other] = table[chosen]
+            batch, count = batches[number], len(self.owner)
+            ray, other = self.map.met(batch.rays, batch.near, torch.minimum(batch.far, home.end))
+            ray, other = ray[other != number], other[other != number]
+            each = torch.bincount(other, minlength=count)
+            self.wanted[number][:count] += each.cpu()
+            self.wanted[number][count] += len(batch.rays)
+            links = [link for link in self.map.links[number].tolist() if link >= 0]
+            linked = torch.zeros(count, dtype=torch.bool, device=ray.device)
+            linked[links] = True
+            learnt[number] = torch.ones(len(batch.rays), dtype=torch.bool, device=ray.device)
+            learnt[number][ray[~linked[other]]] = False  # where few of the rays go, they are not learnt from
+            table, ends = self._table(batch), each.cumsum(0).tolist()
+            for link in links:
+                chosen = ray[(ends[link - 1] if link else 0) : ends[link]]
+                rows[number, link] = chosen[learnt[number][chosen]]
+                parts[number, link] = table[rows[number, link]]
         return parts, rows, learnt
 
     def _table(self, batch: Batch) -> Tensor:
@@ -453,16 +491,13 @@ def see_together(joint: JointLoss, rays: Rays, near: Tensor, far: Tensor, backgr
         far: [r].
         background: [3] or [r, 3], or None.
     """
-    group, ranks = joint.group, range(joint.group.size)
-    met = joint.map.met(rays, near, far)
+    group = joint.group
+    ray, other = joint.map.met(rays, near, far)
     table = torch.cat((rays.origins, rays.directions, near[:, None], far[:, None]), 1)
-    rows = {(group.rank, number): met[:, number].nonzero()[:, 0] for number in range(len(joint.owner))}
-    routes = [
-        Route(rank, owner, (rank, number))
-        for rank in ranks
-        for number, owner in enumerate(joint.owner)
-        if group.rank in (rank, owner)
-    ]
+    each = ray.split(torch.bincount(other, minlength=len(joint.owner)).tolist())
+    rows = {(group.rank, number): chosen for number, chosen in enumerate(each)}
+    routes = [Route(group.rank, owner, (group.rank, number)) for number, owner in enumerate(joint.owner)]
+    routes += [Route(r, group.rank, (r, n)) for r in range(group.size) if r != group.rank for n in joint.territories]
     parts = {key: table[chosen] for key, chosen in rows.items()}
     came = send(group, "rays of pictures", 8, parts, routes)
     sums = {key: _pictured(joint.territories[key[1]], part) for key, part in came.items()}

@@ -55,7 +55,7 @@ class TrainConfig:
     images: Literal["auto", "memory", "disk"] = "auto"
     """Keep the images of a scene folder or city in memory, or on disk: decoded once into a file of the cache
     (VORONERF_CACHE, or voronerf in the user's caches), from which the pixels of each step are read. auto is on disk for
-    what does not fit into memory."""
+    what does not fit into memory, and with several processes."""
     allow_outside: bool = False
     """Also read images that lie outside of the scene folder, which it may name by .., an absolute path or a link."""
     out: Path | None = None

@@ -270,7 +270,7 @@ class JointTrainer:
                 trainer.step, trainer.seconds, trainer.rate_factor = self.step, self.seconds, self.rate_factor
                 trainer.draws.manual_seed((trainer.config.seed * 6364136223846793005 + self.step) % 2**63)
                 trainer.prepare()
-                batches[number] = trainer.draw()
+                batches[number] = trainer.draw(float(self.joint.map.shares[number]))
             with first.precision():
                 found = self.joint.run(batches, backward=self.config.precision == "fp32")
             self._losses = 0.0
@@ -506,7 +506,8 @@ class JointTrainer:
             threads=torch.get_num_threads(),
         )
         known = self.joint.map
-        tensors = {"joint.bounds": known.bounds, "joint.links": known.links, "joint.owner": torch.tensor(self.owner)}
+        tensors = {"joint.bounds": known.bounds, "joint.links": known.links, "joint.shares": known.shares}
+        tensors["joint.owner"] = torch.tensor(self.owner)
         paths = [part_path(self.out, token, number) for number in range(len(self.owner))]
         values = {**asdict(stored), "stages": list(stored.stages)}
         index = functools.partial(self._index, Checkpoint(tensors, values), paths)
@@ -573,7 +574,8 @@ class JointTrainer:
             failed = torch.tensor(float(failure is not None), device=self.group.device)
             if self.group.largest(failed) == 0:
                 assert index is not None
-                self._take(parts, Map(index.tensors["joint.bounds"].clone(), index.tensors["joint.links"].clone()))
+                names = "bounds", "links", "shares"
+                self._take(parts, Map(*(index.tensors[f"joint.{name}"].clone() for name in names)))
                 self._continue(values)
                 if errors:
                     self.say(f"{errors[0]}; {path.name} takes its place")

@@ -375,9 +375,10 @@ class Trainer:
             found = self.learner.run(batch, self.draws, backward=self.config.precision == "fp32")
         return self.learn(found)
 
-    def draw(self) -> Batch:
-        """The batch of a step."""
-        return self.batches.draw(self.rays, self.draws, random_background=self.config.background == "random")
+    def draw(self, share: float = 1.0) -> Batch:
+        """The batch of a step; ``share`` is a factor on its rays."""
+        rays = max(1, round(share * self.rays))
+        return self.batches.draw(rays, self.draws, random_background=self.config.background == "random")
 
     def precision(self) -> AbstractContextManager[Any]:
         """In which the networks are asked."""
