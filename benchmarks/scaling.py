@@ -36,13 +36,16 @@ def rank(number: int, size: int, port: int, folder: str, options: dict[str, Any]
     os.environ |= {"RANK": str(number), "LOCAL_RANK": str(number), "WORLD_SIZE": str(size)}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "TORCHELASTIC_USE_AGENT_STORE": "True"}
     torch.set_num_threads(options["threads"])
-    from voronerf.data import city_scene
+    from voronerf.data import city_scene, load_scene
     from voronerf.distributed.group import joined
     from voronerf.training.config import TrainConfig
     from voronerf.training.joint import JointTrainer
 
     blocks = tuple(options["blocks"] or CITIES[size])
-    scene = city_scene(options["size"], blocks=blocks, train_views=20, test_views=2, images=options["images"])
+    if options["data"] is None:
+        scene = city_scene(options["size"], blocks=blocks, train_views=20, test_views=2, images=options["images"])
+    else:
+        scene = load_scene(options["data"], downscale=options["downscale"])
     device = torch.device(options["device"], number if options["device"] == "cuda" else None)
     steps, last = options["steps"], options["last"]
     config = TrainConfig(
@@ -174,6 +177,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--territories", type=int)
     parser.add_argument("--blocks", type=int, nargs=2)
+    parser.add_argument("--data", help="another scene than the city")
+    parser.add_argument("--downscale", type=int)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--plot", type=Path)
     arguments = vars(parser.parse_args())

@@ -15,12 +15,16 @@ from pathlib import Path
 
 from attempts import REFUSED, RIGHT, Failed
 from given import FIELDS, TINY
-from training_attacks import ends_well, same_runs, same_tensors, train
+from training_attacks import same_runs, same_tensors
 
 from voronerf.training.checkpoint import checkpoint_path, checkpoint_paths, load_checkpoint, network_files
 
 #: The networks of a joint training, which has four territories.
-VARIANTS = (*FIELDS.values(), [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6"])
+VARIANTS = (
+    *FIELDS.values(),
+    [*FIELDS["hashgrid"], "--contraction", "sphere"],
+    [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6"],
+)
 #: Of a chain: ranks that are killed, stopped for good, and stopped for as many seconds.
 FAULTS = {"kill": 6, "stop": 6, "pause": 2}
 PAUSE = 1.5
@@ -77,18 +81,19 @@ class Ranks:
             raise Failed(f"ranks that are to say {sign!r} ended with status {status}: {lines}")
 
 
-def harmed_ranks(rng: random.Random, folder: Path, given: Path) -> Counter[str]:
+def harmed_ranks(rng: random.Random, folder: Path, _given: Path) -> Counter[str]:
     """Whatever happens to a rank, one line tells of it, and the run ends, to the bit, as that of one process."""
-    os.chdir(given)
-    options = [*("--data", "blender"), *TINY, *rng.choice(VARIANTS), "--territories", "4"]
-    options += ["--steps", "600", "--checkpoint-every", rng.choice(("1e-9", "0.1"))]
-    whole = folder / "whole"
-    ends_well(train(whole, options))
-    count = Counter({RIGHT: _ended_ranks(rng, folder, whole, options)})
+    options = [*("--data", "builtin", "--downscale", "8"), *TINY, *rng.choice(VARIANTS), "--territories", "4"]
+    options += ["--steps", "300", "--checkpoint-every", rng.choice(("1e-9", "0.1"))]
+    whole, began = folder / "whole", time.monotonic()
+    Ranks(whole, 1, options).ends_well()
+    count = Counter({RIGHT: _ended_ranks(rng, folder, whole, options, time.monotonic() - began)})
     part = folder / "part"
     Ranks(part, 2, [*options, "--panels", "1"], rank=1, file_size=20_000).is_refused("File too large")
     size = rng.choice((2, 3, 4))
-    Ranks(part, size, [*options, *_again(part)], rank=size - 1, options=["--data", "capture"]).is_refused("the scene")
+    Ranks(part, size, [*options, *_again(part)], rank=size - 1, options=["--data", "builtin-rich"]).is_refused(
+        "the scene"
+    )
     Ranks(part, size, [*options, *_again(part)], rank=1, options=["--seed", "1"]).is_refused("--seed must be the same")
     harmed = _damage(rng, part)
     ranks = Ranks(part, size, [*options, *_again(part)])
@@ -99,8 +104,8 @@ def harmed_ranks(rng: random.Random, folder: Path, given: Path) -> Counter[str]:
     return count + Counter({REFUSED: 3, RIGHT: 1})
 
 
-def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[str]) -> int:
-    """Ends ranks at random moments, which torchrun starts again; how many."""
+def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[str], length: float) -> int:
+    """Ends ranks at random moments of a start, which takes ``length``, and torchrun starts again; how many."""
     faults = list(Counter(FAULTS).elements())
     rng.shuffle(faults)
     done, runs = 0, 0
@@ -109,7 +114,7 @@ def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[st
         ranks = Ranks(part, rng.choice((2, 3, 4)), options, restarts=3 * len(faults))
         numbers = ranks.started(set())
         while numbers and faults:
-            time.sleep(rng.uniform(0, 8))
+            time.sleep(rng.uniform(0, length))
             fault, chosen, before = faults[-1], rng.choice(sorted(numbers)), len(ranks.complaints)
             began = time.monotonic()
             try:

@@ -45,23 +45,23 @@ def killed_training(rng: random.Random, folder: Path, given: Path) -> Counter[st
     options += ["--steps", str(rng.choice((30, 60))), "--checkpoint-every", rng.choice(("1e-9", "0.02", "0.1"))]
     whole, part = folder / "whole", folder / "part"
     began = time.monotonic()
-    ends_well(train(whole, options))
+    _ends_well(_train(whole, options))
     length = time.monotonic() - began
     for _ in range(KILLS):
         number = rng.choice(SIGNALS)
         if number is None:  # a disk that is full after so many bytes of a file
-            pid = train(part, options, rng.randrange(1, 200_000))
+            pid = _train(part, options, rng.randrange(1, 200_000))
         else:
-            pid = train(part, options)
+            pid = _train(part, options)
             time.sleep(rng.uniform(0, length))
             os.kill(pid, number)
         _ends(pid, number)
-    ends_well(train(part, options))
+    _ends_well(_train(part, options))
     same_runs(whole, part)
     return Counter({RIGHT: KILLS})
 
 
-def train(out: Path, options: list[str], file_size: int | None = None) -> int:
+def _train(out: Path, options: list[str], file_size: int | None = None) -> int:
     """The number of a process that begins or continues a training; files may have so many bytes."""
 
     def begin() -> int:
@@ -84,7 +84,7 @@ def _ends(pid: int, number: int | None) -> None:
         raise Failed(f"a training that got {number or 'a full disk'} ended with status {status}")
 
 
-def ends_well(pid: int) -> None:
+def _ends_well(pid: int) -> None:
     status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     if status != 0:
         raise Failed(f"a training that was left alone ended with status {status}")

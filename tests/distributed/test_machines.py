@@ -12,6 +12,7 @@ from test_faults import command
 from voronerf.cli import main
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has more than one loopback address")
 def test_two_machines_train_as_one_process(tmp_path):
     """Each finds the rendezvous at the address of the first; the run ends as that of one process, bit for bit."""

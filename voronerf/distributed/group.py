@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -86,6 +87,7 @@ class Group:
             # torchrun keeps one store for all starts: a rank would find the addresses of those that were killed.
             self.store = dist.PrefixStore(f"voronerf/{restarts()}", store)
             dist.init_process_group(backend, store=self.store, rank=rank, world_size=size, timeout=timeout)
+        _let_gloo_wait()
 
     @contextlib.contextmanager
     def _waiting(self) -> Iterator[None]:
@@ -189,6 +191,20 @@ class Group:
             with self._waiting():
                 dist.broadcast_object_list(box, src=0)
         return box[0]
+
+
+def _let_gloo_wait() -> None:
+    """Lets gloo's threads preempt no other, which takes a millisecond off each exchange where ranks share a core.
+
+    A message wakes gloo's thread. Where that preempts the one that trains, while this has the lock of the connection,
+    it spins until its time is over.
+    """
+    if not hasattr(os, "SCHED_BATCH"):
+        return
+    for thread in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(OSError):
+            if "gloo" in (thread / "comm").read_text():
+                os.sched_setscheduler(int(thread.name), os.SCHED_BATCH, os.sched_param(0))
 
 
 def _message(rows: Tensor, room: int) -> Tensor:
