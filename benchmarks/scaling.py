@@ -12,6 +12,7 @@ whole process, its messages included; a rank that waits for others takes none. W
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import multiprocessing
 import os
@@ -45,7 +46,7 @@ def rank(number: int, size: int, port: int, folder: str, options: dict[str, Any]
     if options["data"] is None:
         scene = city_scene(options["size"], blocks=blocks, train_views=20, test_views=2, images=options["images"])
     else:
-        scene = load_scene(options["data"], downscale=options["downscale"])
+        scene = load_scene(options["data"], downscale=options["downscale"], images=options["images"])
     device = torch.device(options["device"], number if options["device"] == "cuda" else None)
     steps, last = options["steps"], options["last"]
     config = TrainConfig(
@@ -118,6 +119,7 @@ def measure(size: int, options: dict[str, Any]) -> dict[str, Any]:
         found = [json.loads(Path(folder, f"{n}.json").read_text()) for n in range(size)]
     row: dict[str, Any] = {
         "ranks": size,
+        "seed": options["seed"],
         "blocks": list(options["blocks"] or CITIES[size]),
         "wall_s": time.monotonic() - began,
     }
@@ -137,7 +139,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     first = next(row for row in rows if row["ranks"] == 4)
-    shown = [row for row in rows if row["ranks"] >= 4]
+    shown = [row for row in rows if row["ranks"] >= 4 and row["seed"] == first["seed"]]
     figure, axes = plt.subplots(figsize=(6, 3.4))
     names = {
         "ms": "processor time, median",
@@ -165,13 +167,13 @@ def main() -> None:
     """Measures, and writes a file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ranks", type=int, nargs="+", default=list(CITIES))
-    parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--last", type=int, default=100, help="steps that count")
+    parser.add_argument("--steps", type=int, default=320)
+    parser.add_argument("--last", type=int, default=48, help="steps that count")
     parser.add_argument("--rays", type=int, default=256)
     parser.add_argument("--cells", type=int, default=8)
     parser.add_argument("--size", type=int, default=50)
     parser.add_argument("--field", default="hashgrid")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--images", choices=("memory", "disk"), default="disk")
     parser.add_argument("--threads", type=int, default=1)
@@ -184,8 +186,8 @@ def main() -> None:
     arguments = vars(parser.parse_args())
     out, sizes, drawn = arguments.pop("out"), arguments.pop("ranks"), arguments.pop("plot")
     rows = []
-    for size in sizes:
-        rows.append(measure(size, arguments))
+    for seed, size in itertools.product(arguments["seeds"], sizes):
+        rows.append(measure(size, {**arguments, "seed": seed}))
         print({key: round(value, 3) if isinstance(value, float) else value for key, value in rows[-1].items()})
         row = metadata(**arguments, load=[round(value, 1) for value in os.getloadavg()], commit=_commit())
         out.write_text(json.dumps({"metadata": row, "results": rows}, indent=1) + "\n")

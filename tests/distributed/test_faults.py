@@ -4,12 +4,14 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 from unittest import mock
 
 import pytest
 from ranks import joint_tensors, new_store, on_ranks
 
 from voronerf.cli import main
+from voronerf.distributed import group
 from voronerf.training.checkpoint import checkpoint_path, load_checkpoint, network_files
 from voronerf.training.joint import JointTrainer
 
@@ -33,6 +35,21 @@ def dies(args, step):
         return real(self)
 
     with mock.patch.object(JointTrainer, "train_step", train_step):
+        return main(args)
+
+
+def stops(args, answered):
+    """Stops rank 1, in a step for a second, and later until it is killed; ranks wait for each other ``answered`` s."""
+    real = JointTrainer.train_step
+
+    def train_step(self):
+        later = {5: "sleep 1; kill -CONT", 19: f"sleep {answered + 4}; kill -KILL"}.get(self.step)
+        if later and os.environ["RANK"] == "1":
+            subprocess.Popen(["sh", "-c", f"{later} {os.getpid()}"])
+            os.kill(os.getpid(), signal.SIGSTOP)
+        return real(self)
+
+    with mock.patch.object(JointTrainer, "train_step", train_step), mock.patch.object(group, "PATIENCE", answered):
         return main(args)
 
 
@@ -100,6 +117,16 @@ def test_a_rank_that_is_killed(tmp_path):
     assert first.keys() == second.keys() and all(first[name].equal(second[name]) for name in first)
     metrics = [json.loads((tmp_path / run / "summary.json").read_text())["psnr"] for run in ("whole", "run")]
     assert metrics[0] == metrics[1]
+
+
+@pytest.mark.slow
+def test_a_rank_that_is_stopped(tmp_path):
+    """For a second, which is no fault; and for good, which the other tells when it has waited long enough."""
+    out = command(tmp_path / "run", "--checkpoint-every", "1e-6", "--steps", "24")
+    codes, texts = on_ranks(stops, out, 8, folder=tmp_path)
+    assert codes == [1, -signal.SIGKILL]
+    assert len(complaints(texts)) == 1 and "has not answered for 8 s" in complaints(texts)[0]
+    assert load_checkpoint(checkpoint_path(tmp_path / "run")).values["step"] in (8, 16)
 
 
 @pytest.fixture(scope="module")

@@ -99,21 +99,25 @@ class Map:
             Rays and territories, int64 [p] each, by territories and then rays. What is asked grows with p, and with the
             logarithm of T.
         """
-        ray, device = (far > near).nonzero()[:, 0], near.device
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
-        node = torch.zeros_like(ray)
-        for boxes in self._levels:
-            boxes, ray = boxes.to(device), ray.repeat_interleave(FAN)
-            node = (FAN * node[:, None] + torch.arange(FAN, device=device)).reshape(-1)
+        tops, *levels = (boxes.to(near.device) for boxes in self._levels)
+        ends = rays.origins[:, None], inverse[:, None], near[:, None], far[:, None]
+        ray, node = _meets(tops, *ends).nonzero(as_tuple=True)
+        for boxes in levels:
+            ray, node = ray.repeat_interleave(FAN), FAN * node[:, None] + torch.arange(FAN, device=node.device)
+            node = node.reshape(-1)
             ray, node = ray[node < len(boxes)], node[node < len(boxes)]
-            box = boxes[node]
-            ends = (box - rays.origins[ray, None]) * inverse[ray, None]
-            first, last = ends.amin(1).amax(1), ends.amax(1).amin(1)
-            meets = torch.maximum(first, near[ray]) < torch.minimum(last, far[ray])
-            meets &= box[:, 0, 0] <= box[:, 1, 0]  # not empty
-            ray, node = ray[meets], node[meets]
+            kept = _meets(boxes[node], rays.origins[ray], inverse[ray], near[ray], far[ray])
+            ray, node = ray[kept], node[kept]
         order = (node * len(near) + ray).argsort()
         return ray[order], node[order]
+
+
+def _meets(boxes: Tensor, origins: Tensor, inverse: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    """Whether rays, by the inverse of their directions, meet boxes [..., 2, 3] that are not empty."""
+    low, high = ((boxes[..., end, :] - origins) * inverse for end in (0, 1))
+    first, last = torch.minimum(low, high).amax(-1), torch.maximum(low, high).amin(-1)
+    return (torch.maximum(first, near) < torch.minimum(last, far)) & (boxes[..., 0, 0] <= boxes[..., 1, 0])
 
 
 class JointLoss:
