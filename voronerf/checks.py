@@ -66,29 +66,28 @@ def check_shape(
     """
     check_tensor(op, name, tensor)
     known = {} if sizes is None else sizes
-    # Letters met for the first time, kept apart because an error names the ones known before. Each size is read once: a
-    # small network takes no longer than a few dozen checks.
-    found: dict[str, int] = {}
-    came = tensor.shape
+    before, came = len(known), tensor.shape
     fits = len(came) == len(shape)
     if fits:
+        # Each size is read once: a small network takes no longer than a few dozen checks.
         for entry, size in zip(shape, came):
             if isinstance(entry, int):
                 fits = size == entry
+            elif entry in known:
+                fits = size == known[entry]
+            elif entry[-2:] == "+1":
+                fits = size >= 1 and size - 1 == known.setdefault(entry[:-2], size - 1)
             else:
-                letter, extra = (entry[:-2], 1) if entry[-2:] == "+1" else (entry, 0)
-                bound = known if letter in known else found
-                fits = size == bound.setdefault(letter, size - extra) + extra and size >= extra
+                known[entry] = size
             if not fits:
                 break
     if not fits:
         # Only in case of an error, because torch.compile cannot turn a symbolic size into text.
         wanted = [str(entry) for entry in shape]
         letters = dict.fromkeys(entry.removesuffix("+1") for entry in wanted)
-        values = ", ".join(f"{letter} = {known[letter]}" for letter in letters if letter in known)
+        values = ", ".join(f"{letter} = {known[letter]}" for letter in letters if letter in list(known)[:before])
         rule = f"[{', '.join(wanted)}]" + (f" with {values}" if values else "")
         raise ValueError(f"{op}: {name} must have shape {rule}, got {list(tensor.shape)}")
-    known.update(found)
 
 
 def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype] = FLOATING) -> None:
@@ -186,7 +185,10 @@ class Checked:
 
     def no_inference(self) -> None:
         """`check_no_inference` of all tensors."""
-        check_no_inference(self.op, **self.tensors)
+        if torch.is_grad_enabled() and not torch.compiler.is_compiling():
+            for tensor in self.tensors.values():
+                if tensor.is_inference():
+                    check_no_inference(self.op, **self.tensors)
 
 
 def check_writable(op: str, name: str, tensor: Tensor) -> None:

@@ -137,25 +137,29 @@ class Op:
     def __init__(
         self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], structs: Structs, listed: bool
     ) -> None:
-        self._op, self._run, self._devices, self.structs, self._listed = op, run, devices, structs, listed
+        self._op, self._run, self._on_cuda, self.structs, self._listed = op, run, "cuda" in devices, structs, listed
         self._function: Any = None
         self.__name__ = ""
 
     def __call__(self, *arguments: Any) -> Any:
         """What the op gives."""
         flat = self.structs.flat(arguments)
-        if torch.compiler.is_compiling():
+        if torch.compiler.is_dynamo_compiling():
             return self._op(*flat)
         for listens in _LISTENERS:
             if listens():
                 return self._op(*flat)
-        tensors = [flat[place] for place in self.structs.tensors if flat[place] is not None]
+        tensors = [flat[place] for place in self.structs.tensors]
         for place in self.structs.lists:
-            tensors += [entry for entry in flat[place] if entry is not None]
+            tensors += flat[place]
+        learns = False
         for tensor in tensors:
-            if type(tensor) not in _PLAIN or tensor.device.type not in self._devices:
-                return self._op(*flat)
-        if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
+            if tensor is not None:
+                here = tensor.is_cpu or (tensor.is_cuda and self._on_cuda)
+                if not here or type(tensor) not in _PLAIN:  # fake tensors of other tracers among them
+                    return self._op(*flat)
+                learns = learns or tensor.requires_grad
+        if not (learns and torch.is_grad_enabled()):
             return self._run(*arguments)
         if self._function is None:
             return self._op(*flat)
@@ -222,14 +226,14 @@ def in_float32(op: Op, given: tuple[Any, ...]) -> Any:
     """What an op gives that computes in float32, in the dtype of the tensors it is given.
 
     Args:
-        op: of floating-point tensors of one dtype; its results are a tensor or a tuple of them.
+        op: of floating-point tensors of one dtype, the first argument among them; its results are a tensor or a tuple
+            of them.
         given: its arguments or, as a named tuple, its only one.
     """
-    narrow = next(part.dtype for part in given if isinstance(part, Tensor) and part.is_floating_point())
-    if narrow is not torch.float32:
-        wide = [part.float() if isinstance(part, Tensor) and part.is_floating_point() else part for part in given]
-        given = type(given)._make(wide) if hasattr(given, "_make") else tuple(wide)
-    found = op(given) if hasattr(given, "_make") else op(*given)
-    if narrow is torch.float32:
-        return found
+    alone = hasattr(given, "_make")
+    if given[0].dtype is torch.float32:
+        return op(given) if alone else op(*given)
+    narrow = given[0].dtype
+    wide = [part.float() if isinstance(part, Tensor) and part.is_floating_point() else part for part in given]
+    found = op(type(given)._make(wide)) if alone else op(*wide)  # type: ignore[attr-defined]
     return found.to(narrow) if isinstance(found, Tensor) else tuple(part.to(narrow) for part in found)
