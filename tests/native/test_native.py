@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads, refuses
+from helpers import refuses
 from torch import Tensor
 
 from voronerf import backends, cell_sort, locate_cell, nearest_centre
@@ -120,14 +120,6 @@ def test_nearest_of_mixed_and_half_types_and_strided_tensors(isa: str) -> None:
     for dtype in (torch.float16, torch.bfloat16, torch.float64):
         chosen(points.to(dtype), centres)
         chosen(points, centres.to(dtype), weights)
-
-
-def test_threads_do_not_change_a_bit() -> None:
-    points, centres, cells = torch.rand(10 * BLOCK + 1, 3), torch.rand(50, 3), torch.randint(0, 50, (10 * BLOCK + 1,))
-    tree = random_tree((4, 3))
-    on_any_number_of_threads(lambda: [nearest_centre(points, centres, backend="native")])
-    on_any_number_of_threads(lambda: cell_sort(cells.int(), 50, backend="native"))
-    on_any_number_of_threads(lambda: [locate_cell(points, **tree, backend="native")])
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 255, 256, 257, 5000])

@@ -39,17 +39,6 @@ def test_any_number_of_rays(isa: str, counts: list[int]) -> None:
     assert_close(scene(counts, background="all", outside=(7, 1)))
 
 
-def test_only_the_gradients_asked_for() -> None:
-    cast, leaves = leaves_of(dense(6, 21), torch.float32)
-    full = torch.autograd.grad(sum(part.sum() for part in composite(**cast, backend="native")), leaves)
-    for chosen in ([0], [1], [2], [3], [4], [0, 1], [1, 2, 4]):
-        for index, tensor in enumerate(leaves):
-            tensor.requires_grad_(index in chosen)
-        total = sum(part.sum() for part in composite(**cast, backend="native"))
-        some = torch.autograd.grad(total, [leaves[index] for index in chosen])
-        assert all(torch.equal(full[index], gradient) for index, gradient in zip(chosen, some))
-
-
 @pytest.mark.parametrize("c", [3, 2])
 def test_same_bits_for_any_number_of_threads(isa: str, c: int) -> None:
     packed = scene([0, 5000, 1, 9000, *[70] * 100], c, "all", outside=(5, 9))
@@ -77,27 +66,6 @@ def test_huge_densities(isa: str, density: float) -> None:
     assert (found[3][:, 13:] < 1e-10).all()
 
 
-def test_every_output_is_written(request: pytest.FixtureRequest) -> None:
-    cases = [scene([0, 50, 13, 0, 200], 3, "ray", (4, 6)), scene([3, 0, 9], 2, "all", (1, 1)), dense(3, 5, 4, "all")]
-    cases += [dense(2, 0), scene([0, 0], 3, "all", (2, 3))]
-    wanted = [evaluate(given, torch.float32, "native", ("colour",)) for given in cases]
-    guards = request.getfixturevalue("poisoned")
-    for given, want in zip(cases, wanted):
-        assert all(torch.equal(a, b) for a, b in zip(want, evaluate(given, torch.float32, "native", ("colour",))))
-    assert len(guards) > 40
-
-
-def test_expanded_gradients() -> None:
-    given, _ = leaves_of(dense(4, 9), torch.float32)
-    leaf = torch.rand(4, 9, requires_grad=True)
-    result = composite(**{**given, "sigma": leaf}, backend="native")
-    expanded, same = (
-        torch.autograd.grad(result.weights, leaf, slope, retain_graph=True)[0]
-        for slope in (torch.ones(1, 1).expand(4, 9), torch.ones(4, 9))
-    )
-    assert torch.equal(expanded, same)
-
-
 @pytest.mark.parametrize("form", ["dense", "packed"])
 @pytest.mark.parametrize("parts", [("colour",), ("depth",), PARTS])
 def test_second_derivatives(form: str, parts: tuple[str, ...]) -> None:
@@ -112,14 +80,6 @@ def test_second_derivatives(form: str, parts: tuple[str, ...]) -> None:
         results[backend] = torch.autograd.grad(penalty, leaves, allow_unused=True, materialize_grads=True)
     for want, got in zip(results["reference"], results["native"]):
         torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-5 * (1 + float(want.abs().max())))
-
-
-@pytest.mark.parametrize("form", ["dense", "packed"])
-def test_opcheck_of_some_gradients(form: str) -> None:
-    cast, _ = leaves_of(dense(3, 5) if form == "dense" else scene([3, 0, 5], 2, "all", (1, 1)), torch.float32)
-    slope = torch.rand_like(composite(**cast, backend="native").colour).requires_grad_()
-    given = (slope, None, None, None, *cast.values(), [True, True, False, False, True])
-    torch.library.opcheck(torch.ops.voronerf.composite_native_backward.default, given)
 
 
 def test_offsets_that_do_not_rise() -> None:

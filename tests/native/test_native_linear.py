@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
@@ -86,32 +85,6 @@ def test_strided_and_unaligned(dtype: torch.dtype) -> None:
         found = evaluate(native.grouped_linear, form, flipped, bias, spread, "sigmoid")
         for got, want in zip(found, expected):
             assert torch.equal(got, want)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
-def test_results_do_not_depend_on_threads(dtype: torch.dtype) -> None:
-    n, k = 5000, 3
-    x, weight, bias = torch.randn(n, 33).to(dtype), torch.randn(k, 40, 33).to(dtype), torch.randn(k, 40).to(dtype)
-    offsets = torch.tensor([0, 4000, 4100, n], dtype=torch.int32)
-    g = torch.randn(n, 40).to(dtype)
-
-    def run() -> list[Tensor]:
-        leaves = [tensor.clone().requires_grad_() for tensor in (x, weight, bias)]
-        y = native.grouped_linear(leaves[0], offsets, *leaves[1:], activation="softplus")
-        return [y, *torch.autograd.grad(y, leaves, g)]
-
-    on_any_number_of_threads(run)
-
-
-def test_only_what_is_wanted() -> None:
-    x, weight, bias, g = inputs(20, 12, torch.float32)
-    full = evaluate(native.grouped_linear, x, weight, bias, g, "relu")
-    offsets = torch.tensor(OFFSETS, dtype=torch.int32)
-    for at, want in enumerate(full[1:]):
-        given = [tensor.clone() for tensor in (x, weight, bias)]
-        given[at].requires_grad_()
-        y = native.grouped_linear(given[0], offsets, *given[1:], activation="relu")
-        assert torch.equal(torch.autograd.grad(y, given[at], g)[0], want)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])

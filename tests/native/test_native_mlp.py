@@ -261,31 +261,6 @@ def test_same_bits_for_any_number_of_threads(isa: str, dtype: torch.dtype, netwo
     on_any_number_of_threads(lambda: evaluate(given, dtype, "native"))
 
 
-@pytest.mark.parametrize("name", ["graph", "hashed 17"])
-def test_every_output_is_written(request: pytest.FixtureRequest, name: str) -> None:
-    given = arguments(NETWORKS[name], [0, 50, 13, 0], rays=4)
-    given["positions"] = torch.cat([given["positions"], torch.ones(6, 3, dtype=torch.float64)])  # rows of no cell
-    given["direction_index"] = torch.cat([given["direction_index"], torch.zeros(6, dtype=torch.int32)])
-    want = evaluate(given, torch.float32, "native")
-    guards = request.getfixturevalue("poisoned")
-    got = evaluate(given, torch.float32, "native")
-    assert all(torch.equal(a, b) for a, b in zip(want, got))
-    assert len(guards) > 10
-    assert (got[0][-6:] == 0).all() and (got[1][-6:] == 0).all()
-
-
-@pytest.mark.parametrize("layers", [nerf(16, 2), NETWORKS["hashed 32"]], ids=["nerf", "hashed"])
-def test_only_the_gradients_asked_for(layers: MLP) -> None:
-    given = cast(arguments(layers, [20, 30], rays=7), torch.float32)
-    everything = tensors(given)
-    full = torch.autograd.grad(grouped_mlp(**given, backend="native").sum(), everything)
-    for chosen in ([0], [1], [2], [0, 1], [3], [2, len(everything) - 1]):
-        for index, tensor in enumerate(everything):
-            tensor.requires_grad_(index in chosen)
-        some = torch.autograd.grad(grouped_mlp(**given, backend="native").sum(), [everything[i] for i in chosen])
-        assert all(torch.equal(full[i], gradient) for i, gradient in zip(chosen, some))
-
-
 @pytest.mark.parametrize("where", ["positions", "weights", "directions"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 3e38])
 def test_what_is_not_finite_stays_where_it_is(where: str, value: float) -> None:
@@ -351,25 +326,6 @@ def test_float64_positions_are_encoded_in_float64() -> None:
     mixed = {**cast(given, torch.float32), "positions": given["positions"]}
     got = grouped_mlp(**mixed, backend="native").detach()
     assert float((got - exact).abs().max()) <= 1e-5 * float(exact.abs().max())
-
-
-def test_opcheck() -> None:
-    layer_table, ops = pytest.importorskip("voronerf.ops.grouped_mlp.layer_table"), torch.ops.voronerf
-    given = cast(arguments(nerf(6, 2), [5, 0, 8], rays=4), torch.float32)
-    passed = [given[name] for name in ("positions", "weights", "biases", "layers", "directions")]
-    table = layer_table.network(layer_table.Given(*passed), None, hashed_before=False)[0].table
-    network = (given["positions"], given["weights"], given["biases"], table)
-    network, offsets = (*network, given["directions"], given["direction_index"], None), given["offsets"]
-    torch.library.opcheck(ops.grouped_mlp_native.default, (*network, offsets, False))
-    # Gradients that are differentiated again are not this op's.
-    network = torch.utils._pytree.tree_map_only(Tensor, Tensor.detach, network)
-    gradient, order, encoded = torch.randn(13, 4), torch.randperm(13, dtype=torch.int32), torch.empty(0)
-    backward = ops.grouped_mlp_native_backward.default
-    torch.library.opcheck(backward, (gradient, *network, offsets, order, encoded, [True, True, True, False]))
-    # Memory only for the gradients that are asked for.
-    found = backward(gradient, *network, offsets, None, encoded, [False, True, False, False])
-    assert [each.numel() > 0 for each in found] == [False] * (len(found) - 3) + [True, False, False]
-    assert layer_table.Table.parse(table).with_widths(given["weights"]) == given["layers"]
 
 
 def test_an_index_of_no_ray_is_refused() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from helpers import all_pairs, on_any_number_of_threads
+from helpers import all_pairs
 from tolerances import assert_as_exact
 from torch import Tensor
 
@@ -107,29 +107,6 @@ def test_large_variances(isa: str) -> None:
         torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
 
 
-def test_same_bits_for_any_number_of_threads(isa: str) -> None:
-    cases = all_encodings(1000)
-    weights, edges = torch.rand(300, 40), torch.rand(300, 41).cumsum(1)
-    uniforms = torch.rand(300, 50)
-    for run, inputs in cases:
-        on_any_number_of_threads(lambda run=run, inputs=inputs: evaluate(run, inputs, torch.float32, "native"))
-    on_any_number_of_threads(lambda: [resample(weights, edges, 50, uniforms=uniforms, backend="native")])
-
-
-def test_every_output_is_written(request: pytest.FixtureRequest) -> None:
-    def run_all() -> list[Tensor]:
-        found = [tensor for run, inputs in cases for tensor in evaluate(run, inputs, torch.float32, "native")]
-        return [*found, resample(weights, edges, 9, backend="native")]
-
-    cases = [case for n in (0, 1, 33, 70) for case in all_encodings(n, 5)]
-    cases.append((lambda x, backend: frequency_encode(x, 3, backend=backend), [points(35, 20)]))
-    weights, edges = torch.rand(7, 5), torch.rand(7, 6).cumsum(1)
-    wanted = run_all()
-    guards = request.getfixturevalue("poisoned")
-    assert all(torch.equal(a, b) for a, b in zip(wanted, run_all()))
-    assert len(guards) > 100
-
-
 @pytest.mark.parametrize("dtype", HALVES)
 def test_half_gradients(dtype: torch.dtype) -> None:
     for run, inputs in all_encodings(20, 3):
@@ -139,17 +116,6 @@ def test_half_gradients(dtype: torch.dtype) -> None:
         for got, right in zip(found, want):
             scale = float(right.abs().max())
             torch.testing.assert_close(got.float(), right, rtol=0, atol=2 * torch.finfo(dtype).eps * scale)
-
-
-def test_non_contiguous_gradients() -> None:
-    for run, inputs in all_encodings(20):
-        leaves = [tensor.float().requires_grad_() for tensor in inputs]
-        out = run(*leaves, backend="native")
-        expanded, same = (
-            torch.autograd.grad(out, leaves, slope, retain_graph=True)
-            for slope in (torch.ones(1, 1).expand_as(out), torch.ones_like(out))
-        )
-        assert all(torch.equal(a, b) for a, b in zip(expanded, same))
 
 
 @pytest.mark.parametrize(("r", "s", "count"), [(1, 1, 1), (7, 1, 5), (9, 33, 2), (40, 64, 65)])

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads
 from op_cases import refusals, strided
 
 from voronerf.ops import balance_centres
@@ -79,12 +78,6 @@ def test_cells_and_samples_without_mass(device, backend):
         assert torch.equal(moved, centres) and torch.equal(weights, torch.zeros_like(weights))
     moved, weights = balance_centres(points, nothing + 1, centres[:1], steps=5, backend=backend)
     assert torch.equal(moved, centres[:1]) and weights.tolist() == [20.0]
-
-
-@pytest.mark.native
-def test_same_bits_for_any_number_of_threads():
-    points, masses = samples(9000)
-    on_any_number_of_threads(lambda: balance_centres(points, masses, points[:150], steps=5, backend="native"))
 
 
 def test_refuses_what_makes_no_sense():

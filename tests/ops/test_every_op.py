@@ -14,6 +14,7 @@ from unittest import mock
 
 import pytest
 import torch
+from helpers import on_any_number_of_threads
 from op_cases import need, refused, strided
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
@@ -37,9 +38,19 @@ RUNS = [
 ]
 NETWORKS = ("grouped_mlp", "grouped_program", "learn_outputs", "routed_mlp", "sparse_adam", "adam")
 """Ops that check their tensors in ways of their own."""
-every_op = pytest.mark.parametrize(
-    ("name", "backend", "device"), RUNS, indirect=["device"], ids=["-".join(run) for run in RUNS]
-)
+
+
+def rows(runs):
+    """A test of a name, a backend and a device."""
+    return pytest.mark.parametrize(
+        ("name", "backend", "device"), runs, indirect=["device"], ids=["-".join(run) for run in runs]
+    )
+
+
+every_op = rows(RUNS)
+smooth_op = rows([run for run in RUNS if CASES[run[0].partition(",")[0]].differentiable])
+natively = dict.fromkeys(name for name, backend, _ in RUNS if backend == "native")
+native_op = pytest.mark.parametrize("name", list(natively))
 
 
 def prepare(name, backend, device):
@@ -128,6 +139,55 @@ def test_any_size_gives_what_the_reference_gives(device, backend, name):
         given = tensors(n)
         expected = results(functools.partial(run, backend="reference"), given)
         assert_close(results(run, given), expected)
+
+
+@smooth_op
+def test_only_the_gradients_asked_for(device, backend, name):
+    """Each alone is what it is among all, also of a gradient that arrives expanded."""
+    run, tensors = prepare(name, backend, device)
+    given = tensors(33)
+    leaves = [leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor) and leaf.requires_grad]
+    options = {"allow_unused": True, "materialize_grads": True}
+
+    def outputs():
+        return [part for part in tree_leaves(run(given)) if isinstance(part, Tensor) and part.requires_grad]
+
+    smooth = outputs()
+    full = torch.autograd.grad(smooth, leaves, [torch.ones_like(part) for part in smooth], **options)
+    for chosen, expected in zip(leaves, full):
+        for leaf in leaves:
+            leaf.requires_grad_(leaf is chosen)
+        smooth = outputs()
+        if smooth:
+            found = torch.autograd.grad([part.sum() for part in smooth], chosen, **options)
+            assert_close(found, [expected])
+        else:
+            assert not expected.any()
+    for leaf in leaves:
+        leaf.requires_grad_()
+    with torch.no_grad():
+        assert not outputs()
+
+
+@pytest.mark.native
+@native_op
+def test_same_bits_for_any_number_of_threads(isa, name):
+    run, tensors = prepare(name, "native", torch.device("cpu"))
+    given = tensors(3000)
+    on_any_number_of_threads(lambda: [part.nan_to_num(7) for part in results(run, given)])
+
+
+@pytest.mark.native
+@native_op
+def test_every_output_is_written(request, name):
+    """Memory comes with what it held, which must not show, and between guards that must survive."""
+    run, tensors = prepare(name, "native", torch.device("cpu"))
+    wanted = [results(run, tensors(n)) for n in (0, 1, 33, 70)]
+    guards = request.getfixturevalue("poisoned")
+    for n, expected in zip((0, 1, 33, 70), wanted):
+        for found, right in zip(results(run, tensors(n)), expected, strict=True):
+            torch.testing.assert_close(found, right, rtol=0, atol=0, equal_nan=True)
+    assert len(guards) >= 8
 
 
 class Calls(TorchFunctionMode):

@@ -253,17 +253,6 @@ def test_what_is_not_a_number_stays_in_its_cell(device, backend):
     assert all(leaf.grad[[0, 2]].isfinite().all() for leaf in leaves[2:])
 
 
-def test_gradients_only_where_asked_for(device, backend):
-    case = Case.make("nerf", COUNTS["odd"])
-    every = [tensor.to(device) for tensor in case.inputs]
-    for wanted in range(len(every)):
-        leaves = [tensor.clone().requires_grad_(index == wanted) for index, tensor in enumerate(every)]
-        case.run(grouped_mlp, leaves, backend=backend).sum().backward()
-        assert [leaf.grad is not None for leaf in leaves] == [index == wanted for index in range(len(leaves))]
-    with torch.no_grad():
-        assert not case.run(grouped_mlp, leaves, backend=backend).requires_grad
-
-
 @pytest.mark.parametrize("name", TABLES)
 def test_gradcheck(name):
     case = Case.make(name, [2, 0, 1], torch.float64, rays=2)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers import all_pairs, on_any_number_of_threads
+from helpers import all_pairs
 from op_cases import FLOATS, HALVES, need, refusals, refused
 from tolerances import assert_as_exact
 
@@ -241,13 +241,6 @@ def test_every_instruction_set(isa, poisoned, name, dtype, several):
     for a, b, c in zip(found, plain, exact, strict=True):
         rounding = torch.finfo(a.dtype).eps
         assert (a.double() - c).norm() <= 2 * (b.double() - c).norm() + (2 * rounding + 1e-6) * c.norm()
-
-
-@pytest.mark.native
-def test_bits_do_not_depend_on_threads():
-    grid, n = GRIDS["both"], 3000
-    x, table = points(n, grid), features(grid)
-    on_any_number_of_threads(lambda: derivatives(hash_encode, grid, x, table, None, torch.float32), (1, 2, 5))
 
 
 def test_third_derivatives(backend):

@@ -160,22 +160,6 @@ def test_checked_gradient_of_the_reference():
     assert torch.autograd.gradcheck(loss, raw)
 
 
-@pytest.mark.native
-def test_native_does_not_depend_on_threads_and_passes_opcheck(isa):
-    raw, deltas, offsets, target, background = rays([5, 0, 200, 17] * 70, torch.float32)
-    results, before = [], torch.get_num_threads()
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(evaluate("cpu", (raw, deltas, offsets, target, background), torch.float32, "native"))
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other))
-    few = rays([2, 0, 3], torch.float32)
-    arguments = (few[0].requires_grad_(), *few[1:], SCALE, 0.1)
-    torch.library.opcheck(torch.ops.voronerf.render_loss_native.default, arguments)
-
-
 def test_in_a_compiled_function(device, backend):
     raw, deltas, offsets, target, background = (t.to(device) for t in rays([4, 0, 9], torch.float32))
     raw.requires_grad_()
