@@ -2,11 +2,12 @@
 
 Registers, spills, shared memory, and the warps that registers let a multiprocessor hold, are printed for every kernel
 and compared with the table that is kept, .ci/cuda_resources.json: a spill that is not in it is a failure, and with the
-nvcc that it was made by so are registers or shared memory above it. ``--update`` writes it anew. The last architecture
-is compiled to PTX as well. Kernels of the toolkit's own (CUB) are counted and not judged: their names change with its
-version, and this project cannot change them. It is a failure if the resources of a kernel are not reported for every
-architecture, if there is no kernel at all, or if ptxas serializes products of four warps (wgmma). The last line says in
-one sentence what was compiled and whether it passed.
+nvcc that it was made by so are registers or shared memory above it, or fewer warps. sm_80 is an A100, sm_89 an RTX
+4090, sm_90a an H200. ``--update`` notes the given architectures in it, and forgets kernels that are no more. The last
+architecture is compiled to PTX as well. Kernels of the toolkit's own (CUB) are counted and not judged: their names
+change with its version, and this project cannot change them. It is a failure if the resources of a kernel are not
+reported for every architecture, if there is no kernel at all, or if ptxas serializes products of four warps (wgmma).
+The last line says in one sentence what was compiled and whether it passed.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ OUT = ROOT / "build" / "cuda-check"
 TABLE = ROOT / ".ci" / "cuda_resources.json"
 REGISTERS = 65536
 """Of a multiprocessor."""
+MOST_WARPS = {"sm_75": 32, "sm_86": 48, "sm_89": 48, "sm_120": 48}
+"""Of a multiprocessor; 64 elsewhere."""
 FLAGS = ["-std=c++17", "-O3", "-Werror", "all-warnings", "-Xcompiler", "-Wall,-Wextra,-Werror", "-Xptxas", "-v"]
 KERNEL = re.compile(
     r"Compiling entry function '(?P<name>\w+)' for '(?P<arch>\w+)'.*?"
@@ -79,7 +82,7 @@ def main(architectures: list[str]) -> int:
                 "registers": int(match["registers"]),
                 "spilled_bytes": int(match["stores"]) + int(match["loads"]),
                 "shared_bytes": int(shared[1]) if shared else 0,
-                "warps": warps(int(match["registers"])),
+                "warps": warps(int(match["registers"]), match["arch"]),
             }
     for kernel, by_architecture in sorted(kernels.items()):
         columns = {key: [row[key] for row in by_architecture.values()] for key in next(iter(by_architecture.values()))}
@@ -114,7 +117,7 @@ def main(architectures: list[str]) -> int:
     else:
         outcome = f"held without a warning, {spilling} spilling"
         if update:
-            TABLE.write_text(as_text(version, kernels))
+            TABLE.write_text(as_text(version, merged(version, kernels)))
     toolkit = f" and {len(borrowed)} of the toolkit's" if borrowed else ""
     print(f"cuda-check: {len(sources)} files, {len(kernels)} kernels{toolkit} compiled for {targets} {outcome}.")
     return 1 if failed or lacking or worse or serial or not kernels else 0
@@ -134,7 +137,24 @@ def regressions(version: str, kernels: Kernels) -> list[str]:
             for key in compared:
                 if row[key] > known.get(key, row[key]):
                     worse.append(f"{kernel} ({architecture}): {key} {row[key]}, above {known[key]}")
+            if "registers" in compared and row["warps"] < known.get("warps", 0):
+                worse.append(f"{kernel} ({architecture}): warps {row['warps']}, below {known['warps']}")
     return worse
+
+
+def merged(version: str, kernels: Kernels) -> Kernels:
+    """What was found, and what the table has, by the same nvcc, of other architectures for these kernels."""
+    table = json.loads(TABLE.read_text()) if TABLE.exists() else {"nvcc": ""}
+    kept = table["kernels"] if table["nvcc"] == version else {}
+    return {
+        kernel: dict(sorted((unpack(kept.get(kernel, {})) | found).items(), key=lambda row: number(row[0])))
+        for kernel, found in kernels.items()
+    }
+
+
+def number(architecture: str) -> int:
+    """Of "sm_90a" 90."""
+    return int(re.sub(r"\D", "", architecture))
 
 
 COLUMNS = ("registers", "spilled_bytes", "shared_bytes", "warps")
@@ -155,9 +175,9 @@ def unpack(rows: dict[str, list[int]]) -> dict[str, dict[str, int]]:
     return {architecture: dict(zip(COLUMNS, row)) for architecture, row in rows.items()}
 
 
-def warps(registers: int) -> int:
-    """Warps of which the registers fit a multiprocessor; 64 at most, on some 32 or 48."""
-    return min(64, REGISTERS // (32 * -(-max(registers, 1) // 8) * 8))
+def warps(registers: int, architecture: str) -> int:
+    """Warps of which the registers fit a multiprocessor."""
+    return min(MOST_WARPS.get(architecture, 64), REGISTERS // (32 * -(-max(registers, 1) // 8) * 8))
 
 
 def nvcc_version(nvcc: str) -> str:

@@ -219,5 +219,24 @@ def test_cuda_check_compares_with_the_table(check, monkeypatch, tmp_path):
         "kernel (sm_80): spilled_bytes 12, above 8",
         "kernel (sm_80): registers 41, above 40",
     ]
+    fewer = {"kernel": {"sm_80": {**row, "warps": 47}}}
+    assert check.regressions("V13", fewer) == ["kernel (sm_80): warps 47, below 48"]
     assert check.regressions("V14", more) == ["kernel (sm_80): spilled_bytes 12, above 8"]
-    assert [check.warps(registers) for registers in (8, 32, 33, 255)] == [64, 64, 51, 8]
+    assert [check.warps(registers, "sm_90a") for registers in (8, 32, 33, 255)] == [64, 64, 51, 8]
+    assert [check.warps(8, architecture) for architecture in ("sm_75", "sm_89")] == [32, 48]
+
+
+def test_cuda_check_notes_the_architectures_it_was_asked_for(check, monkeypatch, reporting, tmp_path):
+    monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
+    old = {"registers": 40, "spilled_bytes": 0, "shared_bytes": 0, "warps": 48}
+    _, said = reporting(REPORT.format("90a"), "90a")
+    kernel = next(line for line in said.splitlines() if "kernel" in line).split(": registers")[0]
+    known = {kernel: {"sm_100": old, "sm_90a": old}, "gone": {"sm_100": old}}
+    check.TABLE.write_text(check.as_text("V12", known))
+    reporting(REPORT.format("90a"), "90a", "--update")
+    assert list(check.json.loads(check.TABLE.read_text())["kernels"][kernel]) == ["sm_90a"]  # of another nvcc
+    check.TABLE.write_text(check.as_text("", known))
+    reporting(REPORT.format("90a"), "90a", "--update")
+    kept = check.json.loads(check.TABLE.read_text())["kernels"]
+    assert list(kept[kernel]) == ["sm_90a", "sm_100"] and "gone" not in kept
+    assert kept[kernel]["sm_100"] == list(old.values()) != kept[kernel]["sm_90a"]
