@@ -1,6 +1,7 @@
 """Steps for CUDA graphs, on a machine that has none: what they may not do, and when they are captured and replayed."""
 
 import contextlib
+import functools
 from dataclasses import replace
 from typing import Any
 
@@ -136,6 +137,38 @@ def test_a_split_ends_a_graph(tmp_path, scene, fake_cuda, monkeypatch):
     trainer.split()
     trainer.train_step()
     assert [graphed.runs for graphed in made] == [WARMUP, 1] and made[1].graph is None
+
+
+@pytest.mark.native
+def test_what_a_graph_cannot_follow_ends_it(tmp_path, scene, fake_cuda):
+    """Other numbers of rays and a return to a checkpoint do; other rates and the same number do not."""
+    trainer = Trainer(small(tmp_path, occupancy=True, ray_growth=4.0), scene)
+    graphs = functools.partial(object.__setattr__, trainer.config, "cuda_graph")
+    trainer.save()
+    graphs(True)  # which no configuration without a GPU may say
+    trainer._begin_stage()
+
+    def graph():
+        for _ in range(WARMUP + 1):
+            trainer.train_step()
+        captured = trainer._compute.graph
+        assert captured is not None
+        return captured
+
+    def read(samples):
+        trainer._rows = torch.tensor([samples], dtype=torch.int32)
+        trainer._read(torch.zeros(()))
+
+    first, rays = graph(), trainer.rays
+    set_learning_rate(trainer.optimizer, 1e-4)
+    read(rays * trainer.config.samples)  # all of space is occupied
+    assert trainer.rays == rays and graph() is first
+    read(1)
+    assert trainer.rays == 4 * rays
+    second = graph()
+    assert second is not first
+    trainer._go_back("losses not finite")
+    assert graph() is not second
 
 
 def test_a_learning_rate_in_a_tensor_is_changed_in_place():
