@@ -195,6 +195,8 @@ class MarchSpace(NamedTuple):
 
 MlpCaller: tuple[str, ...]  # grouped_mlp grouped_linear routed_mlp
 
+class MlpCudaCall: ...
+
 MlpCudaWay: tuple[str, ...]  # auto chain tiles layers wgmma
 
 class MlpEncoding(NamedTuple):
@@ -450,22 +452,25 @@ def grouped_linear_backward(_0: LinearInputs, _1: LinearGradients, _2: Cpu) -> N
 # MlpTable, MlpInputs, float32*, Cpu
 @overload
 def grouped_mlp(_0: MlpTable, _1: MlpInputs, _2: Tensor | None, _3: Cpu) -> None: ...
-# MlpTable, MlpInputs, float32*, MlpPrecision, MlpCudaWay, uint8*, Cuda
+# MlpCudaCall, MlpInputs, float32*, uint8*, Cuda
 @overload
-def grouped_mlp(_0: MlpTable, _1: MlpInputs, _2: Tensor | None, _3: str, _4: str, _5: Tensor | None, _6: Cuda) -> None: ...
+def grouped_mlp(_0: MlpCudaCall, _1: MlpInputs, _2: Tensor | None, _3: Tensor | None, _4: Cuda) -> None: ...
 
 # MlpTable, MlpInputs, MlpGradients, Cpu
 @overload
 def grouped_mlp_backward(_0: MlpTable, _1: MlpInputs, _2: MlpGradients, _3: Cpu) -> None: ...
-# MlpTable, MlpInputs, MlpGradients, MlpPrecision, MlpCudaWay, uint8*, Cuda
+# MlpCudaCall, MlpInputs, MlpGradients, uint8*, Cuda
 @overload
-def grouped_mlp_backward(_0: MlpTable, _1: MlpInputs, _2: MlpGradients, _3: str, _4: str, _5: Tensor | None, _6: Cuda) -> None: ...
+def grouped_mlp_backward(_0: MlpCudaCall, _1: MlpInputs, _2: MlpGradients, _3: Tensor | None, _4: Cuda) -> None: ...
+
+# MlpTable, int64, int64, bool, bool, MlpPrecision, MlpCudaWay, Cuda
+def grouped_mlp_call(_0: MlpTable, _1: int, _2: int, _3: bool, _4: bool, _5: str, _6: str, _7: Cuda) -> MlpCudaCall: ...
 
 # MlpTable, MlpPrecision, MlpCudaWay, Cuda
 def grouped_mlp_hashes(_0: MlpTable, _1: str, _2: str, _3: Cuda) -> bool: ...
 
-# MlpTable, int64, int64, bool, bool, MlpPrecision, MlpCudaWay, Cuda
-def grouped_mlp_workspace(_0: MlpTable, _1: int, _2: int, _3: bool, _4: bool, _5: str, _6: str, _7: Cuda) -> int: ...
+# MlpCudaCall
+def grouped_mlp_workspace(_0: MlpCudaCall) -> int: ...
 
 # ProgramInputs, float32**, float32**, Cpu
 @overload

@@ -1,6 +1,6 @@
-// The hash encoding on CUDA: a thread a point and a level, levels one after the other along the grid, so that those
-// which are read at a time fit the second-level cache, as Mueller et al. 2022 do it in section 4. Tables may begin
-// anywhere, so features are loaded one by one; those of an entry lie in one sector of the cache.
+// The hash encoding on CUDA: a thread a point and a few levels, these one after the other along the grid, so that what
+// is read at a time fits the second-level cache, as Mueller et al. 2022 do it in section 4 level by level. A thread's
+// levels have eight features together: it writes, and backward reads, a whole sector of 32 bytes.
 //
 // The table's gradient is added up by atomic operations, in any order. The gradient of the positions is a thread a
 // point, which sums over its levels.
@@ -13,6 +13,7 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 256;
+constexpr int kSector = 8;  // features of the levels of a thread
 
 // A point in the eyes of one level.
 struct Corners {
@@ -52,23 +53,28 @@ template <int kFeatures, TableType kType>
 __global__ void __launch_bounds__(kThreads) hash_encode_kernel(HashEncoding in, float* __restrict__ out) {
   const int64_t point = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (point >= in.in.n) return;
-  const GridLevel& level = in.levels[blockIdx.y];
   const auto* table = static_cast<const typename HashElement<kType>::Type*>(in.in.table);
   HashPlace places[3];
   place_of(in, point, places);
-  const Corners at = corners_of(in, point, level, places);
-  const int64_t first = first_of<kFeatures>(in, level, point);
-  float sums[kFeatures] = {};
-  if (first >= 0) {
-    hash_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
-      const float weight = hash_weight(at.axes, at.directed, at.along, x, y, z);
+#pragma unroll 1
+  for (int i = 0; i < kSector / kFeatures; ++i) {
+    const int number = blockIdx.y * (kSector / kFeatures) + i;
+    if (number >= in.count) return;
+    const GridLevel& level = in.levels[number];
+    const Corners at = corners_of(in, point, level, places);
+    const int64_t first = first_of<kFeatures>(in, level, point);
+    float sums[kFeatures] = {};
+    if (first >= 0) {
+      hash_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
+        const float weight = hash_weight(at.axes, at.directed, at.along, x, y, z);
+        float found[kFeatures];
+        hash_load<kType>(table + entry, found);
 #pragma unroll
-      for (int f = 0; f < kFeatures; ++f) sums[f] += weight * hash_element<kType>(table + entry + f);
-    });
+        for (int f = 0; f < kFeatures; ++f) sums[f] += weight * found[f];
+      });
+    }
+    hash_store(out + (point * in.count + number) * kFeatures, sums);
   }
-  float* to = out + (point * in.count + blockIdx.y) * kFeatures;
-#pragma unroll
-  for (int f = 0; f < kFeatures; ++f) to[f] = sums[f];
 }
 
 template <int kFeatures>
@@ -77,20 +83,26 @@ __global__ void __launch_bounds__(kThreads)
                                       float* __restrict__ of_table) {
   const int64_t point = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (point >= in.in.n) return;
-  const GridLevel& level = in.levels[blockIdx.y];
-  const int64_t first = first_of<kFeatures>(in, level, point);
-  if (first < 0) return;
   HashPlace places[3];
   place_of(in, point, places);
-  const Corners at = corners_of(in, point, level, places);
-  float arriving[kFeatures];
+#pragma unroll 1
+  for (int i = 0; i < kSector / kFeatures; ++i) {
+    const int number = blockIdx.y * (kSector / kFeatures) + i;
+    if (number >= in.count) return;
+    const GridLevel& level = in.levels[number];
+    const int64_t first = first_of<kFeatures>(in, level, point);
+    if (first < 0) return;
+    const Corners at = corners_of(in, point, level, places);
+    float arriving[kFeatures];
+    hash_load<TableType::float32>(gradient + (point * in.count + number) * kFeatures, arriving);
+    hash_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
+      const float weight = hash_weight(at.axes, at.directed, at.along, x, y, z);
+      float added[kFeatures];
 #pragma unroll
-  for (int f = 0; f < kFeatures; ++f) arriving[f] = gradient[(point * in.count + blockIdx.y) * kFeatures + f];
-  hash_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
-    const float weight = hash_weight(at.axes, at.directed, at.along, x, y, z);
-#pragma unroll
-    for (int f = 0; f < kFeatures; ++f) atomicAdd(of_table + entry + f, weight * arriving[f]);
-  });
+      for (int f = 0; f < kFeatures; ++f) added[f] = weight * arriving[f];
+      hash_add(of_table + entry, added);
+    });
+  }
 }
 
 template <int kFeatures, TableType kType>
@@ -108,13 +120,14 @@ __global__ void __launch_bounds__(kThreads)
     const Corners at = corners_of(in, point, level, places);
     const int64_t first = first_of<kFeatures>(in, level, point);
     if (first < 0) break;
-    const float* arriving = gradient + (point * in.count + number) * kFeatures;
+    float arriving[kFeatures];
+    hash_load<TableType::float32>(gradient + (point * in.count + number) * kFeatures, arriving);
     hash_corners<kFeatures>(at.axes, level, first, [&](int64_t entry, int x, int y, int z) {
-      float product = 0.0f;
+      float product = 0.0f, found[kFeatures];
+      hash_load<kType>(table + entry, found);
 #pragma unroll
-      for (int f = 0; f < kFeatures; ++f) product += arriving[f] * hash_element<kType>(table + entry + f);
+      for (int f = 0; f < kFeatures; ++f) product += arriving[f] * found[f];
       const int corner[3] = {x, y, z};
-#pragma unroll
 #pragma unroll
       for (int axis = 0; axis < 3; ++axis) {
         sums[axis] += product * hash_weight_slope(at.axes, at.directed, at.along, axis, corner);
@@ -169,12 +182,18 @@ unsigned blocks_of(int64_t n) {
   return static_cast<unsigned>(ceil_div<int64_t>(n, kThreads));
 }
 
+dim3 blocks_of(const HashEncoding& in) {
+  return dim3(blocks_of(in.in.n), static_cast<unsigned>(ceil_div(in.count * in.features, kSector)));
+}
+
 }  // namespace
 
 void hash_encode_cuda(const HashInputs& in, const HashGrid& grid, float* out, void* stream) {
   if (in.n == 0) return;
+  VN_CHECK(reinterpret_cast<std::uintptr_t>(in.table) % 16 == 0,
+           "hash_encode: the table must begin at a multiple of 16 bytes");
   const HashEncoding given = hash_encoding(in, grid);
-  const dim3 blocks(blocks_of(in.n), static_cast<unsigned>(given.count));
+  const dim3 blocks = blocks_of(given);
   for_table(given, [&](auto features, auto type) {
     const auto kernel = hash_encode_kernel<decltype(features)::value, decltype(type)::value>;
     VN_LAUNCH(kernel, blocks, kThreads, 0, stream, given, out);
@@ -183,13 +202,17 @@ void hash_encode_cuda(const HashInputs& in, const HashGrid& grid, float* out, vo
 
 void hash_encode_backward_cuda(const HashInputs& in, const HashGrid& grid, const float* gradient, float* of_table,
                                float* of_positions, void* stream) {
+  VN_CHECK(reinterpret_cast<std::uintptr_t>(in.table) % 16 == 0,
+           "hash_encode: the table must begin at a multiple of 16 bytes");
+  VN_CHECK(reinterpret_cast<std::uintptr_t>(gradient) % 16 == 0,
+           "hash_encode: the gradient must begin at a multiple of 16 bytes");
   const HashEncoding given = hash_encoding(in, grid);
   if (of_table != nullptr) {
     const size_t bytes = sizeof(float) * static_cast<size_t>(in.tables * in.entries * grid.features);
     VN_CUDA_CHECK(cudaMemsetAsync(of_table, 0, bytes, static_cast<cudaStream_t>(stream)));
   }
   if (in.n == 0) return;
-  const dim3 blocks(blocks_of(in.n), static_cast<unsigned>(given.count));
+  const dim3 blocks = blocks_of(given);
   if (of_table != nullptr) {
     for_width(given.features, [&](auto features) {
       const auto kernel = hash_encode_table_backward_kernel<decltype(features)::value>;

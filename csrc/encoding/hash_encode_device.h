@@ -1,4 +1,7 @@
 // What the CUDA kernels share that look hash grids up: the numbers of a table, and the corners around a point.
+//
+// The features of an entry are loaded, added and stored at once, in pieces of at most 16 bytes. Tables and what else
+// has rows of features begin at multiples of 16 bytes; the caller sees to that.
 #pragma once
 
 #include "common/cuda_wrappers.h"
@@ -15,13 +18,61 @@ struct HashElement<TableType::float32> {
   using Type = float;
 };
 
-template <TableType kType>
-__device__ __forceinline__ float hash_element(const typename HashElement<kType>::Type* from) {
-  if constexpr (kType == TableType::float32) {
-    return *from;
-  } else {
-    return unpack_half<kType == TableType::bfloat16>(*from);
+// Numbers that are moved together.
+template <typename Type, int kFeatures>
+struct alignas(kFeatures * sizeof(Type) < 16 ? kFeatures * sizeof(Type) : 16) HashPiece {
+  static constexpr int kCount = kFeatures * sizeof(Type) < 16 ? kFeatures : 16 / sizeof(Type);
+  Type values[kCount];
+};
+
+template <TableType kType, int kFeatures>
+__device__ __forceinline__ void hash_load(const typename HashElement<kType>::Type* from, float (&to)[kFeatures]) {
+  using Piece = HashPiece<typename HashElement<kType>::Type, kFeatures>;
+#pragma unroll
+  for (int first = 0; first < kFeatures; first += Piece::kCount) {
+    const Piece piece = *reinterpret_cast<const Piece*>(from + first);
+#pragma unroll
+    for (int f = 0; f < Piece::kCount; ++f) {
+      if constexpr (kType == TableType::float32) {
+        to[first + f] = piece.values[f];
+      } else {
+        to[first + f] = unpack_half<kType == TableType::bfloat16>(piece.values[f]);
+      }
+    }
   }
+}
+
+template <int kFeatures>
+__device__ __forceinline__ void hash_store(float* to, const float (&values)[kFeatures]) {
+  using Piece = HashPiece<float, kFeatures>;
+#pragma unroll
+  for (int first = 0; first < kFeatures; first += Piece::kCount) {
+    Piece piece;
+#pragma unroll
+    for (int f = 0; f < Piece::kCount; ++f) piece.values[f] = values[first + f];
+    *reinterpret_cast<Piece*>(to + first) = piece;
+  }
+}
+
+// Adds to the gradient of an entry by atomic operations, which take several features from sm_90 on.
+template <int kFeatures>
+__device__ __forceinline__ void hash_add(float* to, const float (&values)[kFeatures]) {
+#if defined(VN_EMULATE) || __CUDA_ARCH__ >= 900
+  if constexpr (kFeatures == 2) {
+    atomicAdd(reinterpret_cast<float2*>(to), make_float2(values[0], values[1]));
+  } else if constexpr (kFeatures == 1) {
+    atomicAdd(to, values[0]);
+  } else {
+#pragma unroll
+    for (int f = 0; f < kFeatures; f += 4) {
+      const float4 four = make_float4(values[f], values[f + 1], values[f + 2], values[f + 3]);
+      atomicAdd(reinterpret_cast<float4*>(to + f), four);
+    }
+  }
+#else
+#pragma unroll
+  for (int f = 0; f < kFeatures; ++f) atomicAdd(to + f, values[f]);
+#endif
 }
 
 // run(number of the first feature, x, y, z) for each corner.

@@ -50,6 +50,6 @@ def emulated(
     with (
         mock.patch.object(_native, "compiled", _Both(loaded, _native.compiled)),
         mock.patch.object(_native, "on_cuda", lambda tensor: True),
-        mock.patch.object(_native, "stream", lambda tensor: (0, 0)),
+        mock.patch.object(_native, "stream", lambda tensor: (loaded.current(), 0)),
     ):
         yield loaded

@@ -43,6 +43,14 @@ inline float2 make_float2(float x, float y) {
 inline float4 make_float4(float x, float y, float z, float w) {
   return {x, y, z, w};
 }
+// Each component by itself, as on the device.
+inline float2 atomicAdd(float2* to, float2 value) {
+  return {atomicAdd(&to->x, value.x), atomicAdd(&to->y, value.y)};
+}
+inline float4 atomicAdd(float4* to, float4 value) {
+  return {atomicAdd(&to->x, value.x), atomicAdd(&to->y, value.y), atomicAdd(&to->z, value.z),
+          atomicAdd(&to->w, value.w)};
+}
 inline uint4 make_uint4(unsigned x, unsigned y, unsigned z, unsigned w) {
   return {x, y, z, w};
 }
@@ -63,10 +71,6 @@ inline const char* cudaGetErrorString(cudaError_t) {
   return "error of the emulation";
 }
 inline cudaError_t cudaGetLastError() {
-  return cudaSuccess;
-}
-inline cudaError_t cudaGetDevice(int* device) {
-  *device = 0;
   return cudaSuccess;
 }
 inline cudaError_t cudaSetDevice(int) {
@@ -92,6 +96,7 @@ constexpr size_t kSlot = 64;  // bytes a lane may hand to the others of its warp
 
 struct Settings {
   uint64_t seed = 0;
+  int device = 0;           // its number: whoever changes one of the others makes another device
   int capability = 90;      // of the device that is played
   int compiled = 120;       // architecture that kernels are compiled for
   int multiprocessors = 2;  // few, so that loops over a grid are walked
@@ -180,6 +185,10 @@ void agree(const char* operation, uint64_t argument);
 
 }  // namespace vn_emulation
 
+inline cudaError_t cudaGetDevice(int* device) {
+  *device = vn_emulation::settings().device;
+  return cudaSuccess;
+}
 inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, int) {
   const auto& settings = vn_emulation::settings();
   switch (attribute) {

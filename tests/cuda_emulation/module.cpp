@@ -82,9 +82,14 @@ PYBIND11_MODULE(voronerf_emulation, module) {
   module.def("launches", &vn_emulation::launches);
   module.def("seed", [](uint64_t seed) { vn_emulation::settings().seed = seed; });
   module.def("device", [](int capability, int compiled, int shared_bytes) {
+    ++vn_emulation::settings().device;
     vn_emulation::settings().capability = capability;
     vn_emulation::settings().compiled = compiled;
     vn_emulation::settings().shared = shared_bytes;
   });
-  module.def("multiprocessors", [](int count) { vn_emulation::settings().multiprocessors = count; });
+  module.def("current", [] { return vn_emulation::settings().device; });
+  module.def("multiprocessors", [](int count) {
+    ++vn_emulation::settings().device;
+    vn_emulation::settings().multiprocessors = count;
+  });
 }

@@ -37,7 +37,8 @@ def table(layers, d=None):
     weights = [torch.zeros(1, o, i) for o, i in layers.weight_shapes(d, 3 if layers.uses_directions else 0)]
     call = layer_table.Given(torch.zeros(1, d), weights, [None] * len(weights), layers, seen)
     given, _ = layer_table.network(call, None, hashed_before=False)
-    return layer_table.compiled_table(given.table, given.positions, given.weights, given.directions)
+    key = layer_table.table_key(given.table, given.positions, given.weights, given.directions)
+    return layer_table.table_of(*key)
 
 
 def plan(layers, n=MANY, k=16, *, precision="bfloat16", backward=True, d=None, asked="auto"):

@@ -1,7 +1,8 @@
 """The calls of kernels that the ops' cases lead to, as data that a process without torch can make again (sanitize.py).
 
 A call is the function's name, its arguments, and the arrays that these refer to, before and after it. An argument is
-a number, a text, None, a list, ("array", its number) or ("struct", name of the type, names and values of its fields).
+a number, a text, None, a list, ("array", its number), ("struct", name of the type, names and values of its fields), or
+("plan", name of the function that makes it, (), its arguments).
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ class Recorder:
 
     def __init__(self, compiled: Any, kernels: Any) -> None:
         self._compiled, self._kernels, self.calls = compiled, kernels, []
+        self.plans: dict[int, tuple[Any, Any]] = {}  # by their addresses, and so that these stay theirs
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self._compiled, name)
@@ -48,9 +50,12 @@ class Recorder:
 
         def call(*arguments: Any) -> Any:
             tensors: dict[int, tuple[int, Tensor]] = {}
-            packed = [as_data(argument, tensors) for argument in arguments]
+            packed = [as_data(argument, tensors, self.plans) for argument in arguments]
             before = [as_array(tensor) for _, tensor in tensors.values()]
             result = found(*arguments)
+            if type(result).__name__ == "MlpCudaCall":
+                self.plans[id(result)] = result, ("plan", name, (), packed)
+                return result
             after = [as_array(tensor) for _, tensor in tensors.values()]
             self.calls.append((name, packed, before, after))
             return result
@@ -58,14 +63,16 @@ class Recorder:
         return call
 
 
-def as_data(value: Any, tensors: dict[int, tuple[int, Tensor]]) -> Any:
+def as_data(value: Any, tensors: dict[int, tuple[int, Tensor]], plans: dict[int, tuple[Any, Any]]) -> Any:
+    if id(value) in plans:
+        return plans[id(value)][1]
     if isinstance(value, Tensor):
         return "array", tensors.setdefault(id(value), (len(tensors), value))[0]
     if hasattr(value, "_fields"):
-        fields = [as_data(part, tensors) for part in value]
+        fields = [as_data(part, tensors, plans) for part in value]
         return "struct", type(value).__name__, value._fields, fields
     if isinstance(value, (list, tuple)):
-        return [as_data(part, tensors) for part in value]
+        return [as_data(part, tensors, plans) for part in value]
     assert value is None or isinstance(value, (bool, int, float, str)), value
     return value
 

@@ -18,10 +18,10 @@ DTYPES = {name: name for name in ("float32", "float64", "int32", "int64", "uint8
 LEAST, MOST = -(2**31), 2**31 - 1
 HOSTILE = {"cell_sort": False, "hash_encode": False, "hash_encode_backward": False, "grouped_mlp": False}
 HOSTILE |= {"grouped_mlp_backward": False, "locate_cell": True, "composite": True, "composite_backward": True}
-HOSTILE |= {"render_loss": True, "resample": True}
+HOSTILE |= {"render_loss": True, "resample": True, "grouped_program": False}
 """Functions that take whatever is in their arrays, and whether that holds of floating-point numbers, too."""
-SOUND = ("order", "direction_index")
-"""Fields with indices that are checked, or made by the library itself."""
+SOUND = ("order", "direction_index", "code", "turned")
+"""Fields that are checked, or made by the library itself."""
 
 
 class Memory:

@@ -198,18 +198,22 @@ def test_cells_that_overlap_stay_inside_the_workspace(monkeypatch) -> None:
     leaves = [leaf.requires_grad_() for leaf in (torch.rand(n, 3), torch.rand(5, 8, 3), torch.rand(5, 2, 8))]
     sizes = []
     with emulated() as loaded:
-        size_of, backward = loaded.grouped_mlp_workspace, loaded.grouped_mlp_backward
+        new, size_of, backward = loaded.grouped_mlp_call, loaded.grouped_mlp_workspace, loaded.grouped_mlp_backward
 
-        def larger(table, n: int, k: int, backward: bool, parameters: bool, precision: str, *others) -> int:
+        def call(table, n: int, k: int, backward: bool, parameters: bool, precision: str, *others):
             plan = module().grouped_mlp_plan(table, PRECISIONS.index(precision), n, k, backward)
             assert not plan["by_layers"] and 3 * -(-n // plan["task_rows"]) > plan["tasks"]
-            sizes.append(size_of(table, n, k, backward, parameters, precision, *others) + beyond)
+            return new(table, n, k, backward, parameters, precision, *others)
+
+        def larger(call) -> int:
+            sizes.append(size_of(call) + beyond)
             return sizes[-1]
 
         def poisoned(*given: Any) -> None:
             given[-2].fill_(0xFF)
             backward(*given)
 
+        monkeypatch.setattr(loaded, "grouped_mlp_call", call)
         monkeypatch.setattr(loaded, "grouped_mlp_workspace", larger)
         monkeypatch.setattr(loaded, "grouped_mlp_backward", poisoned)
         offsets = torch.tensor([0, n, 0, n, 0, n], dtype=torch.int32)

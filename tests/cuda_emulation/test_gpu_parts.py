@@ -56,14 +56,15 @@ def test_every_small_case_is_right_on_the_emulated_device(parts):
 def test_steps_to_capture_are_right_on_the_emulated_device(parts, monkeypatch):
     ways = []
     with emulated() as loaded:
-        entry = loaded.grouped_mlp
+        new = loaded.grouped_mlp_call
 
-        def forward(table, inputs, out, precision, *others):
-            plan = module().grouped_mlp_plan(table, loaded.MlpPrecision.index(precision), inputs.n, inputs.k, False)
-            ways.append(plan["by_layers"])
-            entry(table, inputs, out, precision, *others)
+        def call(table, n, k, backward, parameters, precision, *others):
+            if not backward:
+                plan = module().grouped_mlp_plan(table, loaded.MlpPrecision.index(precision), n, k, False)
+                ways.append(plan["by_layers"])
+            return new(table, n, k, backward, parameters, precision, *others)
 
-        monkeypatch.setattr(loaded, "grouped_mlp", forward)
+        monkeypatch.setattr(loaded, "grouped_mlp_call", call)
         for name, step in parts.captured_steps("cpu", 40):
             allowed = 8e-2 if "bfloat16" in name else 1e-5  # rounding moves samples across kinks
             for found, exact in zip(step(), step("reference", torch.float64)):
@@ -383,6 +384,22 @@ def test_sizes_and_a_profiled_step(parts, timings, monkeypatch, tmp_path):
     assert row["seconds"] > 0 and row["launches"] == row["waits"] == 0
 
 
+def test_rivals_that_are_absent_are_left_out_with_the_reason(parts, timings, monkeypatch, tmp_path):
+    import harness
+
+    monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
+    tool = tmp_path / "tcnn"
+    tool.write_text("#!/bin/sh\necho 7 ns\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("VORONERF_TCNN", str(tool))
+    assert timings.rivals(tmp_path, parts.Again(("rivals",), case_seconds=60.0), "cpu", 1 << 10) == 0
+    kept = read_json(tmp_path / "rivals.json")
+    assert [row["said"] for row in kept["cases"]] == ["7 ns\n"]
+    assert [(row["name"].rsplit(" by ")[-1], row["reason"]) for row in kept["skipped"]] == [
+        (name, "not on CUDA") for name in ("torch.compile", "Triton", "tiny-cuda-nn")
+    ]
+
+
 def test_the_summary_says_what_was_reached_and_what_is_wrong(check):
     row = {"limit": "copy", "seconds": 2e-5, "share": 0.5, "aim": None}
     timed = [{**row, "name": f"cell_sort k=16 by {way}"} for way in ("counting", "torch.sort")]
@@ -399,10 +416,11 @@ def test_the_summary_says_what_was_reached_and_what_is_wrong(check):
         "captured": "captured.json: torn",
         "tests": {"files": [{"name": "test_a.py", "right": False, "said": "1 failed"}]},
         "memcheck": None,
+        "rivals": {"skipped": [{"name": "far by Triton", "reason": "no package triton"}]},
         "step": {"rows": [{**row, "name": name} for name in ("loss", "loss by torch, sums by rays")]},
     }
     said = check.highlights(found)
-    assert len(said) == 18
+    assert len(said) == 19
     assert said[3].endswith("0.020 ms  50.0 % of copy, MISSED 60 %") and said[4].endswith("copy, reached 40 %")
     assert said[9:] == [
         "cell_sort k=16 by counting: 0.50 x the time of radix",
@@ -410,6 +428,7 @@ def test_the_summary_says_what_was_reached_and_what_is_wrong(check):
         "far: 2.00 x the time of wgmma",
         "loss: 1.00 x the time of torch, sums by rays",
         "RULE sort: counting up to 1,022 cells stays",
+        "left out: far by Triton: no package triton",
         "training plain: 8.25 ms a step, PSNR 21.50 after 90 steps",
         "WRONG in roofs: slow: hangs",
         "WRONG in training: bf16: no",

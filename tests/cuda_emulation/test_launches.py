@@ -12,7 +12,7 @@ from voronerf.data import builtin_scene
 from voronerf.training.config import TrainConfig
 from voronerf.training.trainer import Trainer
 
-LAUNCHES, READS = 29, 0
+LAUNCHES, READS = 26, 0
 """Of a default step. The launches go down only."""
 
 

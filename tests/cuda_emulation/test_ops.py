@@ -11,6 +11,7 @@ from helpers import same
 
 import voronerf
 from voronerf import VoronoiDiagram
+from voronerf.layers import MLP, POSITIONS, Layer
 from voronerf.ops.cell_sort.native import WAYS
 from voronerf.ops.cell_sort.native import sort as sort_cells
 from voronerf.ops.draw_pixels import native as draw_pixels
@@ -101,16 +102,43 @@ def test_adam_leaves_out_a_step_that_is_not_finite(spoilt):
     assert_adam(45, backend="native", spoilt=spoilt, limit=torch.inf if spoilt == "loss" else 1e3)
 
 
-def test_atomic_sums_are_refused_where_deterministic_algorithms_are_asked_for():
+def test_tables_and_gradients_that_are_not_aligned():
+    """Features are loaded several at a time, from multiples of 16 bytes: what begins elsewhere is copied."""
+    grid, positions = voronerf.HashGrid(levels=2, features=4, log2_entries=10, finest=20), torch.rand(50, 3)
+    table, gradient = torch.rand(grid.table_shape), torch.rand(50, 8)
+    moved = [torch.cat([torch.zeros(1), x.flatten()])[1:].view(x.shape) for x in (table, gradient)]
+    assert all(x.data_ptr() % 16 for x in moved)
+    layers = MLP((Layer((POSITIONS,), 8),), (0,), position_encoding="hash", grid=grid)
+    given = positions, torch.tensor([0, 50], dtype=torch.int32), [torch.rand(1, 8, 8)], [None]
+    found = []
+    for features, arriving in ((table, gradient), moved):
+        leaf = features.detach().requires_grad_()
+        for out in (
+            voronerf.hash_encode(positions, leaf, grid, backend="native"),
+            voronerf.grouped_mlp(*given, layers=layers, features=leaf, backend="native"),
+        ):
+            found += [out, *torch.autograd.grad(out, [leaf], arriving)]
+    for one, other in zip(found[:4], found[4:], strict=True):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("op", ["hash_encode", "grouped_mlp"])
+def test_atomic_sums_are_refused_where_deterministic_algorithms_are_asked_for(op):
+    """Of a table that is looked up by itself, and inside of a network."""
     grid = voronerf.HashGrid(levels=2, features=2, log2_entries=10, finest=20)
-    table = torch.rand(grid.table_shape, requires_grad=True)
-    total = voronerf.hash_encode(torch.rand(9, 3), table, grid, backend="native").sum()
+    table, positions = torch.rand(grid.table_shape, requires_grad=True), torch.rand(9, 3)
+    if op == "hash_encode":
+        total = voronerf.hash_encode(positions, table, grid, backend="native").sum()
+    else:
+        layers = MLP((Layer((POSITIONS,), 3),), (0,), position_encoding="hash", grid=grid)
+        given = positions, torch.tensor([0, 9], dtype=torch.int32), [torch.rand(1, 3, 4)], [None]
+        total = voronerf.grouped_mlp(*given, layers=layers, features=table, backend="native").sum()
     try:
         torch.use_deterministic_algorithms(True)
-        with pytest.raises(RuntimeError, match=r"^hash_encode: the gradient of a hash grid's table has no determ"):
+        with pytest.raises(RuntimeError, match=rf"^{op}: the gradient of a hash grid's table has no determ"):
             total.backward(retain_graph=True)
         torch.use_deterministic_algorithms(True, warn_only=True)
-        with pytest.warns(UserWarning, match=r"^hash_encode: the gradient"):
+        with pytest.warns(UserWarning, match=rf"^{op}: the gradient"):
             total.backward()
     finally:
         torch.use_deterministic_algorithms(False)

@@ -8,7 +8,7 @@ from emulated_networks import BRANCHED, GAUSSIANS, KIB, WIDE, check
 from helpers import refuses
 from network_plans import PRECISIONS, SHARED, SIZES, assert_covers, nerf, plan, table
 
-from voronerf.fields import DensityField, NeRF
+from voronerf.fields import DensityField, HashGridField, NeRF
 
 MIB = 1024 * KIB
 # Capability, shared memory that a block may ask for, multiprocessors, second-level cache.
@@ -80,6 +80,35 @@ def test_networks_of_the_benchmarks_are_fused(network, gpu):
     assert module().plan_for(layers, precision, 1 << 22, 16, False, device)["chained"]
     if device[1] >= 163 * KIB:
         assert not module().plan_for(layers, precision, 1 << 22, 16, True, device)["by_layers"]
+
+
+LEAST_WARPS = {
+    "H200": {"hash32": (12, 8, 12, 8), "w64d4": (12, 8, 12, 8), "nerf64": (4, 2, 12, 4)},
+    "A100": {"hash32": (12, 8, 12, 8), "w64d4": (8, 4, 12, 8), "nerf64": (4, 2, 12, 4)},
+    "RTX 4090": {"hash32": (8, 8, 12, 8), "w64d4": (4, 2, 12, 4), "nerf64": (2, 0, 12, 0)},
+}
+"""Warps of a multiprocessor in float32 forward and backward, then in bfloat16; 0: layer by layer. They go up only."""
+
+
+@pytest.mark.parametrize("gpu", LEAST_WARPS)
+def test_multiprocessors_have_their_warps(gpu):
+    """By the shared memory of the plans, and the registers that __launch_bounds__ of the kernels leave."""
+    device, found = GPUS[gpu], {}
+    for network in LEAST_WARPS[gpu]:
+        layers = HashGridField(32).layers if network == "hash32" else NETWORKS[network]
+        warps = []
+        for precision, backward in itertools.product((0, 1), (False, True)):
+            plan = module().plan_for(table(layers), precision, 1 << 20, 16, backward, device)
+            if plan["by_layers"]:
+                warps.append(0)
+                continue
+            block = plan["threads"] // 32
+            most = 8 if backward else 12
+            by_memory = (device[1] + KIB) // (plan["shared_bytes"] + KIB)
+            warps.append(block * min(by_memory, most // block))
+        found[network] = tuple(warps)
+    for network, least in LEAST_WARPS[gpu].items():
+        assert all(warps >= known for warps, known in zip(found[network], least, strict=True)), found
 
 
 @pytest.mark.parametrize("capability", SHARED)

@@ -132,6 +132,11 @@ def machine(tensor: Tensor) -> compiled.Cpu | compiled.Cuda:
     return compiled.Cuda(*stream(tensor)) if on_cuda(tensor) else cpu()
 
 
+def aligned(tensor: Tensor) -> Tensor:
+    """A tensor whose memory begins at a multiple of 16 bytes, as CUDA kernels want what they read in pieces."""
+    return tensor.clone() if on_cuda(tensor) and tensor.data_ptr() % 16 else tensor
+
+
 def on_huge_pages(result: Tensor) -> None:
     """Asks for huge pages for a result that has just been allocated, where it is large and the system gives them."""
     if result.nbytes >= _LARGE and result.device.type == "cpu":

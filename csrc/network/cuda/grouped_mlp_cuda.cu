@@ -1,4 +1,5 @@
-// grouped_mlp on CUDA: plans a call for the device that is current, and goes the way of the plan.
+// grouped_mlp on CUDA: plans calls for the device that is current, and goes the way of the plan.
+#include <memory>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -11,19 +12,6 @@
 namespace voronerf {
 
 namespace {
-
-MlpCudaChoice choose(const MlpTable& table, int64_t n, int64_t k, bool backward, MlpPrecision precision,
-                     MlpCudaWay way) {
-  MlpCudaDevice device = mlp_cuda_device();
-  device.groups = way == MlpCudaWay::groups && mlp_chain_groups_compiled();
-  MlpCudaChoice choice;
-  if (const char* fault = mlp_cuda_choose(table, precision, n, k, backward, way, device, choice)) {
-    const char* callers[] = {"grouped_mlp", "grouped_linear", "routed_mlp"};
-    throw std::invalid_argument(std::string(callers[static_cast<int>(table.caller)]) + ": " + fault +
-                                " on CUDA; use backend='reference'");
-  }
-  return choice;
-}
 
 MlpCudaData data_of(const MlpInputs& in) {
   MlpCudaData data{};
@@ -40,6 +28,8 @@ MlpCudaData data_of(const MlpInputs& in) {
 
 HashEncoding grid_of(const MlpTable& table, const MlpInputs& in) {
   if (table.position.kind != MlpEncodingKind::hash) return {};
+  VN_CHECK(reinterpret_cast<std::uintptr_t>(in.features) % 16 == 0,
+           "grouped_mlp: the features must begin at a multiple of 16 bytes");
   const GridLevel& last = table.grid.levels.back();
   const int64_t entries = last.offset + last.entries;
   return hash_encoding({in.positions, nullptr, in.features, in.features_type, nullptr, in.n, in.tables, entries},
@@ -64,26 +54,35 @@ MlpCudaParameters parameters_of(const MlpTable& table, const MlpInputs& in) {
 
 }  // namespace
 
-int64_t grouped_mlp_workspace_cuda(const MlpTable& table, int64_t n, int64_t k, bool backward, bool parameters,
-                                   MlpPrecision precision, MlpCudaWay way) {
-  const MlpCudaChoice choice = choose(table, n, k, backward, precision, way);
-  switch (choice.way) {
-    case MlpCudaWay::chain:
-      return mlp_chain_workspace(choice.chain, k).bytes;
-    case MlpCudaWay::tiles:
-      return mlp_cuda_workspace(choice.fused, k, parameters).bytes;
-    default:
-      return mlp_layers_workspace(choice.layers, k, parameters).bytes;
+std::unique_ptr<MlpCudaCall> grouped_mlp_call_cuda(const MlpTable& table, int64_t n, int64_t k, bool backward,
+                                                   bool parameters, MlpPrecision precision, MlpCudaWay way) {
+  MlpCudaDevice device = mlp_cuda_device();
+  device.groups = way == MlpCudaWay::groups && mlp_chain_groups_compiled();
+  auto call = std::make_unique<MlpCudaCall>();
+  call->table = table;
+  MlpCudaChoice& choice = call->choice;
+  if (const char* fault = mlp_cuda_choose(table, precision, n, k, backward, way, device, choice)) {
+    const char* callers[] = {"grouped_mlp", "grouped_linear", "routed_mlp"};
+    throw std::invalid_argument(std::string(callers[static_cast<int>(table.caller)]) + ": " + fault +
+                                " on CUDA; use backend='reference'");
   }
+  call->workspace = choice.way == MlpCudaWay::chain   ? mlp_chain_workspace(choice.chain, k).bytes
+                    : choice.way == MlpCudaWay::tiles ? mlp_cuda_workspace(choice.fused, k, parameters).bytes
+                                                      : mlp_layers_workspace(choice.layers, k, parameters).bytes;
+  return call;
+}
+
+int64_t grouped_mlp_workspace_cuda(const MlpCudaCall& call) {
+  return call.workspace;
 }
 
 bool grouped_mlp_hashes_cuda(const MlpTable& table, MlpPrecision precision, MlpCudaWay way) {
   return mlp_cuda_hashes(table, precision, way, mlp_cuda_device());
 }
 
-void grouped_mlp_cuda(const MlpTable& table, const MlpInputs& in, float* out, MlpPrecision precision, MlpCudaWay way,
-                      unsigned char* workspace, void* stream) {
-  const MlpCudaChoice choice = choose(table, in.n, in.k, false, precision, way);
+void grouped_mlp_cuda(const MlpCudaCall& call, const MlpInputs& in, float* out, unsigned char* workspace,
+                      void* stream) {
+  const auto& [table, choice, _] = call;
   MlpCudaData data = data_of(in);
   data.out = out;
   switch (choice.way) {
@@ -96,9 +95,9 @@ void grouped_mlp_cuda(const MlpTable& table, const MlpInputs& in, float* out, Ml
   }
 }
 
-void grouped_mlp_backward_cuda(const MlpTable& table, const MlpInputs& in, const MlpGradients& gradients,
-                               MlpPrecision precision, MlpCudaWay way, unsigned char* workspace, void* stream) {
-  const MlpCudaChoice choice = choose(table, in.n, in.k, true, precision, way);
+void grouped_mlp_backward_cuda(const MlpCudaCall& call, const MlpInputs& in, const MlpGradients& gradients,
+                               unsigned char* workspace, void* stream) {
+  const auto& [table, choice, _] = call;
   MlpCudaData data = data_of(in);
   data.grad_out = gradients.output;
   data.grad_positions = gradients.positions;

@@ -36,8 +36,14 @@ struct MlpCudaParameterGradients {
 constexpr int kMlpLayerThreads = 256;
 unsigned mlp_cuda_layer_blocks(int64_t k, int layers, int64_t elements);
 
-// Properties of the current device.
-MlpCudaDevice mlp_cuda_device();
+// Properties of the current device, which each thread asks for once.
+const MlpCudaDevice& mlp_cuda_device();
+
+// Rows to clear where they are of no cell; null where there are none.
+struct MlpStrays {
+  float* rows[2];
+  int widths[2];
+};
 
 // grid: of positions that are hashed.
 void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const HashEncoding& grid,
@@ -48,10 +54,11 @@ void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const Ha
                              const MlpCudaParameters& parameters, const MlpCudaParameterGradients* gradients,
                              unsigned char* workspace, void* stream);
 
-// Steps around the kernel of rows: weights packed and tasks mapped before it, rows of no cell cleared, partials summed.
+// Steps around the kernel of rows: in one launch weights packed, tasks mapped and rows of no cell cleared before it;
+// partials summed.
 void mlp_cuda_number_tasks(const MlpCudaData& data, int64_t task_rows, int64_t tasks, void* stream);
 void mlp_cuda_prepare(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters,
-                      void* stream);
+                      const MlpStrays& strays, void* stream);
 void mlp_cuda_zero_strays(const MlpCudaData& data, int width, float* rows, void* stream);
 void mlp_cuda_clear_gradient(const MlpCudaData& data, bool used, int width, float* gradient, void* stream);
 void mlp_cuda_reduce(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameterGradients& gradients,

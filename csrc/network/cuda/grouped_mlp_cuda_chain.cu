@@ -3,15 +3,20 @@
 #include <algorithm>
 
 #include "network/cuda/grouped_mlp_cuda_chain_kernel.h"
+#include "network/cuda/grouped_mlp_cuda_tasks.h"
 
 namespace voronerf {
 
 namespace {
 
-// Grid (k, layers, blocks of a layer).
+// Grid: mlp_prepare_grid().
 template <bool kBfloat16>
 __global__ void __launch_bounds__(kMlpLayerThreads)
-    mlp_chain_pack_kernel(const MlpChainPlan plan, const MlpCudaData data, const MlpCudaParameters parameters) {
+    mlp_chain_pack_kernel(const MlpChainPlan plan, const MlpCudaData data, const MlpCudaParameters parameters,
+                          const MlpStrays strays) {
+  if (blockIdx.y == static_cast<unsigned>(plan.layer_count)) {
+    return mlp_prepare_rows(data, plan.task_rows, plan.tasks, strays);
+  }
   const int64_t cell = blockIdx.x;
   const MlpChainLayer& layer = plan.layers[blockIdx.y];
   unsigned char* piece = data.packed + cell * plan.packed_bytes + layer.piece;
@@ -50,9 +55,9 @@ void pack(const MlpChainPlan& plan, const MlpCudaData& data, const MlpCudaParame
   for (int l = 0; l < plan.layer_count; ++l) {
     words = std::max(words, int64_t{plan.layers[l].steps} * chain_pairs(8) * kChainQuad / 4);
   }
-  const unsigned packers = mlp_cuda_layer_blocks(data.k, plan.layer_count, words);
-  VN_LAUNCH((mlp_chain_pack_kernel<kBfloat16>), dim3(static_cast<unsigned>(data.k), plan.layer_count, packers),
-            kMlpLayerThreads, 0, stream, plan, data, parameters);
+  const MlpStrays strays = {{data.out}, {plan.out_features}};
+  VN_LAUNCH((mlp_chain_pack_kernel<kBfloat16>), mlp_prepare_grid(data.k, plan.layer_count, words), kMlpLayerThreads, 0,
+            stream, plan, data, parameters, strays);
 }
 
 }  // namespace
@@ -63,8 +68,6 @@ void mlp_chain_cuda(const MlpChainPlan& plan, MlpCudaData data, const MlpCudaPar
   const MlpCudaWorkspace parts = mlp_chain_workspace(plan, data.k);
   data.packed = workspace + parts.packed;
   data.first_task = reinterpret_cast<int32_t*>(workspace + parts.first_task);
-  mlp_cuda_number_tasks(data, plan.task_rows, plan.tasks, stream);
-  mlp_cuda_zero_strays(data, plan.out_features, data.out, stream);
   if (plan.precision == MlpPrecision::bfloat16) {
     pack<true>(plan, data, parameters, stream);
   } else {

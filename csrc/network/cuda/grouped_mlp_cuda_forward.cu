@@ -72,8 +72,7 @@ void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const HashEncodin
   const MlpCudaWorkspace parts = mlp_cuda_workspace(plan, data.k, false);
   data.packed = workspace + parts.packed;
   data.first_task = reinterpret_cast<int32_t*>(workspace + parts.first_task);
-  mlp_cuda_prepare(plan, data, parameters, stream);
-  mlp_cuda_zero_strays(data, plan.out_features, data.out, stream);
+  mlp_cuda_prepare(plan, data, parameters, {{data.out}, {plan.out_features}}, stream);
   switch (plan.precision) {
     case MlpPrecision::bfloat16:
       return launch<HalfProducts<true>>(plan, data, grid, stream);

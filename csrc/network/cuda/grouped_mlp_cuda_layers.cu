@@ -50,7 +50,7 @@ __global__ void __launch_bounds__(kThreads)
 // One block: the tiles of every cell in the slab, numbered.
 __global__ void __launch_bounds__(kScanThreads)
     layers_tasks_kernel(const MlpSlab slab, int32_t* first_task, int64_t most) {
-  number_tasks(slab.k, most, first_task, [&](int64_t cell) {
+  number_tasks<kScanThreads>(slab.k, most, first_task, [&](int64_t cell) {
     const MlpRows rows = mlp_slab_rows(slab, cell);
     return static_cast<int32_t>(ceil_div<int64_t>(rows.end - rows.begin, kLayersRows));
   });

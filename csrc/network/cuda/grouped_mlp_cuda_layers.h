@@ -80,6 +80,13 @@ struct MlpCudaChoice {
 const char* mlp_cuda_choose(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k, bool backward,
                             MlpCudaWay wanted, const MlpCudaDevice& device, MlpCudaChoice& choice);
 
+// A call of a table with its choice.
+struct MlpCudaCall {
+  MlpTable table;
+  MlpCudaChoice choice;
+  int64_t workspace;
+};
+
 // Whether a table's hash grid is looked up by tiles, forward and backward; else its positions are to be encoded before.
 // Tiles take networks of this kind from the chain: those are narrow, and what the chain is faster by (5 ps a sample at
 // width 32 by the counts of docs/cuda.md, 33 at 64) is as much as writing and reading 16 features (27 ps of an H200).

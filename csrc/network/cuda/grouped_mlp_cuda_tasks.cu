@@ -1,11 +1,11 @@
-// What grouped_mlp does before and after its rows on CUDA: every cell's weights are rounded and packed as the kernels
-// want them in shared memory, so that loading them there is one straight copy; the tasks of all cells are numbered, so
-// that a block finds its rows without the host having read the offsets; rows of no cell are cleared; and the partial
-// weight gradients of a cell's tasks are summed in their order, which makes them the same every time.
+// What grouped_mlp does before and after its rows on CUDA. In one launch every cell's weights are rounded and packed as
+// the kernels want them in shared memory, so that loading them there is one straight copy; the tasks of all cells are
+// numbered, so that a block finds its rows without the host having read the offsets; and rows of no cell are cleared.
+// The partial weight gradients of a cell's tasks are summed in an order that the offsets alone say, which makes them
+// the same every time.
 #include <algorithm>
 
 #include "network/cuda/grouped_mlp_cuda_tasks.h"
-#include "network/cuda/grouped_mlp_cuda_tile.h"
 
 namespace voronerf {
 
@@ -13,12 +13,17 @@ namespace {
 
 constexpr int kThreads = kMlpLayerThreads;
 constexpr int64_t kBlocksPerMultiprocessor = 8;  // of kernels with blocks for each cell
+constexpr int kManyPartials = 16;                // of a cell, which the warps of a block then share
 
-// Grid (k, layers, blocks of a layer).
+// Grid: mlp_prepare_grid().
 template <typename Products>
 __global__ void __launch_bounds__(kThreads)
-    mlp_pack_kernel(const MlpCudaPlan plan, const MlpCudaData data, const MlpCudaParameters parameters) {
+    mlp_pack_kernel(const MlpCudaPlan plan, const MlpCudaData data, const MlpCudaParameters parameters,
+                    const MlpStrays strays) {
   using Element = typename Products::Element;
+  if (blockIdx.y == static_cast<unsigned>(plan.layer_count)) {
+    return mlp_prepare_rows(data, plan.task_rows, plan.tasks, strays);
+  }
   const int64_t cell = blockIdx.x;
   const MlpCudaLayer& layer = plan.layers[blockIdx.y];
   unsigned char* packed = data.packed + cell * plan.packed_bytes;
@@ -50,8 +55,7 @@ __global__ void __launch_bounds__(kThreads)
 // One block.
 __global__ void __launch_bounds__(kScanThreads)
     mlp_tasks_kernel(const MlpCudaData data, int64_t task_rows, int64_t tasks) {
-  number_tasks(data.k, tasks, data.first_task,
-               [&](int64_t cell) { return static_cast<int32_t>(ceil_div(mlp_cell_rows(data, cell), task_rows)); });
+  mlp_number_tasks<kScanThreads>(data, task_rows, tasks);
 }
 
 __global__ void __launch_bounds__(kThreads) mlp_strays_kernel(const MlpCudaData data, int width, float* rows) {
@@ -70,37 +74,57 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t cell = blockIdx.x;
   const MlpCudaLayer& layer = plan.layers[blockIdx.y];
   const int64_t first = data.first_task[cell], last = layer.live ? data.first_task[cell + 1] : first;
-  const auto sum = [&](int at) {
-    float total = 0.0f;
-    for (int64_t task = first; task < last; ++task) total += data.partials[task * plan.partial + at];
-    return total;
+  // Of many partials each warp adds up a part, in order, and the parts are added up in theirs.
+  const int warps = last - first < kManyPartials ? 1 : kThreads / 32, wide = kThreads / warps;
+  const int part = threadIdx.x / wide;
+  const int64_t share = ceil_div(last - first, static_cast<int64_t>(warps)), begin = first + part * share;
+  const int64_t end = begin + share < last ? begin + share : last;
+  VN_SHARED(sums, float[kThreads]);
+  // to(i, the sum at place(i)) for i up to count.
+  const auto sum = [&](int count, const auto& place, const auto& to) {
+    for (int from = blockIdx.z * wide; from < count; from += gridDim.z * wide) {
+      const int i = from + threadIdx.x % wide;
+      float total = 0.0f;
+      if (i < count) {
+        const int at = place(i);
+        for (int64_t task = begin; task < end; ++task) total += data.partials[task * plan.partial + at];
+      }
+      if (warps > 1) {
+        sums[threadIdx.x] = total;
+        __syncthreads();
+        for (int other = 1; part == 0 && other < warps; ++other) total += sums[other * wide + threadIdx.x];
+        __syncthreads();  // the sums are read
+      }
+      if (part == 0 && i < count) to(i, total);
+    }
   };
-  const int thread = blockIdx.z * kThreads + threadIdx.x, step = gridDim.z * kThreads;
   float* weights = gradients.weights[blockIdx.y];
   float* biases = gradients.biases[blockIdx.y];
   for (int s = 0; s < layer.source_count; ++s) {
     const MlpCudaSource& source = layer.sources[s];
-    for (int i = thread; i < layer.width * source.width; i += step) {
-      const int row = i / source.width, feature = i - row * source.width;
-      weights[(cell * layer.width + row) * layer.inputs + source.column + feature] =
-          sum(layer.partial + row * layer.partial_stride + source.packed + feature);
-    }
+    const auto row = [&](int i) { return i / source.width; };
+    sum(
+        layer.width * source.width,
+        [&](int i) { return layer.partial + row(i) * (layer.partial_stride - source.width) + source.packed + i; },
+        [&](int i, float total) {
+          weights[(cell * layer.width + row(i)) * layer.inputs + source.column + i - row(i) * source.width] = total;
+        });
   }
-  for (int i = thread; biases != nullptr && i < layer.width; i += step) {
-    biases[cell * layer.width + i] = sum(layer.partial_bias + i);
-  }
+  if (biases == nullptr) return;
+  sum(
+      layer.width, [&](int i) { return layer.partial_bias + i; },
+      [&](int i, float total) { biases[cell * layer.width + i] = total; });
 }
 
 template <typename Products>
-void pack(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters, void* stream) {
+void pack(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters,
+          const MlpStrays& strays, void* stream) {
   int64_t pairs = 1;
   for (int l = 0; l < plan.layer_count; ++l) {
     pairs = std::max(pairs, int64_t{plan.layers[l].padded} * plan.layers[l].weight_stride / 2);
   }
-  VN_LAUNCH(
-      (mlp_pack_kernel<Products>),
-      dim3(static_cast<unsigned>(data.k), plan.layer_count, mlp_cuda_layer_blocks(data.k, plan.layer_count, pairs)),
-      kThreads, 0, stream, plan, data, parameters);
+  VN_LAUNCH((mlp_pack_kernel<Products>), mlp_prepare_grid(data.k, plan.layer_count, pairs), kThreads, 0, stream, plan,
+            data, parameters, strays);
 }
 
 }  // namespace
@@ -112,11 +136,13 @@ unsigned mlp_cuda_layer_blocks(int64_t k, int layers, int64_t elements) {
   return static_cast<unsigned>(wanted < useful ? wanted : useful);
 }
 
-MlpCudaDevice mlp_cuda_device() {
-  int device = 0, major = 0, minor = 0;
-  int cache = 0;
-  MlpCudaDevice found{};
+const MlpCudaDevice& mlp_cuda_device() {
+  thread_local int asked = -1;
+  thread_local MlpCudaDevice found{};
+  int device = 0;
   VN_CUDA_CHECK(cudaGetDevice(&device));
+  if (asked == device) return found;
+  int major = 0, minor = 0, cache = 0;
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&minor, cudaDevAttrComputeCapabilityMinor, device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
@@ -127,6 +153,7 @@ MlpCudaDevice mlp_cuda_device() {
   VN_CUDA_CHECK(cudaFuncGetAttributes(&compiled, mlp_tasks_kernel));
   found.capability = std::min(10 * major + minor, compiled.ptxVersion);
   found.cache_bytes = cache;
+  asked = device;
   return found;
 }
 
@@ -135,17 +162,16 @@ void mlp_cuda_number_tasks(const MlpCudaData& data, int64_t task_rows, int64_t t
 }
 
 void mlp_cuda_prepare(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters,
-                      void* stream) {
-  mlp_cuda_number_tasks(data, plan.task_rows, plan.tasks, stream);
+                      const MlpStrays& strays, void* stream) {
   switch (plan.precision) {
     case MlpPrecision::bfloat16:
-      return pack<HalfProducts<true>>(plan, data, parameters, stream);
+      return pack<HalfProducts<true>>(plan, data, parameters, strays, stream);
     case MlpPrecision::float16:
-      return pack<HalfProducts<false>>(plan, data, parameters, stream);
+      return pack<HalfProducts<false>>(plan, data, parameters, strays, stream);
     case MlpPrecision::tf32:
-      return pack<FloatProducts<true>>(plan, data, parameters, stream);
+      return pack<FloatProducts<true>>(plan, data, parameters, strays, stream);
     case MlpPrecision::float32:
-      return pack<FloatProducts<false>>(plan, data, parameters, stream);
+      return pack<FloatProducts<false>>(plan, data, parameters, strays, stream);
   }
 }
 
@@ -171,10 +197,10 @@ void mlp_cuda_reduce(const MlpCudaPlan& plan, const MlpCudaData& data, const Mlp
       weights = std::max(weights, int64_t{plan.layers[l].width} * plan.layers[l].sources[s].width);
     }
   }
-  VN_LAUNCH(
-      mlp_reduce_kernel,
-      dim3(static_cast<unsigned>(data.k), plan.layer_count, mlp_cuda_layer_blocks(data.k, plan.layer_count, weights)),
-      kThreads, 0, stream, plan, data, gradients);
+  VN_LAUNCH(mlp_reduce_kernel,
+            dim3(static_cast<unsigned>(data.k), plan.layer_count,
+                 mlp_cuda_layer_blocks(data.k, plan.layer_count, kThreads / 32 * weights)),
+            kThreads, 0, stream, plan, data, gradients);
 }
 
 }  // namespace voronerf

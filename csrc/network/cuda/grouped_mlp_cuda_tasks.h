@@ -1,22 +1,23 @@
-// The map from blocks to rows of cells, which the device makes, so that the host does not read the offsets.
+// The map from blocks to rows of cells, which the device makes, so that the host does not read the offsets, and what
+// else precedes a network: kernels that pack weights have more blocks for it.
 #pragma once
 
-#include "common/cuda_wrappers.h"
+#include "network/cuda/grouped_mlp_cuda_tile.h"
 
 namespace voronerf {
 
 constexpr int kScanThreads = 1024;
 
-// first_task [k+1] by one block of kScanThreads: the running sum of tasks_of(cell). Cells that overlap, which offsets
+// first_task [k+1] by one block of kThreads: the running sum of tasks_of(cell). Cells that overlap, which offsets
 // that fall make, could have more tasks than `most`, what the grid has blocks for and the workspace partials: no number
 // exceeds it, and what such cells get is undefined.
-template <typename Tasks>
+template <int kThreads, typename Tasks>
 __device__ void number_tasks(int64_t k, int64_t most, int32_t* first_task, const Tasks& tasks_of) {
-  VN_SHARED(sums, int64_t[32]);
+  VN_SHARED(sums, int64_t[kThreads / 32]);
   const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
   const auto inside = [most](int64_t tasks) { return static_cast<int32_t>(tasks < most ? tasks : most); };
   int64_t carry = 0;
-  for (int64_t start = 0; start < k; start += kScanThreads) {
+  for (int64_t start = 0; start < k; start += kThreads) {
     const int64_t cell = start + threadIdx.x;
     const int64_t tasks = cell < k ? tasks_of(cell) : 0;
     int64_t running = tasks;
@@ -27,7 +28,7 @@ __device__ void number_tasks(int64_t k, int64_t most, int32_t* first_task, const
     if (lane == 31) sums[warp] = running;
     __syncthreads();
     int64_t before = carry, total = 0;
-    for (int i = 0; i < 32; ++i) {
+    for (int i = 0; i < kThreads / 32; ++i) {
       if (i < warp) before += sums[i];
       total += sums[i];
     }
@@ -36,6 +37,38 @@ __device__ void number_tasks(int64_t k, int64_t most, int32_t* first_task, const
     __syncthreads();  // the sums are read by all
   }
   if (threadIdx.x == 0) first_task[k] = inside(carry);
+}
+
+// The same for tasks of so many rows of every cell.
+template <int kThreads>
+__device__ void mlp_number_tasks(const MlpCudaData& data, int64_t task_rows, int64_t tasks) {
+  number_tasks<kThreads>(data.k, tasks, data.first_task, [&](int64_t cell) {
+    return static_cast<int32_t>(ceil_div(mlp_cell_rows(data, cell), task_rows));
+  });
+}
+
+// Beside the packing of weights, whose grid is (k, layers, blocks of a layer): the blocks of one layer more number the
+// tasks and clear the strays.
+inline dim3 mlp_prepare_grid(int64_t k, int layers, int64_t elements) {
+  return dim3(static_cast<unsigned>(k), static_cast<unsigned>(layers + 1), mlp_cuda_layer_blocks(k, layers, elements));
+}
+__device__ inline void mlp_prepare_rows(const MlpCudaData& data, int64_t task_rows, int64_t tasks,
+                                        const MlpStrays& strays) {
+  const int64_t block = blockIdx.x + static_cast<int64_t>(blockIdx.z) * gridDim.x;
+  const int64_t blocks = static_cast<int64_t>(gridDim.x) * gridDim.z;
+  if (block == blocks - 1) mlp_number_tasks<kMlpLayerThreads>(data, task_rows, tasks);
+  if (strays.rows[0] == nullptr && strays.rows[1] == nullptr) return;
+  const int64_t low = mlp_cell_begin(data, 0), last = data.offsets[data.k];
+  const int64_t high = last < low ? low : last > data.n ? data.n : last;
+  for (int64_t i = block * kMlpLayerThreads + threadIdx.x; i < data.n - (high - low); i += blocks * kMlpLayerThreads) {
+    const int64_t row = mlp_source_row(data, i < low ? i : i + high - low);
+#pragma unroll
+    for (int each = 0; each < 2; ++each) {
+      if (strays.rows[each] == nullptr) continue;
+      const int width = strays.widths[each];
+      for (int column = 0; column < width; ++column) strays.rows[each][row * width + column] = 0.0f;
+    }
+  }
 }
 
 }  // namespace voronerf

@@ -164,16 +164,19 @@ def encoded_already(layers: MLP, sources: str) -> MLP:
     return layers
 
 
-def compiled_table(
-    text: str, positions: Tensor, weights: Sequence[Tensor], directions: Tensor | None
-) -> native.compiled.MlpTable:
-    """The table of a string as compiled functions take it."""
+Key = tuple[str, int, int, tuple[int, ...]]
+"""Of a table: its string, p, q, and the widths of the weights."""
+
+
+def table_key(text: str, positions: Tensor, weights: Sequence[Tensor], directions: Tensor | None) -> Key:
+    """What a compiled table depends on, to be looked up by."""
     q = 0 if directions is None else directions.shape[1]
-    return _compiled(text, positions.shape[1], q, tuple([weight.shape[1] for weight in weights]))
+    return text, positions.shape[1], q, tuple([weight.shape[1] for weight in weights])
 
 
 @functools.lru_cache(maxsize=256)
-def _compiled(text: str, p: int, q: int, widths: tuple[int, ...]) -> native.compiled.MlpTable:
+def table_of(text: str, p: int, q: int, widths: tuple[int, ...]) -> native.compiled.MlpTable:
+    """The compiled table of a key."""
     table, compiled = Table.parse(text), native.compiled
     layers = table.layers
     return compiled.MlpTable(

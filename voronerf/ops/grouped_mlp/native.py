@@ -3,12 +3,13 @@
 n samples, r rays, k cells, p and q features of a raw position and direction, i inputs and o outputs of a layer. Tensors
 are cast to float32 on the way in and back on the way out, a cell having few weights. With bfloat16 storage, or under
 autocast to it, products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16), and float32
-ones elsewhere; sums are float32 always. Gradients that will be differentiated again are taken layer by layer
-(``layerwise.py``).
+ones elsewhere, or torch multiplies (``by_torch.py``); sums are float32 always. Gradients that will be differentiated
+again are taken layer by layer (``layerwise.py``).
 """
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,15 +22,18 @@ from voronerf import native
 from voronerf.custom_op import custom_op
 from voronerf.derivatives import asked_for
 from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
+from voronerf.ops.grouped_mlp import by_torch
 from voronerf.ops.grouped_mlp.layer_table import (
     Given,
+    Key,
     Network,
     Table,
-    compiled_table,
     in_float32,
     network,
     operands,
     storage,
+    table_key,
+    table_of,
     table_text,
 )
 from voronerf.ops.grouped_mlp.layerwise import gradients as differentiable
@@ -81,6 +85,12 @@ def grouped_mlp(
     Under ``torch.autocast`` to bfloat16, products take bfloat16 operands where the processor has them.
     """
     given = Given(positions, weights, biases, layers, directions, direction_index, features)
+    return (by_torch.run if by_torch.is_faster(given, fused) else fused)(given, offsets)
+
+
+def fused(given: Given, offsets: Tensor) -> Tensor:
+    """The same by the kernels."""
+    features, positions = given.features, given.positions
     own, before = features is not None and features.dim() == 3, hashes_before(given)
     cells = cells_of(offsets, positions) if own and before else None
     taken, dtype = network(given, cells, hashed_before=before)
@@ -120,10 +130,14 @@ def hashes_before(given: Given) -> bool:
         return True
     multiplied = operands(positions, storage(positions, weights))
     text = table_text(layers.text, "grouped_mlp", multiplied, "")
-    table = compiled_table(text, positions, weights, given.directions)
     machine = native.machine(positions)
     assert isinstance(machine, native.compiled.Cuda)
-    return not native.compiled.grouped_mlp_hashes(table, _precision(multiplied), _way, machine)
+    return not _hashes(table_key(text, positions, weights, given.directions), _precision(multiplied), _way, machine)
+
+
+@functools.lru_cache(maxsize=256)
+def _hashes(key: Key, precision: str, way: str, machine: native.compiled.Cuda) -> bool:
+    return native.compiled.grouped_mlp_hashes(table_of(*key), precision, way, machine)
 
 
 def keeps_encoded(given: Network) -> bool:
@@ -155,13 +169,13 @@ def run(out: Tensor, encoded: Tensor, network: Network, offsets: Tensor, order: 
     """Fills the output of sorted rows, or of those that ``order`` int32 [n] sorts."""
     native.on_huge_pages(out)
     native.on_huge_pages(encoded)
-    given, inputs = _compiled_table(network), _inputs(network, offsets, order, encoded)
+    inputs, key = _inputs(network, offsets, order, encoded), _key(network)
     compiled, machine = native.compiled, native.machine(network.positions)
     if isinstance(machine, compiled.Cuda):
-        rest = _on_cuda(network.table, given, inputs, machine, backward=False, parameters=False)
-        compiled.grouped_mlp(given, inputs, out, *rest, machine)
+        call, workspace = _on_cuda(key, inputs, machine, backward=False, parameters=False)
+        compiled.grouped_mlp(call, inputs, out, workspace, machine)
     else:
-        compiled.grouped_mlp(given, inputs, out, machine)
+        compiled.grouped_mlp(table_of(*key), inputs, out, machine)
 
 
 @custom_op("grouped_mlp_native_backward")
@@ -187,7 +201,7 @@ def backward(
     for result in results:
         native.on_huge_pages(result)
     compiled, machine = native.compiled, native.machine(positions)
-    given, inputs = _compiled_table(network), _inputs(network, offsets, order, encoded)
+    inputs, key = _inputs(network, offsets, order, encoded), _key(network)
     to_directions = results[-2] if wanted[2] else None
     of_samples = None
     if isinstance(machine, compiled.Cuda) and wanted[2] and direction_index is not None and directions is not None:
@@ -201,17 +215,19 @@ def backward(
         features=results[-1] if wanted[3] else None,
     )
     if isinstance(machine, compiled.Cuda):
-        rest = _on_cuda(network.table, given, inputs, machine, backward=True, parameters=wanted[0])
-        compiled.grouped_mlp_backward(given, inputs, gradients, *rest, machine)
+        if wanted[3]:
+            native.refuse_where_deterministic(Table.parse(network.table).caller, positions)
+        call, workspace = _on_cuda(key, inputs, machine, backward=True, parameters=wanted[0])
+        compiled.grouped_mlp_backward(call, inputs, gradients, workspace, machine)
     else:
-        compiled.grouped_mlp_backward(given, inputs, gradients, machine)
+        compiled.grouped_mlp_backward(table_of(*key), inputs, gradients, machine)
     if of_samples is not None and direction_index is not None:
         # torch adds in a fixed order where deterministic algorithms are asked for.
         results[-2].zero_().index_add_(0, direction_index, of_samples)
 
 
-def _compiled_table(network: Network) -> native.compiled.MlpTable:
-    return compiled_table(network.table, network.positions, network.weights, network.directions)
+def _key(network: Network) -> Key:
+    return table_key(network.table, network.positions, network.weights, network.directions)
 
 
 def _inputs(network: Network, offsets: Tensor, order: Tensor | None, encoded: Tensor) -> native.compiled.MlpInputs:
@@ -227,7 +243,7 @@ def _inputs(network: Network, offsets: Tensor, order: Tensor | None, encoded: Te
         r=0 if directions is None else directions.shape[0],
         k=offsets.shape[0] - 1,
         order=order,
-        features=features,
+        features=None if features is None else native.aligned(features),
         features_type="float32" if features is None else str(features.dtype).removeprefix("torch."),
         tables=1 if features is None or features.dim() == 2 else features.shape[0],
         encoded=encoded if encoded.numel() else None,
@@ -240,21 +256,27 @@ def _present(biases: Sequence[Tensor]) -> list[Tensor | None]:
 
 
 def _on_cuda(
-    table: str,
-    given: native.compiled.MlpTable,
+    key: Key,
     inputs: native.compiled.MlpInputs,
     machine: native.compiled.Cuda,
     *,
     backward: bool,
     parameters: bool,
-) -> tuple[str, str, Tensor]:
-    """What a call takes besides its tensors: the type of the products, the way, a workspace."""
-    precision, positions = _precision(Table.parse(table).operands), inputs.positions
-    size = native.compiled.grouped_mlp_workspace(
-        given, inputs.n, inputs.k, backward, parameters, precision, _way, machine
-    )
-    assert positions is not None
-    return precision, _way, positions.new_empty(size, dtype=torch.uint8)
+) -> tuple[native.compiled.MlpCudaCall, Tensor]:
+    """What a call takes besides its tensors: its plan and a workspace."""
+    assert inputs.positions is not None
+    precision = _precision(Table.parse(key[0]).operands)
+    call, size = _plan(key, inputs.n, inputs.k, backward, parameters, precision, _way, machine)
+    return call, inputs.positions.new_empty(size, dtype=torch.uint8)
+
+
+@functools.lru_cache(maxsize=256)
+def _plan(
+    key: Key, n: int, k: int, backward: bool, parameters: bool, precision: str, way: str, machine: native.compiled.Cuda
+) -> tuple[native.compiled.MlpCudaCall, int]:
+    """The plan of a call, which takes tens of microseconds, and the bytes of its workspace."""
+    call = native.compiled.grouped_mlp_call(table_of(*key), n, k, backward, parameters, precision, way, machine)
+    return call, native.compiled.grouped_mlp_workspace(call)
 
 
 def _precision(multiplied: str) -> str:

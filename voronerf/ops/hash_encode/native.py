@@ -41,7 +41,7 @@ def _backward(gradient: Tensor, given: Hashed, to_positions: bool, to_table: boo
     native.compiled.hash_encode_backward(
         _inputs(given),
         compiled_grid(given.grid),
-        gradient,
+        native.aligned(gradient),
         of_table if to_table else None,
         of_positions if to_positions else None,
         native.machine(given.positions),
@@ -53,7 +53,7 @@ def _inputs(given: Hashed) -> native.compiled.HashInputs:
     return native.compiled.HashInputs(
         positions=given.positions,
         direction=given.direction,
-        table=table,
+        table=native.aligned(table),
         type=str(table.dtype).removeprefix("torch."),
         cells=cells,
         n=given.positions.shape[0],
