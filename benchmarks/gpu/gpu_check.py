@@ -15,6 +15,8 @@ is a Blender scene for the trainings.
         sizes      a network at 2^13 to 2^22 samples, 1 to 4,096 cells, all precisions, beside torch's products
         step       what surrounds the networks in a step, and hash grids, beside the same in plain torch
         profile    a default step: launches, the share of the time that the device works, waits of the host
+        rivals     a network by torch.compile, Triton and tiny-cuda-nn (VORONERF_TCNN names a benchmark of it), where
+                   they are
     3   training   trainings on --data or the built-in scene, with PSNR over seconds
         tests      the tests of the operations on CUDA, a process for each file
         counters   ncu over eight kernels, where it is installed
@@ -51,7 +53,7 @@ SPLIT = "--split-compile=0"
 TARGETS = {"90": "90a"}
 """What to build for, where that is not the compute capability as it is: with wgmma, to compare it."""
 JUDGED = (
-    *("small", "large", "captured", "roofs", "sizes", "step", "profile", "training"),
+    *("small", "large", "captured", "roofs", "sizes", "step", "profile", "rivals", "training"),
     *("memcheck", "racecheck", "synccheck", "initcheck"),
 )
 """Parts that have cases, each right or wrong."""
@@ -71,7 +73,7 @@ class Part:
 
 CALLS = {
     "1": ("machine", "build", "small", "large", "captured", "memcheck"),
-    "2": ("build", "roofs", "sizes", "step", "profile"),
+    "2": ("build", "roofs", "sizes", "step", "profile", "rivals"),
     "3": ("build", "training", "tests", "counters", "racecheck", "synccheck", "initcheck"),
 }
 """Parts of each call. All begin with the build, which takes no time where an earlier call's is there."""
@@ -156,9 +158,10 @@ def parts(out: Path, data: Path | None) -> dict[str, Part]:
         "small": program("small", 75),
         "large": program("large", 95),
         "captured": program("captured", 45),
-        "roofs": program("roofs", 90),
-        "sizes": program("sizes", 90),
-        "step": program("step", 75),
+        "roofs": program("roofs", 80),
+        "sizes": program("sizes", 80),
+        "step": program("step", 65),
+        "rivals": program("rivals", 40),
         "profile": program("profile", 40),
         "training": program("training", 120, "builtin" if data is None else str(data)),
         "tests": program("tests", 75) if importlib.util.find_spec("pytest") else Part("no pytest", 0),
@@ -220,7 +223,7 @@ def highlights(found: dict[str, Any]) -> list[str]:
         return kept.get(kind, []) if isinstance(kept, dict) else []
 
     lines = []
-    timed = [row for part in ("roofs", "sizes", "step") for row in rows(part, "rows")]
+    timed = [row for part in ("roofs", "sizes", "step", "rivals") for row in rows(part, "rows")]
     for row in timed:
         aim = row["aim"]
         verdict = "" if aim is None else f", {'reached' if row['share'] >= aim else 'MISSED'} {100 * aim:.0f} %"
@@ -235,6 +238,7 @@ def highlights(found: dict[str, Any]) -> list[str]:
             if other.startswith(f"{name} by "):
                 lines.append(f"{name}: {seconds / its:.2f} x the time of {other.removeprefix(f'{name} by ')}")
     lines += [f"RULE {line}" for line in ruled(times)]
+    lines += [f"left out: {row['name']}: {row['reason']}" for row in rows("rivals", "skipped")]
     for row in rows("profile", "steps"):
         said = f"{row['launches']} launches, {row['waits']} waits, busy {100 * row['busy']:.0f} %"
         lines.append(f"step {row['name']}: {said}, {row['nanoseconds']:.1f} ns a sample")

@@ -7,6 +7,7 @@
     tests      tests/ops on CUDA, a process for each file
     roofs      the networks, look-ups and sorts at full size, beside the machine's own copy and products
     sizes      a network at many sizes and precisions, beside torch's products
+    rivals     a network by torch.compile, Triton and tiny-cuda-nn, where they are
     step       what surrounds the networks in a training step, beside the same in plain torch
     profile    launches and waits of a default step
     training   short trainings, and ones whose steps are replayed from a CUDA graph
@@ -36,7 +37,7 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / place) for place in ("benchmarks/gpu", "
 from gpu_cases import captured_steps, small_cases  # noqa: E402
 from gpu_journal import CASE_SECONDS, Again, Case, Journal, one_by_one, settling  # noqa: E402
 from gpu_large import large_cases  # noqa: E402
-from gpu_timings import profile, roofs, sizes, step  # noqa: E402
+from gpu_timings import profile, rivals, roofs, sizes, step  # noqa: E402
 
 FILE_SECONDS = 60.0
 """For one file of the tests."""
@@ -214,14 +215,14 @@ NERF: dict[str, Any] = {"field": "nerf", "occupancy": False}
 TRAININGS: dict[str, dict[str, Any]] = {
     "default": {},
     "default, every sample": {"occupancy": False},
-    "default in a graph": {"occupancy": False, "cuda_graph": True},
-    "default in a graph, bf16": {"occupancy": False, "cuda_graph": True, "precision": "bf16"},
+    "default in a graph": {"cuda_graph": True},
+    "default in a graph, bf16": {"cuda_graph": True, "precision": "bf16"},
     "nerf": NERF,
     "nerf, bf16": {**NERF, "precision": "bf16"},
     "nerf in a graph, bf16": {**NERF, "precision": "bf16", "cuda_graph": True},
     "nerf in a graph, fp16": {**NERF, "precision": "fp16", "cuda_graph": True},
 }
-"""What each training sets; a graph has no room for an occupancy grid."""
+"""What each training sets."""
 
 
 def main(arguments: list[str]) -> int:
@@ -237,7 +238,7 @@ def main(arguments: list[str]) -> int:
     seconds = given.case_seconds or PARTS[given.part] * CASE_SECONDS
     again = Again((given.part, str(given.out), given.data), given.start, given.failed, seconds)
     checks = {"small": small, "large": large, "captured": captured}
-    timings = {"roofs": roofs, "sizes": sizes, "step": step, "profile": profile}
+    timings = {"roofs": roofs, "sizes": sizes, "step": step, "profile": profile, "rivals": rivals}
     if given.part in checks:
         return checks[given.part](again, Journal(given.out, given.part, begun=given.start > 0))
     if given.part in timings:
@@ -248,7 +249,7 @@ def main(arguments: list[str]) -> int:
 
 
 PARTS = {"machine": 1, "small": 1, "large": 3, "captured": 1, "roofs": 2, "sizes": 2, "step": 2, "profile": 3}
-PARTS |= {"training": 4, "tests": 1}
+PARTS |= {"rivals": 2, "training": 4, "tests": 1}
 """Times ``CASE_SECONDS`` that a case may take: a timing makes a batch as well, and a training is one."""
 
 

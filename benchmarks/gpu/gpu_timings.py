@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import functools
+import importlib
+import importlib.util
 import itertools
+import os
+import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -168,6 +172,66 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
     return rows.measure()
 
 
+def products(n: int, k: int, where: Any, grouped: bool) -> Run:
+    """The layers of w64d4 as torch's products, over cells of one size."""
+    import torch
+    from ops.networks import NETS
+
+    share = n // k
+    shapes = [(i + -i % 16, o + -o % 16) for o, i in NETS["w64d4"].weight_shapes(3)]  # multiples of 16 for _grouped_mm
+    weights = [torch.randn(k, *shape, device=where, dtype=torch.bfloat16) for shape in shapes]
+    first = torch.randn(k, share, shapes[0][0], device=where, dtype=torch.bfloat16)
+    ends = torch.arange(1, k + 1, dtype=torch.int32, device=where) * share
+
+    def run() -> Any:
+        x = first.flatten(0, 1) if grouped else first
+        for weight in weights:
+            x = (torch._grouped_mm(x, weight, offs=ends) if grouped else torch.bmm(x, weight)).relu_()
+        return x
+
+    return run
+
+
+def rivals(out: Path, again: Again, device: str = "cuda", n: int = 1 << 18) -> int:
+    """The forward pass of w64d4 by other people's compilers and libraries; why one is left out, where it is."""
+    import torch
+    from ops.networks import NETS, cost
+
+    rows = Rows(out, "rivals", again, device)
+    where, work = rows.device, cost(NETS["w64d4"]).forward * n
+
+    def compiled(options: dict[str, Any] | None) -> Run:
+        return torch.compile(products(n, 16, where, False), options=options)
+
+    def tiny() -> Run:
+        shape = {"otype": "FullyFusedMLP", "activation": "ReLU", "output_activation": "None"}
+        shape |= {"n_neurons": 64, "n_hidden_layers": 4}
+        net = importlib.import_module("tinycudann").Network(64, 4, shape)
+        x = torch.rand(n, 64, device=where).half()
+        return torch.no_grad()(lambda: net(x))
+
+    triton = {"max_autotune": True, "max_autotune_gemm_backends": "TRITON"}
+    ways = (
+        ("torch.compile", "triton", 16, functools.partial(compiled, None)),
+        ("Triton", "triton", 16, functools.partial(compiled, triton)),
+        ("tiny-cuda-nn", "tinycudann", 1, tiny),
+    )
+    for name, module, k, prepare in ways:
+        title = f"w64d4 bfloat16 n={n} k={k} by {name}"
+        reason = "not on CUDA" if where.type != "cuda" else f"no package {module}"
+        if where.type == "cuda" and importlib.util.find_spec(module):
+            rows.add(title, prepare, "bfloat16", work)
+        elif not again.start:
+            rows.journal.add("skipped", {"name": title, "reason": reason})
+            print(f"left out  {title}: {reason}", flush=True)
+    program = os.environ.get("VORONERF_TCNN")
+    if program:  # a benchmark of tiny-cuda-nn that was built beforehand
+        rows.cases.append(
+            (program, lambda: subprocess.run([program], capture_output=True, text=True, check=True).stdout)
+        )
+    return rows.measure()
+
+
 def sizes(
     out: Path,
     again: Again,
@@ -201,23 +265,6 @@ def sizes(
 
         return run
 
-    def products(n: int, k: int, grouped: bool) -> Run:
-        share = n // k
-        shapes = [
-            (i + -i % 16, o + -o % 16) for o, i in net.weight_shapes(3)
-        ]  # torch._grouped_mm wants multiples of 16
-        weights = [torch.randn(k, *shape, device=where, dtype=torch.bfloat16) for shape in shapes]
-        first = torch.randn(k, share, shapes[0][0], device=where, dtype=torch.bfloat16)
-        ends = torch.arange(1, k + 1, dtype=torch.int32, device=where) * share
-
-        def run() -> Any:
-            x = first.flatten(0, 1) if grouped else first
-            for weight in weights:
-                x = (torch._grouped_mm(x, weight, offs=ends) if grouped else torch.bmm(x, weight)).relu_()
-            return x
-
-        return run
-
     for n in samples:
         for k in cells:
             for precision in ("bfloat16", "float16", "tf32", "float32") if k == 16 else ("bfloat16", "float32"):
@@ -227,9 +274,9 @@ def sizes(
                     work = (price.forward + price.backward * backward) * n
                     rows.add(name, functools.partial(network, n, k, precision, backward), limit, work)
             ours = f"w64d4 bfloat16 n={n} k={k}"
-            rows.add(f"{ours} by torch.bmm", functools.partial(products, n, k, False), "bfloat16", price.forward * n)
+            plain, grouped = (functools.partial(products, n, k, where, of) for of in (False, True))
+            rows.add(f"{ours} by torch.bmm", plain, "bfloat16", price.forward * n)
             if where.type == "cuda" and hasattr(torch, "_grouped_mm"):
-                grouped = functools.partial(products, n, k, True)
                 rows.add(f"{ours} by torch._grouped_mm", grouped, "bfloat16", price.forward * n)
     return rows.measure()
 
