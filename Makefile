@@ -47,8 +47,8 @@ check: $(VENV)/.built
 docs: $(VENV)/.built $(VENV)/.docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-cuda-check:
-	@$(PYTHON) .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
+cuda-check: $(VENV)/.installed
+	@$(BIN)/python .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
 
 # The C++ of the CPU kernels on 64-bit Arm, in qemu: needs g++-aarch64-linux-gnu and qemu-user.
 arm-check:

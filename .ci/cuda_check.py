@@ -1,5 +1,8 @@
 """Compile every .cu for every architecture, warnings as errors, without a GPU: ``cuda_check.py 80 90a ...``.
 
+It does so by the rules of setup.py and into the folder of the build: a build for the same architectures takes the
+objects as they are.
+
 Registers, spills, shared memory, and the warps that registers let a multiprocessor hold, are printed for every kernel
 and compared with the table that is kept, .ci/cuda_resources.json: a spill that is not in it is a failure, and with the
 nvcc that it was made by so are registers or shared memory above it, or fewer warps. sm_80 is an A100, sm_89 an RTX
@@ -15,20 +18,23 @@ from __future__ import annotations
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-OUT = ROOT / "build" / "cuda-check"
+BUILD = runpy.run_path(str(ROOT / "setup.py"), run_name="voronerf_setup")
+OUT: Path = BUILD["build_folder"]()
 TABLE = ROOT / ".ci" / "cuda_resources.json"
 REGISTERS = 65536
 """Of a multiprocessor."""
 MOST_WARPS = {"sm_75": 32, "sm_86": 48, "sm_89": 48, "sm_120": 48}
 """Of a multiprocessor; 64 elsewhere."""
-FLAGS = ["-std=c++17", "-O3", "-Werror", "all-warnings", "-Xcompiler", "-Wall,-Wextra,-Werror", "-Xptxas", "-v"]
+FLAGS = "-Werror all-warnings -Xcompiler -Wall,-Wextra,-Werror -Xptxas -v"
+OBJECT = re.compile(r"^\[\d+/\d+\] (?=\S+\.cu\.o$)", re.MULTILINE)
+"""Of ninja, before what a compilation says."""
 KERNEL = re.compile(
     r"Compiling entry function '(?P<name>\w+)' for '(?P<arch>\w+)'.*?"
     r"(?P<stores>\d+) bytes spill stores, (?P<loads>\d+) bytes spill loads.*?"
@@ -43,42 +49,31 @@ def main(architectures: list[str]) -> int:
     update = "--update" in architectures
     architectures = [architecture for architecture in architectures if architecture != "--update"]
     nvcc = shutil.which("nvcc") or shutil.which("nvcc", path="/usr/local/cuda/bin")
-    # The networks' files compile longest; the others fill the gaps that they leave at the end.
-    sources = sorted((ROOT / "csrc").rglob("*.cu"), key=lambda path: ("grouped_mlp" not in path.name, path.name))
     if nvcc is None:
         print("cuda-check: nothing was compiled, because nvcc is neither on PATH nor in /usr/local/cuda/bin.")
         return 1
+    cuda = BUILD["Cuda"]("", Path(nvcc), tuple(architectures))
     OUT.mkdir(parents=True, exist_ok=True)
-    generate = [f"-gencode=arch=compute_{arch},code=sm_{arch}" for arch in architectures]
-    generate.append(f"-gencode=arch=compute_{architectures[-1]},code=compute_{architectures[-1]}")
-
-    def compile_one(source: Path) -> subprocess.CompletedProcess[str]:
-        command = [
-            nvcc,
-            *FLAGS,
-            f"-I{ROOT / 'csrc'}",
-            *generate,
-            "-c",
-            str(source),
-            "-o",
-            str(OUT / f"{source.name}.o"),
-        ]
-        return subprocess.run(command, capture_output=True, text=True)
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        results = list(pool.map(compile_one, sources))
-    failed = [source.name for source, result in zip(sources, results) if result.returncode != 0]
+    (OUT / "cuda.ninja").write_text(BUILD["ninja_file"](Path("_C.so"), cuda))
+    objects = [f"{path.relative_to(ROOT / 'csrc').as_posix()}.o" for path in sorted((ROOT / "csrc").rglob("*.cu"))]
+    for name in objects:  # what is up to date says nothing
+        (OUT / name).unlink(missing_ok=True)
+    command = [*BUILD["ninja"](), "-C", str(OUT), "-f", "cuda.ninja", "-k", "0", *objects]
+    environment = {**os.environ, "NVCC_APPEND_FLAGS": FLAGS}
+    said = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment).stdout
+    results = dict(part.split("\n", 1) for part in OBJECT.split(said)[1:])
+    failed = [name for name in objects if "\nFAILED: " in f"\n{results.get(name, 'FAILED: ')}"]
     kernels: Kernels = {}
     borrowed = set()
-    for source, result in zip(sources, results):
-        if result.returncode != 0:
-            print(f"{source.name}:\n{result.stdout}{result.stderr}")
-        for match in KERNEL.finditer(result.stderr):
+    for name, text in results.items():
+        if name in failed:
+            print(f"{name}:\n{text}")
+        for match in KERNEL.finditer(text):
             if "3cub" in match["name"]:
                 borrowed.add(match["name"])
                 continue
             shared = re.search(r"(\d+) bytes smem", match["rest"])
-            kernels.setdefault(f"{source.name}: {demangled(match['name'])}", {})[match["arch"]] = {
+            kernels.setdefault(f"{Path(name).stem}: {demangled(match['name'])}", {})[match["arch"]] = {
                 "registers": int(match["registers"]),
                 "spilled_bytes": int(match["stores"]) + int(match["loads"]),
                 "shared_bytes": int(shared[1]) if shared else 0,
@@ -88,11 +83,11 @@ def main(architectures: list[str]) -> int:
         columns = {key: [row[key] for row in by_architecture.values()] for key in next(iter(by_architecture.values()))}
         print(f"{kernel}: " + ", ".join(f"{key} {span(values)}" for key, values in columns.items()))
     version = nvcc_version(nvcc)
-    (OUT / "resources.json").write_text(as_text(version, kernels))
     spilling = sum(row["spilled_bytes"] > 0 for rows in kernels.values() for row in rows.values())
     targets = f"{', '.join(f'sm_{arch}' for arch in architectures)} and PTX of {architectures[-1]}"
     # What did not compile lacks architectures for that reason.
-    compiled = {kernel: found for kernel, found in kernels.items() if kernel.split(":")[0] not in failed}
+    broken = {Path(name).stem for name in failed}
+    compiled = {kernel: found for kernel, found in kernels.items() if kernel.split(":")[0] not in broken}
     lacking = [
         f"{kernel} (sm_{arch})"
         for kernel, found in sorted(compiled.items())
@@ -101,7 +96,7 @@ def main(architectures: list[str]) -> int:
     ]
     worse = [] if update else regressions(version, kernels)
     # ptxas reports products of four warps that it does not run side by side, but not as a warning.
-    serial = [line.strip() for result in results for line in result.stderr.splitlines() if SERIAL in line]
+    serial = [line.strip() for line in said.splitlines() if SERIAL in line]
     for line in [*worse, *serial]:
         print(line)
     if failed:
@@ -119,7 +114,7 @@ def main(architectures: list[str]) -> int:
         if update:
             TABLE.write_text(as_text(version, merged(version, kernels)))
     toolkit = f" and {len(borrowed)} of the toolkit's" if borrowed else ""
-    print(f"cuda-check: {len(sources)} files, {len(kernels)} kernels{toolkit} compiled for {targets} {outcome}.")
+    print(f"cuda-check: {len(objects)} files, {len(kernels)} kernels{toolkit} compiled for {targets} {outcome}.")
     return 1 if failed or lacking or worse or serial or not kernels else 0
 
 

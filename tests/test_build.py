@@ -159,9 +159,9 @@ def program(path, text="") -> None:
 def reporting(check, monkeypatch, capsys, tmp_path):
     """Status and words of a check with an nvcc that compiles nothing and reports what it is told to."""
 
-    def run(report, *architectures):
+    def run(report, *architectures, command="cat '{}' >&2"):
         (tmp_path / "report").write_text(report)
-        program(tmp_path / "nvcc", f"cat '{tmp_path}/report' >&2")
+        program(tmp_path / "nvcc", command.format(tmp_path / "report"))
         monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
         return check.main(list(architectures)), capsys.readouterr().out.rstrip()
 
@@ -186,7 +186,14 @@ def test_cuda_check_compiles_with_the_folder_that_includes_start_from(check, rep
     program(tmp_path / "nvcc", f"echo \"$@\" >> '{tmp_path}/commands'")
     check.main(["80"])
     compiled = [line for line in (tmp_path / "commands").read_text().splitlines() if " -c " in line]
-    assert compiled and all(f" -I{ROOT / 'csrc'} " in line for line in compiled)
+    assert len(compiled) == len(list((ROOT / "csrc").rglob("*.cu")))
+    assert all(f" -I{ROOT / 'csrc'} " in line for line in compiled)
+
+
+def test_cuda_check_names_what_does_not_compile(reporting):
+    breaks = "case \"$*\" in *cell_sort.cu*) echo 'error: no'; exit 1;; esac; cat '{}' >&2"
+    status, said = reporting(REPORT.format("80"), "80", command=breaks)
+    assert status == 1 and "error: no" in said and said.endswith("failed in geometry/cell_sort.cu.o.")
 
 
 def test_cuda_check_leaves_the_toolkits_own_kernels_alone(reporting):
