@@ -36,6 +36,7 @@ def settings(out, name, **more):
         "evaluations": 1,
         "final_views": 2,
         "reservoir_batches": 10,
+        "checkpoint_every": 600.0,  # none by the clock, on a busy machine
         **CONFIGS[name],
         **more,
     }
@@ -69,14 +70,18 @@ def train(folder, configs, stop=None, moves={}):  # noqa: B006
             (folder / f"{name}-{group.rank}.json").write_text(json.dumps(found))
 
 
+#: Ranks of each; of nerf there are other numbers below.
+RANKS = {"nerf": 4, "dense": 2, "hashgrid": 4, "contracted": 2, "random": 3}
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Runs of one process, and of two and four ranks."""
+    """Runs of one process, and of several ranks."""
     folder = tmp_path_factory.mktemp("ranks")
     for name in CONFIGS:
         JointTrainer(settings(folder / f"1-{name}", name), scene()).run()
-    for size in (2, 4):
-        each = {name: settings(folder / f"{size}-{name}", name) for name in CONFIGS}
+    for size in sorted(set(RANKS.values())):
+        each = {name: settings(folder / f"{size}-{name}", name) for name in CONFIGS if RANKS[name] == size}
         codes, _ = on_ranks(train, folder, each, folder=folder, size=size)
         assert codes == [0] * size
     return folder
@@ -92,13 +97,13 @@ def assert_same(first, second):
 def test_ranks_are_one_process_to_the_bit(runs, name):
     one = joint_tensors(runs / f"1-{name}")
     assert any(key.endswith("router.diagram.centres") and len(value) > 1 for key, value in one.items())
-    for size in (2, 4):
-        assert_same(one, joint_tensors(runs / f"{size}-{name}"))
-    files = [{p.name.split("-")[0] for p in (runs / f"{size}-{name}").rglob("*.*")} for size in (1, 2, 4)]
-    assert files[0] == files[1] == files[2]
-    scores = [json.loads((runs / f"{size}-{name}" / "summary.json").read_text()) for size in (1, 2, 4)]
+    both = [runs / f"{size}-{name}" for size in (1, RANKS[name])]
+    assert_same(one, joint_tensors(both[1]))
+    files = [{p.name.split("-")[0] for p in run.rglob("*.*")} for run in both]
+    assert files[0] == files[1]
+    scores = [json.loads((run / "summary.json").read_text()) for run in both]
     for key in ("psnr", "ssim", "parameters", "cells", "splits_left"):
-        assert scores[0][key] == scores[1][key] == scores[2][key], key
+        assert scores[0][key] == scores[1][key], key
 
 
 def test_what_a_rank_holds_and_sends(runs):

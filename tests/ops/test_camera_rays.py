@@ -54,12 +54,9 @@ def test_rays_pass_through_their_pixels(device, backend, b, lens):
 def test_refuses_what_makes_no_sense():
     some, x = cameras(2, "bent"), torch.rand(5)
     refuses = refusals(camera_rays, poses=some.poses, intrinsics=some.intrinsics, x=x, y=x)
-    refuses("camera must have dtype int32, got int64", camera=torch.zeros(5, dtype=torch.int64))
     wrong = torch.tensor([0, 1, 2, 0, 0], dtype=torch.int32)
     refuses("camera must lie in 0 to 1, got values from 0 to 2", camera=wrong)
     models = torch.tensor([0, 2], dtype=torch.int32)
     refuses("distortion must be given with models, got None", models=models)
-    refuses("models must have dtype int32, got int64", models=models.long())
     refuses("models must lie in 0 to 2, got values from 1 to 3", models=models + 1)
-    refuses("poses must have dtype float32, got float64", poses=some.poses.double())
     refuses("poses must hold at least one camera, got none", poses=some.poses[:0], intrinsics=some.intrinsics[:0])

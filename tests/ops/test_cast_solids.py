@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import refusals, strided
+from op_cases import strided
 
 from voronerf.ops import cast_solids
 
@@ -81,10 +81,3 @@ def test_by_hand(device, backend):
     none = [tensor[:0] for tensor in (kinds, frames, sizes)]
     depths, which = cast_solids(*(t.to(device) for t in (*none, origins, directions)), backend=backend)
     assert bool((depths == inf).all()) and bool((which == -1).all())
-
-
-def test_refuses_what_makes_no_sense():
-    kinds, frames, sizes, origins, directions = [*solids(3), *rays(5)]
-    refuses = refusals(cast_solids, kinds=kinds, frames=frames, sizes=sizes, origins=origins, directions=directions)
-    refuses("kinds must have dtype int32, got int64", kinds=kinds.long())
-    refuses("frames must have dtype float32, got float64", frames=frames.double())

@@ -6,7 +6,7 @@ import pytest
 import torch
 from composite_cases import dense, evaluate, leaves_of, scene
 from helpers import all_pairs
-from op_cases import FLOATS, HALVES, need, offsets_of, refusals, strided
+from op_cases import FLOATS, HALVES, need, offsets_of, strided
 from tolerances import assert_as_exact
 
 from voronerf.ops import Composite, composite
@@ -237,14 +237,3 @@ def test_half_storage(backend, dtype):
     wide = {name: None if tensor is None else tensor.float() for name, tensor in cast.items()}
     for part, want in zip(result, composite(**wide, backend=backend)):
         torch.testing.assert_close(part.float(), want, rtol=torch.finfo(dtype).eps, atol=1e-6)
-
-
-def test_errors():
-    sigma, rgb, depths, deltas = rays(4, 5)
-    refuses = refusals(composite, sigma=sigma, rgb=rgb, depths=depths, deltas=deltas)
-    refuses("sigma must have shape [m], got [4, 5]", ray_offsets=offsets_of([5] * 4))
-    packed = pack((sigma, rgb, depths, deltas), [5] * 4)
-    names = ("sigma", "rgb", "depths", "deltas")
-    refuses(
-        "ray_offsets must have dtype int32, got int64", **dict(zip(names, packed)), ray_offsets=offsets_of([20]).long()
-    )

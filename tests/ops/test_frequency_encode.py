@@ -32,15 +32,6 @@ def test_matches_a_slow_loop(device, backend, n, d, octaves, include_input):
     torch.testing.assert_close(encoded.double().cpu(), slow(x, octaves, include_input), rtol=0, atol=3e-7)
 
 
-def test_empty(device, backend):
-    x = torch.empty(0, 3, device=device, requires_grad=True)
-    encoded = frequency_encode(x, 10, backend=backend)
-    assert encoded.shape == (0, 63)
-    encoded.sum().backward()
-    assert x.grad is not None and x.grad.shape == (0, 3)
-    assert frequency_encode(x.new_empty(4, 0), 2, backend=backend).shape == (4, 0)
-
-
 @pytest.mark.parametrize("dtype", FLOATS)
 def test_dtypes(device, backend, dtype):
     need("frequency_encode", backend, device, dtype)

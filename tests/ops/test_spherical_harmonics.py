@@ -84,14 +84,6 @@ def test_of_any_length_as_in_tiny_cuda_nn(device, backend):
     torch.testing.assert_close(found.double().cpu(), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_empty(device, backend):
-    directions = torch.empty(0, 3, device=device, requires_grad=True)
-    found = spherical_harmonics(directions, 3, backend=backend)
-    assert found.shape == (0, 9)
-    found.sum().backward()
-    assert directions.grad is not None and directions.grad.shape == (0, 3)
-
-
 @pytest.mark.parametrize("dtype", FLOATS)
 def test_dtypes(device, backend, dtype):
     need("spherical_harmonics", backend, device, dtype)
