@@ -41,7 +41,7 @@ def available() -> bool:
 def is_faster(given: Given, kernel: Run) -> bool:
     """Whether torch is to multiply instead of the kernel."""
     positions, weights, _, layers, directions, *_ = given
-    if not available() or torch.compiler.is_compiling() or positions.device.type != "cpu" or native.on_cuda(positions):
+    if torch.compiler.is_compiling() or not available() or positions.device.type != "cpu" or native.on_cuda(positions):
         return False
     if storage(positions, weights) != torch.bfloat16 or layers.grid is not None or positions.shape[0] == 0:
         return False
