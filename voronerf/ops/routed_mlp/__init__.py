@@ -25,7 +25,7 @@ from voronerf.compiler import constant_result
 from voronerf.layers import MLP
 from voronerf.ops.grouped_mlp.checks import check_network
 from voronerf.ops.nearest_centre import of_one_dtype
-from voronerf.ops.routed_mlp.reference import Operations
+from voronerf.ops.routed_mlp.reference import Operations, Where
 from voronerf.ops.routed_mlp.reference import routed_mlp as compose
 
 _OP = backends.declare(
@@ -33,19 +33,8 @@ _OP = backends.declare(
     native=Implementation(EVERYWHERE, FLOATS),
 )
 _DEFAULTS: dict[str, Any] = {
-    "layers": None,
-    "centres": None,
-    "child_offsets": None,
-    "child": None,
-    "depth": 1,
-    "centre_weights": None,
-    "cells": None,
-    "coords": None,
-    "directions": None,
-    "direction_index": None,
-    "features": None,
-    "frozen": None,
-    "rows": None,
+    **dict.fromkeys(("layers", "directions", "direction_index", "features", "frozen")),
+    **Where._field_defaults,
 }
 
 

@@ -24,7 +24,7 @@ from voronerf.ops.grouped_mlp import native as grouped_mlp
 from voronerf.ops.grouped_mlp.layer_table import Given, Network, network
 from voronerf.ops.locate_cell import native as locate_cell
 from voronerf.ops.nearest_centre import native as nearest_centre
-from voronerf.ops.routed_mlp.reference import Operations, first_rows
+from voronerf.ops.routed_mlp.reference import Operations, Where, first_rows
 from voronerf.ops.routed_mlp.reference import routed_mlp as compose
 
 _APART = Operations(
@@ -38,50 +38,22 @@ def routed_mlp(
     biases: Sequence[Tensor | None],
     *,
     layers: MLP,
-    centres: Tensor | None = None,
-    child_offsets: Tensor | None = None,
-    child: Tensor | None = None,
-    depth: int = 1,
-    centre_weights: Tensor | None = None,
-    cells: Tensor | None = None,
-    coords: Tensor | None = None,
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
     features: Tensor | None = None,
-    rows: Tensor | None = None,
+    **given: Any,
 ) -> tuple[Tensor, Tensor]:
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
-    where = Where(centres, child_offsets, child, depth, centre_weights, cells, coords, rows)
+    where = Where(**given)
     if by_torch.is_faster(Given(positions, weights, biases, layers, directions), grouped_mlp.fused):
-        return compose(
-            positions,
-            weights,
-            biases,
-            layers=layers,
-            **where._asdict(),
-            directions=directions,
-            direction_index=direction_index,
-            operations=_APART,
-        )
+        read: dict[str, Any] = {"layers": layers, "directions": directions, "direction_index": direction_index}
+        return compose(positions, weights, biases, **read, **given, operations=_APART)
     call, dtype = prepared(positions, weights, biases, layers, where, directions, direction_index, features)
     out, found, *_ = forward(*call)
     if call.where.cells is not None:
         found = call.where.cells
     out = out.to(dtype)
     return (out, found) if call.where.rows is None or native.on_cuda(out) else first_rows(out, found, call.where.rows)
-
-
-class Where(NamedTuple):
-    """What tells the cells, as ``voronerf.ops.routed_mlp`` takes it."""
-
-    centres: Tensor | None = None
-    child_offsets: Tensor | None = None
-    child: Tensor | None = None
-    depth: int = 1
-    centre_weights: Tensor | None = None
-    cells: Tensor | None = None
-    coords: Tensor | None = None
-    rows: Tensor | None = None
 
 
 class Call(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,40 +34,40 @@ class Operations:
 REFERENCE = Operations()
 
 
+class Where(NamedTuple):
+    """What tells the cells, as ``voronerf.ops.routed_mlp`` takes it."""
+
+    centres: Tensor | None = None
+    child_offsets: Tensor | None = None
+    child: Tensor | None = None
+    depth: int = 1
+    centre_weights: Tensor | None = None
+    cells: Tensor | None = None
+    coords: Tensor | None = None
+    rows: Tensor | None = None
+
+
 def routed_mlp(
     positions: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor | None],
     *,
     layers: MLP,
-    centres: Tensor | None = None,
-    child_offsets: Tensor | None = None,
-    child: Tensor | None = None,
-    depth: int = 1,
-    centre_weights: Tensor | None = None,
-    cells: Tensor | None = None,
-    coords: Tensor | None = None,
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
     features: Tensor | None = None,
-    rows: Tensor | None = None,
     operations: Operations = REFERENCE,
+    **where: Any,
 ) -> tuple[Tensor, Tensor]:
     """Output [n, out] in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
+    centres, child_offsets, child, depth, centre_weights, cells, coords, rows = Where(**where)
     k, n = weights[0].shape[0], positions.shape[0]
     check_direction_index("routed_mlp", directions, direction_index)
+    read: dict[str, Any] = {"layers": layers, "directions": directions, "direction_index": direction_index}
+    read["features"] = features
     if cells is None and k == 1:
         offsets = torch.tensor([0, n], dtype=torch.int32, device=positions.device)
-        out = operations.grouped_mlp(
-            positions,
-            offsets,
-            weights,
-            biases,
-            layers=layers,
-            directions=directions,
-            direction_index=direction_index,
-            features=features,
-        )
+        out = operations.grouped_mlp(positions, offsets, weights, biases, **read)
         return first_rows(out, torch.zeros(n, dtype=torch.int32, device=positions.device), rows)
     if cells is None:
         assert coords is not None and centres is not None
@@ -78,19 +78,10 @@ def routed_mlp(
     check_range("routed_mlp", "cells", cells, k)
     order, offsets = operations.cell_sort(cells, k)
     if direction_index is not None:
-        direction_index = direction_index[order]
+        read["direction_index"] = direction_index[order]
     elif directions is not None:
-        directions = directions[order]
-    out = operations.grouped_mlp(
-        positions[order],
-        offsets,
-        weights,
-        biases,
-        layers=layers,
-        directions=directions,
-        direction_index=direction_index,
-        features=features,
-    )
+        read["directions"] = directions[order]
+    out = operations.grouped_mlp(positions[order], offsets, weights, biases, **read)
     # The backward of index_copy is a gather, where that of an index would be a scatter that adds.
     return first_rows(torch.zeros_like(out).index_copy(0, order.long(), out), cells, rows)
 
