@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import random
+import resource
+import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -17,7 +16,12 @@ from attempts import REFUSED, RIGHT, Failed
 from given import FIELDS, TINY
 from training_attacks import same_runs, same_tensors
 
+from voronerf.cli import main
+from voronerf.distributed import group
 from voronerf.training.checkpoint import checkpoint_path, checkpoint_paths, load_checkpoint, network_files
+
+sys.path.append(str(Path(__file__).parents[1] / "distributed"))
+from ranks import complaints, said_by, start_ranks
 
 #: The networks of a joint training, which has four territories.
 VARIANTS = (
@@ -26,122 +30,132 @@ VARIANTS = (
     [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6"],
 )
 #: Of a chain: ranks that are killed, stopped for good, and stopped for as many seconds.
-FAULTS = {"kill": 6, "stop": 6, "pause": 2}
+FAULTS = {"kill": 10, "stop": 10, "pause": 2}
 PAUSE = 1.5
+#: Share of the faults after which a bit of the last checkpoint is another.
+DAMAGED = 0.25
 #: Seconds that ranks of an attack wait for each other (50 in a training), and in which the fault is to be told.
-PATIENCE, TOLD = 10, 60
+PATIENCE, TOLD = 8, 60
+
+
+def rank(args: list[str], file_size: int | None = None) -> int:
+    """A rank, whose files may have so many bytes, as on a full disk."""
+    group.PATIENCE = PATIENCE
+    if file_size is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
+    return main(args)
 
 
 class Ranks:
-    """A training by torchrun.
+    """A training on several ranks, which goes on from its last checkpoint.
 
     Args:
         out: The run directory; what is printed goes beside it.
         size: How many ranks.
         options: Of ``voronerf train``.
-        restarts: How often torchrun starts the ranks again.
-        harm: What is wrong with a rank, see ``rank.py``.
+        also: More of them for the last rank alone.
+        file_size: The bytes that a file of the last rank may have.
     """
 
-    def __init__(self, out: Path, size: int, options: list[str], restarts: int = 0, **harm: object) -> None:
-        self.size, self.said = size, out.with_suffix(".txt")
-        script, given = Path(__file__).with_name("rank.py"), {"patience": PATIENCE, **harm}
-        torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(size)]
-        command = [*torchrun, "--max-restarts", str(restarts), str(script), "train", "--out", str(out), *options]
-        with self.said.open("wb") as said:
-            environment = {**os.environ, "HARM": json.dumps(given), "OMP_NUM_THREADS": "1"}
-            self.process = subprocess.Popen([sys.executable, *command], stdout=said, stderr=said, env=environment)
+    def __init__(
+        self, out: Path, size: int, options: list[str], also: tuple[str, ...] = (), file_size: int | None = None
+    ) -> None:
+        again = ["--resume"] if checkpoint_paths(out) else []
+        args = ["train", "--out", str(out), *options, *again]
+        last = ([*args, *also], file_size)
+        self.said = out.with_name(f"{out.name}-said")
+        shutil.rmtree(self.said, ignore_errors=True)
+        self.said.mkdir()
+        self.processes = start_ranks(rank, [(args,)] * (size - 1) + [last], self.said)
 
-    def started(self, old: set[int]) -> set[int]:
-        """The processes of all ranks when torchrun has started others than the old ones; none when it has ended."""
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        while self.process.poll() is None:
-            with contextlib.suppress(OSError):
-                ranks = {int(number) for number in children.read_text().split()} - old
-                if len(ranks) == self.size:
-                    return ranks
-            time.sleep(0.05)
-        return set()
+    def end(self, but: int = -1) -> list[int | None]:
+        """Waits for all ranks, but one; the exit status of each."""
+        until = time.monotonic() + TOLD
+        for number, process in enumerate(self.processes):
+            if number != but:
+                process.join(max(0.0, until - time.monotonic()))
+                if process.is_alive():
+                    raise Failed(f"a rank has not ended after {TOLD} s")
+        return [process.exitcode for process in self.processes]
 
     @property
     def complaints(self) -> list[str]:
         """The lines that tell of an error."""
-        lines = self.said.read_text(errors="replace").splitlines()
-        return [line for line in lines if line.startswith("voronerf: error: ")]
+        return complaints(said_by(self.processes, self.said))
 
     def ends_well(self) -> None:
-        if self.process.wait() != 0:
-            raise Failed(f"torchrun ended with status {self.process.returncode}: {self.complaints}")
+        for process in self.processes:
+            process.join()
+        if any(process.exitcode for process in self.processes):
+            raise Failed(f"ranks that were left alone ended with {self.end()}: {self.complaints}")
 
     def is_refused(self, sign: str) -> None:
         """All ranks end, and one of them says why in a line."""
-        began = time.monotonic()
-        status, lines = self.process.wait(), self.complaints
-        if status == 0 or len(lines) != 1 or sign not in lines[0] or time.monotonic() - began > TOLD:
-            raise Failed(f"ranks that are to say {sign!r} ended with status {status}: {lines}")
+        codes, lines = self.end(), self.complaints
+        if not all(codes) or len(lines) != 1 or sign not in lines[0]:
+            raise Failed(f"ranks that are to say {sign!r} ended with {codes}: {lines}")
 
 
 def harmed_ranks(rng: random.Random, folder: Path, _given: Path) -> Counter[str]:
     """Whatever happens to a rank, one line tells of it, and the run ends, to the bit, as that of one process."""
     options = [*("--data", "builtin", "--downscale", "8"), *TINY, *rng.choice(VARIANTS), "--territories", "4"]
     options += ["--steps", "300", "--checkpoint-every", rng.choice(("1e-9", "0.1"))]
-    whole, began = folder / "whole", time.monotonic()
+    whole, part = folder / "whole", folder / "part"
     Ranks(whole, 1, options).ends_well()
-    count = Counter({RIGHT: _ended_ranks(rng, folder, whole, options, time.monotonic() - began)})
-    part = folder / "part"
-    Ranks(part, 2, [*options, "--panels", "1"], rank=1, file_size=20_000).is_refused("File too large")
+    Ranks(part, 2, options, file_size=20_000).is_refused("File too large")
+    done = _ended_ranks(rng, folder, whole, options)
     size = rng.choice((2, 3, 4))
-    Ranks(part, size, [*options, *_again(part)], rank=size - 1, options=["--data", "builtin-rich"]).is_refused(
-        "the scene"
-    )
-    Ranks(part, size, [*options, *_again(part)], rank=1, options=["--seed", "1"]).is_refused("--seed must be the same")
-    harmed = _damage(rng, part)
-    ranks = Ranks(part, size, [*options, *_again(part)])
-    ranks.ends_well()
-    if harmed and "takes its place" not in ranks.said.read_text():
-        raise Failed(f"nothing was said of the damage to {harmed}")
+    Ranks(part, size, options, ("--data", "builtin-rich")).is_refused("the scene must be")
+    Ranks(part, size, options, ("--seed", "1")).is_refused("--seed must be")
+    Ranks(part, size, options).ends_well()
     _same_runs(whole, part)
-    return count + Counter({REFUSED: 3, RIGHT: 1})
+    return Counter({REFUSED: 3, RIGHT: done})
 
 
-def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[str], length: float) -> int:
-    """Ends ranks at random moments of a start, which takes ``length``, and torchrun starts again; how many."""
+def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[str]) -> int:
+    """Ends ranks at random moments, and starts others; how many."""
     faults = list(Counter(FAULTS).elements())
     rng.shuffle(faults)
-    done, runs = 0, 0
+    done, runs, length = 0, 0, 4.0
     while faults:  # a run may end before all of them
-        part, runs = folder / f"part-{runs}", runs + 1
-        ranks = Ranks(part, rng.choice((2, 3, 4)), options, restarts=3 * len(faults))
-        numbers = ranks.started(set())
-        while numbers and faults:
+        part, ended = folder / f"part-{runs}", False
+        while not ended:
+            ranks, began = Ranks(part, rng.choice((2, 3, 4)), options), time.monotonic()
+            if not faults:
+                ranks.ends_well()
+                break
             time.sleep(rng.uniform(0, length))
-            fault, chosen, before = faults[-1], rng.choice(sorted(numbers)), len(ranks.complaints)
-            began = time.monotonic()
-            try:
-                os.kill(chosen, signal.SIGKILL if fault == "kill" else signal.SIGSTOP)
-                if fault == "pause":  # which is none
-                    time.sleep(PAUSE)
-                    os.kill(chosen, signal.SIGCONT)
-                    faults.pop()
-                    done += 1
-                    continue
-                while fault == "stop" and time.monotonic() < began + TOLD and len(ranks.complaints) == before:
-                    time.sleep(0.1)
-                if fault == "stop":  # what else torchrun would do after 30 s
-                    os.kill(chosen, signal.SIGKILL)
-            except ProcessLookupError:  # they have ended
-                numbers = ranks.started(numbers)
+            chosen = rng.randrange(len(ranks.processes))
+            number, at = ranks.processes[chosen].pid, time.monotonic()
+            assert number is not None
+            if any(process.exitcode is not None for process in ranks.processes):  # the run has ended
+                ranks.ends_well()
+                ended, length = True, max(2.0, 0.8 * (time.monotonic() - began))
                 continue
-            took, numbers = time.monotonic() - began, ranks.started(numbers)
-            told = len(ranks.complaints) - before
-            print(f"{fault}: {took:.1f} s, {told} lines", *ranks.complaints[before:], flush=True)
-            if told > 1 or took > TOLD:
-                raise Failed(f"{fault}: {told} lines after {took:.0f} s: {ranks.complaints[before:]}")
-            if numbers:
-                faults.pop()
-                done += 1
-        ranks.ends_well()
+            fault = faults.pop()
+            os.kill(number, signal.SIGKILL if fault == "kill" else signal.SIGSTOP)
+            if fault == "pause":  # which is none
+                time.sleep(PAUSE)
+                os.kill(number, signal.SIGCONT)
+                ranks.ends_well()
+                ended = True
+            else:
+                codes = ranks.end(but=chosen)
+                took = time.monotonic() - at
+                if fault == "stop":
+                    os.kill(number, signal.SIGKILL)
+                ranks.end()
+                told = ranks.complaints
+                print(f"{fault} {at - began:.1f} s after the start, told after {took:.1f} s:", *told, flush=True)
+                left = [code for other, code in enumerate(codes) if other != chosen]
+                ended = not any(left) and bool(checkpoint_paths(part))  # they were through
+                if len(told) != (0 if ended else 1):
+                    raise Failed(f"{fault}: ranks ended with {codes} and said {told}")
+                if len(checkpoint_paths(part)) > 1 and rng.random() < DAMAGED:
+                    _damage(rng, part)
+            done += 1
         _same_runs(whole, part)
+        runs += 1
     return done
 
 
@@ -157,18 +171,11 @@ def _same_runs(whole: Path, part: Path) -> None:
         same_tensors(first, second)
 
 
-def _again(out: Path) -> list[str]:
-    return ["--resume"] if checkpoint_paths(out) else []
-
-
-def _damage(rng: random.Random, run: Path) -> Path | None:
-    """Changes a bit of a territory's file of the last checkpoint, where there is another to go back to."""
-    paths = checkpoint_paths(run)
-    if len(paths) < 2:
-        return None
-    files = network_files(load_checkpoint(paths[0], keep=lambda name: not name.startswith("part-")).values)
-    path = paths[0].with_name(rng.choice(files))
+def _damage(rng: random.Random, run: Path) -> None:
+    """Changes a bit of a territory's file of the last checkpoint."""
+    last = checkpoint_paths(run)[0]
+    files = network_files(load_checkpoint(last, keep=lambda name: not name.startswith("part-")).values)
+    path = last.with_name(rng.choice(files))
     data = bytearray(path.read_bytes())
     data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
     path.write_bytes(data)
-    return path

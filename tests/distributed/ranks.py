@@ -38,30 +38,47 @@ def new_store():
     return TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
 
 
-def on_ranks(function, *args, folder, size=2, each=None, restarts=0, store=None):
-    """Calls a function on every rank, with arguments of its own where ``each`` has them.
+def start_ranks(function, each, folder, restarts=0, store=None):
+    """The processes of ranks that call a function, each with arguments of its own; what they print comes into a folder.
 
-    The store is that of earlier starts, as torchrun keeps it. Returns the exit status of each rank, and what it
-    printed.
+    The store is that of earlier starts, as torchrun keeps it.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["voronerf.cli", "voronerf.training.trainer"])
-    folder = Path(folder)
-    store = store or new_store()
-    given = each or [args] * size
+    store, size = store or new_store(), len(each)
     ranks = [
-        context.Process(target=_rank, args=(rank, size, store.port, folder, restarts, function, given[rank]))
-        for rank in range(size)
+        context.Process(target=_rank, args=(rank, size, store.port, folder, restarts, function, given))
+        for rank, given in enumerate(each)
     ]
     for rank in ranks:
         rank.start()
+    ranks[0].store = store  # which lives as long
+    return ranks
+
+
+def said_by(ranks, folder):
+    """What each rank has printed, once it has ended by itself."""
+    said = [Path(folder) / f"rank-{rank}.txt" for rank in range(len(ranks))]
+    return [path.read_text() if path.is_file() else "" for path in said]
+
+
+def complaints(texts):
+    """The lines that tell of an error."""
+    return [line for text in texts for line in text.splitlines() if line.startswith("voronerf: error:")]
+
+
+def on_ranks(function, *args, folder, size=2, each=None, restarts=0, store=None):
+    """Calls a function on every rank, with arguments of its own where ``each`` has them.
+
+    Returns the exit status of each rank, and what it printed.
+    """
+    ranks = start_ranks(function, each or [args] * size, Path(folder), restarts, store)
     for rank in ranks:
         rank.join(LIMIT)
         if rank.is_alive():
             rank.kill()
             rank.join()
-    said = [folder / f"rank-{rank}.txt" for rank in range(size)]
-    texts = [path.read_text() if path.is_file() else "" for path in said]
+    texts = said_by(ranks, folder)
     print(*texts, sep="\n", file=sys.stderr)  # where a test fails
     return [rank.exitcode for rank in ranks], texts
 

@@ -8,7 +8,7 @@ import subprocess
 from unittest import mock
 
 import pytest
-from ranks import joint_tensors, new_store, on_ranks
+from ranks import complaints, joint_tensors, new_store, on_ranks
 
 from voronerf.cli import main
 from voronerf.distributed import group
@@ -58,10 +58,6 @@ def has_no_room(args):
     full = OSError(28, "No space left on device")
     with mock.patch("voronerf.training.checkpoint.save_checkpoint", side_effect=full):
         return main(args)
-
-
-def complaints(texts):
-    return [line for text in texts for line in text.splitlines() if line.startswith("voronerf: error:")]
 
 
 def test_settings_that_ranks_cannot_use(tmp_path):
