@@ -10,10 +10,14 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import itertools
 import json
+import math
+import mmap
+import os
+import re
 import subprocess
 import sys
-import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -30,13 +34,13 @@ from voronerf.rendering import orbit_cameras
 from voronerf.rendering.rays import intersect_box
 from voronerf.router import Similarity, Solid
 from voronerf.training.config import TrainConfig
-from voronerf.training.streaming import _File, anonymous_bytes
 from voronerf.training.trainer import Trainer
 
 RESULT = Path(__file__).parent / "results" / "editing.json"
 PICTURES = Path(__file__).parent.parent / "docs" / "images"
 BLOCKS, SIZE, BLEND = 2, 64, 0.03
 OVERLAP = 0.1  # of a half, on each side of the border
+GUIDE = 0.2  # of the time of a half, for a training that says which half a pixel shows
 
 
 def keep(name: str, values: list, **extra: object) -> None:
@@ -75,6 +79,15 @@ def seen(scene: Scene, views: torch.Tensor | None = None, box: torch.Tensor | No
     return replace(scene, train=train)
 
 
+def places_shown(run: Run, scene: Scene) -> torch.Tensor:
+    """x of what each pixel of the training views shows, [views, h, w], NaN for the background; for blocks of 4 x 4."""
+    cameras, rows = scene.train.cameras.downscaled(4), []
+    for view in range(len(cameras)):
+        image = run.render(cameras, view)
+        rows.append(torch.where(image.opacity > 0.5, image.heaviest[..., 0], torch.nan))
+    return torch.stack(rows).repeat_interleave(4, 1).repeat_interleave(4, 2)
+
+
 def half(scene: Scene, side: int) -> torch.Tensor:
     """The box of a half, and the overlap beyond its border."""
     box = scene.box.clone()
@@ -92,18 +105,28 @@ def city(out: Path, seconds: float, seeds: list[int]) -> None:
     places = scene.train.cameras.origins[:, 0]
     for seed in seeds:
         runs = {"one training": train(out / f"one-{seed}", scene, 2 * seconds, seed, cells=(16,))}
-        for way in ("views by position", "pixels by cell"):
+        began = time.process_time()
+        guide = train(out / f"guide-{seed}", scene, GUIDE * seconds, seed, cells=())
+        shown = places_shown(guide, scene)
+        left = seconds - (time.process_time() - began) / 2
+        for way in ("pixels by surface", "views by position", "pixels by cell"):
             halves = []
             for side in (0, 1):
                 sign = 1 if side == 0 else -1
                 near = sign * (places - middle) < OVERLAP * BLOCKS / 2
-                own = seen(scene, views=near) if way == "views by position" else seen(scene, box=half(scene, side))
-                name = f"{way.split()[0]}-{side}-{seed}"
-                run = train(out / name, own, seconds, seed, cells=(8,))
-                box = half(scene, side).tolist()
+                box = half(scene, side)
+                if way == "pixels by surface":
+                    own = replace(seen(scene, box=box), box=box)
+                    inside = (shown > box[0, 0]) & (shown < box[1, 0]) | shown.isnan()
+                    own = replace(own, train=replace(own.train, masks=own.train.masks & inside))
+                else:
+                    own = seen(scene, views=near) if way == "views by position" else seen(scene, box=box)
+                name = f"{way.replace(' ', '-')}-{side}-{seed}"
+                run = train(out / name, own, left if way == "pixels by surface" else seconds, seed, cells=(8,))
+                box = box.tolist()
                 there = out / f"cut-{name}"
                 halves.append(open_run(there, scene=scene) if there.exists() else run.cut(Solid.box(*box), there))
-            there = out / f"joined-{way.split()[0]}-{seed}"
+            there = out / f"joined-{way.replace(' ', '-')}-{seed}"
             joined = open_run(there, scene=scene) if there.exists() else Run.join(halves, there)
             runs[way] = replace(joined, scene=scene)
         for way, run in runs.items():
@@ -166,53 +189,81 @@ def stream(out: Path, seconds: float) -> None:
         frames = [Similarity.of((width * (i % side), width * (i // side), 0)) for i in range(side * side)]
         Run.join(blocks, joined, frames=frames)
         del blocks, block
-    values = {"blocks": side * side, "GiB": round(size(joined) / 1024, 2), "rows": []}
-    for memory in ("512M", "none"):
-        command = [sys.executable, __file__, "picture", "--out", str(out), "--memory", memory]
-        started = time.perf_counter()
-        values["rows"].append(
-            json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[-1])
-        )
-        print(memory, time.perf_counter() - started, values["rows"][-1])
-    first, second = (torch.load(out / f"picture-{memory}.pt") for memory in ("512M", "none"))
-    values["same bits"] = all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
-    keep("stream", values["rows"])
+    rows = []
+    for memory, detail in (("512M", 1.0), ("512M", 0.0), ("none", 1.0), ("none", 0.0)):
+        os.sync()
+        for path in (joined / "checkpoints").iterdir():  # as after a start of the machine
+            with open(path, "rb") as file:
+                os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        command = [sys.executable, __file__, "picture", "--out", str(out), "--memory", memory, "--detail", str(detail)]
+        most, printed = watched(command, joined / "checkpoints")
+        rows.append({**json.loads(printed.splitlines()[-1]), **most})
+        print(rows[-1])
+    pictures = {(r["memory"], r["detail"]): torch.load(out / f"picture-{r['memory']}-{r['detail']}.pt") for r in rows}
+    for detail in (0.0, 1.0):
+        bounded, free = pictures["512M", detail], pictures["none", detail]
+        assert all(torch.equal(a, b) for a, b in zip(bounded, free, strict=True)), "the bound must not change a bit"
+    for row in rows:
+        errors = zip(pictures[row["memory"], row["detail"]], pictures["none", 0.0], strict=True)
+        if row["detail"]:
+            row["against all fine dB"] = [round(-10 * math.log10(float((a - b).square().mean())), 2) for a, b in errors]
+    keep("stream", rows, blocks=side * side, GiB=round(size(joined) / 1024, 2))
 
 
-def picture(out: Path, memory: str) -> None:
-    """Renders views of the town in this process, and watches what it and the files take."""
-    started, cpu = time.perf_counter(), time.process_time()
-    run_scene = read_scene(out / "town" / "scene.json")
-    run = open_run(out / "town", scene=run_scene, memory=None if memory == "none" else memory)
-    opened = time.perf_counter() - started
-    files = [_File(path) for path in sorted((out / "town" / "checkpoints").glob("networks-*"))]
-    libc, most, ended = ctypes.CDLL(None), [0, 0, 0], threading.Event()
+def watched(command: list[str], folder: Path) -> tuple[dict[str, int], str]:
+    """Runs a program: the most memory that it and the files of a folder take, seen from outside, and what it prints."""
+    libc, maps, most = ctypes.CDLL(None), [], [0, 0, 0]
+    for path in folder.iterdir():
+        with open(path, "rb") as file:
+            pages = mmap.mmap(file.fileno(), 0, flags=mmap.MAP_PRIVATE)
+        start = ctypes.addressof(ctypes.c_char.from_buffer(pages))
+        maps.append((pages, ctypes.c_void_p(start), (ctypes.c_ubyte * -(-len(pages) // mmap.PAGESIZE))()))
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        while process.poll() is None:
+            status = Path(f"/proc/{process.pid}/status").read_text()
+            anonymous = re.search(r"RssAnon:\s*(\d+)", status)
+            found = [0 if anonymous is None else int(anonymous[1]) * 1024, 0]
+            for pages, start, states in maps:
+                libc.mincore(start, ctypes.c_size_t(len(pages)), states)
+                found[1] += bytes(states).count(1) * mmap.PAGESIZE
+            most = [max(old, new) for old, new in zip(most, (*found, sum(found)), strict=True)]
+            time.sleep(0.05)
+        assert process.returncode == 0
+        names = ("anonymous MiB", "files MiB", "together MiB")
+        assert process.stdout is not None
+        return dict(zip(names, (round(x / 2**20) for x in most), strict=True)), process.stdout.read()
 
-    def watch() -> None:
-        while not ended.wait(0.5):
-            anonymous, cached = anonymous_bytes(), sum(file.resident(libc) for file in files)
-            most[:] = [max(old, new) for old, new in zip(most, (anonymous, cached, anonymous + cached), strict=True)]
 
-    thread = threading.Thread(target=watch)
-    thread.start()
-    box, cameras = run_scene.box, run_scene.train.cameras
-    middle, wide = box.mean(0), float((box[1] - box[0]).norm())
+def picture(out: Path, memory: str, detail: float) -> None:
+    """Renders views of the town in this process."""
+    began = float(Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()[19]) / os.sysconf("SC_CLK_TCK")
+    started = time.clock_gettime(time.CLOCK_BOOTTIME)
+    scene = read_scene(out / "town" / "scene.json")
+    run = open_run(out / "town", scene=scene, memory=None if memory == "none" else memory, detail=detail)
+    opened = time.clock_gettime(time.CLOCK_BOOTTIME)
+    assert scene.box is not None
+    middle, wide = scene.box.mean(0), float((scene.box[1] - scene.box[0]).norm())
     above = orbit_cameras(1, radius=0.8 * wide, elevation=0.6, width=64, height=48, focal=64.0)
     above = replace(above, poses=above.poses.clone())
     above.poses[:, :3, 3] += middle
-    street = cameras[[0]]
-    pictures, times = [], []
-    for camera in (above, replace(above, intrinsics=above.intrinsics * 2, width=128, height=96), street):
-        begun = time.perf_counter()
+    street = scene.train.cameras[[0]]
+    pictures, ends = [], [opened]
+    for camera, times in ((above, 1), (above, 4), (street, 1), (street, 4)):
+        camera = replace(
+            camera, intrinsics=camera.intrinsics * times, width=camera.width * times, height=camera.height * times
+        )
         pictures.append(run.render(camera, 0, heaviest=False).colour)
-        times.append(round(time.perf_counter() - begun, 2))
-    first = round(opened + times[0], 2)
-    ended.set()
-    thread.join()
-    torch.save(pictures, out / f"picture-{memory}.pt")
-    named = dict(zip(("anonymous MiB", "files MiB", "together MiB"), (round(x / 2**20) for x in most), strict=True))
-    row = {"memory": memory, "opened s": round(opened, 2), "first picture s": first, "pictures s": times}
-    print(json.dumps({**row, **named, "cpu s": round(time.process_time() - cpu, 1)}))
+        ends.append(time.clock_gettime(time.CLOCK_BOOTTIME))
+    torch.save(pictures, out / f"picture-{memory}-{detail}.pt")
+    row = {
+        "memory": memory,
+        "detail": detail,
+        "opened s": round(opened - started, 2),
+        "first picture s": round(ends[1] - started, 2),
+        "since the start of the process s": round(ends[1] - began, 2),
+        "pictures s": [round(b - a, 2) for a, b in itertools.pairwise(ends)],
+    }
+    print(json.dumps(row))
 
 
 def main() -> None:
@@ -222,6 +273,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1])
     parser.add_argument("--memory", default="512M")
+    parser.add_argument("--detail", type=float, default=1.0)
     args = parser.parse_args()
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -230,7 +282,7 @@ def main() -> None:
     elif args.what == "stream":
         stream(args.out, args.seconds)
     else:
-        picture(args.out, args.memory)
+        picture(args.out, args.memory, args.detail)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
 from voronerf.router import Part, Parts, Similarity, Solid, VoronoiRouter
+from voronerf.router.coarse import Coarse, make_coarse
 from voronerf.training.checkpoint import Checkpoint, checkpoint_path, checkpoint_paths, save_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.parts import describe_parts, parts_states
@@ -470,8 +471,22 @@ def check_out(out: Path) -> None:
         raise ConfigError(f"--out must be a new or an empty folder, got {out}")
 
 
+def _coarse_levels(source: Source) -> dict[int, Coarse]:
+    """What the parts show from far away, by their numbers, in voxels as long as half a step along a ray."""
+    box, grid, found = source.scene.box, source.grid, dict[int, Coarse]()
+    if len(source.parts) == 1 or box is None:
+        return found
+    side = float((box[1] - box[0]).norm()) / int(source.config.samples or 64) / 2
+    occupied = None if grid is None else lambda points: grid.occupied.view(-1)[grid.cells(points).long()]
+    for index, part in enumerate(source.parts.eval()):
+        level = make_coarse(part, side, occupied, source.parts.backend)
+        if level is not None:
+            found[index] = level
+    return found
+
+
 def write(source: Source, out: Path) -> None:
-    """Writes a run of parts, whole or not at all.
+    """Writes a run of parts, whole or not at all; with several parts also their coarse levels.
 
     Raises:
         ConfigError: When there is something in the folder.
@@ -498,6 +513,7 @@ def write(source: Source, out: Path) -> None:
         groups: dict[str, dict[str, Tensor]] = dict(parts_states(source.parts))
         if source.grid is not None:
             groups["occupancy"] = source.grid.state_dict()
+        groups |= {f"part-{i}.coarse": vars(level) for i, level in _coarse_levels(source).items()}
         tensors = {
             # What stands in two places is one tensor, which a file does not take twice.
             f"{prefix}.{name}": tensor.detach().cpu().contiguous() if "router-" in name else tensor.cpu().clone()

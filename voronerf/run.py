@@ -28,6 +28,7 @@ from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.config_checks import check_device
 from voronerf.training.joint import joint_config
 from voronerf.training.networks import check_shapes, open_routers, parameter_groups, restore_routers
+from voronerf.training.parts import restore_coarse
 from voronerf.training.renderers import make_picture_grid, make_renderer, through_grid
 from voronerf.training.run_directory import check_folders, check_stored_paths
 from voronerf.training.state import stored_values
@@ -291,6 +292,7 @@ def open_run(
     device: str = "cpu",
     backend: str = "auto",
     memory: str | int | None = None,
+    detail: float = 0.0,
 ) -> Run:
     """Opens a run that ``voronerf train`` or :class:`voronerf.training.trainer.Trainer` has written.
 
@@ -315,6 +317,8 @@ def open_run(
         memory: Bound on the memory of this process and on what the files of networks take of the system's, such as
             "512M", for a run of several parts on the CPU. Networks are read as rays meet them, those that were not used
             for longest are dropped, and their checksums are not compared. Pictures are the same bit for bit.
+        detail: Draw a part of a joined run by its coarse level, where a voxel of it is no wider than so many pixels;
+            0 to draw all by their networks.
 
     Raises:
         CheckpointError: If there is no usable checkpoint.
@@ -347,6 +351,8 @@ def open_run(
     if blend is not None and not 0 <= blend < math.inf:
         raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
     check_folders(path)
+    if not 0 <= detail < math.inf:
+        raise ConfigError(f"--detail must be a number of pixels, 0 or more, got {detail}")
     pages = None if memory is None else Pages(checkpoint_path(path).parent, bytes_of(memory))
     checkpoint = last_checkpoint(path, keep=_shows if pages is None else _shows_without_networks)
     if pages is not None and ("parts" not in checkpoint.values or torch.device(device).type != "cpu"):
@@ -376,8 +382,13 @@ def open_run(
     if several and (config.territories or 1) > 1:  # as it was trained: its parts know their own settings
         config = joint_config(config, scene)
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
-    if isinstance(routers["field"], Parts) and len(routers["field"]) > FEW_PARTS:
-        renderer.tiles = TILES
+    field = routers["field"]
+    if isinstance(field, Parts):
+        renderer.tiles = TILES if len(field) > FEW_PARTS else 1
+        restore_coarse(field, checkpoint)
+        field.detail = detail
+    if detail and not (isinstance(field, Parts) and any(part.coarse for part in field)):
+        raise ConfigError("--detail needs coarse levels, which join, cut and place give a run of several parts")
     state = checkpoint.group("occupancy")
     grid = None
     if state:
@@ -386,4 +397,7 @@ def open_run(
         grid = make_picture_grid(config, scene, renderer)
     if grid is not None:
         renderer.sampler = through_grid(renderer.sampler, grid, picture_samples=samples)
+    if pages is not None:
+        del checkpoint, state
+        pages.forget(checkpoint_path(path))
     return Run(path, config, scene, routers, renderer)

@@ -113,12 +113,14 @@ def update(
         raise ConfigError(f"--data must show the scene of the run, {changes.met:.2%} of its rays meet it")
     if changes.off > MOST_OFF:
         raise ConfigError(
-            f"--data shows another scene, or this one in another frame: {changes.off:.0%} of its rays differ"
+            f"--data shows another scene, or this one in another frame: {changes.off:.0%} of what it shows differs"
         )
     count, k = int(changes.cells.sum()), source.parts.num_cells
-    say(f"{changes.off:.1%} of the new rays are off: {count} of {k} cells learn")
+    say(f"{changes.off:.1%} of the new rays that meet the scene are off: {count} of {k} cells learn")
     if not count:
-        raise ConfigError(f"--data shows nothing new: {changes.off:.1%} of its rays are off, as in training")
+        raise ConfigError(
+            f"--data shows nothing new: {changes.off:.1%} of the rays that meet the scene are off, as in training"
+        )
     parts, learners = split_off(source.parts, changes.cells)
     grid = None if source.grid is None else opened(source.grid, source.parts, changes.cells)
     session = Session(replace(source, parts=parts, grid=grid), learners, changes, seed)

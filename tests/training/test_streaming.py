@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
+import mmap
 import os
 import shutil
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
 from helpers import refuses
 
 from voronerf import Run, open_run
+from voronerf import run as run_module
 from voronerf.data import builtin_scene
 from voronerf.router import Similarity
 from voronerf.training import streaming
@@ -46,36 +50,71 @@ def test_pictures_are_the_same_bits_while_networks_come_and_go(joined, scene, tm
     whole = open_run(joined, scene=scene)
     cameras = scene.test.cameras
     wanted = [whole.render(cameras, view) for view in (0, 1)]
-    shutil.copytree(joined, tmp_path / "run")  # pages that another run has mapped would stay
-    os.sync()
-    streamed = open_run(tmp_path / "run", scene=scene, memory="4G")
-    pages = streamed.router.on_use.__self__
-    dropped = []
-    monkeypatch.setattr(streaming, "EVERY", 0.0)
-    drop = streaming._File.drop
-    monkeypatch.setattr(streaming._File, "drop", lambda file: (dropped.append(file), drop(file)))
+    made = []
+    monkeypatch.setattr(run_module, "Pages", lambda *given: made.append(streaming.Pages(*given)) or made[0])
+    streamed = open_run(joined, scene=scene, memory="4G")
+    (pages,) = made
     largest = max(file.size for file in pages.files.values())
-    monkeypatch.setattr(streaming, "anonymous_bytes", lambda: int(4 * 2**30 * (1 - streaming.SPARE)) - largest)
+    # As if the process took all but the room for two files.
+    limit = int(4 * 2**30 * (1 - streaming.SPARE))
+    monkeypatch.setattr(
+        streaming, "anonymous_bytes", lambda: limit - 2 * largest + sum(file.size for file in pages.held.values())
+    )
     points = torch.rand(2000, 3) * torch.tensor([9.0, 2, 1]) - 1
     asked = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(2000, dtype=torch.int32)
     with torch.no_grad():
         for _ in range(2):
             assert torch.equal(streamed.router(*asked)[1], whole.router(*asked)[1])
-    assert len(set(map(id, dropped))) == 4
-    resident = [file.resident(pages.libc) for file in pages.files.values()]
-    assert sum(resident) <= 2 * largest
+            assert len(pages.held) == 2
+    assert pages.reads == 8  # of four files twice
     for view in (0, 1):
         found = streamed.render(cameras, view)
         assert torch.equal(found.colour, wanted[view].colour) and torch.equal(found.depth, wanted[view].depth)
+    streamed.cut([0, 5, 9], tmp_path / "cut")  # asks for networks that are not in memory
+    whole.cut([0, 5, 9], tmp_path / "other")
+    assert {path.name for path in (tmp_path / "cut").rglob("networks-*")} == {
+        path.name for path in (tmp_path / "other").rglob("networks-*")
+    }
 
 
-def test_opening_reads_no_networks(joined, scene, tmp_path) -> None:
-    shutil.copytree(joined, tmp_path / "run")
-    os.sync()  # pages that are not on disk yet stay in memory
+def test_reading_leaves_nothing_in_the_cache_of_the_system(joined, scene, tmp_path) -> None:
+    shutil.copytree(joined, tmp_path / "run")  # pages that another run has mapped would stay
+    os.sync()
     streamed = open_run(tmp_path / "run", scene=scene, memory="4G")
-    pages = streamed.router.on_use.__self__
-    read = sum(file.resident(pages.libc) for file in pages.files.values())
-    assert read < 0.3 * sum(file.size for file in pages.files.values())
+    with torch.no_grad():
+        streamed.router(torch.rand(2000, 3) * 8, torch.tensor([[0.0, 0, 1]]), torch.zeros(2000, dtype=torch.int32))
+    cached = {path: cached_bytes(path) for path in (tmp_path / "run" / "checkpoints").iterdir()}
+    assert sum(cached.values()) < 0.2 * sum(path.stat().st_size for path in cached)
+
+
+def cached_bytes(path) -> int:
+    """What the system has of a file in memory."""
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, flags=mmap.MAP_PRIVATE) as pages:
+        states = (ctypes.c_ubyte * -(-len(pages) // mmap.PAGESIZE))()
+        start = ctypes.addressof(ctypes.c_char.from_buffer(pages))
+        assert ctypes.CDLL(None).mincore(ctypes.c_void_p(start), ctypes.c_size_t(len(pages)), states) == 0
+        return sum(state & 1 for state in bytes(states)) * mmap.PAGESIZE
+
+
+def test_far_parts_are_drawn_from_their_coarse_level(joined, scene) -> None:
+    """From afar it looks nearly the same, and asks no networks; where pixels are small it is the same."""
+    fine, far = (open_run(joined, scene=scene, detail=detail) for detail in (0.0, 1.0))
+    camera = scene.test.cameras[[0]]
+    closer = replace(camera, intrinsics=camera.intrinsics * torch.tensor([100.0, 100, 1, 1]))
+    assert torch.equal(far.render(closer).colour, fine.render(closer).colour)
+    poses = camera.poses.clone()
+    poses[:, :3, 3] *= 12
+    distant = replace(camera, poses=poses)
+    wide = {"near": 1.0, "far": 100.0}
+    found, wanted = (run.renderer.image(distant, 0, box=run.scene.box, **wide) for run in (far, fine))
+    assert not torch.equal(found.colour, wanted.colour)
+    assert (found.colour - wanted.colour).square().mean() < 1e-3
+    for router in far.router.routers:
+        router.register_forward_pre_hook(lambda *_: pytest.fail("a network was asked"))
+    far.renderer.image(distant, 0, box=far.scene.box, **wide)
+    refuses("--detail must be a number of pixels", lambda: open_run(joined, scene=scene, detail=-1), error=ConfigError)
+    one = joined.parent / "0"
+    refuses("--detail needs coarse levels", lambda: open_run(one, scene=scene, detail=1), error=ConfigError)
 
 
 @pytest.mark.parametrize("text", ["", "512X", "0", "-1M", "M"])

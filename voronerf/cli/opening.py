@@ -7,6 +7,7 @@ from pathlib import Path
 
 from voronerf.data import Scene
 from voronerf.data.record import read_scene
+from voronerf.router import Parts
 from voronerf.run import Run, open_run
 from voronerf.training.config import ConfigError
 
@@ -37,17 +38,23 @@ class Opening:
     memory: str | None = None
     """Bound on memory, such as 512M, for a run of several parts: networks are read as rays meet them, and those that
     were not used for longest are dropped."""
+    detail: float | None = None
+    """Draw far parts of a joined run from a coarse level, whose voxels are at most so many pixels wide; 0 is off. The
+    default is 1 for view and render with --memory, and 0 else."""
 
-    def open_without_images(self, run: Path) -> Run:
+    def open_without_images(self, run: Path, *, pictures: bool = False) -> Run:
         """Opens the run with the cameras of its record, unless other data or other sizes are asked for."""
         record = run / "scene.json"
         known = self.data is None and self.downscale is None and record.is_file()
-        return self.open(run, scene=read_scene(record) if known else None)
+        return self.open(run, scene=read_scene(record) if known else None, pictures=pictures)
 
-    def open(self, run: Path, *, scene: Scene | None = None) -> Run:
-        """Opens the run; see :func:`voronerf.open_run`."""
+    def open(self, run: Path, *, scene: Scene | None = None, pictures: bool = False) -> Run:
+        """Opens the run; see :func:`voronerf.open_run`. ``pictures``: to be looked at, not to be measured."""
         check_counts(samples=self.samples, fine_samples=self.fine_samples, downscale=self.downscale)
-        return open_run(run, scene=scene, **vars(self))
+        opened = open_run(run, scene=scene, **{**vars(self), "detail": self.detail or 0.0})
+        if pictures and self.memory is not None and self.detail is None and isinstance(opened.router, Parts):
+            opened.router.detail = 1.0
+        return opened
 
 
 AS_IN_TRAINING = Opening()

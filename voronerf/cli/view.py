@@ -33,7 +33,7 @@ def view(
     viewers.check_address(host, port)
     record = run / "scene.json"
     scene = read_scene(record) if record.is_file() else None
-    opened = opening.open(run, scene=scene)
+    opened = opening.open(run, scene=scene, pictures=True)
     viewer = viewers.view_run(opened, host=host, port=port)
     say(f"{viewer.audience}; Ctrl-C ends")
 

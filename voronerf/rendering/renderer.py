@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -20,6 +21,7 @@ from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.rays import intersect_box
 from voronerf.rendering.samplers import Occupancy, Stratified
 from voronerf.rendering.volume import Rendered, Samples, per_ray, render_samples
+from voronerf.router import Parts
 
 if TYPE_CHECKING:
     from voronerf.data import Scene
@@ -230,12 +232,15 @@ class Renderer:
         opacity, depth = torch.zeros_like(first), torch.full_like(first, far)
         places = rays.origins + far * rays.directions
         places = places if self.contraction is None else self.contraction.points(places)
-        for rows in self._tiles(hit, cameras.size(index), chunk):
-            seen = self.see(rays[rows], first[rows], last[rows], background, heaviest)
-            for whole, part in zip((colour, opacity, depth), seen):
-                whole[rows] = part.to(whole.dtype)
-            if heaviest:
-                places[rows] = seen.heaviest
+        field, eye = self.field, cameras.origins[index]
+        pixel = 1 / float(cameras.intrinsics[index, :2].max())
+        with field.seen_from(eye, pixel) if isinstance(field, Parts) and field.detail else nullcontext():
+            for rows in self._tiles(hit, cameras.size(index), chunk):
+                seen = self.see(rays[rows], first[rows], last[rows], background, heaviest)
+                for whole, part in zip((colour, opacity, depth), seen):
+                    whole[rows] = part.to(whole.dtype)
+                if heaviest:
+                    places[rows] = seen.heaviest
         size = cameras.size(index)[::-1]
         return RenderedImage(
             colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), places.reshape(*size, 3)

@@ -10,12 +10,13 @@ up, and their colours are mixed by density, as of two clouds in one place.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import inspect
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -25,6 +26,7 @@ from torch import Tensor, nn
 from voronerf import ops
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.blending import blend_cells
+from voronerf.router.coarse import Coarse, is_far
 from voronerf.router.router import VoronoiRouter
 
 #: How far a rotation may be from orthonormal, which rounding in a file makes it.
@@ -295,6 +297,8 @@ class Part(nn.Module):
         self.num_cells, self.whole = int(kept.sum()), bool(kept.all())
         self.frame, self.contraction, self.region = frame or Similarity(), contraction, tuple(region)
         self.layer = layer
+        #: What it shows from far away; None where that is not known, as after every change.
+        self.coarse: Coarse | None = None
         boxes = [solid.moved(self.frame).bounds() for solid in self.region if not solid.outside]
         #: A box [2, 3] of the scene outside of which the part does not speak; None for none.
         self.bounds = None
@@ -449,7 +453,7 @@ class Parts(nn.Module):
         parts: In the order of their cells: part after part, the cells of each in the order of its leaves.
         diagram: Flat, of the centres of all cells in the scene; for drawings.
         num_cells: k.
-        on_use: Called with every part after it was asked.
+        detail: Pixels that a voxel of a coarse level may be wide where `seen_from` shows it; 0 for no such parts.
 
     Args:
         parts: At least one.
@@ -497,7 +501,8 @@ class Parts(nn.Module):
             self.register_buffer(f"_part_of_{level}", owners.to(self.diagram.centres.device), persistent=False)
         self.register_buffer("hidden", None, persistent=False)
         self.backend, self.blend = backend, blend
-        self.on_use: Callable[[Part], None] | None = None
+        self.detail = 0.0
+        self.far: frozenset[int] = frozenset()
 
     def __iter__(self) -> Iterator[Part]:
         return iter(self.parts)  # type: ignore[arg-type]
@@ -551,6 +556,27 @@ class Parts(nn.Module):
         twin = copy.copy(self)
         twin._buffers = {**self._buffers, "hidden": hidden.to(self.diagram.centres.device)}
         return twin
+
+    @contextlib.contextmanager
+    def seen_from(self, eye: Tensor, pixel: float) -> Iterator[None]:
+        """A context in which parts that are far away show their coarse level, if there is a `detail`.
+
+        Args:
+            eye: [3], the place that the scene is seen from.
+            pixel: Width of a pixel at distance 1.
+        """
+        eye = eye.to(self.diagram.centres)
+        self.far = frozenset(
+            index
+            for index, part in enumerate(self)
+            if part.coarse is not None
+            and part.bounds is not None
+            and is_far(part.coarse, part.frame.scale, part.bounds.to(eye), eye, pixel * self.detail)
+        )
+        try:
+            yield
+        finally:
+            self.far = frozenset()
 
     def _hidden_of(self, index: int) -> Tensor | None:
         if self.hidden is None:
@@ -616,7 +642,7 @@ class Parts(nn.Module):
             for _, taken, _, _, share in claims:
                 total.index_add_(0, taken, cast(Tensor, share))
             claims = [(i, rows, own, leaf, cast(Tensor, w) / total[rows]) for i, rows, own, leaf, w in claims]
-        return [claim for claim in claims if len(claim[1])]
+        return sorted((claim for claim in claims if len(claim[1])), key=lambda claim: claim[0])
 
     def _claim(
         self, index: int, positions: Tensor, rows: Tensor, weights: Tensor | None
@@ -691,7 +717,7 @@ class Parts(nn.Module):
         if len(of) == 1:
             part = self[of[0]]
             whole = part.whole and not part.region and self.hidden is None and len(part.routers) == 1
-            if whole and self.on_use is None:
+            if whole:
                 return None, *part.evaluate(part.own_points(positions), None, directions, ray_index)
         claims = self._claims(level, positions, 0.0 if self.training else self.blend)
         if not claims:
@@ -699,9 +725,12 @@ class Parts(nn.Module):
         pieces = []
         for index, rows, own, leaf, weights in claims:
             rays = ray_index if len(rows) == n and weights is None else ray_index[rows]
-            colour, density = self[index].evaluate(own, leaf, directions, rays, self.backend)
-            if self.on_use is not None:
-                self.on_use(self[index])
+            coarse = self[index].coarse
+            if coarse is not None and index in self.far:
+                colour, density = coarse(own)
+                density = density / self[index].frame.scale
+            else:
+                colour, density = self[index].evaluate(own, leaf, directions, rays, self.backend)
             if weights is not None:
                 colour, density = colour * weights[:, None], density * weights
             pieces.append((rows, colour, density))

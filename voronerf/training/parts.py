@@ -17,6 +17,7 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.fields import FIELDS, FieldType
 from voronerf.rendering.contraction import Contraction
 from voronerf.router import Part, Parts, Similarity, Solid, VoronoiRouter
+from voronerf.router.coarse import Coarse
 from voronerf.router.grouping import cell_parameters
 from voronerf.training.average import load_averages
 from voronerf.training.checkpoint import Checkpoint, CheckpointError
@@ -130,7 +131,7 @@ def open_parts(
                 file = str(recipe["file"])
                 if file not in made:
                     leaves = (owner == number).nonzero()[:, 0]
-                    state = checkpoint.group(f"part-{index}.router-{number}") if pages is None else pages.read(file)
+                    state = checkpoint.group(f"part-{index}.router-{number}") if pages is None else pages.tensors(file)
                     made[file] = fill_router(make_router(recipe, device, backend), diagram.part(leaves), state, device)
                     if pages is not None:
                         pages.watch(file, made[file])
@@ -142,8 +143,22 @@ def open_parts(
     parts = Parts(found, backend=backend)
     if pages is not None:
         pages.check()
-        parts.on_use = pages.used
     return parts
+
+
+def restore_coarse(parts: Parts, checkpoint: Checkpoint) -> None:
+    """Gives parts the coarse levels that a checkpoint has of them.
+
+    Raises:
+        CheckpointError: When one does not fit.
+    """
+    for index, part in enumerate(parts):
+        state = checkpoint.group(f"part-{index}.coarse")
+        try:
+            if state:
+                part.coarse = Coarse(**{name: tensor.clone().to(part.owner.device) for name, tensor in state.items()})
+        except (TypeError, ValueError) as error:
+            raise CheckpointError(f"{checkpoint.source}: part-{index}.coarse: {error}") from None
 
 
 @torch.no_grad()

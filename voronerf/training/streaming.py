@@ -1,18 +1,19 @@
-"""Networks as pages of files, of which no more than a bound stays in memory.
+"""Networks that lie in files, of which no more than a bound is in memory.
 
-A page is read when a sample meets it. When a part was asked, but not all the time, what the process has for itself and
-what the files have in memory is counted, and the pages of the networks that were not used for longest are dropped.
+Before a part is asked, its networks are read whole, into memory of this process and past the system's cache; those that
+were not used for longest make room before. So what is in memory is known, and never more than the bound.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import functools
 import json
 import mmap
 import os
 import re
 import sys
-import time
 from collections import OrderedDict
 from math import prod
 from pathlib import Path
@@ -20,14 +21,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from voronerf.router import Part, VoronoiRouter
+from voronerf.router import VoronoiRouter
 from voronerf.training.checkpoint import CheckpointError
 from voronerf.training.config import ConfigError
 
 #: Share of the bound that is left for what comes and goes within a picture.
-SPARE = 0.15
-#: Seconds between two counts of what is in memory.
-EVERY = 0.02
+SPARE = 0.1
+#: Bytes of a read; what the system caches of it, if it does, is dropped before the next.
+_READ = 1 << 23
+#: Bytes that are read of a file to begin with, most often its whole header.
+_HEADER = 1 << 14
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30}
 _DTYPES = {"F32": torch.float32, "F64": torch.float64, "F16": torch.float16, "BF16": torch.bfloat16, "I32": torch.int32}
 
@@ -51,13 +54,20 @@ def anonymous_bytes() -> int:
 
 
 class _File:
-    """The tensors of a safetensors file, mapped."""
+    """The tensors of a safetensors file, in memory of their own that is there or not.
+
+    Where it is not, their addresses lead to the file, so that whoever reads them unasked still finds what they hold.
+    """
 
     def __init__(self, path: Path) -> None:
-        self.number = os.open(path, os.O_RDONLY)
+        self.path = path
+        self.number = _open(path)
         try:
             self.size = os.fstat(self.number).st_size
-            self.pages = mmap.mmap(self.number, 0, flags=mmap.MAP_PRIVATE, prot=mmap.PROT_READ | mmap.PROT_WRITE)
+            self.pages = mmap.mmap(-1, self.size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+            self.start = ctypes.addressof(ctypes.c_char.from_buffer(self.pages))
+            self._read(0, _HEADER)
+            self._read(_HEADER, 8 + int.from_bytes(self.pages[:8], "little"))
             first = 8 + int.from_bytes(self.pages[:8], "little")
             header = json.loads(self.pages[8:first])
             header.pop("__metadata__", None)
@@ -72,30 +82,78 @@ class _File:
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             os.close(self.number)
             raise CheckpointError(f"{path}: not a readable file of networks: {error}") from None
-        self.start = ctypes.addressof(ctypes.c_char.from_buffer(self.pages))
-        self.states = (ctypes.c_ubyte * -(-self.size // mmap.PAGESIZE))()
+        self.drop()
 
-    def resident(self, libc: ctypes.CDLL) -> int:
-        """Bytes of it that are in memory."""
-        if libc.mincore(ctypes.c_void_p(self.start), ctypes.c_size_t(self.size), self.states) != 0:
-            return self.size
-        return bytes(self.states).count(1) * mmap.PAGESIZE
+    def read(self) -> None:
+        """Reads it.
+
+        Raises:
+            CheckpointError: When it cannot be read any more.
+        """
+        self._map(-1)
+        try:
+            for first in range(0, self.size, _READ):
+                self._read(first, first + _READ)
+        except OSError as error:
+            raise CheckpointError(f"{self.path}: {error.strerror or error}") from None
+
+    def _read(self, first: int, end: int) -> None:
+        """Reads some of its bytes, or what there are of them."""
+        end = min(end, self.size)
+        whole = -(-end // mmap.PAGESIZE) * mmap.PAGESIZE  # a read past the cache takes no part of a block
+        while first < end:
+            room = (ctypes.c_char * (whole - first)).from_address(self.start + first)
+            done = os.preadv(self.number, [room], first)
+            os.posix_fadvise(self.number, first, done, os.POSIX_FADV_DONTNEED)
+            if not done:
+                raise OSError("it has become shorter")
+            first += done
 
     def drop(self) -> None:
-        """Gives its memory back; it is read again when it is needed."""
-        self.pages.madvise(mmap.MADV_DONTNEED)
+        """Gives its memory back."""
+        self._map(self.number)
         os.posix_fadvise(self.number, 0, 0, os.POSIX_FADV_DONTNEED)
+
+    def _map(self, number: int) -> None:
+        """Puts new memory, or the file, at the addresses of the tensors."""
+        rights, flags = mmap.PROT_READ | mmap.PROT_WRITE, mmap.MAP_PRIVATE | _MAP_FIXED
+        flags |= mmap.MAP_ANONYMOUS if number < 0 else 0
+        if _libc().mmap(self.start, self.size, rights, flags, number, 0) != self.start:
+            raise MemoryError(f"no memory for {self.path}")
+
+
+#: Of Linux on every processor that this runs on.
+_MAP_FIXED = 0x10
+
+
+@functools.cache
+def _libc() -> ctypes.CDLL:
+    libc = ctypes.CDLL(None, use_errno=True)
+    number, size = ctypes.c_void_p, ctypes.c_size_t
+    libc.mmap.argtypes = [number, size, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long]
+    libc.mmap.restype = ctypes.c_void_p
+    return libc
+
+
+def _open(path: Path) -> int:
+    """Opens a file to read it past the system's cache, where its file system can."""
+    with contextlib.suppress(OSError):
+        return os.open(path, os.O_RDONLY | os.O_DIRECT)
+    return os.open(path, os.O_RDONLY)
 
 
 class Pages:
-    """The files of the networks of a run, and a bound on what they and the process take of memory.
+    """The files of the networks of a run, and a bound on the memory of the process.
 
     Args:
         folder: Of the files.
-        memory: Bytes: anonymous memory of the process and pages of the files together.
+        memory: Bytes of anonymous memory of the process, networks included; next to none is in the system's cache.
+
+    Attributes:
+        reads: Files that were read.
 
     Raises:
-        ConfigError: Where the system cannot tell what is in memory, or the bound is less than a process needs.
+        ConfigError: Where the system cannot tell what is in memory.
     """
 
     def __init__(self, folder: Path, memory: int) -> None:
@@ -103,13 +161,10 @@ class Pages:
             raise ConfigError("--memory works on Linux alone")
         self.folder, self.memory = folder, memory
         self.files: dict[str, _File] = {}
-        self.of: dict[int, str] = {}
-        self.touched: set[str] = set()  # since memory was counted last
-        self.counted = 0.0
-        self.recent: OrderedDict[str, int] = OrderedDict()  # bytes in memory, the file that was used last at the end
-        self.libc = ctypes.CDLL(None, use_errno=True)
+        self.held: OrderedDict[str, _File] = OrderedDict()  # the file that was used last at the end
+        self.reads = 0
 
-    def read(self, name: str) -> dict[str, Tensor]:
+    def tensors(self, name: str) -> dict[str, Tensor]:
         """The tensors of a file, none of which is read yet.
 
         Raises:
@@ -120,12 +175,11 @@ class Pages:
                 self.files[name] = _File(self.folder / name)
             except OSError as error:
                 raise CheckpointError(f"{self.folder / name}: {error.strerror}") from None
-            self.files[name].drop()
         return self.files[name].tensors
 
     def watch(self, name: str, router: VoronoiRouter) -> None:
-        """Remembers that a router has the tensors of a file."""
-        self.of[id(router)] = name
+        """Has a file read before each call of the router that has its tensors."""
+        router.register_forward_pre_hook(lambda *_: self.use(name))
 
     def check(self) -> None:
         """Compares the bound with what is needed.
@@ -138,20 +192,19 @@ class Pages:
             least = needed / (1 - SPARE) / 2**20
             raise ConfigError(f"--memory must be at least {least:.0f}M for this run, got {self.memory / 2**20:.0f}M")
 
-    def used(self, part: Part) -> None:
-        """Counts what the routers of a part that was just asked have read, and drops what is too much."""
-        for router in part:
-            name = self.of[id(router)]
-            self.recent.setdefault(name, 0)
-            self.recent.move_to_end(name)
-            self.touched.add(name)
-        if time.monotonic() - self.counted < EVERY:
+    def forget(self, path: Path) -> None:
+        """Drops what the system has cached of a file that nobody has mapped any more."""
+        with open(path, "rb") as file:
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+    def use(self, name: str) -> None:
+        """Reads a file, if it is not in memory, after others have made room."""
+        if name in self.held:
+            self.held.move_to_end(name)
             return
-        for name in self.touched & self.recent.keys():
-            self.recent[name] = self.files[name].resident(self.libc)
-        self.touched.clear()
-        self.counted = time.monotonic()
-        room = self.memory * (1 - SPARE) - anonymous_bytes()
-        while sum(self.recent.values()) > room and len(self.recent) > 1:
-            oldest, _ = self.recent.popitem(last=False)
-            self.files[oldest].drop()
+        file = self.files[name]
+        while self.held and anonymous_bytes() + file.size > self.memory * (1 - SPARE):
+            self.held.popitem(last=False)[1].drop()
+        file.read()
+        self.reads += 1
+        self.held[name] = file
