@@ -187,7 +187,8 @@ def renew_cells(routed: nn.Module, parents: Tensor, new: Tensor, fresh: dict[str
     names = {id(p): name for name, p in routed.named_parameters()}
     for parameter in cell_parameters(routed):
         with torch.inference_mode(False):
-            values = parameter.detach()[parents.to(parameter.device)]
+            # Without memory for values, as of a run that is being opened, an index would import torch's compiler.
+            values = parameter.detach().index_select(0, parents.to(parameter.device))
             if fresh is not None:
                 values[new.to(values.device)] = fresh[names[id(parameter)]][new].to(values)
             _replace_values(parameter, values)

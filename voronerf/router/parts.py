@@ -662,14 +662,13 @@ class Parts(nn.Module):
         if not len(rows):
             return []
         least = positions.new_full((len(positions),), math.inf)
+        everywhere = positions.new_tensor([[-math.inf] * 3, [math.inf] * 3])
+        boxes = torch.stack([everywhere if (box := self[i].bounds) is None else box.to(positions) for i in of])
+        places = positions[rows][:, None]
+        inside = ((places >= boxes[:, 0]) & (places <= boxes[:, 1])).all(-1)
         found = []
-        for index in of:
-            near, bounds = rows, self[index].bounds
-            if bounds is not None:
-                low, high = bounds.to(positions)
-                near = rows[((positions[rows] >= low) & (positions[rows] <= high)).all(-1)]
-            if not len(near):
-                continue
+        for column in inside.any(0).nonzero()[:, 0].tolist():
+            index, near = of[column], rows[inside[:, column]]
             claim = self._claim(index, positions, near, None)
             taken, centres = claim[1], self[index].kept_centres
             places = positions[taken]
