@@ -40,7 +40,6 @@ RESULT = Path(__file__).parent / "results" / "editing.json"
 PICTURES = Path(__file__).parent.parent / "docs" / "images"
 BLOCKS, SIZE, BLEND = 2, 64, 0.03
 OVERLAP = 0.1  # of a half, on each side of the border
-GUIDE = 0.2  # of the time of a half, for a training that says which half a pixel shows
 
 
 def keep(name: str, values: list, **extra: object) -> None:
@@ -79,15 +78,6 @@ def seen(scene: Scene, views: torch.Tensor | None = None, box: torch.Tensor | No
     return replace(scene, train=train)
 
 
-def places_shown(run: Run, scene: Scene) -> torch.Tensor:
-    """x of what each pixel of the training views shows, [views, h, w], NaN for the background; for blocks of 4 x 4."""
-    cameras, rows = scene.train.cameras.downscaled(4), []
-    for view in range(len(cameras)):
-        image = run.render(cameras, view)
-        rows.append(torch.where(image.opacity > 0.5, image.heaviest[..., 0], torch.nan))
-    return torch.stack(rows).repeat_interleave(4, 1).repeat_interleave(4, 2)
-
-
 def half(scene: Scene, side: int) -> torch.Tensor:
     """The box of a half, and the overlap beyond its border."""
     box = scene.box.clone()
@@ -105,28 +95,18 @@ def city(out: Path, seconds: float, seeds: list[int]) -> None:
     places = scene.train.cameras.origins[:, 0]
     for seed in seeds:
         runs = {"one training": train(out / f"one-{seed}", scene, 2 * seconds, seed, cells=(16,))}
-        began = time.process_time()
-        guide = train(out / f"guide-{seed}", scene, GUIDE * seconds, seed, cells=())
-        shown = places_shown(guide, scene)
-        left = seconds - (time.process_time() - began) / 2
-        for way in ("pixels by surface", "views by position", "pixels by cell"):
+        for way in ("views by position", "pixels by cell"):
             halves = []
             for side in (0, 1):
                 sign = 1 if side == 0 else -1
                 near = sign * (places - middle) < OVERLAP * BLOCKS / 2
-                box = half(scene, side)
-                if way == "pixels by surface":
-                    own = replace(seen(scene, box=box), box=box)
-                    inside = (shown > box[0, 0]) & (shown < box[1, 0]) | shown.isnan()
-                    own = replace(own, train=replace(own.train, masks=own.train.masks & inside))
-                else:
-                    own = seen(scene, views=near) if way == "views by position" else seen(scene, box=box)
-                name = f"{way.replace(' ', '-')}-{side}-{seed}"
-                run = train(out / name, own, left if way == "pixels by surface" else seconds, seed, cells=(8,))
-                box = box.tolist()
+                own = seen(scene, views=near) if way == "views by position" else seen(scene, box=half(scene, side))
+                name = f"{way.split()[0]}-{side}-{seed}"
+                run = train(out / name, own, seconds, seed, cells=(8,))
+                box = half(scene, side).tolist()
                 there = out / f"cut-{name}"
                 halves.append(open_run(there, scene=scene) if there.exists() else run.cut(Solid.box(*box), there))
-            there = out / f"joined-{way.replace(' ', '-')}-{seed}"
+            there = out / f"joined-{way.split()[0]}-{seed}"
             joined = open_run(there, scene=scene) if there.exists() else Run.join(halves, there)
             runs[way] = replace(joined, scene=scene)
         for way, run in runs.items():
