@@ -108,7 +108,13 @@ def test_both_are_timed_and_info_says_it(
     assert "4 layers of 64 9 x as fast as the kernels" in " ".join(capsys.readouterr().out.split())
     monkeypatch.undo()
     assert 1e-3 < by_torch.gain(kernels.fused, TABLES["skips"], 3, 3, 16) < 1e3
-    monkeypatch.setenv("VORONERF_ISA", "portable")
-    by_torch.available.cache_clear()
     assert by_torch.describe(kernels.fused).startswith("not used")
-    by_torch.available.cache_clear()
+
+
+@pytest.mark.parametrize(("amx", "isa", "expected"), [(True, "", True), (True, "portable", False), (False, "", False)])
+def test_torch_is_asked_for_amx(monkeypatch: pytest.MonkeyPatch, amx: bool, isa: str, expected: bool) -> None:
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    monkeypatch.setenv("VORONERF_ISA", isa)
+    assert by_torch.available.__wrapped__() == expected
+    monkeypatch.delattr(torch.cpu, "_is_amx_tile_supported")  # a private function of torch's
+    assert not by_torch.available.__wrapped__()
