@@ -50,7 +50,7 @@ __device__ __forceinline__ int64_t first_of(const HashEncoding& in, const GridLe
 }
 
 template <int kFeatures, TableType kType>
-__global__ void __launch_bounds__(kThreads) hash_encode_kernel(HashEncoding in, float* __restrict__ out) {
+__global__ void __launch_bounds__(kThreads, 4) hash_encode_kernel(HashEncoding in, float* __restrict__ out) {
   const int64_t point = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (point >= in.in.n) return;
   const auto* table = static_cast<const typename HashElement<kType>::Type*>(in.in.table);
@@ -78,7 +78,7 @@ __global__ void __launch_bounds__(kThreads) hash_encode_kernel(HashEncoding in, 
 }
 
 template <int kFeatures>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, 4)
     hash_encode_table_backward_kernel(HashEncoding in, const float* __restrict__ gradient,
                                       float* __restrict__ of_table) {
   const int64_t point = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
@@ -106,7 +106,7 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 template <int kFeatures, TableType kType>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, 3)
     hash_encode_positions_backward_kernel(HashEncoding in, const float* __restrict__ gradient,
                                           float* __restrict__ of_positions) {
   const int64_t point = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;

@@ -9,14 +9,12 @@ namespace voronerf {
 
 namespace {
 
-// Grid: mlp_prepare_grid().
+// Grid (k, layers, blocks of a layer).
 template <bool kBfloat16>
 __global__ void __launch_bounds__(kMlpLayerThreads)
     mlp_chain_pack_kernel(const MlpChainPlan plan, const MlpCudaData data, const MlpCudaParameters parameters,
                           const MlpStrays strays) {
-  if (blockIdx.y == static_cast<unsigned>(plan.layer_count)) {
-    return mlp_prepare_rows(data, plan.task_rows, plan.tasks, strays);
-  }
+  if (blockIdx.y == 0) mlp_prepare_rows(data, plan.task_rows, plan.tasks, strays);
   const int64_t cell = blockIdx.x;
   const MlpChainLayer& layer = plan.layers[blockIdx.y];
   unsigned char* piece = data.packed + cell * plan.packed_bytes + layer.piece;
@@ -56,8 +54,9 @@ void pack(const MlpChainPlan& plan, const MlpCudaData& data, const MlpCudaParame
     words = std::max(words, int64_t{plan.layers[l].steps} * chain_pairs(8) * kChainQuad / 4);
   }
   const MlpStrays strays = {{data.out}, {plan.out_features}};
-  VN_LAUNCH((mlp_chain_pack_kernel<kBfloat16>), mlp_prepare_grid(data.k, plan.layer_count, words), kMlpLayerThreads, 0,
-            stream, plan, data, parameters, strays);
+  const dim3 grid(static_cast<unsigned>(data.k), plan.layer_count,
+                  mlp_cuda_layer_blocks(data.k, plan.layer_count, words));
+  VN_LAUNCH((mlp_chain_pack_kernel<kBfloat16>), grid, kMlpLayerThreads, 0, stream, plan, data, parameters, strays);
 }
 
 }  // namespace

@@ -15,15 +15,13 @@ constexpr int kThreads = kMlpLayerThreads;
 constexpr int64_t kBlocksPerMultiprocessor = 8;  // of kernels with blocks for each cell
 constexpr int kManyPartials = 16;                // of a cell, which the warps of a block then share
 
-// Grid: mlp_prepare_grid().
+// Grid (k, layers, blocks of a layer).
 template <typename Products>
 __global__ void __launch_bounds__(kThreads)
     mlp_pack_kernel(const MlpCudaPlan plan, const MlpCudaData data, const MlpCudaParameters parameters,
                     const MlpStrays strays) {
   using Element = typename Products::Element;
-  if (blockIdx.y == static_cast<unsigned>(plan.layer_count)) {
-    return mlp_prepare_rows(data, plan.task_rows, plan.tasks, strays);
-  }
+  if (blockIdx.y == 0) mlp_prepare_rows(data, plan.task_rows, plan.tasks, strays);
   const int64_t cell = blockIdx.x;
   const MlpCudaLayer& layer = plan.layers[blockIdx.y];
   unsigned char* packed = data.packed + cell * plan.packed_bytes;
@@ -123,8 +121,9 @@ void pack(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParamet
   for (int l = 0; l < plan.layer_count; ++l) {
     pairs = std::max(pairs, int64_t{plan.layers[l].padded} * plan.layers[l].weight_stride / 2);
   }
-  VN_LAUNCH((mlp_pack_kernel<Products>), mlp_prepare_grid(data.k, plan.layer_count, pairs), kThreads, 0, stream, plan,
-            data, parameters, strays);
+  const dim3 grid(static_cast<unsigned>(data.k), plan.layer_count,
+                  mlp_cuda_layer_blocks(data.k, plan.layer_count, pairs));
+  VN_LAUNCH((mlp_pack_kernel<Products>), grid, kThreads, 0, stream, plan, data, parameters, strays);
 }
 
 }  // namespace

@@ -47,16 +47,13 @@ __device__ void mlp_number_tasks(const MlpCudaData& data, int64_t task_rows, int
   });
 }
 
-// Beside the packing of weights, whose grid is (k, layers, blocks of a layer): the blocks of one layer more number the
-// tasks and clear the strays.
-inline dim3 mlp_prepare_grid(int64_t k, int layers, int64_t elements) {
-  return dim3(static_cast<unsigned>(k), static_cast<unsigned>(layers + 1), mlp_cuda_layer_blocks(k, layers, elements));
-}
+// What precedes a network beside the packing of weights, by the blocks of the first layer in a grid (k, layers, blocks
+// of a layer): they clear the strays, and one of them numbers the tasks.
 __device__ inline void mlp_prepare_rows(const MlpCudaData& data, int64_t task_rows, int64_t tasks,
                                         const MlpStrays& strays) {
   const int64_t block = blockIdx.x + static_cast<int64_t>(blockIdx.z) * gridDim.x;
   const int64_t blocks = static_cast<int64_t>(gridDim.x) * gridDim.z;
-  if (block == blocks - 1) mlp_number_tasks<kMlpLayerThreads>(data, task_rows, tasks);
+  if (block == 0) mlp_number_tasks<kMlpLayerThreads>(data, task_rows, tasks);
   if (strays.rows[0] == nullptr && strays.rows[1] == nullptr) return;
   const int64_t low = mlp_cell_begin(data, 0), last = data.offsets[data.k];
   const int64_t high = last < low ? low : last > data.n ? data.n : last;
