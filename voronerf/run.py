@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from voronerf import editing, updating
 from voronerf.data import Scene, load_scene
@@ -18,6 +19,7 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.editing import check_out
 from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import score_views
+from voronerf.files import json_text, read_json, write_text
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import RenderedImage, Renderer, render_camera
@@ -37,6 +39,8 @@ from voronerf.training.streaming import Pages, bytes_of
 #: Pictures of a run of more parts than these are rendered in so many squares along their longer side: a square meets
 #: the networks of few of them, which fit into a bound on memory. It does not depend on a bound, so pictures do not.
 FEW_PARTS, TILES = 8, 8
+#: File of a run's crop: the lowest and the highest corner.
+CROP = "crop.json"
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,14 @@ class Run:
     def diagram(self) -> VoronoiDiagram:
         """The cells of the field."""
         return self.router.diagram
+
+    def cropped(self, box: Tensor | Sequence[Sequence[float]]) -> Run:
+        """This run, of which only what lies in a box [2, 3] is rendered.
+
+        Raises:
+            ConfigError: The box is empty or not finite.
+        """
+        return replace(self, scene=replace(self.scene, box=_box(box, "--crop")))
 
     def render(self, camera: int | Cameras, index: int = 0, *, heaviest: bool = True) -> RenderedImage:
         """Renders a picture, without gradients and without randomness.
@@ -267,6 +279,33 @@ class Run:
         if not isinstance(lpips, Lpips):
             lpips, _ = self.find_lpips(lpips)
         return score_views(self.renderer, self.scene, views=views, lpips=lpips)
+
+
+def read_crop(folder: Path) -> Tensor | None:
+    """The box [2, 3] that the viewer has saved in a run directory, or None.
+
+    Raises:
+        ValueError: The file is no box.
+    """
+    file = folder / CROP
+    return _box(read_json(file), str(file)) if file.is_file() else None
+
+
+def write_crop(folder: Path, box: Tensor) -> None:
+    """Saves a box [2, 3] in a run directory, for ``--crop saved``."""
+    write_text(folder / CROP, json_text(box.tolist()) + "\n")
+
+
+def _box(value: Any, where: str) -> Tensor:
+    """A box float32 [2, 3], the lowest and the highest corner."""
+    try:
+        box = torch.as_tensor(value, dtype=torch.float32).cpu()
+    except (TypeError, ValueError, RuntimeError):
+        box = torch.empty(0)
+    if box.shape != (2, 3) or not bool(box.isfinite().all()) or not bool((box[0] < box[1]).all()):
+        got = value.flatten().tolist() if isinstance(value, Tensor) else value
+        raise ConfigError(f"{where} must be x y z of a corner and of a larger one, got {got!r:.200}")
+    return box
 
 
 def _shows(name: str) -> bool:

@@ -90,6 +90,17 @@ def test_videos_along_a_path(run, tmp_path, fails):
     fails("flight.json: is not a camera path", "render", run, "--path", file)
 
 
+def test_settings_of_a_file(run, tmp_path, fails):
+    again = tmp_path / "again"
+    succeeds("train --config", run / "config.json", "--seed 3 --out", again)
+    first, second = (json.loads((folder / "config.json").read_text()) for folder in (run, again))
+    assert {name for name in first if first[name] != second[name]} == {"seed", "out"}
+    fails("there is no such file", "train --config", tmp_path / "none.json")
+    (tmp_path / "bad.json").write_text('{"cels": [3]}')
+    fails("not a configuration of this version", "train --config", tmp_path / "bad.json")
+    fails("--config must be left out with --resume", "train --resume --config", run / "config.json", "--out", run)
+
+
 def test_exports_of_a_run(run, tmp_path, capsys, fails):
     pytest.importorskip("trimesh", reason="trimesh is not installed")
     pytest.importorskip("skimage", reason="scikit-image is not installed")
@@ -100,10 +111,10 @@ def test_exports_of_a_run(run, tmp_path, capsys, fails):
     succeeds("export", run, "--mesh", files[0], "--cells", files[1], "--video", files[2], options)
     assert all(file.stat().st_size for file in files)
     assert "3 of 3 cells" in capsys.readouterr().out
-    fails("no surface in the box", "export", run, "--box 9 9 9 9.5 9.5 9.5 --points", tmp_path / "points.ply")
-    fails("export needs --points FILE.ply, --mesh", "export", run)
+    fails("no surface in the box", "export", run, "--crop 9 9 9 9.5 9.5 9.5 --points", tmp_path / "points.ply")
+    fails("export needs a file: --splat, --points, --mesh", "export", run)
     fails("the file must end in .glb", "export", run, "--cells cells.stl")
-    fails("--box must be x y z of a corner and of", "export", run, "--box 0 0 0 1 1 0 --mesh", files[0])
+    fails("--crop must be x y z of a corner and of", "export", run, "--crop 0 0 0 1 1 0 --mesh", files[0])
 
 
 def test_info_names_every_backend(capsys):

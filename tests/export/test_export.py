@@ -1,5 +1,6 @@
 """Points, meshes and cells of runs whose field is a formula, loaded again."""
 
+import itertools
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,8 @@ from helpers import refuses, renderer_of, seeded
 
 from voronerf import VoronoiDiagram
 from voronerf.data import builtin_scene
-from voronerf.export import cell_meshes, export_cells, export_mesh, export_points
+from voronerf.export import cell_meshes, export_cells, export_mesh, export_points, export_splats
+from voronerf.export.splats import Splats, picture
 from voronerf.rendering import Contraction, OccupancyGrid
 from voronerf.run import Run
 from voronerf.training.config import ConfigError
@@ -149,11 +151,113 @@ def test_what_is_refused(run, tmp_path, monkeypatch):
     refuses(rule, export_mesh, run, path, resolution=8, density=1e6, error=ConfigError)
     unbounded = replace(run, scene=replace(run.scene, box=None))
     for export in (export_points, export_mesh):
-        refuses("--box must be given", export, unbounded, path, error=ConfigError)
-        rule = "--box must be x y z of a corner and of a larger one"
+        refuses("--crop must be given", export, unbounded, path, error=ConfigError)
+        rule = "--crop must be x y z of a corner and of a larger one"
         refuses(rule, export, run, path, box=BOX.flip(0), error=ConfigError)
     empty = torch.tensor([[5.0, 5, 5], [6.0, 6, 6]])
     refuses("unused: the training views show no surface", export_points, run, path, box=empty, error=ConfigError)
     monkeypatch.setitem(sys.modules, "skimage", None)
     refuses("needs scikit-image: pip install 'voronerf[export]'", export_mesh, run, path, error=ImportError)
     assert not list(tmp_path.iterdir())
+
+
+def read_splats(path):
+    """The columns of a file of splats, by the format's definition, which other programs go by."""
+    data = path.read_bytes()
+    head, body = data.split(b"end_header\n", 1)
+    lines = head.decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = int(lines[2].removeprefix("element vertex "))
+    names = [line.removeprefix("property float ") for line in lines[3:]]
+    values = np.frombuffer(body, "<f4").reshape(count, len(names))
+    return {name: values[:, i].astype(np.float64) for i, name in enumerate(names)}
+
+
+def seen(columns, camera):
+    """A picture [h, w, 3] of splats on white as Kerbl et al. 2023 define it, by loops over pixels and Gaussians."""
+    place = np.stack([columns[name] for name in "xyz"], 1)
+    pose, (fx, fy, cx, cy) = camera.poses[0].double().numpy(), camera.intrinsics[0].tolist()
+    local = (place - pose[:3, 3]) @ pose[:3, :3] * (1, -1, -1)  # x right, y down, z forward
+    away = (place - pose[:3, 3]) / np.linalg.norm(place - pose[:3, 3], axis=1, keepdims=True)
+    harmonics = [0.28209479 + 0 * away[:, 0], *(0.48860251 * away[:, (1, 2, 0)] * (-1, 1, -1)).T]
+    image = np.empty((camera.height, camera.width, 3))
+    order = np.argsort(local[:, 2])
+    gaussians = []
+    for i in order:
+        x, y, z = local[i]
+        w, a, b, c = (columns[f"rot_{k}"][i] for k in range(4))
+        turn = np.array([
+            [1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)],
+            [2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)],
+            [2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)],
+        ])  # fmt: skip
+        axes = turn * np.exp([columns[f"scale_{k}"][i] for k in range(3)])
+        slope = np.array([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
+        flat = slope @ (np.diag([1, -1, -1]) @ pose[:3, :3].T) @ axes
+        inverse = np.linalg.inv(flat @ flat.T + 0.3 * np.eye(2))
+        coefficients = [
+            [columns[f"f_dc_{k}"][i], *(columns[f"f_rest_{3 * k + j}"][i] for j in range(3))] for k in range(3)
+        ]
+        colour = [max(0.5 + sum(h[i] * value for h, value in zip(harmonics, row)), 0) for row in coefficients]
+        opacity = 1 / (1 + np.exp(-columns["opacity"][i]))
+        gaussians.append((np.array((fx * x / z + cx, fy * y / z + cy)), inverse, opacity, np.array(colour)))
+    for row, column in itertools.product(range(camera.height), range(camera.width)):
+        left, image[row, column] = 1.0, 0
+        for middle, inverse, opacity, colour in gaussians:
+            d = np.array((column + 0.5, row + 0.5)) - middle
+            alpha = min(opacity * np.exp(-d @ inverse @ d / 2), 0.99)
+            if alpha >= 1 / 255 and left > 1e-3:
+                image[row, column] += left * alpha * colour
+                left *= 1 - alpha
+        image[row, column] += left
+    return image
+
+
+def test_splats_look_like_the_run_in_another_reader(run, tmp_path):
+    path = tmp_path / "ball.ply"
+    clock = itertools.count().__next__  # 200 steps: it is asked before each, and once more in each hundredth
+    splats, scores = export_splats(run, path, count=400, seconds=300, clock=clock)
+    assert len(splats) == 400 and scores["after"] > scores["before"] + 6 and scores["after"] > 23
+    camera = run.scene.test.cameras[[0]]
+    columns = read_splats(path)
+    image = seen(columns, camera)
+    assert np.abs(image - run.render(0).colour.numpy()).mean() < 0.04
+    assert np.abs(image - picture(splats, camera, torch.ones(3)).numpy()).max() < 2e-3
+
+
+def test_splats_and_meshes_in_the_coordinates_of_the_files(run, tmp_path):
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=seeded(), dtype=torch.float64))[0]
+    turn *= torch.linalg.det(turn)
+    transform = torch.eye(4, dtype=torch.float64)
+    transform[:3, :3], transform[:3, 3] = 0.25 * turn, torch.tensor([0.1, 0.2, 0.3])  # 1 of the scene is 4 metres
+    moved = replace(run, scene=replace(run.scene, transform=transform))
+    assert export_mesh(run, tmp_path / "scene.ply", resolution=32).extents.max() < 1.3
+    extents = export_mesh(moved, tmp_path / "metres.ply", resolution=32, to_files=True).extents
+    assert extents.min() > 4.2 and extents.max() < 5.4
+    splats, _ = export_splats(moved, tmp_path / "splats.ply", count=100, seconds=0, to_files=True)
+    radius = np.linalg.norm(
+        np.stack([read_splats(tmp_path / "splats.ply")[name] for name in "xyz"], 1)
+        - torch.linalg.inv(transform)[:3, 3].numpy(),
+        axis=1,
+    )
+    assert abs(np.median(radius) - 4 * RADIUS) < 0.1
+    # A similarity changes nothing of what a camera that is moved along sees, colours by direction included.
+    splats.colours += 0.2 * torch.randn(splats.colours.shape, generator=seeded())
+    camera = run.scene.test.cameras[[0]]
+    away = torch.linalg.inv(transform)
+    pose = away @ camera.poses[0].double()
+    pose[:3, :3] /= 4
+    there = picture(splats.moved(away), replace(camera, poses=pose.float()[None]), torch.ones(3))
+    assert (there - picture(splats, camera, torch.ones(3))).abs().max() < 2e-3
+
+
+def test_splats_of_a_part_and_what_is_refused(run, tmp_path):
+    upper = torch.tensor([[-1.0, -1, 0], [1.0, 1, 0.8]])
+    splats, _ = export_splats(run, tmp_path / "half.ply", count=200, seconds=0, box=upper)
+    assert isinstance(splats, Splats) and splats.positions[:, 2].min() >= 0
+    for options, rule in (
+        ({"count": 0}, "--count must be at least 1, got 0"),
+        ({"seconds": -1.0}, "--fit must be 0 or more seconds, got -1"),
+        ({"box": torch.tensor([[5.0, 5, 5], [6.0, 6, 6]])}, "the training views show no surface"),
+    ):
+        refuses(rule, export_splats, run, tmp_path / "none.ply", error=ConfigError, **options)

@@ -74,6 +74,14 @@ class Tab:
         """Changes a part of the panel, or presses a button."""
         self.send("GuiUpdateMessage", uuid=self.gui[label]["uuid"], updates={"value": value})
 
+    def drag(self, name, place, wxyz=(1.0, 0.0, 0.0, 0.0)) -> None:
+        """Drags arrows of the scene to a place, when they are there."""
+        self.until(lambda: name in self.nodes)
+        node = {"name": name, "owner": self.nodes[name].get("owner", "")}
+        self.send("TransformControlsDragStartMessage", **node)
+        self.send("TransformControlsUpdateMessage", wxyz=list(wxyz), position=place, **node)
+        self.send("TransformControlsDragEndMessage", **node)
+
     def click(self, x, y) -> None:
         self.send(
             "ScenePointerMessage",
@@ -112,11 +120,20 @@ class Tab:
                     part.update(message["updates"])
         elif kind.startswith("Gui") and "uuid" in message:
             label = props.get("label") or props.get("_markdown", kind)[:20]
-            self.gui[label] = {"uuid": message["uuid"], "value": message.get("value"), **props}
+            self.gui[label] = {
+                "uuid": message["uuid"],
+                "folder": message.get("container_uuid"),
+                "value": message.get("value"),
+                **props,
+            }
+        elif kind == "GuiRemoveMessage":
+            self.gui = {
+                label: part for label, part in self.gui.items() if message["uuid"] not in (part["uuid"], part["folder"])
+            }
         elif kind == "RemoveSceneNodeMessage":
             self.nodes = {name: node for name, node in self.nodes.items() if not name.startswith(message["name"])}
         elif "name" in message and props:
-            self.nodes[message["name"]] = {"kind": kind, **props}
+            self.nodes[message["name"]] = {"kind": kind, "owner": message.get("owner", ""), **props}
         elif kind == "FileTransferStartDownload":
             self.files[message["filename"]] = b""
         elif kind == "FileTransferPart":

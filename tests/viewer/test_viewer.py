@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import shutil
 import socket
 import sys
 import threading
@@ -12,6 +13,7 @@ from contextlib import closing
 from dataclasses import replace
 from http.client import HTTPConnection
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
@@ -26,14 +28,16 @@ from websockets.exceptions import ConnectionClosed
 
 from voronerf import open_run
 from voronerf.cli import main
+from voronerf.cli.opening import crop_box
 from voronerf.data.record import read_scene
 from voronerf.evaluation.panels import palette
-from voronerf.rendering import orbit_cameras, read_camera_path
+from voronerf.rendering import CameraPath, orbit_cameras, read_camera_path, write_camera_path
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.trainer import Trainer
-from voronerf.viewer import TrainingViewer, view_run
+from voronerf.viewer import Subject, Training, view_run, watch
 from voronerf.viewer.cameras import scene_bounds
 from voronerf.viewer.pictures import Look, cells_of, render_look
+from voronerf.viewer.runs import FILES
 
 
 @pytest.fixture
@@ -143,11 +147,112 @@ def test_a_crop_leaves_what_is_inside(run, scene, tab) -> None:
     tab.rest()
     tab.set("Crop", True)
     whole = tab.rest()
-    low, high = scene.box[:, 2].tolist()
-    tab.set("z", [low, (low + high) / 2])
+    low, high = scene.box.tolist()
+    tab.drag("/crop/high", [*high[:2], (low[2] + high[2]) / 2])
     part = tab.rest()
     assert (part[:40].min(-1) < 235).sum() < 0.3 * (whole[:40].min(-1) < 235).sum()
     assert abs(part[-40:].astype(float) - whole[-40:]).mean() < 3
+
+
+def test_a_crop_is_saved_with_the_run(run, scene, tab, viewer) -> None:
+    tab.rest()
+    tab.set("Crop", True)
+    low, beyond = scene.box[0].tolist(), [-9.0, -9.0, -9.0]
+    tab.drag("/crop/low", [0.1, low[1], low[2]])
+    tab.drag("/crop/high", beyond)  # a corner stays beyond the other
+    client = viewer.clients[0]
+    tab.until(lambda: client.look.crop is not None and client.look.crop[1][0] < 0.3)
+    corners = torch.tensor(client.look.crop)
+    assert bool((corners[0] < corners[1]).all()) and torch.allclose(corners[0], torch.tensor([0.1, *low[1:]]))
+    tab.set("Save crop", True)
+    tab.until(lambda: tab.notes)
+    assert torch.allclose(crop_box(run, "saved"), corners)
+    (run.path / "crop.json").unlink()
+    refuses("--crop saved needs a crop", crop_box, run, "saved", error=ConfigError)
+
+
+def test_a_video_is_exported_inside_of_the_crop(run, scene, tab, viewer) -> None:
+    tab.rest()
+    viewer.clients[0].change(crop=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0)))
+    tab.set("Keyframes", "add")
+    tab.set("Seconds", 1.0)
+    tab.set("File", "video")
+    tab.set("Export", True)
+    (name,) = tab.until(lambda: list(tab.files))
+    file = run.path / "exports" / "video.mp4"
+    assert name.endswith("video.mp4") and file.is_file()
+    frames = list(imageio_ffmpeg.read_frames(str(file)))[1:]
+    assert len(frames) == 24 and min(np.frombuffer(frames[0], np.uint8)) > 240  # nothing is in that box
+    tab.until(lambda: not viewer.busy)
+
+
+def test_an_export_can_be_stopped_and_says_what_is_wrong(run, tab, viewer, monkeypatch) -> None:
+    tab.rest()
+
+    def export(run, file, *, box, track):
+        for number in track(range(1000), "a long work"):
+            if number == 3:
+                tab.set("Stop export", True)
+            assert number < 999
+            time.sleep(0.005)
+
+    def fails(run, file, *, box):
+        raise ConfigError("no such thing")
+
+    monkeypatch.setitem(FILES, "mesh", ("mesh.glb", export))
+    monkeypatch.setitem(FILES, "points", ("points.ply", fails))
+    tab.set("File", "mesh")
+    tab.set("Export", True)
+    tab.until(lambda: "Stopped." in str(tab.gui))
+    tab.set("File", "points")
+    tab.set("Export", True)
+    tab.until(lambda: "no such thing" in str(tab.notes))
+    tab.set("Pixels", 192)
+    assert tab.rest().shape[1] == 192  # it goes on
+
+
+def test_a_run_is_trained_further_and_anew_and_others_are_opened(run, scene, viewer, monkeypatch, tmp_path) -> None:
+    folder = tmp_path / "one"
+    shutil.copytree(run.path, folder)
+    viewer.show(Subject.of(open_run(folder, scene=scene)))
+    viewer.open = lambda path: open_run(path, scene=scene)
+    trained = []
+
+    def train(config, scene):
+        trainer = Trainer(config, scene)
+        training = Training(viewer, trainer)
+        trainer.on_step = training.on_step
+
+        def on_step(now):
+            training.on_step(now)
+            if now.step == first + 5:
+                assert viewer.subject.run is None  # so that nothing can be exported, opened or trained meanwhile
+                tab.until(lambda: "Stop training" in tab.gui)
+                tab.set("Stop training", True)
+            time.sleep(0.01)
+
+        first, trainer.on_step = trainer.step, on_step
+        trained.append(trainer.run())
+        training.close()
+
+    viewer.train = train
+    tab = Tab(viewer, scene.test.cameras)
+    tab.rest()
+    viewer.show(viewer.subject)  # with what can be asked for now
+    tab.until(lambda: "Train" in tab.gui)
+    tab.set("Train", "further")
+    tab.until(lambda: len(trained) == 1 and viewer.subject.run is not None)
+    assert trained[0]["steps"] > 120 and viewer.subject.folder == folder
+    tab.until(lambda: "Train" in tab.gui)
+    tab.set("Cells", 1)
+    tab.set("Train", "anew")
+    tab.until(lambda: len(trained) == 2 and viewer.subject.run is not None)
+    assert viewer.subject.folder == tmp_path / "one-2" and viewer.subject.diagram.num_cells == 1
+    tab.until(lambda: "Open" in tab.gui)
+    tab.set("Open", "one")
+    tab.until(lambda: viewer.subject.folder == folder)
+    tab.rest()
+    tab.close()
 
 
 def test_centres_and_cameras_are_drawn_into_the_scene(run, scene, tab) -> None:
@@ -183,6 +288,29 @@ def test_keyframes_become_a_path_that_render_takes(run, scene, tab, capsys) -> N
     ends = path.frames.poses[[0, -1]]
     assert torch.allclose(ends, scene.test.cameras.poses[:2], atol=1e-4)
     assert torch.allclose(path.keyframes.intrinsics[:, 1] * 24 / 128, scene.test.cameras.intrinsics[:2, 1], rtol=1e-4)
+
+
+def test_keyframes_are_drawn_dragged_and_loaded(run, scene, tab, viewer) -> None:
+    tab.rest()
+    frames = orbit_cameras(5, radius=3.0, elevation=10.0, width=64, height=48, focal=50.0)
+    write_camera_path(run.path / "camera_paths" / "of-nerfstudio.json", CameraPath(frames, 5.0, frames[[0, 2, 4]]))
+    viewer.show(viewer.subject)
+    tab.until(lambda: "of-nerfstudio.json" in str(tab.gui.get("Load path")))
+    tab.set("Load path", "of-nerfstudio.json")
+    tab.until(lambda: "/keyframes/line" in tab.nodes)
+    assert {"/keyframes/0", "/keyframes/1", "/keyframes/2"} <= set(tab.nodes)
+    keyframes = viewer.clients[0].keyframes
+    assert torch.allclose(keyframes.cameras[1].poses, frames.poses[[2]], atol=1e-5)
+    keyframes.select(1)
+    tab.drag("/keyframes/arrows", [0.5, 0.25, 2.0])
+    tab.until(lambda: bool((keyframes.cameras[1].origins == torch.tensor([0.5, 0.25, 2.0])).all()))
+    tab.set("Seconds", 1.0)
+    tab.set("Preview", True)
+    pictures = len(tab.pictures)
+    tab.until(lambda: len(tab.pictures) > pictures)
+    tab.set("Load path", "-")
+    tab.set("Keyframes", "clear")
+    tab.until(lambda: not any(name.startswith("/keyframes/") for name in tab.nodes))
 
 
 def test_a_screenshot_is_the_picture(tab) -> None:
@@ -242,7 +370,8 @@ def test_a_training_is_the_same_with_a_viewer(tmp_path, scene, monkeypatch) -> N
     plain = Trainer(TrainConfig(out=tmp_path / "plain", **settings), scene)
     plain.run()
     watched = Trainer(TrainConfig(out=tmp_path / "watched", **settings), scene)
-    viewer = TrainingViewer(watched, port=0)
+    training = watch(watched, port=0)
+    viewer = training.viewer
     tab = Tab(
         viewer,
         scene.test.cameras,
@@ -255,10 +384,10 @@ def test_a_training_is_the_same_with_a_viewer(tmp_path, scene, monkeypatch) -> N
         if now.step == 30:
             tab.read()
             tab.set("Pause", True)
-            tab.until(lambda: viewer.paused)
+            tab.until(lambda: training.paused)
             threading.Timer(0.3, tab.set, ("Pause", True)).start()
         tab.look(scene.test.cameras, now.step % 2)
-        viewer.on_step(now)
+        training.on_step(now)
 
     watched.on_step = on_step
     watched.run()
@@ -274,12 +403,12 @@ def test_a_training_is_the_same_with_a_viewer(tmp_path, scene, monkeypatch) -> N
 
 def test_nothing_is_rendered_for_nobody(tmp_path, scene) -> None:
     trainer = Trainer(TrainConfig(out=tmp_path, steps=4, cells=(), rays=64, samples=8, evaluations=1), scene)
-    viewer = TrainingViewer(trainer, port=0)
+    training = watch(trainer, port=0)
     asked = []
     trainer.renderer.image = lambda *args, **options: asked.append(args)
-    trainer.on_step = viewer.on_step
+    trainer.on_step = training.on_step
     trainer.advance()
-    viewer.close()
+    training.viewer.close()
     assert trainer.step == 4 and not asked
 
 
@@ -325,8 +454,8 @@ def test_pages_of_other_sites_are_refused(run, host, asked, origin, status) -> N
 
 
 BAD = {
-    "a slider of one end": lambda tab: (tab.set("Crop", True), tab.set("x", [1.0])),
-    "a slider of no number": lambda tab: (tab.set("Crop", True), tab.set("x", [float("nan"), 1.0])),
+    "half a corner": lambda tab: (tab.set("Crop", True), tab.drag("/crop/low", [1.0])),
+    "a corner nowhere": lambda tab: (tab.set("Crop", True), tab.drag("/crop/high", [float("nan"), 1.0, 1.0])),
     "a long path": lambda tab: (tab.set("Keyframes", "add"), tab.set("Seconds", 1e9), tab.set("Save path", True)),
     "a large picture": lambda tab: tab.set("Pixels", 10**6),
     "another pane": lambda tab: tab.set("Show", "x" * 1000),
@@ -435,7 +564,7 @@ def test_what_is_shown_is_saved_as_a_run(run, scene, viewer, tab) -> None:
     assert cut.router.num_cells <= k - 1 and cut.scene.box[1, 2] < 0.4
     # What is opened again is viewed, hidden and picked like any run.
     image = cut.render(scene.test.cameras, 0)
-    subject = viewer.subject.__class__("cut", cut.path, cut.scene, cut.router, cut.renderer)
+    subject = Subject.of(cut)
     cells = cells_of(subject, image.heaviest)
     assert int(cells.max()) < cut.router.num_cells and image.opacity.max() > 0.5
     gone = render_look(subject, scene.test.cameras[[0]], Look(hidden=frozenset(range(cut.router.num_cells))))

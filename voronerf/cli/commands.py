@@ -7,13 +7,16 @@ import importlib
 import os
 import shlex
 import signal
-from collections.abc import Iterable, Sequence
+import threading
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import FrameType, ModuleType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import track
@@ -22,16 +25,16 @@ from rich.table import Table
 from voronerf import backends
 from voronerf.cli.board import Board
 from voronerf.cli.display import StageDisplay, TrainingDisplay, printable
-from voronerf.cli.opening import AS_IN_TRAINING, Opening, check_counts
+from voronerf.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
 from voronerf.data import BUILTIN, Scene, SceneError, load_scene
 from voronerf.data.process import process as make_scene
 from voronerf.distributed.group import Group, joined, local_rank, restarts, world_size
 from voronerf.distributed.same import check_same, check_same_scene
-from voronerf.evaluation.panels import picture_of_colour, write_panels
-from voronerf.evaluation.video import check_video, write_video
+from voronerf.evaluation.panels import write_panels
+from voronerf.evaluation.video import check_video
+from voronerf.export.video import export_video
 from voronerf.files import json_text, write_text
-from voronerf.rendering.cameras import turntable_cameras
-from voronerf.rendering.paths import CameraPath, read_camera_path, spiral_cameras
+from voronerf.rendering.paths import CameraPath, read_camera_path
 from voronerf.run import Run, open_run
 from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import ConfigError, TrainConfig
@@ -39,10 +42,19 @@ from voronerf.training.config_checks import check_device, check_joint, why_no_oc
 from voronerf.training.joint import JointTrainer
 from voronerf.training.networks import resolve_config
 from voronerf.training.progress import Progress
-from voronerf.training.run_directory import choose_directory, held, is_outside, write_curve
+from voronerf.training.run_directory import (
+    check_stored_paths,
+    choose_directory,
+    held,
+    is_outside,
+    write_curve,
+)
 from voronerf.training.trainer import Trainer
 
 console = Console(soft_wrap=True)
+
+#: Makes a `voronerf.viewer.Training`, which shows a trainer.
+Watch = Callable[[Trainer], Any]
 
 #: Bytes of a picture's name without its end, which most file systems take.
 LONGEST_NAME = 255 - len(".png")
@@ -56,7 +68,13 @@ def say(line: str) -> None:
 
 
 def train(
-    config: TrainConfig, *, view: bool = False, host: str = "127.0.0.1", port: int = 8080, explain: bool = False
+    config: TrainConfig,
+    *,
+    file: Annotated[Path | None, tyro.conf.arg(name="config")] = None,
+    view: bool = False,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    explain: bool = False,
 ) -> int:
     """Train a scene: coarse network, balanced Voronoi cells, cells trained further.
 
@@ -64,6 +82,7 @@ def train(
 
     Args:
         config: The settings.
+        file: JSON of settings by their names, such as the config.json of a run; options that are given come first.
         view: Show the training in a browser, and its result until Ctrl-C.
         host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
         port: Port that --view listens at; 0 is any that is free.
@@ -86,13 +105,30 @@ def train(
         return 0
     chosen = choose_directory(config, scene)
     assert chosen.out is not None
-    try:
-        summary = run_training(chosen, scene, view=(host, port) if view else None)
-    finally:
+    with contextlib.ExitStack() as stack:
         if config.out is None:
-            with contextlib.suppress(OSError):
-                chosen.out.rmdir()  # fails if something was written, and is then not needed
+            stack.callback(_remove_empty, chosen.out)
+
+        def watch(trainer: Trainer) -> Any:
+            watched = import_viewer().watch(trainer, host=host, port=port)
+            stack.callback(watched.viewer.close)
+            say(watched.viewer.audience)
+            viewers.append(watched.viewer)
+            return watched
+
+        viewers: list[Any] = []
+        summary = run_training(chosen, scene, watch=watch if view else None)
+        for viewer in viewers:
+            if summary["complete"]:
+                say(f"{viewer.address} shows the run until Ctrl-C")
+                viewer.show(import_viewer().Subject.of(open_run(chosen.out, scene=scene, backend=config.backend)))
+                serve_runs(viewer)
     return 0 if summary["complete"] else 130
+
+
+def _remove_empty(folder: Path) -> None:
+    with contextlib.suppress(OSError):
+        folder.rmdir()  # fails if something was written, and is then not needed
 
 
 def train_on_ranks(config: TrainConfig, *, view: bool) -> int:
@@ -142,12 +178,11 @@ def _draw_joint(config: TrainConfig, scene: Scene) -> None:
 
 
 def run_training(
-    config: TrainConfig, scene: Scene, *, view: tuple[str, int] | None = None, group: Group | None = None
+    config: TrainConfig, scene: Scene, *, watch: Watch | None = None, group: Group | None = None
 ) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
 
-    ``view`` is the address and the port where a viewer shows the training, and what came of it until Ctrl-C; ``group``
-    the ranks that train together.
+    ``watch`` makes what shows the training in a viewer; ``group`` are the ranks that train together.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the step in hand: the checkpoint and the summary are written,
     the pictures are not. A second one ends the process at once.
@@ -157,11 +192,11 @@ def run_training(
     if config.panels and len(os.fsencode(longest)) > LONGEST_NAME:
         raise ConfigError(f"--panels must be 0 with image names of more than {LONGEST_NAME} bytes, got {longest}")
     with held(config.out) if group is None or group.rank == 0 else contextlib.nullcontext():
-        return _train_and_draw(config, config.out, scene, view, group)
+        return _train_and_draw(config, config.out, scene, watch, group)
 
 
 def _train_and_draw(
-    config: TrainConfig, out: Path, scene: Scene, view: tuple[str, int] | None, group: Group | None
+    config: TrainConfig, out: Path, scene: Scene, watch: Watch | None, group: Group | None
 ) -> dict[str, Any]:
     with contextlib.ExitStack() as stack:
         with TrainingDisplay(console, scene.name) as display:
@@ -181,17 +216,16 @@ def _train_and_draw(
                 other = "a scene without a box" if bare else "a contraction, unless by --occupancy-resolution 64"
                 obstacle = why_no_occupancy(resolved) or other
                 display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
-            viewer = None
+            watched = None
             board = Board(out / "tensorboard", trainer) if config.tensorboard and trainer.writes else None
-            if view is not None and isinstance(trainer, Trainer):
-                viewer = import_viewer().TrainingViewer(trainer, host=view[0], port=view[1])
-                stack.callback(viewer.close)
-                display.on_event(viewer.audience)
+            if watch is not None and isinstance(trainer, Trainer):
+                watched = watch(trainer)
+                stack.callback(watched.close)
 
             def on_step(now: Progress) -> None:
                 display.on_step(now)
-                if viewer is not None:
-                    viewer.on_step(now)
+                if watched is not None:
+                    watched.on_step(now)
                 if board is not None:
                     board.on_step(now)
 
@@ -211,9 +245,6 @@ def _train_and_draw(
         if trainer.writes:
             write_curve(out)
         say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
-        if viewer is not None:
-            say(f"{viewer.address} shows the run until Ctrl-C")
-            viewer.stay()
         return summary
 
 
@@ -291,6 +322,7 @@ def render(
     spiral: bool = False,
     frames: int = 60,
     fps: float | None = None,
+    crop: Crop = None,
     opening: Opening = AS_IN_TRAINING,
 ) -> int:
     """Render a video of a trained run: a turntable, a spiral, or a camera path.
@@ -303,6 +335,7 @@ def render(
             was taken from one side, for which it is the default.
         frames: Frames of a turntable or a spiral.
         fps: Frames per second; default 24, or those of the path.
+        crop: Show a box only, x y z of its lowest and of its highest corner, or "saved" for the viewer's.
         opening: How the run is opened.
     """
     check_counts(frames=frames)
@@ -316,7 +349,9 @@ def render(
     check_video(out)
     if given is not None:
         given = replace(given, frames=given.frames.downscaled(opening.downscale or 1))
-    write_flight(opened, out, given=given, spiral=spiral, frames=frames, fps=fps)
+    box = crop_box(opened, crop)
+    export_video(opened, out, flight=given, spiral=spiral, frames=frames, fps=fps, box=box, track=tracked)
+    say(f"wrote {out}")
     return 0
 
 
@@ -332,29 +367,48 @@ def tracked(parts: Sequence[Any], name: str) -> Iterable[Any]:
     return track(parts, description=name, console=console, disable=not console.is_terminal)
 
 
-def write_flight(
-    run: Run, out: Path, *, given: CameraPath | None, spiral: bool, frames: int = 60, fps: float | None = None
-) -> None:
-    """Renders a video along a path, a spiral or a turntable, and says so."""
-    scene = run.scene
-    if given is not None:
-        cameras, fps = given.frames, fps or given.fps
-    elif spiral or scene.kind == "forward":
-        cameras = spiral_cameras(scene.train.cameras, frames, near=scene.near, far=scene.far)
-    else:
-        cameras = turntable_cameras(scene.train.cameras, frames)
-    numbers = tracked(range(len(cameras)), "rendering")
-    pictures = (picture_of_colour(run.render(cameras, number, heaviest=False).colour) for number in numbers)
-    write_video(out, pictures, fps or 24)
-    say(f"wrote {out}")
-
-
 def import_viewer() -> ModuleType:
     """The viewer, which needs the extra."""
     try:
         return importlib.import_module("voronerf.viewer")
     except ImportError as error:
         raise ImportError(f"the viewer needs viser: pip install 'voronerf[viewer]' ({error})") from None
+
+
+def serve_runs(viewer: Any, opening: Opening = AS_IN_TRAINING) -> None:
+    """Serves a viewer of runs until Ctrl-C; its pages can open other runs, and train.
+
+    Args:
+        viewer: A `voronerf.viewer.Viewer`.
+        opening: How runs are opened.
+    """
+
+    def read_images(run: Run) -> None:
+        try:
+            if opening.data is None:
+                check_stored_paths(run.path, data=run.config.data)
+            whole = load_scene(run.config.data, allow_outside=opening.allow_outside, **run.config.reading)
+        except (ConfigError, ValueError, OSError) as error:
+            say(f"without the images of the scene: {error}")
+        else:
+            viewer.do(lambda: viewer.subject.run is run and viewer.take_images(whole))
+
+    def open_one(path: Path) -> Run:
+        run = opening.open_without_images(path, pictures=True)
+        if not len(run.scene.train.images) and opening.memory is None:
+            threading.Thread(target=read_images, args=(run,), daemon=True).start()
+        return run
+
+    def train_one(config: TrainConfig, scene: Scene) -> None:
+        run_training(config, scene, watch=partial(import_viewer().Training, viewer))
+
+    viewer.open, viewer.train = open_one, train_one
+    with contextlib.suppress(KeyboardInterrupt):
+        viewer.warm_up()
+        shown = viewer.subject.run
+        if not len(shown.scene.train.images) and opening.memory is None:
+            threading.Thread(target=read_images, args=(shown,), daemon=True).start()
+        viewer.serve()
 
 
 def preload(device: str = "cpu") -> int:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
+import inspect
 import itertools
 import os
 import re
@@ -14,7 +16,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import torch
 import tyro
@@ -26,7 +28,7 @@ from voronerf.cli.display import one_line
 from voronerf.distributed.group import RankLost, may_tell, own_rank
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.progress import TrainingError
-from voronerf.training.run_directory import check_stored_paths, stored_config
+from voronerf.training.run_directory import check_stored_paths, read_config, stored_config
 
 #: Errors that a user can cause; they are printed as one line. ValueError includes SceneError and CheckpointError.
 EXPECTED = (
@@ -125,23 +127,27 @@ def _run(args: list[str] | None, told: TextIO) -> int:
 
 
 def _train_command(args: list[str]) -> Callable[..., int]:
-    """The function behind ``train``; with --resume the settings of the run in --out are its defaults."""
+    """The function behind ``train``; its defaults are the settings of --config, or for --resume those of the run."""
     if args == ["train"]:
         for line in WHAT_TO_TRY.splitlines():
             commands.say(line)
-    if "train" not in args[:1] or "--resume" not in args:
+    file, out = _given_path(args, "--config"), _given_path(args, "--out")
+    if "train" not in args[:1] or (file is None and "--resume" not in args):
         return commands.train
-    out = next((after for word, after in itertools.pairwise(args) if word == "--out"), None)
-    out = next((word.removeprefix("--out=") for word in args if word.startswith("--out=")), out)
-    stored = None if out is None else stored_config(Path(out))
-    if out is None or stored is None:
+    if file is not None and "--resume" in args:
+        raise ConfigError("--config must be left out with --resume, which goes on with the settings of the run")
+    if file is not None and not file.is_file():
+        raise ConfigError(f"--config {file}: there is no such file")
+    stored = read_config(file) if file is not None else None if out is None else stored_config(out)
+    folder = out if file is None else file.parent
+    if folder is None or stored is None:
         return commands.train
 
     def given(name: str) -> bool:
         return any(word == f"--{name}" or word.startswith(f"--{name}=") for word in args)
 
     check_stored_paths(
-        Path(out), data=None if given("data") else stored.data, lpips=None if given("lpips") else stored.lpips
+        folder, data=None if given("data") else stored.data, lpips=None if given("lpips") else stored.lpips
     )
     # A given --steps replaces a stored budget and the other way round; the number that is set here is replaced in turn.
     length = {name for name in ("budget", "steps") if given(name)}
@@ -150,18 +156,23 @@ def _train_command(args: list[str]) -> Callable[..., int]:
     elif length == {"budget"} and stored.steps is not None:
         stored = replace(stored, budget=sys.float_info.max, steps=None)
 
-    def train(
-        config: TrainConfig = stored,
-        *,
-        view: bool = False,
-        host: str = "127.0.0.1",
-        port: int = 8080,
-        explain: bool = False,
-    ) -> int:
-        return commands.train(config, view=view, host=host, port=port, explain=explain)
+    @functools.wraps(commands.train)
+    def train(config: TrainConfig = stored, **others: Any) -> int:
+        return commands.train(config, **others)
 
-    train.__doc__ = commands.train.__doc__
+    signature = inspect.signature(commands.train)
+    first = signature.parameters["config"].replace(default=stored)
+    train.__signature__ = signature.replace(  # type: ignore[attr-defined]
+        parameters=[first, *list(signature.parameters.values())[1:]]
+    )
     return train
+
+
+def _given_path(args: list[str], option: str) -> Path | None:
+    """The value of an option that is a path, or None."""
+    found = next((after for word, after in itertools.pairwise(args) if word == option), None)
+    found = next((word.removeprefix(f"{option}=") for word in args if word.startswith(f"{option}=")), found)
+    return None if found is None else Path(found)
 
 
 def _show_thread_error(args: threading.ExceptHookArgs) -> None:

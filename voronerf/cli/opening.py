@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
+
+from torch import Tensor, tensor
 
 from voronerf.data import Scene
 from voronerf.data.record import read_scene
 from voronerf.router import Parts
-from voronerf.run import Run, open_run
+from voronerf.run import Run, open_run, read_crop
 from voronerf.training.config import ConfigError
+
+#: Six numbers of a box, or the one that the viewer has saved.
+Crop = tuple[float, float, float, float, float, float] | Literal["saved"] | None
 
 
 @dataclass(frozen=True)
@@ -65,3 +71,17 @@ def check_counts(**counts: int | None) -> None:
     for name, value in counts.items():
         if value is not None and value < 1:
             raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+
+
+def crop_box(run: Run, crop: Crop) -> Tensor | None:
+    """The box [2, 3] of --crop, or None.
+
+    Raises:
+        ConfigError: No crop was saved with the run.
+    """
+    if crop != "saved":
+        return None if crop is None else tensor(crop).view(2, 3)
+    box = read_crop(run.path)
+    if box is None:
+        raise ConfigError(f"--crop saved needs a crop, which the viewer saves with the run: {run.path} has none")
+    return box

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 from pathlib import Path
 
-from voronerf.cli.commands import import_viewer, say
+from voronerf.cli.commands import import_viewer, say, serve_runs
 from voronerf.cli.opening import AS_IN_TRAINING, Opening
-from voronerf.data import load_scene
 from voronerf.data.record import read_scene
-from voronerf.training.config import ConfigError
-from voronerf.training.run_directory import check_stored_paths
 
 
 def view(
@@ -36,20 +32,6 @@ def view(
     opened = opening.open(run, scene=scene, pictures=True)
     viewer = viewers.view_run(opened, host=host, port=port)
     say(f"{viewer.audience}; Ctrl-C ends")
-
-    def read_images() -> None:
-        try:
-            if opening.data is None:
-                check_stored_paths(run, data=opened.config.data)
-            whole = load_scene(opened.config.data, allow_outside=opening.allow_outside, **opened.config.reading)
-        except (ConfigError, ValueError, OSError) as error:
-            say(f"without the images of the scene: {error}")
-        else:
-            viewer.do(lambda: viewer.take_images(whole))
-
-    with contextlib.suppress(KeyboardInterrupt), contextlib.closing(viewer):
-        viewer.warm_up()
-        if scene is not None and opening.memory is None:
-            threading.Thread(target=read_images, daemon=True).start()
-        viewer.serve()
+    with contextlib.closing(viewer):
+        serve_runs(viewer, opening)
     return 0

@@ -3,5 +3,7 @@
 from voronerf.export.cells import cell_meshes, export_cells
 from voronerf.export.mesh import export_mesh
 from voronerf.export.points import export_points
+from voronerf.export.splats import export_splats
+from voronerf.export.video import export_video
 
-__all__ = ["cell_meshes", "export_cells", "export_mesh", "export_points"]
+__all__ = ["cell_meshes", "export_cells", "export_mesh", "export_points", "export_splats", "export_video"]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from voronerf.diagram import VoronoiDiagram
 from voronerf.evaluation.panels import palette
-from voronerf.export.space import box_of, check_export, write_geometry
+from voronerf.export.space import box_of, check_export, placed, write_geometry
 from voronerf.run import Run
 
 SUFFIXES = (".glb",)
@@ -24,7 +24,7 @@ SUFFIXES = (".glb",)
 THINNEST = 1e-6
 
 
-def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None) -> Any:
+def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None, to_files: bool = False) -> Any:
     """Writes the cells of a run, clipped to the scene's box, as .glb with an object for each; returns the scene.
 
     The objects are named `cell_0000` and so on, and have the colours that the cells have in pictures.
@@ -33,6 +33,7 @@ def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None) -> An
         run: trained run, as `open_run` opens it.
         path: file to write, .glb.
         box: [2, 3]; default the scene's, or that around the sphere of the contraction.
+        to_files: whether positions are those of the scene's files, in metres if those are, rather than the scene's.
 
     Raises:
         ConfigError: no box.
@@ -53,6 +54,7 @@ def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None) -> An
     scene = trimesh.Scene()
     for cell, mesh in cell_meshes(run.diagram, box_of(run, box)).items():
         scene.add_geometry(mesh, node_name=f"cell_{cell:04}", geom_name=f"cell_{cell:04}")
+    scene = placed(run, scene, to_files)
     write_geometry(path, scene)
     return scene
 

@@ -25,6 +25,7 @@ from voronerf.export.space import (
     density_at,
     hidden_and_seen,
     in_silence,
+    placed,
     training_views,
     write_geometry,
 )
@@ -50,6 +51,7 @@ def export_mesh(
     resolution: int | None = None,
     density: float | None = None,
     box: Tensor | None = None,
+    to_files: bool = False,
     track: Track = in_silence,
 ) -> Any:
     """Writes the surface of a run as .ply, .glb or .obj, and returns it as a ``trimesh.Trimesh``.
@@ -64,6 +66,7 @@ def export_mesh(
         density: of the surface, per scene unit; default that of which a thirtieth of that side lets half of the light
             pass.
         box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
+        to_files: whether positions are those of the scene's files, in metres if those are, rather than the scene's.
         track: shows progress: it is given the parts of each of the three long works, a sequence, and the work's name,
             and yields the parts.
 
@@ -82,7 +85,7 @@ def export_mesh(
     """
     path = Path(path)
     check_export(path, SUFFIXES)
-    mesh = _surface(run, resolution, density, box, track)
+    mesh = placed(run, _surface(run, resolution, density, box, track), to_files)
     write_geometry(path, mesh)
     return mesh
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from voronerf.export.space import VIEWS, box_of, check_export, training_views, write_geometry
+from voronerf.export.space import VIEWS, box_of, check_export, placed, training_views, write_geometry
 from voronerf.run import Run
 from voronerf.training.config import ConfigError
 
@@ -18,7 +18,9 @@ SUFFIXES = (".ply",)
 NEIGHBOURS = 16
 
 
-def export_points(run: Run, path: Path | str, *, count: int = 200_000, box: Tensor | None = None) -> Any:
+def export_points(
+    run: Run, path: Path | str, *, count: int = 200_000, box: Tensor | None = None, to_files: bool = False
+) -> Any:
     """Writes what the pixels of training views show as .ply, and returns it as a ``trimesh.Trimesh`` without faces.
 
     Each point has the colour of its pixel, and a normal towards its camera: the direction in which it and its nearest
@@ -29,6 +31,7 @@ def export_points(run: Run, path: Path | str, *, count: int = 200_000, box: Tens
         path: file to write, .ply.
         count: points at the most, drawn at random where the views have more.
         box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
+        to_files: whether positions are those of the scene's files, in metres if those are, rather than the scene's.
 
     Raises:
         ConfigError: a count below 1, no box, or views that show nothing in it.
@@ -44,7 +47,7 @@ def export_points(run: Run, path: Path | str, *, count: int = 200_000, box: Tens
     """
     path = Path(path)
     check_export(path, SUFFIXES)
-    points = _surface(run, count, box)
+    points = placed(run, _surface(run, count, box), to_files)
     write_geometry(path, points, vertex_normal=True)
     return points
 

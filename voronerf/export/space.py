@@ -56,6 +56,13 @@ def write_geometry(path: Path, geometry: Any, **options: Any) -> None:
     write_bytes(path, data.encode() if isinstance(data, str) else data)
 
 
+def placed(run: Run, geometry: Any, to_files: bool) -> Any:
+    """A geometry of trimesh, in the coordinates of the scene's files where that is asked for."""
+    if to_files and run.scene.transform is not None:
+        geometry.apply_transform(torch.linalg.inv(run.scene.transform).numpy())
+    return geometry
+
+
 def box_of(run: Run, box: Tensor | None = None) -> Tensor:
     """The box [2, 3] that is exported: the one given, the scene's, or one around the sphere of a contraction.
 
@@ -63,14 +70,12 @@ def box_of(run: Run, box: Tensor | None = None) -> Tensor:
         ConfigError: the given box is empty or not finite, or the scene has no box.
     """
     if box is not None:
-        if box.shape != (2, 3) or not bool(box.isfinite().all()) or not bool((box[0] < box[1]).all()):
-            raise ConfigError(f"--box must be x y z of a corner and of a larger one, got {box.flatten().tolist()}")
-        return box.float().cpu()
+        run = run.cropped(box)
     if run.scene.box is not None:
         return run.scene.box.float().cpu()
     contraction = run.renderer.contraction
     if not isinstance(contraction, Contraction):
-        raise ConfigError("--box must be given, six numbers: the scene has no bounds")
+        raise ConfigError("--crop must be given, six numbers or saved: the scene has no bounds")
     return torch.stack((contraction.centre - contraction.radius, contraction.centre + contraction.radius)).cpu()
 
 

@@ -162,10 +162,10 @@ def smooth_path(keyframes: Cameras, count: int, *, closed: bool = False) -> Came
         (-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2), dim=-1
     ).div(2)[:, :, None]
     positions = (keyframes.origins.double()[around] * weights).sum(1)
-    turns = _quaternions(keyframes.poses[:, :3, :3].double())[around]
+    turns = quaternions(keyframes.poses[:, :3, :3].double())[around]
     turns = torch.where((turns * turns[:, 1:2]).sum(-1, keepdim=True) < 0, -turns, turns)  # q and -q are one rotation
     poses = torch.eye(4, dtype=torch.float64, device=device).repeat(count, 1, 1)
-    poses[:, :3, :3] = _rotations(torch.nn.functional.normalize((turns * weights).sum(1), dim=-1))
+    poses[:, :3, :3] = rotations(torch.nn.functional.normalize((turns * weights).sum(1), dim=-1))
     poses[:, :3, 3] = positions
     intrinsics = keyframes.intrinsics
     intrinsics = torch.lerp(intrinsics[around[:, 1]], intrinsics[around[:, 2]], t.to(intrinsics))
@@ -265,7 +265,7 @@ def _entries(cameras: Cameras, key: str) -> list[dict[str, Any]]:
     ]
 
 
-def _quaternions(rotations: Tensor) -> Tensor:
+def quaternions(rotations: Tensor) -> Tensor:
     """Unit quaternions (w, x, y, z) [c, 4] of rotations [c, 3, 3], of either sign.
 
     They are the eigenvectors of the largest eigenvalue of a symmetric matrix (Bar-Itzhack 2000), which is stable for
@@ -283,7 +283,8 @@ def _quaternions(rotations: Tensor) -> Tensor:
     return torch.linalg.eigh(matrix)[1][..., -1]
 
 
-def _rotations(quaternions: Tensor) -> Tensor:
+def rotations(quaternions: Tensor) -> Tensor:
+    """Rotations [c, 3, 3] of unit quaternions (w, x, y, z) [c, 4]."""
     w, x, y, z = quaternions.unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

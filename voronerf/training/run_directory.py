@@ -131,13 +131,21 @@ def stored_config(run: Path) -> TrainConfig | None:
         ValueError: When it is no JSON.
     """
     path = run / "config.json"
-    if not path.is_file():
-        return None
+    return replace(read_config(path), out=run) if path.is_file() else None
+
+
+def read_config(path: Path) -> TrainConfig:
+    """The settings in a file, for a training of another person; without directory, --resume and --allow-outside.
+
+    Raises:
+        ConfigError: When the file is of another version, or text in it would be obeyed by a terminal.
+        ValueError: When it is no JSON.
+    """
     config = TrainConfig.from_json(json.dumps(read_json(path)), str(path))
     for name, value in vars(config).items():  # they are defaults, which the help prints
         if not "".join(map(str, value if isinstance(value, tuple) else (value,))).isprintable():
             raise ConfigError(f"{path}: {name} must be printable text, got {value!r:.60}")
-    return replace(config, out=run, allow_outside=False)
+    return replace(config, out=None, resume=False, allow_outside=False)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:

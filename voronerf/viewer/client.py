@@ -22,9 +22,11 @@ from voronerf.rendering.cameras import Cameras
 from voronerf.training.config import ConfigError
 from voronerf.viewer.cameras import FLIP, look_point, make_camera, scene_bounds
 from voronerf.viewer.cells import describe_cell
+from voronerf.viewer.crop import CropBox
 from voronerf.viewer.door import chosen
 from voronerf.viewer.path import Keyframes
-from voronerf.viewer.pictures import PANES, Look, cell_at, cells_of, groups_of
+from voronerf.viewer.pictures import PANES, Look, cell_at, cells_of, groups_of, save_shown
+from voronerf.viewer.runs import Exports, Runs
 
 if TYPE_CHECKING:
     from voronerf.viewer.viewer import Viewer
@@ -53,18 +55,35 @@ class Client:
 
     def __init__(self, handle: viser.ClientHandle, viewer: Viewer) -> None:
         self.handle, self.viewer = handle, viewer
-        self.look, self.longest = Look(level=viewer.subject.diagram.depth), SHARP
+        self.longest = SHARP
         self.version, self.moved_at, self.drawn_at, self.cost = 0, 0.0, 0.0, 0.0
         self.wants_coarse = self.wants_sharp = True
         start = viewer.server.initial_camera
         self.camera: Callable[[int], Cameras] = partial(make_camera, np.eye(3), start.position, start.fov, 1.0)
         self._look_around()
-        self.picked: int | None = None
-        self.wants_screenshot = False
-        self.nodes: dict[str, list[Any]] = {"centres": [], "cameras": []}
-        self._build()
+        self._start()
         handle.camera.on_update(self._moved)
         handle.scene.on_click()(self._clicked)
+
+    def _start(self) -> None:
+        self.look = Look(level=self.viewer.subject.diagram.depth)
+        self.picked: int | None = None
+        self.wants_screenshot = False
+        self.nodes: dict[str, list[Any]] = {kind: [] for kind in ("centres", "cameras", "crop", "keyframes")}
+        self._build()
+
+    def on_subject(self) -> None:
+        """Shows another subject, from its first test view."""
+        for kind in self.nodes:
+            self.clear(kind)
+        self.handle.gui.reset()
+        self._start()
+        self.stand(self.viewer.subject.scene.test.cameras, 0)
+        self.change()
+
+    def tell(self, title: str, body: str) -> None:
+        """Shows a note for some seconds."""
+        self.handle.add_notification(title, body, auto_close_seconds=15.0)
 
     # --- what it sees ----------------------------------------------------------------------------------------------
 
@@ -113,7 +132,7 @@ class Client:
     # --- the panel -------------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
-        gui, depth = self.handle.gui, self.viewer.subject.diagram.depth
+        gui, depth, run = self.handle.gui, self.viewer.subject.diagram.depth, self.viewer.subject.run
         pane = gui.add_dropdown("Show", PANES, initial_value="colour", hint="What each pixel shows.")
         self.on(pane.on_update, lambda: self.change(pane=chosen(pane)))
         size = gui.add_slider("Pixels", 128, LARGEST, 64, SHARP, hint="Along the longer side of a picture at rest.")
@@ -124,7 +143,7 @@ class Client:
             self.info = gui.add_markdown(NO_CELL)
             hide = gui.add_button_group("Cell", ("hide", "only this", "show all"))
             self.on(hide.on_click, lambda: self._hide(hide.value))
-            if self.viewer.subject.save is not None:
+            if run is not None:
                 save = gui.add_button("Save what is shown", hint="As a run of its own, beside this one.")
                 self.on(save.on_click, lambda: self.viewer.do(lambda: self.viewer.serve_client(self, self._save)))
         with gui.add_folder("Scene", expand_by_default=False):
@@ -132,26 +151,17 @@ class Client:
             self.on(centres.on_update, lambda: self._show_centres(centres.value))
             cameras = gui.add_checkbox("Cameras", False, hint="The training views; click on one to stand there.")
             self.on(cameras.on_update, lambda: self._show_cameras(cameras.value))
-            crop = gui.add_checkbox("Crop", False, hint="Render the space inside of a box only.")
-            low, high = scene_bounds(self.viewer.subject.scene).tolist()
-            sides = [
-                gui.add_multi_slider(axis, a, b, (b - a) / 100, (a, b), visible=False)
-                for axis, a, b in zip("xyz", low, high)
-            ]
-
-            def cut() -> None:
-                for side in sides:
-                    side.visible = crop.value
-                corners = tuple(zip(*map(chosen, sides)))
-                self.change(crop=corners if crop.value else None)
-
-            self.on(crop.on_update, cut)
-            for side in sides:
-                self.on(side.on_update, cut)
+            self.crop = CropBox(self)
         with gui.add_folder("Camera", expand_by_default=False):
             self.keyframes = Keyframes(self, self.viewer.subject.folder)
             shot = gui.add_button("Screenshot", icon=viser.Icon.CAMERA)
             self.on(shot.on_click, self._ask_screenshot)
+        if run is not None:
+            with gui.add_folder("Export", expand_by_default=False):
+                Exports(self, run)
+            if self.viewer.open is not None:
+                with gui.add_folder("Runs", expand_by_default=False):
+                    Runs(self, run)
 
     def on(self, register: Callable[[Callable[[Any], None]], object], work: Callable[[], object]) -> None:
         """Has something done when a part of the panel is used; where that fails, the client is disconnected."""
@@ -202,21 +212,23 @@ class Client:
 
     def _save(self) -> None:
         """Writes what is shown as a run, and says where, or why not."""
-        assert self.viewer.subject.save is not None
+        run = self.viewer.subject.run
+        assert run is not None
         try:
-            self.info.content = f"Saved as `{self.viewer.subject.save(self.look).name}`."
+            self.info.content = f"Saved as `{save_shown(run, self.look).name}`."
         except (ConfigError, OSError) as error:
             self.info.content = f"Not saved: {error}."
 
     # --- what is drawn into the scene ------------------------------------------------------------------------------
 
-    def _clear(self, kind: str) -> None:
+    def clear(self, kind: str) -> None:
+        """Takes away what is drawn of one kind."""
         for node in self.nodes[kind]:
             node.remove()
         self.nodes[kind] = []
 
     def _show_centres(self, show: bool) -> None:
-        self._clear("centres")
+        self.clear("centres")
         if show:
             diagram, contraction = self.viewer.subject.diagram, self.viewer.subject.renderer.contraction
             centres = diagram.leaf_centres if contraction is None else contraction.inverse(diagram.leaf_centres)
@@ -233,7 +245,7 @@ class Client:
         self.change()
 
     def _show_cameras(self, show: bool) -> None:
-        self._clear("cameras")
+        self.clear("cameras")
         if show:
             train = self.viewer.subject.scene.train
             apart = float((train.cameras.origins - train.cameras.origins.mean(0)).norm(dim=-1).mean())
@@ -254,7 +266,7 @@ class Client:
         pose = cameras.poses[view].double().numpy()
         width, height = cameras.size(view)
         fov = 2 * math.atan(height / 2 / float(cameras.intrinsics[view, 1]))
-        node = self.handle.scene.add_camera_frustum(
+        node: Any = self.handle.scene.add_camera_frustum(
             f"/cameras/{view}",
             fov=fov,
             aspect=width / height,
@@ -266,12 +278,14 @@ class Client:
             position=pose[:3, 3],
         )
 
-        @node.on_click
-        def _(_: object) -> None:
-            with self.handle.atomic():
-                self.handle.camera.position = pose[:3, 3]
-                self.handle.camera.look_at = look_point(scene, cameras, view).numpy()
-                self.handle.camera.up_direction = pose[:3, 1]
-                self.handle.camera.fov = fov
-
+        self.on(node.on_click, lambda: self.stand(cameras, view))
         return node
+
+    def stand(self, cameras: Cameras, view: int) -> None:
+        """Goes to one of several cameras."""
+        pose = cameras.poses[view].double().numpy()
+        with self.handle.atomic():
+            self.handle.camera.position = pose[:3, 3]
+            self.handle.camera.look_at = look_point(self.viewer.subject.scene, cameras, view).numpy()
+            self.handle.camera.up_direction = pose[:3, 1]
+            self.handle.camera.fov = 2 * math.atan(cameras.size(view)[1] / 2 / float(cameras.intrinsics[view, 1]))

@@ -27,7 +27,10 @@ log = logging.getLogger(__name__)
 LARGEST = 2**16
 
 #: Kinds of messages that the viewer takes; the wish for a public address is none of them.
-KINDS = ("ViewerCameraMessage", "GuiUpdateMessage", "ScenePointerMessage", "SceneNodeClickMessage")
+KINDS = (
+    *("ViewerCameraMessage", "GuiUpdateMessage", "ScenePointerMessage", "SceneNodeClickMessage"),
+    *(f"TransformControls{what}Message" for what in ("DragStart", "Update", "DragEnd")),
+)
 
 
 def chosen(part: Any) -> Any:

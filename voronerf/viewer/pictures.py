@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from voronerf import editing
 from voronerf.data import Scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.evaluation.panels import (
@@ -24,7 +25,9 @@ from voronerf.evaluation.panels import (
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.field import Field
 from voronerf.rendering.renderer import RenderedImage, Renderer, render_camera
-from voronerf.router import Parts, VoronoiRouter
+from voronerf.router import Parts, Solid, VoronoiRouter
+from voronerf.run import Run
+from voronerf.training.config import ConfigError
 from voronerf.viewer.cameras import crop_camera
 from voronerf.viewer.errors import ViewErrors
 
@@ -59,7 +62,7 @@ class Subject:
         router: its diagram has the cells.
         renderer: how rays become colours.
         weights: a context in which the networks have the weights to show.
-        save: writes what a look shows as a run of its own, and says where; None for a run in training.
+        run: what can be exported and trained further; None for a run in training.
     """
 
     name: str
@@ -68,7 +71,12 @@ class Subject:
     router: VoronoiRouter | Parts
     renderer: Renderer
     weights: Callable[[], AbstractContextManager[None]] = nullcontext
-    save: Callable[[Look], Path] | None = None
+    run: Run | None = None
+
+    @classmethod
+    def of(cls, run: Run, scene: Scene | None = None) -> Subject:
+        """A run; the scene may have the images that the run's own lacks."""
+        return cls(run.path.resolve().name, run.path, scene or run.scene, run.router, run.renderer, run=run)
 
     @property
     def diagram(self) -> VoronoiDiagram:
@@ -193,3 +201,26 @@ def cell_at(subject: Subject, camera: Cameras, look: Look, x: float, y: float) -
     left, top = (min(int(max(0.0, min(share, 1.0)) * size), size - 1) for share, size in sides)
     image = render_look(subject, crop_camera(camera, left, top, 1, 1), replace(look, pane="cells"))
     return int(cells_of(subject, image.heaviest)) if float(image.opacity) > 0.5 else None
+
+
+def save_shown(run: Run, look: Look) -> Path:
+    """Writes what a look shows of a run as a run beside it; returns the folder.
+
+    Raises:
+        ConfigError: nothing is hidden, or nothing is left.
+        OSError: it cannot be written.
+    """
+    if not look.hidden and look.crop is None:
+        raise ConfigError("everything is shown: hide cells or crop first")
+    source = run.source
+    if look.hidden:
+        shown = torch.ones(source.parts.num_cells, dtype=torch.bool)
+        shown[list(look.hidden)] = False
+        source = editing.cut(source, shown)
+    if look.crop is not None:
+        source = editing.cut(source, Solid.box(*look.crop))
+    folder = run.path.resolve()
+    names = (f"{folder.name}-cut", *(f"{folder.name}-cut-{i}" for i in range(2, 1000)))
+    out = next(path for name in names if not (path := folder.parent / name).exists())
+    editing.write(source, out)
+    return out

@@ -25,13 +25,13 @@ import viser
 from torch import Tensor
 from viser.uplot import Scale, Series
 
-from voronerf import editing
+from voronerf.backends import BackendUnavailable
 from voronerf.data import Scene
 from voronerf.rendering.cameras import Cameras
 from voronerf.rendering.renderer import RenderedImage
-from voronerf.router import Solid
 from voronerf.run import Run
-from voronerf.training.config import ConfigError
+from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.progress import TrainingError
 from voronerf.training.run_directory import read_curve
 from voronerf.viewer.cameras import axial_depth, look_point
 from voronerf.viewer.client import Client
@@ -53,6 +53,10 @@ REFRESH = 0.05
 EVERYWHERE = ("0.0.0.0", "::", "")
 #: Depth of empty pixels in scene units, the largest that viser takes.
 NOWHERE = 160.0
+#: Pixels around the curve: above, right, below, left. Without them its labels are cut off.
+PADDING = (14, 14, 0, 0)
+#: What may go wrong with what a page asks for, without a fault of the program or of the page.
+EXPECTED = (ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError, MemoryError)
 
 
 class Viewer:
@@ -63,6 +67,10 @@ class Viewer:
         host: address to listen at.
         port: to listen at; 0 is any that is free.
 
+    Attributes:
+        open: opens the run in a directory, or None: then no page can ask for another run.
+        train: trains a scene with some settings, or None: then no page can ask for that.
+
     Raises:
         ConfigError: the address cannot be listened at.
     """
@@ -70,6 +78,9 @@ class Viewer:
     def __init__(self, subject: Subject, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         check_address(host, port)
         self.subject = subject
+        self.open: Callable[[Path], Run] | None = None
+        self.train: Callable[[TrainConfig, Scene], None] | None = None
+        self.busy = False
         self.clients: dict[int, Client] = {}
         self.tasks: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.wake = threading.Event()
@@ -80,10 +91,7 @@ class Viewer:
             self.server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
         self.host, self.port = host, self.server.get_port()
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
-        start, cameras = self.server.initial_camera, subject.scene.test.cameras
-        start.position = cameras.origins[0].numpy()
-        start.look_at = look_point(subject.scene, cameras, 0).numpy()
-        start.fov = 2 * math.atan(cameras.size(0)[1] / 2 / float(cameras.intrinsics[0, 1]))
+        self._stand()
         self.curve: viser.GuiUplotHandle | None = None
         self.server.on_client_connect(self._enter)
         self.server.on_client_disconnect(self._leave)
@@ -100,6 +108,28 @@ class Viewer:
         others = self.host in EVERYWHERE
         return f"open {self.address} in a browser" + "; whoever can reach this machine can use the viewer" * others
 
+    def _stand(self) -> None:
+        """Has new browsers stand where the first test view is."""
+        start, scene = self.server.initial_camera, self.subject.scene
+        cameras = scene.test.cameras
+        start.position = cameras.origins[0].numpy()
+        start.look_at = look_point(scene, cameras, 0).numpy()
+        start.fov = 2 * math.atan(cameras.size(0)[1] / 2 / float(cameras.intrinsics[0, 1]))
+
+    def show(self, subject: Subject) -> None:
+        """Shows something else, to every browser."""
+        self.subject = subject
+        self.errors = ViewErrors(subject.scene, self._render_view)
+        self.server.gui.set_panel_label(subject.name)
+        self._stand()
+        if self.curve is not None:
+            self.curve.remove()
+            self.curve = None
+        if subject.run is not None:
+            self.show_curve(read_curve(subject.folder))
+        for client in self.list_clients():
+            self.serve_client(client, client.on_subject)
+
     def show_curve(self, points: Sequence[tuple[float, float]]) -> None:
         """Draws PSNR in dB over training seconds, from the second evaluation on.
 
@@ -114,7 +144,7 @@ class Viewer:
             return
         series = (Series(label="s"), Series(label="PSNR [dB]", stroke="#00897b", width=2))
         self.curve = self.server.gui.add_uplot(
-            (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, order=-1
+            (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, padding=PADDING, order=-1
         )
 
     def take_images(self, scene: Scene) -> None:
@@ -142,6 +172,23 @@ class Viewer:
         """Has something done by the thread that renders."""
         self.tasks.put(task)
         self.wake.set()
+
+    def work(self, client: Client, work: Callable[[], None]) -> None:
+        """Has a long work done by the thread that renders, one at a time; tells the client why it could not be."""
+
+        def task() -> None:
+            if self.busy:
+                client.tell("Not now", "An export or a training is at work.")
+                return
+            self.busy = True
+            try:
+                work()
+            except EXPECTED as error:
+                client.tell("Not done", str(error))
+            finally:
+                self.busy = False
+
+        self.do(lambda: self.serve_client(client, task))
 
     def serve_client(self, client: Client, work: Callable[[], object]) -> None:
         """Does something that a client asked for; where that fails, the client is disconnected, with a line."""
@@ -258,29 +305,6 @@ def check_address(host: str, port: int) -> None:
         raise ConfigError(f"--host {host} --port {port}: cannot listen there: {error.strerror}") from None
 
 
-def save_shown(run: Run, look: Look) -> Path:
-    """Writes what a look shows of a run as a run beside it; returns the folder.
-
-    Raises:
-        ConfigError: nothing is hidden, or nothing is left.
-        OSError: it cannot be written.
-    """
-    if not look.hidden and look.crop is None:
-        raise ConfigError("everything is shown: hide cells or crop first")
-    source = run.source
-    if look.hidden:
-        shown = torch.ones(source.parts.num_cells, dtype=torch.bool)
-        shown[list(look.hidden)] = False
-        source = editing.cut(source, shown)
-    if look.crop is not None:
-        source = editing.cut(source, Solid.box(*look.crop))
-    folder = run.path.resolve()
-    names = (f"{folder.name}-cut", *(f"{folder.name}-cut-{i}" for i in range(2, 1000)))
-    out = next(path for name in names if not (path := folder.parent / name).exists())
-    editing.write(source, out)
-    return out
-
-
 def view_run(run: Run, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
     """The viewer of a trained run; `Viewer.serve` renders for it.
 
@@ -292,8 +316,6 @@ def view_run(run: Run, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
     Raises:
         ConfigError: the address cannot be listened at.
     """
-    name = run.path.resolve().name
-    subject = Subject(name, run.path, run.scene, run.router, run.renderer, save=partial(save_shown, run))
-    viewer = Viewer(subject, host=host, port=port)
+    viewer = Viewer(Subject.of(run), host=host, port=port)
     viewer.show_curve(read_curve(run.path))
     return viewer
