@@ -139,7 +139,8 @@ def test_a_region_is_cut_exactly(opened, tmp_path) -> None:
     for found, where in ((kept, inside), (rest, ~inside)):
         density, occupied = found.router(*asked)[1], found.router.assign(points) >= 0
         assert not density[~where].any()
-        assert occupied.any() and torch.equal(density[occupied], wanted[occupied])
+        assert occupied.any()
+        torch.testing.assert_close(density[occupied], wanted[occupied])  # fewer rows may be added up in another order
     assert (kept.scene.box[1] - kept.scene.box[0]).max() <= 0.8 + 2 * 2.36 / 16
     size = {path: sum(map(len, contents(tmp_path / path).values())) for path in ("kept", "rest")}
     assert size["kept"] <= size["rest"] < sum(map(len, contents(run.path).values()))
