@@ -27,7 +27,7 @@ PARTS = {
     for part, long, short in (
         (Part("valid-calls", op_attacks.valid_call, 60, 200), 140_000, 300),
         (Part("invalid-calls", op_attacks.invalid_call, 60, 200), 60_000, 300),
-        (Part("kills", training_attacks.killed_training, 300, 1, given.prepare_scenes), 20, 0),
+        (Part("kills", training_attacks.killed_training, 300, 1, given.prepare_scenes), 20, 1),
         (Part("ranks", rank_attacks.harmed_ranks, 1200), 3, 0),
         (Part("bits", run_attacks.flipped_bit, 60, 20, given.prepare_runs), 500, 15),
         (Part("scenes", scene_attacks.stranger_scene, 60, 1, given.prepare_photographs), 150, 6),
