@@ -5,7 +5,10 @@ so a build is parallel and redoes only what has changed, headers included. Files
 for each instruction set (csrc/common/isa.h); the choice among them is made at run time.
 
 Environment:
-    CXX, CXXFLAGS                the C++ compiler and its flags (default c++, else g++); "ccache g++" works too
+    CXX, CXXFLAGS                the C++ compiler and its flags (default c++, else g++, clang++ on Windows, where MSVC
+                                 cannot compile GNU's vectors); "ccache g++" works too
+    VORONERF_OPENMP              0: without OpenMP, so that operations run on one thread. It is so on macOS and Windows,
+                                 and clang on Linux asks for it, whose OpenMP is another than torch's
     VORONERF_CUDA                auto (default): with CUDA where nvcc and a GPU are found, for that GPU; 1: for all
                                  GPUs, also where none is found, and fail without nvcc; 0: never
     VORONERF_CUDA_ARCHITECTURES  such as "80;90": machine code for each, and PTX of the last for what comes after it
@@ -36,6 +39,7 @@ ISAS = {
     "aarch64": {"neon": ["-DVN_ISA=3"]},
 }
 """Of an architecture, beside the portable path."""
+WINDOWS = sys.platform == "win32"
 LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
 # One of each major version, which runs on its minor ones. Without 100 and 120 a Blackwell GPU would compile the PTX of
 # 90 for minutes when a kernel is first used.
@@ -129,7 +133,8 @@ def architectures_there() -> tuple[str, ...] | None:
 
 def compiler() -> list[str]:
     """The command of the C++ compiler: a launcher, if any, the program, and arguments."""
-    return shlex.split(os.environ.get("CXX", "")) or [shutil.which("c++") or "g++"]
+    default = "clang++" if WINDOWS else shutil.which("c++") or "g++"
+    return shlex.split(os.environ.get("CXX", "")) or [default]
 
 
 def host_compiler() -> list[str]:
@@ -137,6 +142,11 @@ def host_compiler() -> list[str]:
     words = compiler()
     program, *arguments = words[1:] if Path(words[0]).name in LAUNCHERS and len(words) > 1 else words
     return ["-ccbin", program, *(part for argument in arguments for part in ("-Xcompiler", argument))]
+
+
+def openmp() -> bool:
+    """Whether operations run on torch's threads."""
+    return sys.platform.startswith("linux") and os.environ.get("VORONERF_OPENMP") != "0"
 
 
 def ninja() -> list[str]:
@@ -159,14 +169,14 @@ def isas() -> dict[str, list[str]]:
 def build_info(cuda: Cuda) -> str:
     """A header that records the build."""
     version = subprocess.run([*compiler(), "--version"], check=True, capture_output=True, text=True).stdout
-    if "clang" in version and sys.platform.startswith("linux"):
+    if "clang" in version and openmp():
         raise SystemExit(
-            f"voronerf: on Linux the extension runs on torch's OpenMP, GCC's, and needs that compiler: set CXX=g++ "
-            f"(got {version.splitlines()[0]})"
+            f"voronerf: on Linux the extension runs on torch's OpenMP, GCC's, and needs that compiler: set CXX=g++, or "
+            f"VORONERF_OPENMP=0 for one thread (got {version.splitlines()[0]})"
         )
     values = {
         "VN_COMPILER": f'"{version.splitlines()[0]}"',
-        "VN_OPENMP": str(int(sys.platform != "darwin")),
+        "VN_OPENMP": str(int(openmp())),
         "VN_CUDA_BUILT": str(int(cuda.nvcc is not None)),
         "VN_CUDA_OUTCOME": f'"{cuda.outcome}"',
         "VN_CUDA_ARCHITECTURES": f'"{";".join(cuda.architectures)}"',
@@ -194,9 +204,9 @@ def bindings() -> dict[str, str]:
 
 def ninja_file(module: Path, cuda: Cuda) -> str:
     """Text of build.ninja; paths in it are quoted for ninja, commands run in the build folder."""
-    common = ["-std=c++17", "-O3", "-fPIC", "-fvisibility=hidden", "-Wall", "-Wextra", "-I."]
+    common = ["-std=c++17", "-O3", *([] if WINDOWS else ["-fPIC"]), "-fvisibility=hidden", "-Wall", "-Wextra", "-I."]
     # Without OpenMP its pragmas mean nothing, nor do the numbers of threads that stand in them.
-    openmp = ["-fopenmp"] if sys.platform != "darwin" else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
+    threads = ["-fopenmp"] if openmp() else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
     includes = [f"-I{SOURCES}", f"-isystem{pybind11_headers()}", f"-isystem{sysconfig.get_path('include')}"]
     # After CXXFLAGS: results are defined by separate roundings (csrc/geometry/nearest_centre_math.h), fused ones are
     # named, and NaN and infinity are distinguished from numbers. A root that may set errno is a call, which keeps its
@@ -208,11 +218,13 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
         linker = [str(cuda.nvcc), "-shared", "-cudart=static", *host_compiler(), "-Xlinker", "--exclude-libs,ALL"]
     elif sys.platform == "darwin":
         linker = [*compiler(), "-bundle", "-undefined", "dynamic_lookup"]
+    elif WINDOWS:  # where pyconfig.h names the library of Python, and the processor's features are asked of compiler-rt
+        linker = [*compiler(), "-shared", f"-L{Path(sys.base_prefix) / 'libs'}", *compiler_rt()]
     else:
         linker = [*compiler(), "-shared", "-Wl,--exclude-libs,ALL"]
     lines = [
         "rule cxx",
-        f"  command = {join(compiler() + common + openmp + includes + extra)} $flags -MMD -MF $out.d -c $in -o $out",
+        f"  command = {join(compiler() + common + threads + includes + extra)} $flags -MMD -MF $out.d -c $in -o $out",
         "  depfile = $out.d",
         "  deps = gcc",
         "  description = $out",
@@ -251,6 +263,13 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
             lines.append(f"build {objects[-1]}: nvcc {quote(str(source))}")
     lines.append(f"build {quote(module.name)}: link {' '.join(objects)}")
     return "\n".join([*lines, f"default {quote(module.name)}", ""])
+
+
+def compiler_rt() -> list[str]:
+    """Clang's own library, which it leaves out where it links as MSVC does."""
+    asked = [*compiler(), "--rtlib=compiler-rt", "-print-libgcc-file-name"]
+    found = Path(subprocess.run(asked, check=True, capture_output=True, text=True).stdout.strip())
+    return [str(found)] if found.is_file() else []
 
 
 def pybind11_headers() -> str:
@@ -294,7 +313,7 @@ def quote(path: str) -> str:
 
 def join(flags: list[str]) -> str:
     """Flags in a command of a build.ninja."""
-    return shlex.join(flags).replace("$", "$$")
+    return (subprocess.list2cmdline(flags) if WINDOWS else shlex.join(flags)).replace("$", "$$")
 
 
 def write_if_changed(path: Path, text: str) -> None:

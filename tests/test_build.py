@@ -83,10 +83,27 @@ def test_clang_on_linux_is_refused_before_it_builds(build, monkeypatch):
     answer = SimpleNamespace(stdout="Ubuntu clang version 18.1.3\nTarget: x86_64")
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: answer)
     monkeypatch.setattr(sys, "platform", "linux")
-    with pytest.raises(SystemExit, match=r"set CXX=g\+\+ \(got Ubuntu clang version 18.1.3\)"):
+    monkeypatch.delenv("VORONERF_OPENMP", raising=False)
+    wanted = r"set CXX=g\+\+, or VORONERF_OPENMP=0 for one thread \(got Ubuntu clang version 18.1.3\)"
+    with pytest.raises(SystemExit, match=wanted):
         build["build_info"](build["Cuda"]("none"))
+    with monkeypatch.context() as context:
+        context.setenv("VORONERF_OPENMP", "0")
+        assert "VN_OPENMP 0" in build["build_info"](build["Cuda"]("none"))
+        assert " -fopenmp " not in commands(build, build["Cuda"]("none"))["cxx"]
     monkeypatch.setattr(sys, "platform", "darwin")
     assert "clang version 18.1.3" in build["build_info"](build["Cuda"]("none"))
+
+
+def test_windows_builds_with_clang(build, monkeypatch):
+    """What the commands are; no machine with Windows has run them."""
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setitem(build["ninja_file"].__globals__, "WINDOWS", True)
+    monkeypatch.setitem(build["ninja_file"].__globals__, "compiler_rt", lambda: [r"C:\Program Files\LLVM\rt.lib"])
+    rules = commands(build, build["Cuda"]("built without CUDA"))
+    assert rules["cxx"].startswith("clang++ -std=c++17 ") and "-fPIC" not in rules["cxx"]
+    assert rules["link"].startswith("clang++ -shared ") and '"C:\\Program Files\\LLVM\\rt.lib"' in rules["link"]
 
 
 def test_nvcc_is_found_where_cuda_home_has_none(build, monkeypatch, tmp_path):

@@ -267,7 +267,12 @@ def _short(dtype: torch.dtype) -> str:
 
 
 def physical_memory() -> int:
-    """Bytes of memory of this machine, or fewer where the process may have no more (``ulimit -v``)."""
+    """Bytes of memory of this machine, or fewer where the process may have no more (``ulimit -v``).
+
+    On Windows, where Python does not know, it is the largest number, so that nothing is refused for its size.
+    """
+    if not hasattr(os, "sysconf"):
+        return sys.maxsize
     there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
         import resource

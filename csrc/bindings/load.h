@@ -89,6 +89,12 @@ struct Opaque;
 // Text of named tuples and enumerations in the stub, by name.
 using Declarations = std::map<std::string, std::string>;
 
+// void for any T. To clang, two specialisations that differ in std::void_t<...> alone are one.
+template <typename T>
+struct Void {
+  using type = void;
+};
+
 template <typename T, typename = void>
 struct Loader;
 template <typename A>
@@ -289,7 +295,7 @@ struct Loader<std::vector<T>> {
 // Structs.
 
 template <typename S>
-struct Loader<S, std::void_t<decltype(Fields<S>::members)>> {
+struct Loader<S, typename Void<decltype(Fields<S>::members)>::type> {
   template <typename Tuple>
   struct Parts;
   template <typename... F>
@@ -357,7 +363,7 @@ struct Loader<S, std::void_t<decltype(Fields<S>::members)>> {
 };
 
 template <typename T>
-struct Loader<T, std::void_t<decltype(Opaque<T>::type)>> {
+struct Loader<T, typename Void<decltype(Opaque<T>::type)>::type> {
   py::detail::make_caster<T> caster;
   bool load(PyObject* given) { return caster.load(given, false); }
   T& get() { return static_cast<T&>(caster); }

@@ -2,7 +2,6 @@
 
 #include <atomic>
 #include <chrono>
-#include <cstdlib>
 #include <cstring>
 #include <memory>
 #include <new>
@@ -64,11 +63,10 @@ double measure_multiply_adds(Peak kind, Isa isa, int threads) {
 
 double measure_copy(Isa isa, int threads) {
   struct Free {
-    void operator()(float* memory) const { std::free(memory); }
+    void operator()(float* memory) const { ::operator delete(memory, std::align_val_t{kLine}); }
   };
   const std::unique_ptr<float, Free> memory(
-      static_cast<float*>(std::aligned_alloc(kLine, 2 * kCopied * sizeof(float))));
-  if (memory == nullptr) throw std::bad_alloc();
+      static_cast<float*>(::operator new(2 * kCopied * sizeof(float), std::align_val_t{kLine})));
   float *from = memory.get(), *to = from + kCopied;
   constexpr int64_t kPiece = 1 << 16;
   std::atomic<int64_t> copied{0};

@@ -78,7 +78,8 @@ def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int]
             if not sums:
                 (folder / "store.json").unlink(missing_ok=True)
                 (folder / "pixels").unlink(missing_ok=True)
-            file = os.open(folder / "pixels", os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o600)
+            flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)  # of POSIX, and of Windows
+            file = os.open(folder / "pixels", os.O_RDWR | os.O_CREAT | flags, 0o600)
             try:
                 _allocate(file, size)
                 mapped = mmap.mmap(file, size, access=mmap.ACCESS_READ)
@@ -169,9 +170,9 @@ def _build(
 
 
 def _write(file: int, data: memoryview, place: int) -> None:
+    os.lseek(file, place, os.SEEK_SET)
     while data:
-        written = os.pwrite(file, data, place)
-        data, place = data[written:], place + written
+        data = data[os.write(file, data) :]
 
 
 @contextlib.contextmanager

@@ -1,6 +1,5 @@
 #include "network/cpu/row_tasks.h"
 
-#include <cstdlib>
 #include <memory>
 #include <new>
 #include <stdexcept>
@@ -15,10 +14,10 @@ namespace {
 constexpr int64_t kTasks = 64;
 // What a thread keeps from one call to the next, in floats.
 constexpr int64_t kKeptFloats = 2 * kPartialFloats;
-constexpr int64_t kAlign = 64;
+constexpr std::align_val_t kAlign{64};  // std::aligned_alloc is not on Windows
 
 struct Free {
-  void operator()(float* memory) const { std::free(memory); }
+  void operator()(float* memory) const { ::operator delete(memory, kAlign); }
 };
 
 struct Block {
@@ -33,8 +32,7 @@ thread_local Block kept;
 Workspace::Workspace(int64_t floats) {
   if (floats <= kept.size) return;
   kept = Block{};
-  kept.memory.reset(static_cast<float*>(std::aligned_alloc(kAlign, ceil_div(floats * 4, kAlign) * kAlign)));
-  if (kept.memory == nullptr) throw std::bad_alloc();
+  kept.memory.reset(static_cast<float*>(::operator new(static_cast<size_t>(floats) * sizeof(float), kAlign)));
   kept.size = floats;
 }
 
