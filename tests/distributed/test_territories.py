@@ -9,6 +9,7 @@ from helpers import refuses, seeded
 
 from voronerf import NeRF, OccupancyGrid, VoronoiDiagram, VoronoiRouter
 from voronerf.data import builtin_scene, city_scene
+from voronerf.data.scene import Sightings
 from voronerf.distributed.group import Group
 from voronerf.distributed.territories import Territories, cut_space, halve
 from voronerf.rendering import Rays, Renderer, Stratified
@@ -16,8 +17,27 @@ from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.rays import intersect_box
 from voronerf.step import Batch
 from voronerf.step.ray_runs import LINKS, JointLoss, Map, Territory, see_together
+from voronerf.training.batches import RayBatches
 
 BOX = torch.tensor([[0.0, 0, 0], [4.0, 2, 2]])
+
+
+def test_a_copy_of_some_views_draws_the_same_rays():
+    scene = builtin_scene(12, train_views=8, test_views=1)
+    cameras = replace(scene.train.cameras, sizes=torch.tensor([[12, 12], [9, 7]] * 4))
+    masks = torch.rand(8, 12, 12, generator=seeded()) < 0.8
+    seen = Sightings(torch.arange(0, 8 * 144, 5), torch.linspace(2, 4, 231))
+    for train in (scene.train, replace(scene.train, cameras=cameras, masks=masks, sightings=seen)):
+        for views in (torch.tensor([1, 2, 6]), torch.arange(8)):
+            whole, own = replace(scene, train=train), replace(scene, train=train.copy(views))
+            found = [
+                RayBatches(each, torch.device("cpu"), sightings=True, views=chosen).draw(500, seeded())
+                for each, chosen in ((whole, views), (own, None))
+            ]
+            assert torch.equal(found[0].rays.origins, found[1].rays.origins)
+            for name in ("near", "far", "target", "background", "seen"):
+                first, second = (getattr(each, name) for each in found)
+                assert first is second is None or torch.equal(first, second), name
 
 
 def line(count=2):
@@ -103,7 +123,8 @@ def test_a_tree_of_bounds_finds_what_each_of_them_meets(count):
     low = 10 * torch.rand(count, 3, generator=seeded())
     bounds = torch.stack((low, low + torch.rand(count, 3, generator=seeded())), 1)
     bounds[::7] = torch.tensor([[torch.inf] * 3, [-torch.inf] * 3])
-    known = Map(bounds, torch.full((count, LINKS), -1), torch.ones(count, dtype=torch.float64))
+    links, lit = torch.full((count, LINKS), -1), torch.zeros(count, dtype=torch.int64)
+    known = Map(bounds, links, lit, torch.ones(count, dtype=torch.float64))
     origins, directions = 10 * torch.rand(2, 50, 3, generator=seeded())
     rays, near, far = Rays(origins, directions - 5), torch.zeros(50), 5 * torch.rand(50, generator=seeded())
     expected = []
@@ -117,12 +138,30 @@ def test_a_tree_of_bounds_finds_what_each_of_them_meets(count):
 def test_all_territories_evaluate_as_many_samples():
     """One that gets rays of others draws fewer of its own, and the mean stays."""
     loss = joint(3)
-    for _ in range(2):
-        for number, rays in enumerate((100, 200, 100)):
-            loss.wanted[number][-2:] = torch.tensor((rays, rays * float(loss.map.shares[number])))
+    for _ in range(20):
+        for number, others in enumerate((0, 50, 25)):
+            loss.counts[number][-2:] = torch.tensor((1000 * float(loss.map.shares[number]), 10 * others))
         loss.survey(SURVEYED)
-    shares = loss.map.shares
-    assert float(shares.mean()) == pytest.approx(1) and float(shares[0] / shares[1]) == pytest.approx(2)
+    assert loss.map.shares.tolist() == pytest.approx([1.25, 0.75, 1.0], abs=2e-3), "1,250 samples each"
+
+
+def test_rays_go_to_territories_that_bring_no_light_now_and_then():
+    """So it is known when these bring light again."""
+    loss = joint(3)
+    batch = rays_through(200)
+    fill(loss, (0.1, 0.1, 1e-6), torch.full((3, 3), 0.5))
+    loss.run({0: batch})
+    assert loss.counts[0].tolist()[:8] == [0, 200, 200, 0, 200, 0, 200, 200]
+    loss.survey(SURVEYED)
+    assert loss.map.links[0, :3].tolist() == [1, 2, -1] and loss.map.lit[0] == 1
+    found = loss.run({0: batch})
+    assert (found[0].error > 0).all() and len(found[1].weights) and not len(found[2].weights)
+    assert loss.counts[0].tolist()[:8] == [0, 200, 200, 0, 0, 0, 200, 0]
+    loss.survey(SURVEYED - 1)
+    fill(loss, (0.1, 0.1, 0.1), torch.full((3, 3), 0.5))
+    assert len(loss.run({0: batch})[2].weights) and loss.counts[0].tolist()[3:6] == [0, 200, 200]
+    loss.survey(SURVEYED)
+    assert loss.map.lit[0] == 2
 
 
 def joint(count):
@@ -212,7 +251,7 @@ def test_a_ray_that_has_ended_goes_no_further():
     fill(loss, (100.0,) * 3, torch.full((3, 3), 0.5))
     batch = rays_through(30)
     found = loss.run({0: batch})
-    assert loss.wanted[0].tolist()[:4] == [0, 0, 0, 30] and len(found[1].weights) == 0
+    assert loss.counts[0].tolist()[:7] == [0] * 6 + [30] and len(found[1].weights) == 0
     loss.survey(SURVEYED)
     assert (loss.map.links[0] < 0).all()
 
@@ -220,12 +259,12 @@ def test_a_ray_that_has_ended_goes_no_further():
 def test_rays_to_where_few_go_are_not_learnt_from():
     """The others are; and once more rays go there, these are learnt from, too."""
     loss = joint(3)
-    loss.map.links[0], loss.routes = -1, []
+    loss.map.links[0], loss.routes = -1, [[], []]
     batch = rays_through(10)
     away = replace(batch, far=torch.where(torch.arange(10) < 5, 1.2, 9.0))
     found = loss.run({0: away})
     assert (found[0].error[:5] > 0).all() and (found[0].error[5:] == 0).all()
-    assert loss.wanted[0].tolist()[:4] == [0, 5, 5, 10]
+    assert loss.counts[0].tolist()[:7] == [0, 5, 5, 0, 0, 0, 10]
     loss.survey(SURVEYED)
     assert loss.map.links[0, :2].tolist() == [1, 2]
     assert (loss.run({0: away})[0].error > 0).all()

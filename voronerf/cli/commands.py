@@ -154,7 +154,7 @@ def train_on_ranks(config: TrainConfig, *, view: bool) -> int:
         check_joint(config, world_size())
         assert config.out is not None
         reading = config.reading
-        if config.images == "auto" and config.data not in BUILTIN:  # each rank reads its own of one copy
+        if config.data not in BUILTIN:  # each rank reads its own of one copy
             reading["images"] = "disk"
         scene = load_scene(config.data, allow_outside=config.allow_outside, **reading)
         check_same_scene(group, scene)

@@ -62,6 +62,23 @@ class Split:
     def __len__(self) -> int:
         return len(self.names)
 
+    def copy(self, views: Tensor) -> Split:
+        """Some views alone, with images in memory of their own.
+
+        Args:
+            views: int64, ascending.
+        """
+        seen = self.sightings
+        if seen is not None:
+            size = self.images.shape[1] * self.images.shape[2]
+            own = torch.isin(seen.pixels // size, views)
+            pixels, distances = seen.pixels[own], seen.distances[own]
+            view = torch.searchsorted(views, pixels // size)
+            seen = Sightings(view * size + pixels % size, distances) if len(pixels) else None
+        names = tuple(self.names[view] for view in views.tolist())
+        masks = None if self.masks is None else self.masks[views]
+        return Split(self.cameras[views], self.images[views], names, masks, sightings=seen)
+
     def truth(self, index: int, background: Tensor | None) -> Tensor:
         """One image in 0..1 over `background` ([3]; None is black, as in rendering), float32 [h, w, 3]."""
         if self.on_disk:

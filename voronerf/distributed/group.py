@@ -12,7 +12,7 @@ import re
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -135,37 +135,49 @@ class Group:
         self.swap("agreement", dict.fromkeys(children, values), {})
         return values
 
-    def exchange(self, kind: str, width: int, parts: Mapping[int, Tensor], sources: Iterable[int]) -> dict[int, Tensor]:
+    def exchange(
+        self, kind: str, width: int, parts: Mapping[int, Sequence[Tensor]], sources: Mapping[int, int]
+    ) -> dict[int, list[Tensor]]:
         """Sends some ranks their parts, and gets those of others; how many rows these have need not be known.
 
-        A message has room for some more rows than the one of its kind before it to the same rank, and says how many
-        there are. What does not fit follows in another.
+        A message begins with the rows of each part, and has room for some more rows than the one of its kind before it
+        to the same rank. What does not fit follows in another.
 
         Args:
             kind: What they are.
             width: c, the columns of all parts of a kind.
-            parts: float32 [n, c] for each rank that gets one.
-            sources: The ranks that send this one a part.
+            parts: float32 [n, c] for each rank that gets some, at least one of them.
+            sources: The ranks that send this one parts, and how many.
 
         Returns:
             The parts that came, by rank.
         """
-        there = {rank: self._rooms.get((kind, "to", rank), 0) for rank in parts}
+        heads = {rank: -(-count // width) for rank, count in sources.items()}
         room = {rank: self._rooms.get((kind, "from", rank), 0) for rank in sources}
         empty = torch.empty(0, width, device=self.device)
-        messages = {rank: _message(part, there[rank]) for rank, part in parts.items()}
-        came = self.swap(kind, messages, {rank: empty.new_empty(1 + n, width) for rank, n in room.items()})
-        counts = {rank: int(message[0, :1].view(torch.int32)) for rank, message in came.items()}
-        rests = {rank: part[there[rank] :] for rank, part in parts.items() if len(part) > there[rank]}
-        more = {rank: empty.new_empty(n - room[rank], width) for rank, n in counts.items() if n > room[rank]}
-        more = self.swap(kind, rests, more)
-        for way, sizes in (("to", {rank: len(part) for rank, part in parts.items()}), ("from", counts)):
-            for rank, n in sizes.items():
-                self._rooms[kind, way, rank] = n * 9 // 8 + 8
-        return {
-            rank: torch.cat((message[1:], more[rank])) if rank in more else message[1 : 1 + counts[rank]]
+        messages, rests = {}, {}
+        for rank, own in parts.items():
+            message, end, total = _message(own, width, self._rooms.get((kind, "to", rank), 0))
+            messages[rank] = message[:end]
+            if len(message) > end:
+                rests[rank] = message[end:]
+            self._rooms[kind, "to", rank] = _room(total)
+        came = self.swap(kind, messages, {rank: empty.new_empty(heads[rank] + n, width) for rank, n in room.items()})
+        sizes = {
+            rank: message[: heads[rank]].view(-1).view(torch.int32)[: sources[rank]].tolist()
             for rank, message in came.items()
         }
+        counts = {rank: sum(each) for rank, each in sizes.items()}
+        more = {rank: empty.new_empty(n - room[rank], width) for rank, n in counts.items() if n > room[rank]}
+        if rests or more:
+            more = self.swap(kind, rests, more)
+        found = {}
+        for rank, message in came.items():
+            rows = message[heads[rank] : heads[rank] + counts[rank]]
+            rows = torch.cat((rows, more[rank])) if rank in more else rows
+            found[rank] = [rows] if len(sizes[rank]) == 1 else list(rows.split(sizes[rank]))
+            self._rooms[kind, "from", rank] = _room(counts[rank])
+        return found
 
     def swap(self, kind: str, parts: Mapping[int, Tensor], came: Mapping[int, Tensor]) -> dict[int, Tensor]:
         """Sends some ranks a tensor each, and fills the tensors for what comes of others; returns these.
@@ -175,12 +187,21 @@ class Group:
             parts: Contiguous, by rank.
             came: Of the sizes of what comes, by rank.
         """
-        messages = [dist.P2POp(dist.irecv, tensor, rank) for rank, tensor in came.items()]
-        messages += [dist.P2POp(dist.isend, tensor, rank) for rank, tensor in parts.items()]
         self.sent[kind] += sum(tensor.numel() * tensor.element_size() for tensor in parts.values())
         self.messages[kind] += len(parts)
-        with self._waiting():  # gloo takes half as long for these as for its collectives
-            for work in dist.batch_isend_irecv(messages) if messages else []:
+        if not parts and not came:
+            return {}
+        with self._waiting():
+            if self.device.type == "cuda":
+                calls = [dist.P2POp(dist.irecv, tensor, rank) for rank, tensor in came.items()]
+                calls += [dist.P2POp(dist.isend, tensor, rank) for rank, tensor in parts.items()]
+                works = dist.batch_isend_irecv(calls)
+            else:  # past the checks of torch.distributed, which take gloo as long again
+                world = dist.group.WORLD
+                assert world is not None
+                works = [world.recv([tensor], rank, 0) for rank, tensor in came.items()]
+                works += [world.send([tensor], rank, 0) for rank, tensor in parts.items()]
+            for work in works:
                 work.wait()
         return dict(came)
 
@@ -207,12 +228,21 @@ def _let_gloo_wait() -> None:
                 os.sched_setscheduler(int(thread.name), os.SCHED_BATCH, os.sched_param(0))
 
 
-def _message(rows: Tensor, room: int) -> Tensor:
-    """The number of rows [n, c], and as many of them as there is room for, [1 + room, c]."""
-    message = rows.new_empty(1 + room, rows.shape[1])
-    message[0, :1].view(torch.int32).fill_(len(rows))
-    message[1 : 1 + len(rows)] = rows[:room]
-    return message
+def _message(parts: Sequence[Tensor], width: int, room: int) -> tuple[Tensor, int, int]:
+    """A message of the rows of each part, then these, then what is left of the room; where it ends, and all rows.
+
+    What comes after that end had no room.
+    """
+    sizes = [len(part) for part in parts]
+    rows, head = sum(sizes), -(-len(sizes) // width)
+    header = torch.tensor(sizes + [0] * (head * width - len(sizes)), dtype=torch.int32).view(torch.float32)
+    left = parts[0].new_empty(max(room - rows, 0), width)
+    return torch.cat((header.view(head, width).to(left.device), *parts, left)), head + room, rows
+
+
+def _room(rows: int) -> int:
+    """For so many rows in the next message."""
+    return rows * 9 // 8 + 8
 
 
 _current: Group | None = None

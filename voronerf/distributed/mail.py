@@ -69,17 +69,7 @@ def send(
             there[target].append(parts.get(key, empty))
         else:
             here[source].append(key)
-    came = group.exchange(kind, width, {rank: _packed(those, width) for rank, those in there.items()}, here)
+    came = group.exchange(kind, width, there, {source: len(keys) for source, keys in here.items()})
     for source, keys in here.items():
-        header = -(-len(keys) // width)
-        sizes = came[source][:header].reshape(-1)[: len(keys)].view(torch.int32).tolist()
-        found.update(zip(keys, came[source][header:].split(sizes), strict=True))
+        found.update(zip(keys, came[source], strict=True))
     return {key: found[key] for _, target, key in routes if target == group.rank}  # in an order that no rank decides
-
-
-def _packed(parts: Sequence[Tensor], width: int) -> Tensor:
-    """Their numbers of rows, and the rows."""
-    header = torch.zeros(-(-len(parts) // width) * width, dtype=torch.int32)
-    header[: len(parts)] = torch.tensor([len(part) for part in parts])
-    device = parts[0].device
-    return torch.cat((header.view(torch.float32).reshape(-1, width).to(device), *parts))

@@ -12,13 +12,13 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
 from voronerf.distributed.group import Group
-from voronerf.distributed.mail import Route, send
+from voronerf.distributed.mail import Key, Route, send
 from voronerf.distributed.territories import Place
 from voronerf.ops.composite import composite
 from voronerf.ops.learn_outputs import learn_outputs
@@ -37,14 +37,17 @@ from voronerf.rendering.volume import Samples, ask, gradient_shares, normalised
 from voronerf.router import VoronoiRouter
 from voronerf.step.ray_loss import Batch, Found, density_scale, why_not_fused
 
-#: Most territories that the rays of one go to, and the share of its rays that has to meet one of them.
+#: Most territories that the rays of one go to, and the share of its rays that has to meet one, or to get light there.
 LINKS, LEAST = 32, 1 / 500
+#: Light that is worth a message, one level of an 8-bit image.
+FAINT = 1 / 255
 #: Steps after which territories tell all others what of them is not empty, and where their rays go; sooner at first.
-SURVEY_EVERY = 64
+#: In so many steps before, rays go to all that they meet, not only to those that bring them light.
+SURVEY_EVERY, WIDE = 64, 4
 #: Boxes in a box of the tree of all bounds.
 FAN = 16
 #: The most that a territory's share of the rays is above, or below, the mean.
-UNEVEN = 2.0
+UNEVEN = 4.0
 
 
 @dataclass(frozen=True)
@@ -64,17 +67,19 @@ class Territory:
 
 @dataclass
 class Map:
-    """What all ranks know of all territories, 312 bytes of each; and a tree of the bounds, 26 bytes of each.
+    """What all ranks know of all territories, 336 bytes of each; and a tree of the bounds, 26 bytes of each.
 
     Attributes:
         bounds: float32 [T, 2, 3], around what is not empty.
-        links: int64 [T, LINKS], the territories that rays of each go to, and -1.
+        links: int64 [T, LINKS], the territories that rays of each meet, and -1; those that bring them light first.
+        lit: int64 [T], how many of them bring light.
         shares: float64 [T], of how many rays each draws, 1 in the mean: fewer where it has many of others, so that all
             evaluate as many samples.
     """
 
     bounds: Tensor
     links: Tensor
+    lit: Tensor
     shares: Tensor
 
     def __post_init__(self) -> None:
@@ -90,7 +95,13 @@ class Map:
         nearest = torch.cdist(centres, centres).argsort(dim=1, stable=True)[:, 1 : LINKS + 1]
         links = torch.full((len(centres), LINKS), -1)
         links[:, : nearest.shape[1]] = nearest
-        return Map(boxes.clone(), links, torch.ones(len(boxes), dtype=torch.float64))
+        lit = torch.full((len(boxes),), nearest.shape[1])
+        return Map(boxes.clone(), links, lit, torch.ones(len(boxes), dtype=torch.float64))
+
+    def goes_to(self, number: int, wide: bool) -> Tensor:
+        """Where rays of a territory go, int64, ascending: all that they meet if they go ``wide``."""
+        links = self.links[number] if wide else self.links[number, : int(self.lit[number])]
+        return links[links >= 0].sort().values
 
     def met(self, rays: Rays, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
         """Which territories rays [r] may meet between near and far.
@@ -136,32 +147,40 @@ class JointLoss:
     ) -> None:
         self.group, self.territories, self.owner = group, dict(territories), list(owner)
         self.map, self.sightings = known, sightings
-        #: For each own territory how many of its rays met each, and had not ended; last its rays, and its samples.
-        self.wanted = {number: torch.zeros(len(owner) + 2, dtype=torch.int64) for number in territories}
-        self.routes = self._routes()
+        #: What each own territory counts: its rays that met each of all and had not ended, those that got light there,
+        #: its rays, those of steps in which they go wide, its samples of them, and its samples of the rays of others.
+        self.counts = {number: torch.zeros(2 * len(owner) + 4, dtype=torch.int64) for number in territories}
+        self.wide = True
+        self._chart()
 
     def survey(self, step: int) -> None:
         """At some steps, all territories tell what of them is not empty, and where their rays go."""
+        self.wide = step < SURVEY_EVERY or step % SURVEY_EVERY >= SURVEY_EVERY - WIDE
         if step % SURVEY_EVERY and (step > SURVEY_EVERY or step & (step - 1)):
             return
-        record = torch.zeros(len(self.owner), 7 + LINKS, dtype=torch.float64, device=self.group.device)
+        count = len(self.owner)
+        record = torch.zeros(count, 10 + LINKS, dtype=torch.float64, device=self.group.device)
         for number, territory in self.territories.items():
-            *counts, rays, samples = self.wanted[number].tolist()
-            links = self.map.links[number].tolist()
+            met, lit, (rays, wide, own, others) = self.counts[number].split((count, count, 4))
+            links, bright = self.map.links[number], self.map.lit[number]
             if rays:
-                many = [other for other, n in enumerate(counts) if n > LEAST * rays and other != number]
-                links = sorted(sorted(many, key=lambda other: -counts[other])[:LINKS])
+                order = (lit * rays + met).argsort(descending=True, stable=True)  # the light decides, then who is met
+                links = order[met[order] > LEAST * rays][:LINKS]
+                bright = (lit[links] > LEAST * wide).sum()
             record[number, :6] = territory.place.bounds(territory.renderer.occupancy).reshape(-1)
-            record[number, 6] = samples
-            record[number, 7:] = torch.tensor((links + [-1] * LINKS)[:LINKS])
-            self.wanted[number].zero_()
+            record[number, 6:10] = torch.stack((own, others, bright, links.new_tensor(len(links))))
+            record[number, 10 : 10 + len(links)] = links.double()
+            self.counts[number].zero_()
         record = self.group.total(record).cpu()
-        shares, samples = self.map.shares, record[:, 6]
-        if bool((samples > 0).all()):
-            shares = (shares * samples.mean() / samples).clamp(1 / UNEVEN, UNEVEN)
+        shares, own, others = self.map.shares, record[:, 6], record[:, 7]
+        if bool((own > 0).all()):  # each is to evaluate the mean; most of the way, for what others send changes too
+            mean = (own + others).mean()
+            shares = (shares * (0.25 + 0.75 * (mean - others) / own)).clamp(1 / UNEVEN, UNEVEN)
             shares = shares / shares.mean()
-        self.map = Map(record[:, :6].reshape(-1, 2, 3).float(), record[:, 7:].long(), shares)
-        self.routes = self._routes()
+        bright, many, links = record[:, 8].long(), record[:, 9:10], record[:, 10:].long()
+        links[torch.arange(LINKS) >= many] = -1
+        self.map = Map(record[:, :6].reshape(-1, 2, 3).float(), links, bright, shares)
+        self._chart()
 
     def run(self, batches: Mapping[int, Batch], *, backward: bool = False) -> dict[int, Found]:
         """The loss and what was found, for each own territory.
@@ -171,76 +190,76 @@ class JointLoss:
             backward: Whether gradients may be added to those of the parameters at once; a loss that has none then.
         """
         given: dict[str, Any] = {"sightings": self.sightings, "backward": backward}
+        routes = self.routes[self.wide]
         homes = {n: _Pass(self.territories[n], batch, **given) for n, batch in batches.items()}
         guests: dict[int, _Pass] = {}
 
         def travel() -> None:
-            parts, rows, learnt = self._leave(homes, batches)
-            came = send(self.group, "rays", 8 + (self.sightings > 0), parts, self.routes)
-            sizes: dict[int, list[tuple[Any, int]]] = {n: [] for n in self.territories}
+            left = {n: self._leave(n, home, batches[n]) for n, home in homes.items()}
+            parts = {key: part for each in left.values() for key, part in each.parts.items()}
+            came = send(self.group, "rays", 8 + (self.sightings > 0), parts, routes)
+            sizes: dict[int, dict[Key, int]] = {n: {} for n in self.territories}
             for key, table in came.items():
-                sizes[key[1]].append((key, len(table)))
-            for number, territory in self.territories.items():
-                if sizes[number]:
-                    table = torch.cat([came[key] for key, _ in sizes[number]])
+                sizes[key[1]][key] = len(table)
+            for number, keys in sizes.items():
+                if keys:
+                    table = torch.cat([came[key] for key in keys])
                     seen = table[:, 8] if self.sightings else None
-                    guests[number] = _Pass(territory, _batch(table, seen), **given)
-            _nest(list(guests.values()), lambda: compose_all(sizes, rows, learnt))
+                    guests[number] = _Pass(self.territories[number], _batch(table, seen), **given)
+            _nest(list(guests.values()), lambda: compose_all(sizes, left))
 
-        def compose_all(sizes: Any, rows: Any, learnt: Any) -> None:
+        def compose_all(sizes: Mapping[int, Mapping[Key, int]], left: Mapping[int, _Left]) -> None:
             width = 6 + int(self.sightings > 0)
-            sums: dict[Any, Tensor] = {}
-            for number, own in sizes.items():
-                if own:
-                    sums.update(guests[number].parted(own))
-            back = [route.back() for route in self.routes]
-            answers: dict[Any, Tensor] = {}
-            came = send(self.group, "sums", width, sums, back)
+            sums: dict[Key, Tensor] = {}
+            for number, guest in guests.items():
+                sums |= guest.parted(sizes[number])
+            came = send(self.group, "sums", width, sums, [route.back() for route in routes])
+            answers: dict[Key, Tensor] = {}
             for number, home in homes.items():
-                keys = [key for key in came if key[0] == number]
-                answers.update(self._compose(home, batches[number], {k: came[k] for k in keys}, rows, learnt[number]))
-            told = send(self.group, "answers", width, answers, self.routes)
-            for number, own in sizes.items():
-                if own:
-                    guests[number].answers = torch.cat([told[key] for key, _ in own])
+                answers |= self._compose(number, home, batches[number], left[number], came)
+            told = send(self.group, "answers", width, answers, routes)
+            for number, guest in guests.items():
+                guest.answers = torch.cat([told[key] for key in sizes[number]])
 
         _nest(list(homes.values()), travel)
-        found = {n: _together(homes.get(n), guests.get(n)) for n in self.territories if n in homes or n in guests}
-        for number, each in found.items():
-            self.wanted[number][-1] += len(each.weights)
-        return found
+        for number, counts in self.counts.items():
+            counts[-2] += homes[number].samples if number in homes else 0
+            counts[-1] += guests[number].samples if number in guests else 0
+        return {n: _together(homes.get(n), guests.get(n)) for n in self.territories if n in homes or n in guests}
 
-    def _routes(self) -> list[Route]:
-        """From each territory to those that its rays go to, where one of the two is here."""
+    def _chart(self) -> None:
+        """The routes from each territory to those that its rays go to, where one of the two is here."""
         here = self.group.rank
-        return [
-            Route(self.owner[number], self.owner[other], (number, other))
-            for number, links in enumerate(self.map.links.tolist())
-            for other in links
-            if other >= 0 and here in (self.owner[number], self.owner[other])
+        #: Without those that bring no light, and with them.
+        self.routes = [
+            [
+                Route(self.owner[number], self.owner[other], (number, other))
+                for number in range(len(self.owner))
+                for other in self.map.goes_to(number, wide).tolist()
+                if here in (self.owner[number], self.owner[other])
+            ]
+            for wide in (False, True)
         ]
 
-    def _leave(self, homes: Mapping[int, _Pass], batches: Mapping[int, Batch]) -> tuple[Any, Any, Any]:
-        """The rays that go on: their tables and numbers by (from, to); and for each batch the rays that are learnt."""
-        parts, rows, learnt = {}, {}, {}
-        for number, home in homes.items():
-            batch, count = batches[number], len(self.owner)
-            ray, other = self.map.met(batch.rays, batch.near, torch.minimum(batch.far, home.end))
-            ray, other = ray[other != number], other[other != number]
-            each = torch.bincount(other, minlength=count)
-            self.wanted[number][:count] += each.cpu()
-            self.wanted[number][count] += len(batch.rays)
-            links = [link for link in self.map.links[number].tolist() if link >= 0]
-            linked = torch.zeros(count, dtype=torch.bool, device=ray.device)
-            linked[links] = True
-            learnt[number] = torch.ones(len(batch.rays), dtype=torch.bool, device=ray.device)
-            learnt[number][ray[~linked[other]]] = False  # where few of the rays go, they are not learnt from
-            table, ends = self._table(batch), each.cumsum(0).tolist()
-            for link in links:
-                chosen = ray[(ends[link - 1] if link else 0) : ends[link]]
-                rows[number, link] = chosen[learnt[number][chosen]]
-                parts[number, link] = table[rows[number, link]]
-        return parts, rows, learnt
+    def _leave(self, number: int, home: _Pass, batch: Batch) -> _Left:
+        """The rays of a territory that go on."""
+        count, counts, rays = len(self.owner), self.counts[number], len(batch.rays)
+        ray, other = self.map.met(batch.rays, batch.near, torch.minimum(batch.far, home.end))
+        away = other != number
+        ray, other = ray[away], other[away]
+        counts[:count] += torch.bincount(other, minlength=count).cpu()
+        counts[2 * count] += rays
+        counts[2 * count + 1] += rays * self.wide
+        links, known = (self.map.goes_to(number, wide).to(ray.device) for wide in (self.wide, True))
+        sent, linked = torch.zeros(2, count, dtype=torch.bool, device=ray.device)
+        sent[links] = linked[known] = True
+        learnt = torch.ones(rays, dtype=torch.bool, device=ray.device)
+        learnt[ray[~linked[other]]] = False  # what lies where rays never go is not known
+        goes = learnt[ray] & sent[other]
+        rows = ray[goes]
+        sizes = torch.bincount(other[goes], minlength=count)[links].tolist()
+        parts = self._table(batch)[rows].split(sizes)
+        return _Left(links, rows, learnt, {(number, n): part for n, part in zip(links.tolist(), parts, strict=True)})
 
     def _table(self, batch: Batch) -> Tensor:
         """Rays as rows of numbers."""
@@ -251,18 +270,18 @@ class JointLoss:
         return torch.cat(columns, 1)
 
     def _compose(
-        self, home: _Pass, batch: Batch, came: Mapping[Any, Tensor], rows: Mapping[Any, Tensor], learnt: Tensor
-    ) -> dict[Any, Tensor]:
+        self, number: int, home: _Pass, batch: Batch, left: _Left, came: Mapping[Key, Tensor]
+    ) -> dict[Key, Tensor]:
         """Puts the rays of a territory together; returns the answers to the others."""
-        own = home.sums.clone()
-        own[:, -1] = home.ids[own[:, -1].long()].to(own.dtype)
-        parts = [own]
-        for key, sums in came.items():
-            sums = sums.clone()
-            sums[:, -1] = rows[key][sums[:, -1].long()].to(sums.dtype)
-            parts.append(sums)
-        every = torch.cat(parts)
-        known = learnt[every[:, -1].long()]
+        parts = [home.sums, *(came[key] for key in left.parts)]
+        counts = [len(part) for part in parts]
+        first = torch.tensor([0, len(home.ids), *(len(part) for part in left.parts.values())]).cumsum(0)
+        each = torch.tensor(counts)
+        starts = torch.repeat_interleave(first[:-1], each).to(home.near.device)
+        every, numbers = torch.cat(parts), torch.cat((home.ids, left.rows))
+        ray = numbers[starts + every[:, -1].long()]
+        every[:, -1] = ray.to(every.dtype)
+        known = left.learnt[ray]
         sums = every if bool(known.all()) else every[known]
         target, background = batch.target, batch.background
         if every.shape[1] == 6:
@@ -274,10 +293,30 @@ class JointLoss:
             told = answers.new_zeros(every.shape)
             told[known] = answers
             answers = told
+        if self.wide:
+            others, count = slice(counts[0], None), len(self.owner)
+            light = torch.exp(-answers[others, -2]) * -torch.expm1(-every[others, -3])
+            source = torch.repeat_interleave(left.links.cpu(), each[1:])[(light > FAINT).cpu()]
+            self.counts[number][count : 2 * count] += torch.bincount(source, minlength=count)
         home.loss = loss
-        mine, *others = answers.split([len(part) for part in parts])
-        home.answers = mine
-        return dict(zip(came, others, strict=True))
+        home.answers, *rest = answers.split(counts)
+        return dict(zip(left.parts, rest, strict=True))
+
+
+class _Left(NamedTuple):
+    """Rays of a batch [r] that go on to other territories.
+
+    Attributes:
+        links: int64, the territories, ascending.
+        rows: int64 [n], the rays, territory after territory.
+        learnt: bool [r], the rays that go to all that they meet.
+        parts: For each territory what is said of its rays.
+    """
+
+    links: Tensor
+    rows: Tensor
+    learnt: Tensor
+    parts: dict[Key, Tensor]
 
 
 class _Pass:
@@ -390,16 +429,19 @@ class _Pass:
         error.index_copy_(0, ray, self.answers[:, -1].to(error.dtype))
         self.found = Found(self.loss, error, weights, density, _samples(own))
 
-    def parted(self, sizes: Sequence[tuple[Any, int]]) -> dict[Any, Tensor]:
+    @property
+    def samples(self) -> int:
+        """How many were evaluated."""
+        return 0 if self.found is None else len(self.found.weights)
+
+    def parted(self, sizes: Mapping[Key, int]) -> dict[Key, Tensor]:
         """The sums of rays that came in parts of these sizes, by the keys of the parts, rays numbered in each."""
-        sums, found, first = self.sums.clone(), {}, 0
-        number = self.ids[sums[:, -1].long()]
-        for key, size in sizes:
-            begin, end = torch.searchsorted(number, torch.tensor((first, first + size), device=number.device)).tolist()
-            sums[begin:end, -1] = (number[begin:end] - first).to(sums.dtype)
-            found[key] = sums[begin:end]
-            first += size
-        return found
+        number = self.ids[self.sums[:, -1].long()]
+        ends = torch.tensor([0, *sizes.values()], device=number.device).cumsum(0)
+        each = torch.searchsorted(number, ends).diff()
+        sums = self.sums.clone()
+        sums[:, -1] = (number - torch.repeat_interleave(ends[:-1], each)).to(sums.dtype)
+        return dict(zip(sizes, sums.split(each.tolist()), strict=True))
 
 
 def _nest(passes: Sequence[_Pass], last: Callable[[], None]) -> None:

@@ -14,7 +14,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +70,8 @@ from voronerf.training.trainer import FIGURES, Trainer
 AGREE_EVERY = 8
 #: Steps after which territories may move, and the share of the mean work from which the heaviest rank gives some away.
 BALANCE_EVERY, HEAVIEST = 256, 1.15
+#: What checkpoints keep of a `Map`.
+KNOWN = tuple(field.name for field in fields(Map))
 #: The most voxels of the grid that a finished run is drawn with.
 VOXELS = 1 << 21
 
@@ -220,10 +222,10 @@ class JointTrainer:
         before = getattr(self, "joint", None)
         self.joint: JointLoss = JointLoss(self.group, members, self.owner, known, self.whole.sightings or 0.0)
         if before is not None:
-            self.joint.wanted |= {n: counts for n, counts in before.wanted.items() if n in members}
+            self.joint.counts |= {n: counts for n, counts in before.counts.items() if n in members}
         for number, found in checkpoints.items():
             if found is not None:
-                self.joint.wanted[number] = found.tensors["joint.wanted"].clone()
+                self.joint.counts[number] = found.tensors["joint.counts"].clone()
         first = next(iter(self.trainers.values())).renderer
         self.renderer = Renderer(first.fields, first.sampler, backend=first.backend)
         self.renderer.look = self._look
@@ -233,14 +235,14 @@ class JointTrainer:
         config = replace(
             self.config, seed=seed, lpips=Path("off"), resume=False, territories=None, evaluation_share=0.0
         )
-        scene, views = self.territories.scene(self.scene, number), self.territories.views(number)
-        batches = RayBatches(
-            self.scene,
-            self.device,
-            sightings=bool(self.whole.sightings),
-            views=views,
-            backend=config.backend,
-        )
+        scene = self.territories.scene(self.scene, number)
+        views: Tensor | None = self.territories.views(number)
+        images = self.scene
+        memory = config.images == "memory" and images.train.on_disk
+        if memory or (config.images != "disk" and self.device.type != "cpu"):
+            images, views = replace(images, train=images.train.copy(self.territories.views(number))), None
+        given: dict[str, Any] = {"sightings": bool(self.whole.sightings), "backend": config.backend}
+        batches = RayBatches(images, self.device, views=views, **given)
         if checkpoint is not None:
             check_shapes(resolve_config(config, scene), checkpoint)
         trainer = Trainer(config, scene, clock=self.clock, batches=batches, checkpoint=checkpoint)
@@ -506,7 +508,7 @@ class JointTrainer:
             threads=torch.get_num_threads(),
         )
         known = self.joint.map
-        tensors = {"joint.bounds": known.bounds, "joint.links": known.links, "joint.shares": known.shares}
+        tensors = {f"joint.{name}": getattr(known, name) for name in KNOWN}
         tensors["joint.owner"] = torch.tensor(self.owner)
         paths = [part_path(self.out, token, number) for number in range(len(self.owner))]
         values = {**asdict(stored), "stages": list(stored.stages)}
@@ -519,7 +521,7 @@ class JointTrainer:
     def _part(self, number: int) -> Checkpoint:
         """The checkpoint of a territory of this rank."""
         found = self.trainers[number].state()
-        return replace(found, tensors={**found.tensors, "joint.wanted": self.joint.wanted[number].clone()})
+        return replace(found, tensors={**found.tensors, "joint.counts": self.joint.counts[number].clone()})
 
     def _index(self, known: Checkpoint, paths: Sequence[Path]) -> Checkpoint:
         """The checkpoint that names the files of all territories, which are written: their cells, and one grid."""
@@ -574,8 +576,7 @@ class JointTrainer:
             failed = torch.tensor(float(failure is not None), device=self.group.device)
             if self.group.largest(failed) == 0:
                 assert index is not None
-                names = "bounds", "links", "shares"
-                self._take(parts, Map(*(index.tensors[f"joint.{name}"].clone() for name in names)))
+                self._take(parts, Map(*(index.tensors[f"joint.{name}"].clone() for name in KNOWN)))
                 self._continue(values)
                 if errors:
                     self.say(f"{errors[0]}; {path.name} takes its place")
