@@ -229,17 +229,16 @@ class JointLoss:
 
     def _chart(self) -> None:
         """The routes from each territory to those that its rays go to, where one of the two is here."""
-        here = self.group.rank
+        links, count = self.map.links, len(self.owner)
+        here = torch.tensor(self.owner) == self.group.rank
+        first = torch.arange(LINKS) < self.map.lit[:, None]
         #: Without those that bring no light, and with them.
-        self.routes = [
-            [
-                Route(self.owner[number], self.owner[other], (number, other))
-                for number in range(len(self.owner))
-                for other in self.map.goes_to(number, wide).tolist()
-                if here in (self.owner[number], self.owner[other])
-            ]
-            for wide in (False, True)
-        ]
+        self.routes: list[list[Route]] = []
+        for chosen in (first & (links >= 0), links >= 0):
+            number, place = (chosen & (here[:, None] | here[links.clamp(min=0)])).nonzero(as_tuple=True)
+            pairs = (number * count + links[number, place]).sort().values.tolist()
+            keys = [divmod(pair, count) for pair in pairs]
+            self.routes.append([Route(self.owner[n], self.owner[other], (n, other)) for n, other in keys])
 
     def _leave(self, number: int, home: _Pass, batch: Batch) -> _Left:
         """The rays of a territory that go on."""
