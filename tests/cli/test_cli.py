@@ -164,18 +164,27 @@ def test_demo_compares_two_runs(tmp_path, capsys, monkeypatch, fails):
     # A step takes ten milliseconds however busy the machine is.
     ticks = itertools.count()
     monkeypatch.setattr("voronerf.training.trainer.time", SimpleNamespace(perf_counter=lambda: 0.0101 * next(ticks)))
+    monkeypatch.setattr("voronerf.cli.demo.PICTURE", 32)
+    monkeypatch.setattr("voronerf.cli.demo.FRAME", 16)
+    monkeypatch.setattr("voronerf.cli.demo.FRAMES", 4)
     for _ in range(2):  # in the place of the first
-        succeeds("demo --budget 0.3 --size 16 --cells 3 --out", tmp_path)
+        succeeds("demo --budget 0.3 --size 16 --blocks 1 --cells 3 --out", tmp_path)
     output = capsys.readouterr().out
-    results = {name: read_json(tmp_path / name / "summary.json") for name in ("single", "voronoi")}
-    assert (results["single"]["cells"], results["voronoi"]["cells"]) == (1, 3)
+    results = {name: read_json(tmp_path / name / "summary.json") for name in ("one", "cells")}
+    assert (results["one"]["cells"], results["cells"]["cells"]) == (1, 3)
     for result in results.values():
-        assert f"{result['psnr']:.2f}" in output
-    assert "<h2>PSNR over training time</h2>" in (tmp_path / "compare.html").read_text()
-    config = read_json(tmp_path / "voronoi" / "config.json")
-    assert (config["data"], config["downscale"]) == ("builtin", 6)  # 100 // 6 = 16, for who resumes or scores it
+        assert result["views"] == 4 and f"{result['psnr']:.2f} dB, SSIM {result['ssim']:.3f}" in output
+    gain = results["cells"]["psnr"] - results["one"]["psnr"]
+    assert f"3 cells are {abs(gain):.2f} dB {'better' if gain >= 0 else 'worse'}" in output
+    assert f"{abs(1 - 10 ** (-gain / 10)):.0%} {'less' if gain >= 0 else 'more'} squared error" in output
+    with Image.open(tmp_path / "wipe.png") as picture:
+        assert picture.width > 2 * 32
+    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "wipe.mp4"))[0] == 4
+    config = read_json(tmp_path / "cells" / "config.json")
+    assert (config["data"], config["downscale"]) == ("builtin-city:1x1", 6)  # 100 // 6 = 16, for who resumes it
     fails("--size must be 100 over a whole number", "demo --size 60")
     fails("--cells must be at least 2", "demo --cells 1 --out", tmp_path / "x")
+    fails("blocks must be 1 to 32, got 0", "demo --blocks 0 --out", tmp_path / "x")
     assert not (tmp_path / "x").exists()
 
 

@@ -7,7 +7,7 @@ from helpers import refuses
 
 from voronerf import backends
 from voronerf.data import SceneError, city_scene, load_scene
-from voronerf.data.builtin.city import block_caster, city_cameras
+from voronerf.data.builtin.city import block_caster, city_cameras, city_views
 from voronerf.data.builtin.city_solids import TALLEST, city
 from voronerf.data.builtin.solids import Sphere, first_hits, normalised
 
@@ -23,6 +23,11 @@ def street_rays(blocks, count):
     origins = cameras.origins.numpy()[random.integers(len(cameras), size=count)]
     targets = random.uniform((-1, -1, 0), (1, 1, 0.5), size=(count, 3)).astype(np.float32)
     return origins, normalised(targets - origins)
+
+
+def test_other_cameras_see_the_same_city(scene):
+    cameras = scene.test.cameras[[0]]
+    assert torch.equal(city_views(cameras, (2, 2)).images[0], scene.test.images[0])
 
 
 @pytest.mark.parametrize("way", ["numpy", pytest.param("warp", marks=pytest.mark.warp)])

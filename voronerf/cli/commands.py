@@ -178,11 +178,17 @@ def _draw_joint(config: TrainConfig, scene: Scene) -> None:
 
 
 def run_training(
-    config: TrainConfig, scene: Scene, *, watch: Watch | None = None, group: Group | None = None
+    config: TrainConfig,
+    scene: Scene,
+    *,
+    watch: Watch | None = None,
+    group: Group | None = None,
+    quiet: bool = False,
 ) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
 
-    ``watch`` makes what shows the training in a viewer; ``group`` are the ranks that train together.
+    ``watch`` makes what shows the training in a viewer; ``group`` are the ranks that train together. ``quiet`` leaves
+    out all lines but the live one.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the step in hand: the checkpoint and the summary are written,
     the pictures are not. A second one ends the process at once.
@@ -192,14 +198,14 @@ def run_training(
     if config.panels and len(os.fsencode(longest)) > LONGEST_NAME:
         raise ConfigError(f"--panels must be 0 with image names of more than {LONGEST_NAME} bytes, got {longest}")
     with held(config.out) if group is None or group.rank == 0 else contextlib.nullcontext():
-        return _train_and_draw(config, config.out, scene, watch, group)
+        return _train_and_draw(config, config.out, scene, watch, group, quiet)
 
 
 def _train_and_draw(
-    config: TrainConfig, out: Path, scene: Scene, watch: Watch | None, group: Group | None
+    config: TrainConfig, out: Path, scene: Scene, watch: Watch | None, group: Group | None, quiet: bool
 ) -> dict[str, Any]:
     with contextlib.ExitStack() as stack:
-        with TrainingDisplay(console, scene.name) as display:
+        with TrainingDisplay(console, scene.name, quiet=quiet) as display:
             for note in scene.notes:
                 display.on_event(f"{scene.name}: {note}")
             told: dict[str, Any] = {"on_step": display.on_step, "on_event": display.on_event}
@@ -244,7 +250,8 @@ def _train_and_draw(
             _draw_joint(config, scene)
         if trainer.writes:
             write_curve(out)
-        say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
+        if not quiet:
+            say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
         return summary
 
 

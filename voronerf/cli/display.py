@@ -49,10 +49,11 @@ class TrainingDisplay:
     Args:
         console: Where to write; its own detection of a terminal decides between a live line and plain ones.
         label: Name of the run.
+        quiet: Leave out lines that stay.
     """
 
-    def __init__(self, console: Console, label: str) -> None:
-        self.console = console
+    def __init__(self, console: Console, label: str, *, quiet: bool = False) -> None:
+        self.console, self.quiet = console, quiet
         self.progress = Progress(
             TextColumn("[bold]{task.description}"),
             BarColumn(bar_width=24),
@@ -96,6 +97,8 @@ class TrainingDisplay:
 
     def on_event(self, line: str) -> None:
         """Prints a line that stays, above the live one."""
+        if self.quiet:
+            return
         self.console.print(printable(line), highlight=False, markup=False, emoji=False)
 
 

@@ -48,7 +48,7 @@ WHAT_TO_TRY = """This trains the built-in scene for 480 s, into runs/. Ctrl-C st
   voronerf train --budget 60                the same for a minute
   voronerf train --data DIR --downscale 4   your scene: Blender, transforms.json, COLMAP or LLFF
   voronerf train --view                     watch it in a browser
-  voronerf demo                             one network against 16 cells, on the built-in scene
+  voronerf demo                             one network against 64 cells, in a built-in city
   voronerf train --help                     every option"""
 
 #: What ``voronerf NAME`` runs; arguments and docstring of each function are its options and its help.

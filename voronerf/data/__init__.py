@@ -13,7 +13,11 @@ from voronerf.data.builtin.city import city_of
 from voronerf.data.colmap import find_model, load_colmap
 from voronerf.data.errors import SceneError
 from voronerf.data.llff import FILE, load_llff
+from voronerf.data.metashape import FILE as METASHAPE
+from voronerf.data.metashape import load_metashape
 from voronerf.data.photographs import Reading
+from voronerf.data.polycam import find_polycam, load_polycam
+from voronerf.data.record3d import find_record3d, load_record3d
 from voronerf.data.scene import KINDS, Scene, Split
 from voronerf.data.transforms import load_transforms
 
@@ -50,6 +54,9 @@ FORMATS = {
     "colmap": Format("a COLMAP model in sparse/0", load_colmap, find_model),
     "transforms": Format("transforms.json", load_transforms),
     "llff": Format(FILE, load_llff),
+    "metashape": Format(METASHAPE, load_metashape),
+    "polycam": Format("Polycam's keyframes/cameras", load_polycam, find_polycam),
+    "record3d": Format("Record3D's metadata.json with rgb", load_record3d, find_record3d),
 }
 
 
@@ -73,13 +80,13 @@ def load_scene(
     Args:
         source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of 16, with
             "builtin-city:4x4,rebuilt=5" for other buildings on block 5, or a folder with `transforms_train.json`
-            (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, or LLFF's
-            `poses_bounds.npy`.
+            (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, LLFF's
+            `poses_bounds.npy`, Metashape's `cameras.xml`, Polycam's `keyframes` or Record3D's `metadata.json`.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,
             and for photographs the least factor that leaves at most 512 pixels a side.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
             or a link.
-        format: of a folder: "blender", "transforms", "colmap" or "llff"; "auto" is the first of them that it holds.
+        format: of a folder, one of `FORMATS` such as "colmap"; "auto" is the first of them that it holds.
         kind: of photographs: "object" (on white), "forward" (the cameras look the same way), "inside-out" or
             "unbounded"; "auto" tells it by transparent pixels and by the cameras.
         normalise: move, turn and scale photographs so that the origin is in the middle, z is up and the farthest camera

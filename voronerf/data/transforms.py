@@ -283,7 +283,9 @@ def has_lens(entries: dict[str, Any], frames: Sequence[Frame]) -> bool:
     return any(given.get(key) is not None for given in (entries, *(f.entries for f in frames)) for key in LENS)
 
 
-def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, reading: Reading) -> Scene:
+def capture_scene(
+    folder: Path, listed: Sequence[Listed], held_out: Tensor, reading: Reading, about: str | None = None
+) -> Scene:
     """Makes the scene of a capture from its frames, see `load_transforms`.
 
     Args:
@@ -291,12 +293,13 @@ def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, read
         listed: its c images.
         held_out: bool [c], the test views.
         reading: how it is read.
+        about: a line about the files; default: the name of the first.
 
     Raises:
         SceneError: as `load_transforms`.
     """
     path, entries, _ = listed[0]
-    notes = [f"{path.name} of {len(listed)} images"]
+    notes = [about or f"{path.name} of {len(listed)} images"]
     if any(entry.frame.entries.get("depth_file_path") is not None for entry in listed):
         notes.append("its depth images are not used")
     applied = entries.get("applied_transform")

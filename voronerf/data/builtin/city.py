@@ -100,6 +100,14 @@ def city_scene(
     return Scene(name, train, test, NEAR, far, torch.from_numpy(box), "linear", "white")
 
 
+def city_views(cameras: Cameras, blocks: tuple[int, int]) -> Split:
+    """The city from other cameras, which are square and have one focal length; in memory."""
+    groups = city(blocks, None)
+    solids = [solid for group in groups for solid in group]
+    look = functools.partial(see, solids=solids, hits=block_caster(groups))
+    return render_views(cameras, "view", look, box=bounds(solids), supersamples=SUPERSAMPLES)
+
+
 def city_of(size: int, text: str, images: str) -> Scene:
     """The city of blocks such as "4x4", "4x8" or "4x4,rebuilt=5"; in the cache if it is larger than one block.
 
