@@ -1,37 +1,22 @@
-"""The viewer in a real browser: Debian's packages chromium and chromium-driver, without a screen and without a GPU."""
+"""The viewer in a real browser."""
 
 from __future__ import annotations
 
-import io
-import shutil
 import threading
-import time
 
 import numpy as np
 import pytest
+from browser import chromium, screenshot, until
 from PIL import Image
 
 pytest.importorskip("viser", reason="viser is not installed")
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 
-FLAGS = """--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking
---disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader
---hide-scrollbars --force-device-scale-factor=1 --window-size=1000,700"""
-
 
 @pytest.fixture
 def browser(tmp_path):
-    paths = [shutil.which(name) for name in ("chromium", "chromedriver")]
-    if None in paths:
-        pytest.skip("there is no chromium with its chromedriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = paths[0]
-    for flag in (*FLAGS.split(), f"--user-data-dir={tmp_path / 'profile'}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(paths[1]))
-    yield driver
-    driver.quit()
+    with chromium(tmp_path / "profile") as driver:
+        yield driver
 
 
 @pytest.fixture
@@ -46,14 +31,6 @@ def served(viewer):
     thread.join()
 
 
-def until(done, seconds=30.0):
-    end = time.monotonic() + seconds
-    while not (found := done()):
-        assert time.monotonic() < end, f"waited {seconds} s in vain"
-        time.sleep(0.1)
-    return found
-
-
 def test_chromium_shows_the_scene_and_its_cells(run, served, browser) -> None:
     browser.get(served.address)
     client = until(lambda: next(iter(served.clients.values()), None))
@@ -62,7 +39,7 @@ def test_chromium_shows_the_scene_and_its_cells(run, served, browser) -> None:
     middle = (slice(height // 3, height), slice(width // 3, 3 * width // 5))  # nothing lies over it
 
     def seen():
-        page = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
+        page = screenshot(browser)
         left, top = canvas.location["x"], canvas.location["y"]
         return np.array(page.crop((left, top, left + width, top + height)), dtype=float)[middle]
 

@@ -69,6 +69,19 @@ def test_a_camera_at_rest_sees_what_render_gives(run, scene, tab) -> None:
     assert min(len(picture) for picture in tab.pictures) < 128  # coarse ones came before
 
 
+def test_on_a_phone_the_panel_is_folded_away(viewer, scene, tab):
+    viewer.show_curve([(1.0, 20.0), (2.0, 21.0)])
+    tab.until(lambda: "GuiUplotMessage" in tab.gui)
+    with closing(Tab(viewer, scene.test.cameras, size=(390, 844), number=1)) as phone:
+        phone.until(lambda: "Runs" in phone.gui or "Export" in phone.gui)
+        phone.until(lambda: "GuiUplotMessage" in phone.gui)
+    folder = phone.gui["Controls"]
+    assert folder["folder"] == "root" and folder["expand_by_default"] is False
+    outside = [label for label, part in phone.gui.items() if part["folder"] == "root"]
+    assert outside == ["Controls"] and phone.gui["Show"]["folder"] == phone.gui["GuiUplotMessage"]["folder"]
+    assert "Controls" not in tab.gui and tab.gui["Show"]["folder"] == "root"
+
+
 def test_panes(run, scene, tab) -> None:
     tab.rest()
     image = run.render(larger(scene.test.cameras, 128), 0)

@@ -6,6 +6,7 @@ import io
 import math
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ import viser
 from PIL import Image
 from torch import Tensor
 from viser.transforms import SO3
+from viser.uplot import Scale, Series
 
 from voronerf.evaluation.panels import palette
 from voronerf.rendering.cameras import Cameras
@@ -36,6 +38,10 @@ SHARP, LARGEST = 512, 2048
 #: Training views that are drawn at most, evenly spread, and the longer side of their pictures.
 MOST_VIEWS, THUMBNAIL = 200, 96
 NO_CELL = "Click on a cell."
+#: Pixels across an upright canvas below which the panel lies over the picture, as on a phone.
+NARROW = 576
+#: Pixels around the curve: above, right, below, left. Without them its labels are cut off.
+PADDING = (14, 14, 0, 0)
 
 
 class Client:
@@ -70,7 +76,13 @@ class Client:
         self.picked: int | None = None
         self.wants_screenshot = False
         self.nodes: dict[str, list[Any]] = {kind: [] for kind in ("centres", "cameras", "crop", "keyframes")}
-        self._build()
+        self.curve: viser.GuiUplotHandle | None = None
+        width, height = self.handle.camera.image_width, self.handle.camera.image_height
+        phone = 0 < width < min(NARROW, height)
+        self.panel = self.handle.gui.add_folder("Controls", expand_by_default=False) if phone else nullcontext()
+        with self.panel:
+            self._build()
+        self.draw_curve()
 
     def on_subject(self) -> None:
         """Shows another subject, from its first test view."""
@@ -162,6 +174,20 @@ class Client:
             if self.viewer.open is not None:
                 with gui.add_folder("Runs", expand_by_default=False):
                     Runs(self, run)
+
+    def draw_curve(self) -> None:
+        """Draws PSNR in dB over training seconds, from the second evaluation on."""
+        if len(self.viewer.points) < 2:
+            return
+        seconds, psnr = np.array(self.viewer.points, dtype=np.float64).T
+        if self.curve is not None:
+            self.curve.data = (seconds, psnr)
+            return
+        series = (Series(label="s"), Series(label="PSNR [dB]", stroke="#00897b", width=2))
+        with self.panel:
+            self.curve = self.handle.gui.add_uplot(
+                (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, padding=PADDING, order=-1
+            )
 
     def on(self, register: Callable[[Callable[[Any], None]], object], work: Callable[[], object]) -> None:
         """Has something done when a part of the panel is used; where that fails, the client is disconnected."""

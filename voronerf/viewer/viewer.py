@@ -19,11 +19,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 import viser
 from torch import Tensor
-from viser.uplot import Scale, Series
 
 from voronerf.backends import BackendUnavailable
 from voronerf.data import Scene
@@ -53,8 +51,6 @@ REFRESH = 0.05
 EVERYWHERE = ("0.0.0.0", "::", "")
 #: Depth of empty pixels in scene units, the largest that viser takes.
 NOWHERE = 160.0
-#: Pixels around the curve: above, right, below, left. Without them its labels are cut off.
-PADDING = (14, 14, 0, 0)
 #: What may go wrong with what a page asks for, without a fault of the program or of the page.
 EXPECTED = (ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError, MemoryError)
 
@@ -92,7 +88,7 @@ class Viewer:
         self.host, self.port = host, self.server.get_port()
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
         self._stand()
-        self.curve: viser.GuiUplotHandle | None = None
+        self.points: list[tuple[float, float]] = []
         self.server.on_client_connect(self._enter)
         self.server.on_client_disconnect(self._leave)
 
@@ -122,11 +118,7 @@ class Viewer:
         self.errors = ViewErrors(subject.scene, self._render_view)
         self.server.gui.set_panel_label(subject.name)
         self._stand()
-        if self.curve is not None:
-            self.curve.remove()
-            self.curve = None
-        if subject.run is not None:
-            self.show_curve(read_curve(subject.folder))
+        self.points = [] if subject.run is None else read_curve(subject.folder)
         for client in self.list_clients():
             self.serve_client(client, client.on_subject)
 
@@ -136,16 +128,9 @@ class Viewer:
         Args:
             points: seconds and PSNR of each evaluation.
         """
-        if len(points) < 2:
-            return
-        seconds, psnr = np.array(points, dtype=np.float64).T
-        if self.curve is not None:
-            self.curve.data = (seconds, psnr)
-            return
-        series = (Series(label="s"), Series(label="PSNR [dB]", stroke="#00897b", width=2))
-        self.curve = self.server.gui.add_uplot(
-            (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, padding=PADDING, order=-1
-        )
+        self.points = list(points)
+        for client in self.list_clients():
+            self.serve_client(client, client.draw_curve)
 
     def take_images(self, scene: Scene) -> None:
         """Takes the scene with its images, which a viewer can do without at first."""
