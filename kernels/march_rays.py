@@ -67,13 +67,15 @@ def _point(origin: wp.vec3, direction: wp.vec3, at: wp.float32, space: wp.array2
     z = origin[2] + at * direction[2]
     if space.shape[0] == 1:
         radius = space[0, 3]
-        x = (x - space[0, 0]) / radius
-        y = (y - space[0, 1]) / radius
-        z = (z - space[0, 2]) / radius
+        scale = 1.0 / radius
+        x = (x - space[0, 0]) * scale
+        y = (y - space[0, 1]) * scale
+        z = (z - space[0, 2]) * scale
         length = wp.sqrt(x * x + y * y + z * z)
         if length < 1.0:
             length = wp.float32(1.0)
-        factor = (2.0 - 1.0 / length) / length
+        inverse = 1.0 / length
+        factor = (2.0 - inverse) * inverse
         x = space[0, 0] + radius * x * factor
         y = space[0, 1] + radius * y * factor
         z = space[0, 2] + radius * z * factor

@@ -348,6 +348,17 @@ class RunsOfRays(NamedTuple):
     r: int  # int64
     rays: int  # int64
 
+class Sightings(NamedTuple):
+    density: Tensor | None  # const float32*
+    depths: Tensor | None  # const float32*
+    deltas: Tensor | None  # const float32*
+    weights: Tensor | None  # const float32*
+    offsets: Tensor | None  # const int32*
+    distances: Tensor | None  # const float32*
+    nearby: float  # float32
+    s: int  # int64
+    m: int  # int64
+
 class SparseAdam(NamedTuple):
     step_size: float  # float32
     decay: float  # float32
@@ -583,6 +594,9 @@ def run_gradients(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3
 
 # RenderLossInputs, const float32*, const int32*, float32*, float32*, Cpu
 def run_sums(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
+
+# Sightings, float32*, float32*, float32*, Cpu
+def sighting_gradient(_0: Sightings, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Cpu) -> None: ...
 
 # SparseAdam, const float32*, float32*, float32*, float32*, int64, Cpu
 @overload

@@ -25,11 +25,17 @@ VN_HD float march_root(float a) {
 }
 
 struct MarchRay {
-  float near, far, count;
+  float near, far, count, share;  // share: 1 / count where that is exact, else 0
 };
 
 VN_HD MarchRay march_ray(const MarchInputs& in, int64_t i) {
-  return {in.near[i], in.far[i], static_cast<float>(in.s)};
+  const float count = static_cast<float>(in.s);
+  return {in.near[i], in.far[i], count, (in.s & (in.s - 1)) == 0 ? 1.0f / count : 0.0f};
+}
+
+// The fraction of the way that is a number of strata. A product with an exact reciprocal is the quotient.
+VN_HD float march_fraction(const MarchRay& ray, float strata) {
+  return ray.share > 0.0f ? march_product(strata, ray.share) : strata / ray.count;
 }
 
 VN_HD float march_depth(const MarchRay& ray, float fraction, bool disparity) {
@@ -40,11 +46,11 @@ VN_HD float march_depth(const MarchRay& ray, float fraction, bool disparity) {
 
 VN_HD float march_edge(const MarchRay& ray, int64_t i, bool disparity) {
   const float number = static_cast<float>(i);
-  return number < ray.count ? march_depth(ray, number / ray.count, disparity) : ray.far;
+  return number < ray.count ? march_depth(ray, march_fraction(ray, number), disparity) : ray.far;
 }
 
 VN_HD float march_sample(const MarchRay& ray, int64_t i, float inside, float first, float last, bool disparity) {
-  const float at = march_depth(ray, (static_cast<float>(i) + inside) / ray.count, disparity);
+  const float at = march_depth(ray, march_fraction(ray, static_cast<float>(i) + inside), disparity);
   const float above = at < first ? first : at;
   return above > last ? last : above;
 }
@@ -71,12 +77,12 @@ VN_HD void march_point(const MarchInputs& in, MarchWhere where, const float* ori
                        float* point) {
   for (int axis = 0; axis < 3; ++axis) point[axis] = origin[axis] + march_product(at, direction[axis]);
   if (where == MarchWhere::kSphere) {
-    const float *centre = in.space.sphere, radius = in.space.sphere[3];
-    for (int axis = 0; axis < 3; ++axis) point[axis] = (point[axis] - centre[axis]) / radius;
+    const float *centre = in.space.sphere, radius = in.space.sphere[3], scale = 1.0f / radius;
+    for (int axis = 0; axis < 3; ++axis) point[axis] = march_product(point[axis] - centre[axis], scale);
     const float whole = march_root(march_product(point[0], point[0]) + march_product(point[1], point[1]) +
                                    march_product(point[2], point[2]));
-    const float length = whole < 1.0f ? 1.0f : whole;
-    const float factor = (2.0f - 1.0f / length) / length;
+    const float inverse = 1.0f / (whole < 1.0f ? 1.0f : whole);
+    const float factor = march_product(2.0f - inverse, inverse);
     for (int axis = 0; axis < 3; ++axis) {
       point[axis] = centre[axis] + march_product(march_product(radius, point[axis]), factor);
     }

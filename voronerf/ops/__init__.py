@@ -35,6 +35,7 @@ from voronerf.ops.ray_runs.reference import OwnSamples
 from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradient
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
+from voronerf.ops.sighting_gradient import sighting_gradient
 from voronerf.ops.sparse_adam import Guard, Rule, adam, sparse_adam
 from voronerf.ops.spherical_harmonics import spherical_harmonics
 from voronerf.ops.update_occupancy import update_occupancy
@@ -80,6 +81,7 @@ __all__ = [
     "routed_mlp",
     "run_gradients",
     "run_sums",
+    "sighting_gradient",
     "sparse_adam",
     "spherical_harmonics",
     "update_occupancy",

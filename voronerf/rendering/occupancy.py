@@ -15,12 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.checks import MAX_COUNT
+from voronerf.checks import check_range
 from voronerf.fields.radiance import activate_density, activate_radiance
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.observe_occupancy.reference import cells_of
-from voronerf.ops.update_occupancy import update_occupancy
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
@@ -137,25 +136,25 @@ class OccupancyGrid:
             backend: of the op.
 
         Raises:
-            ValueError: a decay out of range.
+            ValueError: a decay out of range; on the CPU cells out of range.
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.update: decay must lie in 0..1, got {decay}")
         device = self.box.device
         if cells is None:
             cells = torch.arange(self.occupied.numel(), device=device)
+        check_range("OccupancyGrid.update", "cells", cells, self.occupied.numel())
         drawn_on = device if generator is None else generator.device
-        found = []
-        for part in cells.split(CHUNK):
-            uniforms = torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device)
-            points = self.points(part, uniforms)
-            found.append(density_of(field, points) * self._stretch(points))
-        values = torch.cat(found) if found else self.density.new_empty(0)
-        # What int32 does not hold must stay out of range, not wrap into it.
-        cells = cells.clamp(-1, MAX_COUNT).to(torch.int32)
-        self.density, self.occupied = update_occupancy(
-            self.density, cells, values, decay=decay, threshold=self.threshold, backend=backend
-        )
+        # All points before the first is entered: `decay` is of the densities from before.
+        points = [
+            self.points(part, torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device))
+            for part in cells.split(CHUNK)
+        ]
+        found = [density_of(field, part) for part in points]
+        if found:
+            positions, density = torch.cat(points), torch.cat(found)
+            seen = torch.ones_like(density)
+            self._enter(positions, density, seen, seen, decay=decay, hidden=0.0, backend=backend)
 
     @torch.no_grad()
     def observe(
@@ -187,21 +186,15 @@ class OccupancyGrid:
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
-        samples = self._samples(positions, density, deltas, weights)
-        rule: dict[str, Any] = {"decay": decay, "threshold": self.threshold, "hidden": HIDDEN, "backend": backend}
-        observe_occupancy(self.density, self.occupied, self.box, *samples, **rule)
+        self._enter(positions, density, deltas, weights, decay=decay, hidden=HIDDEN, backend=backend)
 
-    def _samples(
-        self, positions: Tensor, density: Tensor, deltas: Tensor, weights: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Samples in the space and the units of the grid."""
+    def _enter(self, positions: Tensor, density: Tensor, deltas: Tensor, weights: Tensor, **rule: Any) -> None:
+        """Samples, in the units of the world, on their way into the grid; ``rule`` as for `observe_occupancy`."""
         if self.contraction is not None:
             stretch = self.contraction.stretch(positions)
             density, deltas = density * stretch, deltas / stretch
-        return positions, density.float(), deltas.float(), weights.float()
-
-    def _stretch(self, points: Tensor) -> Tensor | float:
-        return 1.0 if self.contraction is None else self.contraction.stretch(points)
+        samples = positions, density.float(), deltas.float(), weights.float()
+        observe_occupancy(self.density, self.occupied, self.box, *samples, threshold=self.threshold, **rule)
 
     def cells(self, points: Tensor) -> Tensor:
         """Flat numbers int32 [n] of the cells that points [n, 3] lie in; outside the box the nearest at its border."""

@@ -10,8 +10,6 @@ from voronerf.ops.resample import resample
 SPACINGS = ("linear", "disparity")
 #: Added to the weights of all intervals before drawing from them (mip-NeRF, equation 18).
 PADDING = 0.01
-#: How far from a surface a point of a sparse model may lie, as a share of its distance from the camera.
-NEARBY = 0.03
 
 
 def stratified_depths(
@@ -183,65 +181,6 @@ def interlevel_loss(edges: Tensor, weights: Tensor, found: Tensor, bounds: Tenso
     bound = total.gather(1, torch.maximum(first, last)) - total.gather(1, first)
     missed = (weights - bound).clamp_min(0)
     return (missed.square() / (weights + 1e-7)).sum(dim=1).mean()
-
-
-def seen_there(depths: Tensor, deltas: Tensor, distances: Tensor) -> Tensor:
-    """Which samples lie where a point was seen: within `NEARBY` of its distance and their own length.
-
-    Args:
-        depths: [...], of samples.
-        deltas: [...], their lengths.
-        distances: [...], of the point that the ray of each ends at; NaN for none.
-    """
-    return (depths - distances).abs() <= NEARBY * distances + deltas
-
-
-def sighting_loss(light: Tensor) -> Tensor:
-    """How little of the light comes from where a point was seen, [s].
-
-    ``-log`` of the weights of the samples that were `seen_there`: the likelihood of Deng et al. 2022,
-    "Depth-supervised NeRF", with a box in the place of their Gaussian. Fog before the point takes from them.
-
-    Args:
-        light: [s], the sum of these weights.
-    """
-    return -torch.log(light.clamp(1e-3, 1))
-
-
-def sighting_gradient(
-    density: Tensor, samples: tuple[Tensor, Tensor, Tensor], ray_offsets: Tensor, distances: Tensor
-) -> tuple[Tensor, Tensor]:
-    """The sum of the `sighting_loss` of packed rays, and its gradient to the densities of their samples.
-
-    With the transmittance T behind a sample and the light S from points that lie behind it, the derivative of the light
-    by the density is ``delta (T there - S)``.
-
-    Args:
-        density: [m].
-        samples: depths, deltas and weights [m].
-        ray_offsets: int32 [s + 1], the samples of each ray; the first may be beyond 0.
-        distances: [s], of the point that each ray ends at.
-
-    Returns:
-        (loss [], gradient [m]).
-    """
-    depths, deltas, weights = samples
-    counts = ray_offsets.diff()
-    ray = torch.repeat_interleave(counts)
-    near = seen_there(depths, deltas, distances[ray])
-    there = weights * near
-    # Sums along each ray are differences of sums along all of them, which float32 would round too much.
-    optical, light = (_sums_along(values, ray, counts) for values in (density * deltas, there))
-    total = torch.zeros_like(distances).index_add(0, ray, there)
-    known = torch.where(total > 1e-3, -1 / total, 0)
-    return sighting_loss(total).sum(), known[ray] * deltas * (torch.exp(-optical) * near - (total[ray] - light))
-
-
-def _sums_along(values: Tensor, ray: Tensor, counts: Tensor) -> Tensor:
-    """Running sums [m] of values [m] along each ray."""
-    sums = values.double().cumsum(0)
-    before = torch.nn.functional.pad(sums, (1, 0))[counts.cumsum(0) - counts]
-    return (sums - before[ray]).to(values.dtype)
 
 
 def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:

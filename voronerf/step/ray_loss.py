@@ -17,11 +17,13 @@ from torch import Tensor
 from voronerf.fields.radiance import activate_radiance
 from voronerf.ops.learn_outputs import learn_outputs
 from voronerf.ops.render_loss import RenderLoss, render_loss_gradient
+from voronerf.ops.sighting_gradient import sighting_gradient
+from voronerf.ops.sighting_gradient.reference import seen_there, sighting_loss
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.occupancy import HIDDEN
 from voronerf.rendering.renderer import Renderer
 from voronerf.rendering.samplers import Occupancy
-from voronerf.rendering.sampling import colour_loss, seen_there, sighting_gradient, sighting_loss
+from voronerf.rendering.sampling import colour_loss
 from voronerf.rendering.volume import Samples, gradient_shares
 from voronerf.router import Parts, VoronoiRouter
 
@@ -206,8 +208,15 @@ class Fused:
         first = int(seen.isnan().sum())
         begin, scale = int(samples.ray_offsets[first]), density_scale(cast(VoronoiRouter, self.renderer.field))
         density = found.density[begin:]
-        rest = samples.depths[begin:], samples.deltas[begin:], found.weights[begin:]
-        loss, slope = sighting_gradient(density, rest, samples.ray_offsets[first:], seen[first:])
+        loss, slope = sighting_gradient(
+            density,
+            samples.depths[begin:],
+            samples.deltas[begin:],
+            found.weights[begin:],
+            samples.ray_offsets[first:],
+            seen[first:],
+            backend=self.renderer.backend if density.is_cpu else "auto",  # a GPU has the reference alone
+        )
         # The density is a softplus of the output, whose derivative is 1 - exp(-density / scale) times the scale.
         gradient[begin:, 3] -= factor * scale * slope * torch.expm1(-density / scale)
         return factor * loss

@@ -26,13 +26,14 @@ from voronerf.ops.learn_outputs.reference import with_gradients
 from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
 from voronerf.ops.ray_runs.reference import OwnSamples, along_rays, answer, compose, sum_runs
 from voronerf.ops.ray_runs.reference import own_samples as keep_own
+from voronerf.ops.sighting_gradient.reference import seen_there, sighting_loss
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.marching import OPAQUE, Seen
 from voronerf.rendering.occupancy import HIDDEN
 from voronerf.rendering.rays import intersect_box
 from voronerf.rendering.renderer import Renderer
 from voronerf.rendering.samplers import Occupancy
-from voronerf.rendering.sampling import colour_loss, seen_there, sighting_loss
+from voronerf.rendering.sampling import colour_loss
 from voronerf.rendering.volume import Samples, ask, gradient_shares, normalised
 from voronerf.router import VoronoiRouter
 from voronerf.step.ray_loss import Batch, Found, density_scale, why_not_fused

@@ -195,7 +195,7 @@ def check_backend(config: TrainConfig, device: torch.device) -> None:
     Raises:
         BackendUnavailable: names the op.
     """
-    marching = ("march_rays", "update_occupancy", "learn_outputs", "render_loss_gradient") if config.occupancy else ()
+    marching = ("march_rays", "observe_occupancy", "learn_outputs", "render_loss_gradient") if config.occupancy else ()
     drawing = () if SAMPLERS[config.sampling].passes == 1 else ("resample",)
     ops = ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite")
     for op in (*ops, *marching, *drawing):

@@ -154,10 +154,12 @@ def contracted(points: list[Tensor], contraction: Tensor | None) -> list[Tensor]
         return points
     if contraction.dim() == 1:
         centre, radius = contraction[:3], contraction[3]
-        x, y, z = ((points[axis] - centre[axis]) / radius for axis in range(3))
+        scale = radius.reciprocal()
+        x, y, z = ((points[axis] - centre[axis]) * scale for axis in range(3))
         # The root in float64 rounds as one in float32 should, which that of torch does not.
         length = (x * x + y * y + z * z).double().sqrt().to(x.dtype).clamp_min(1)
-        factor = (2 - length.reciprocal()) / length
+        inverse = length.reciprocal()
+        factor = (2 - inverse) * inverse
         return [centre[axis] + radius * offset * factor for axis, offset in enumerate((x, y, z))]
     centre, (near, across, down) = contraction[0], contraction[4].unbind()
     x, y, z = (points[axis] - centre[axis] for axis in range(3))

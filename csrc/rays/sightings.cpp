@@ -1,0 +1,60 @@
+// Each ray depends on itself alone, and one thread sums their losses, so results do not depend on the threads.
+#include "rays/sightings.h"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+#include <string>
+
+#include "common/parallel.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr float kLeast = 1e-3f;  // light of a ray whose loss has a gradient
+
+bool seen_there(const Sightings& in, int64_t i, float distance) {
+  return std::fabs(in.depths[i] - distance) <= in.nearby * distance + in.deltas[i];
+}
+
+float learn_ray(const Sightings& in, int64_t begin, int64_t end, float distance, float* gradient) {
+  double sum = 0.0;
+  for (int64_t i = begin; i < end; ++i) sum += seen_there(in, i, distance) ? static_cast<double>(in.weights[i]) : 0.0;
+  const float total = static_cast<float>(sum);
+  if (!(total > kLeast)) {
+    std::fill(gradient + begin, gradient + end, 0.0f);
+    return total == total ? -std::log(kLeast) : total;
+  }
+  double optical = 0.0, light = 0.0;
+  for (int64_t i = begin; i < end; ++i) {
+    const bool there = seen_there(in, i, distance);
+    optical += static_cast<double>(in.density[i] * in.deltas[i]);
+    light += there ? static_cast<double>(in.weights[i]) : 0.0;
+    const float through = there ? std::exp(-static_cast<float>(optical)) : 0.0f;
+    gradient[i] = -in.deltas[i] / total * (through - (total - static_cast<float>(light)));
+  }
+  return -std::log(std::min(total, 1.0f));
+}
+
+}  // namespace
+
+void sighting_gradient_cpu(const Sightings& in, float* loss, float* of_rays, float* gradient, int threads) {
+  constexpr int64_t kRays = 64;  // of a task
+  bool rising = true;
+  for (int64_t i = 0; i < in.s; ++i) rising &= in.offsets[i] <= in.offsets[i + 1];
+  const int64_t first = in.offsets[0];
+  if (!rising || in.offsets[in.s] - first != in.m) {
+    throw std::invalid_argument("sighting_gradient: ray_offsets must rise, by the number of samples, " +
+                                std::to_string(in.m) + ", got offsets from " + std::to_string(first) + " to " +
+                                std::to_string(in.offsets[in.s]));
+  }
+  parallel_for(in.s, kRays, threads, [&](int64_t i) {
+    of_rays[i] = learn_ray(in, in.offsets[i] - first, in.offsets[i + 1] - first, in.distances[i], gradient);
+  });
+  double sum = 0.0;
+  for (int64_t i = 0; i < in.s; ++i) sum += static_cast<double>(of_rays[i]);
+  *loss = static_cast<float>(sum);
+}
+
+}  // namespace voronerf
