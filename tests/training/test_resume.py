@@ -154,6 +154,7 @@ def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
 @pytest.mark.parametrize("contraction", ["none", "sphere"])
 def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch, contraction):
     monkeypatch.setattr("voronerf.step.cells.REVISIT_EVERY", 2)
+    monkeypatch.setattr("voronerf.step.cells.SETTLING_STEPS", 5)
     monkeypatch.setattr("voronerf.training.rates.FILL", 1.5)  # other numbers of rays in every step
     settings = {"contraction": contraction, "precision": "fp32" if contraction == "none" else "bf16"}
     found = assert_resumes(tmp_path, scene, 15, occupancy=True, occupancy_resolution=8, ray_growth=8, **settings)

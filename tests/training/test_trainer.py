@@ -337,6 +337,32 @@ def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch):
         assert evaluate(loaded, scene, views=1) == evaluate(trainer.renderer, scene, views=1)
 
 
+@pytest.mark.parametrize(("contraction", "settling"), [("sphere", 4), ("none", 0)])
+def test_a_grid_in_a_sphere_settles_before_it_learns(tmp_path, scene, monkeypatch, contraction, settling):
+    monkeypatch.setattr("voronerf.step.cells.SETTLING_STEPS", 4)
+    monkeypatch.setattr("voronerf.step.cells.REVISIT_EVERY", 1)
+    settings = {"contraction": contraction, "occupancy": True, "occupancy_resolution": 8, "cells": ()}
+    trainer = Trainer(small(tmp_path, **settings), scene)
+    new, learnt, most = trainer.occupancy.density.clone(), [], []
+    sample = trainer.renderer.sampler.sample
+
+    def counted(*rays, **given):
+        samples = sample(*rays, **given)
+        most.append(int(samples.ray_offsets.diff().max()))
+        return samples
+
+    def look(progress):
+        learnt.append(not torch.equal(trainer.occupancy.density, new))
+        if progress.step == 6:
+            trainer.request_stop()
+
+    monkeypatch.setattr(trainer.renderer.sampler, "sample", counted)
+    trainer.on_step = look
+    trainer.advance()
+    assert learnt == [step >= settling for step in range(6)]
+    assert all((count <= 12 // 4) == (step < settling) for step, count in enumerate(most[:6]))
+
+
 @pytest.mark.cuda
 def test_training_on_a_gpu(tmp_path, scene):
     config = small(tmp_path, device="cuda", assignment="stochastic")

@@ -27,6 +27,8 @@ from voronerf.rendering.volume import Rendered, Samples, Space
 
 #: Share of the first pass in the loss if one network is evaluated in two passes (mip-NeRF, section 3.2).
 COARSE_SHARE = 0.1
+#: One in so many strata is left while an occupancy grid settles.
+SETTLING_PART = 4
 #: Renders samples through one of the networks of a cell, given by its name.
 Look = Callable[[str, Samples], Rendered]
 
@@ -131,6 +133,8 @@ class Occupancy(Stratified):
 
     Attributes:
         grid: Which space is empty; all space outside its box is.
+        settling: Whether the grid has learnt nothing yet. A training step then takes a part of the strata, since no
+            space is skipped, and since a young field finds its surfaces sooner by fewer and longer ones.
 
     Args:
         grid: Can be set at any time. With a contraction it is in contracted space.
@@ -169,6 +173,7 @@ class Occupancy(Stratified):
         if self.space.cones or (grid.contraction is None) != (self.space.contraction is None):
             raise ValueError("Occupancy: grid must be of points, and in the space of the contraction")
         self.grid, self.picture_samples = grid, picture_samples or samples
+        self.settling = False
 
     def sample(
         self,
@@ -207,6 +212,8 @@ class Occupancy(Stratified):
             picture: Whether the strata are those of a picture.
         """
         samples = self.picture_samples if picture else self.samples
+        if self.settling and not picture:
+            samples = max(1, samples // SETTLING_PART)
         walk: dict[str, Any] = {"seed": seed, "start": start, "most": most, "backend": self.backend}
         if seed is not None and start is None and not _on_host(near):  # a training step waits for no device
             walk["capacity"] = max(1, len(near) * samples)

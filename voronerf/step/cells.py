@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -15,8 +15,10 @@ from torch import Tensor
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.reservoir import SampleReservoir, select_heaviest
 from voronerf.diagram.subdivision import Split, split_diagram
+from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.rendering.renderer import Renderer
+from voronerf.rendering.samplers import Occupancy
 from voronerf.router import VoronoiRouter
 from voronerf.step.ray_loss import Found
 from voronerf.step.schedule import PlannedSplit
@@ -26,6 +28,9 @@ from voronerf.step.schedule import PlannedSplit
 REVISIT_EVERY, REVISITED, MOST_REVISITED = 16, 1 / 8, 32_768
 #: The factor on what a voxel remembers for each sample of a batch in it.
 DECAY = 0.8
+#: In a contracted sphere, the first steps of a run, in which the grid learns nothing. A young field is thin everywhere:
+#: a grid would take it for empty, and what is emptied no longer learns.
+SETTLING_STEPS = 400
 #: Steps between tries to split the worst cell.
 SPLIT_EVERY = 5
 
@@ -124,6 +129,11 @@ class Cells:
         return self.renderer.occupancy
 
     @property
+    def sampler(self) -> Occupancy:
+        """That of a renderer with a grid."""
+        return cast(Occupancy, self.renderer.sampler)
+
+    @property
     def diagram(self) -> VoronoiDiagram:
         """The cells."""
         return self.routers["field"].diagram
@@ -142,9 +152,15 @@ class Cells:
     # --- samples -----------------------------------------------------------------------------------------------------
 
     def revisit(self, step: int) -> None:
-        """Before some steps, evaluates the field in random voxels, so that what was wrongly found empty comes back."""
+        """Before some steps, evaluates the field in random voxels, so that what was wrongly found empty comes back.
+
+        In the first `SETTLING_STEPS` in a contracted sphere, tells the sampler that the grid has learnt nothing yet.
+        """
         grid = self.grid
-        if grid is None or step % REVISIT_EVERY:
+        if grid is None:
+            return
+        self.sampler.settling = isinstance(grid.contraction, Contraction) and step < SETTLING_STEPS
+        if self.sampler.settling or step % REVISIT_EVERY:
             return
         self.routers["field"].eval()
         every = grid.occupied.numel()
@@ -172,7 +188,7 @@ class Cells:
 
     def observe(self, found: Found) -> None:
         """Teaches the occupancy grid what the samples of a step found."""
-        if self.grid is not None:
+        if self.grid is not None and not self.sampler.settling:
             observed = found.samples.positions, found.density, found.samples.deltas, found.weights
             self.grid.observe(*observed, decay=DECAY, backend=self.renderer.backend)
 
