@@ -28,14 +28,13 @@ def beside(run_folder: Path, data: Path, view: int | None) -> Image.Image:
     assert config is not None
     scene = load_scene(data, downscale=config.downscale, format=config.format, kind=config.kind)
     run = open_run(run_folder, scene=scene)
-    summary = run.evaluate()
-    scores = [each["psnr"] for each in summary["views"]]
-    number = int(np.argsort(scores)[len(scores) // 2]) if view is None else view
-    truth = scene.test.truth(number, scene.background_colour())
-    drawn = run.render(number, heaviest=False).colour.clamp(0, 1)
+    if view is None:
+        scores = [each["psnr"] for each in run.evaluate()["views"]]
+        view = int(np.argsort(scores)[len(scores) // 2])
+    truth = scene.test.truth(view, scene.background_colour())
+    drawn = run.render(view, heaviest=False).colour.clamp(0, 1)
     said = f"{float(psnr(drawn, truth)):.2f} dB, SSIM {float(ssim(drawn, truth)):.3f}"
-    mean = f"{summary['psnr']:.2f} dB, {summary['ssim']:.3f}"
-    print(f"{run_folder}: view {scene.test.names[number]}: {said}; all {len(scores)}: {mean}")
+    print(f"{run_folder}: {scene.test.names[view]}: {said}")
     pictures = {"photograph, held out": truth, f"voronerf, {said}": drawn}
     height, width = truth.shape[:2]
     scale = min(1.0, LONGEST / max(height, width))
