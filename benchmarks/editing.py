@@ -40,13 +40,15 @@ RESULT = Path(__file__).parent / "results" / "editing.json"
 PICTURES = Path(__file__).parent.parent / "docs" / "images"
 BLOCKS, SIZE, BLEND = 2, 64, 0.03
 OVERLAP = 0.1  # of a half, on each side of the border
+TOGETHER = 0.2  # share of the time in which joined halves are trained together
 
 
 def keep(name: str, values: list, **extra: object) -> None:
     """Adds a part to the JSON."""
-    known = json.loads(RESULT.read_text()) if RESULT.is_file() else {"results": {}}
-    command = "python benchmarks/editing.py city | stream --out DIR"
-    known = {"metadata": metadata(command=command, **extra), "results": {**known["results"], name: values}}
+    known = json.loads(RESULT.read_text()) if RESULT.is_file() else {"metadata": {}, "results": {}}
+    command, here = "python benchmarks/editing.py city | stream --out DIR", metadata(**extra)
+    parts = {**known["metadata"].get("parts", {}), name: here}  # each of a machine of its own
+    known = {"metadata": {"command": command, "parts": parts}, "results": {**known["results"], name: values}}
     RESULT.write_text(json.dumps(known, indent=1) + "\n")
     print(json.dumps(values, indent=1))
 
@@ -95,19 +97,25 @@ def city(out: Path, seconds: float, seeds: list[int]) -> None:
     places = scene.train.cameras.origins[:, 0]
     for seed in seeds:
         runs = {"one training": train(out / f"one-{seed}", scene, 2 * seconds, seed, cells=(16,))}
-        for way in ("views by position", "pixels by cell"):
-            halves = []
+        for way, together in itertools.product(("views by position", "pixels by cell"), (0.0, TOGETHER)):
+            halves, own_seconds = [], (1 - together) * seconds
             for side in (0, 1):
                 sign = 1 if side == 0 else -1
                 near = sign * (places - middle) < OVERLAP * BLOCKS / 2
                 own = seen(scene, views=near) if way == "views by position" else seen(scene, box=half(scene, side))
-                name = f"{way.split()[0]}-{side}-{seed}"
-                run = train(out / name, own, seconds, seed, cells=(8,))
+                name = f"{way.split()[0]}-{side}-{seed}-{own_seconds:g}"
+                run = train(out / name, own, own_seconds, seed, cells=(8,))
                 box = half(scene, side).tolist()
                 there = out / f"cut-{name}"
                 halves.append(open_run(there, scene=scene) if there.exists() else run.cut(Solid.box(*box), there))
-            there = out / f"joined-{way.split()[0]}-{seed}"
+            there = out / f"joined-{way.split()[0]}-{seed}-{own_seconds:g}"
             joined = open_run(there, scene=scene) if there.exists() else Run.join(halves, there)
+            if together:
+                way += ", then together"
+                if not (there / "summary.json").is_file():
+                    config = replace(joined.config, resume=True, out=there, budget=2 * together * seconds, steps=None)
+                    Trainer(config, scene, clock=time.process_time, on_event=print).run()
+                joined = open_run(there, scene=scene)
             runs[way] = replace(joined, scene=scene)
         for way, run in runs.items():
             row = {"way": way, "seed": seed, "cells": run.router.num_cells}
@@ -130,7 +138,16 @@ def city(out: Path, seconds: float, seeds: list[int]) -> None:
             truth = picture_of_colour(scene.test.truth(4, scene.background_colour()))
             save_picture(PICTURES / "editing-join.png", contact_sheet({"truth": truth, **pictures, "blended": blended}))
     keep(
-        "city", rows, **{"blocks": BLOCKS, "size": SIZE, "seconds of a half": seconds, "margin": BLEND, "seeds": seeds}
+        "city",
+        rows,
+        **{
+            "blocks": BLOCKS,
+            "size": SIZE,
+            "seconds of a half": seconds,
+            "margin": BLEND,
+            "seeds": seeds,
+            "together": TOGETHER,
+        },
     )
     cuts, whole = [], out / f"one-{seeds[0]}"
     run = open_run(whole, scene=scene)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
+import signal
 from dataclasses import replace
 
 import pytest
@@ -15,7 +17,8 @@ from voronerf import Run, editing, open_run
 from voronerf.cli.main import main
 from voronerf.data import builtin_scene
 from voronerf.router import Parts, Similarity, Solid
-from voronerf.step import Step
+from voronerf.step import Batch, Step
+from voronerf.step.ray_loss import Composed, Fused
 from voronerf.training.checkpoint import CheckpointError
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.trainer import Trainer
@@ -87,7 +90,7 @@ def test_runs_of_different_fields_are_joined(opened, runs, tmp_path) -> None:
         assert torch.allclose(density[own], run.router(*asked)[1][inside][own], rtol=1e-4, atol=1e-5)
     assert joined.evaluate(lpips="off")["psnr"] > 8
     told = Step(joined.renderer).explain()
-    assert "the run has several parts" in told and "part 1: 4 of 4 cells, NeRF" in told
+    assert "networks, colours, loss and gradients in one operation" in told and "part 1: 4 of 4 cells, NeRF" in told
     assert [contents(run) for run in runs] == before
 
 
@@ -177,6 +180,33 @@ def test_an_object_is_placed_on_top(opened, tmp_path) -> None:
     assert [part.layer for part in again.router] == [0]
 
 
+@pytest.mark.parametrize("backward", [False, True])
+def test_parts_learn_in_one_operation(opened, tmp_path, scene, backward) -> None:
+    """Networks of two architectures and sizes, one of them moved and scaled, as torch differentiates them."""
+    frames = [Similarity(), Similarity.of((0.5, 0.1, 0), (0, 20, 30), 0.7)]
+    run = Run.join(opened, tmp_path / "run", frames=frames)
+    run.router.parts[1][0].module.density_scale = 7.0
+    run.router.requires_grad_().train()
+    rays = scene.train.cameras.image_rays(1)
+    r = len(rays)
+    batch = Batch(rays, torch.full((r,), 1.0), torch.full((r,), 6.0), torch.rand(r, 3), torch.ones(3))
+    assert isinstance(Step(run.renderer).way, Fused)
+    grads, results = [], []
+    for kind in (Composed, Fused):
+        run.router.zero_grad()
+        found = kind(run.renderer, 0.0)(batch, torch.Generator().manual_seed(0), backward=backward)
+        if not backward:
+            (2 * found.loss).backward()
+        grads.append([parameter.grad for parameter in run.router.parameters()])
+        results.append(found)
+    first, second = results
+    for name in ("loss", "error", "weights", "density"):
+        assert torch.allclose(getattr(first, name), getattr(second, name), rtol=1e-4, atol=1e-5), name
+    for one, two in zip(*grads, strict=True):
+        assert (one - two).norm() <= 2e-3 * one.norm()  # what next to no light reaches learns nothing in one of them
+    assert (first.density == 0).any() and all(bool(grad.any()) for grad in grads[1])
+
+
 def test_a_joined_run_trains_and_resumes_bit_for_bit(opened, tmp_path, scene) -> None:
     joined = Run.join(opened, tmp_path / "one")
     before = joined.evaluate(lpips="off")["psnr"]
@@ -245,6 +275,14 @@ def test_a_full_disk_leaves_nothing(opened, tmp_path, monkeypatch) -> None:
     with pytest.raises(OSError, match=r"No space left on device.*joined"):
         Run.join(opened, tmp_path / "joined")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_command_that_is_ended_leaves_nothing(runs, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(editing, "write_scene", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    with pytest.raises(SystemExit) as ended:
+        main(["cut", str(runs[0]), "--cells", "0", "--out", str(tmp_path / "out")])
+    assert ended.value.code == 128 + signal.SIGTERM and not list(tmp_path.iterdir())
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_out_is_a_new_folder(opened, tmp_path) -> None:

@@ -36,9 +36,6 @@ from voronerf.training.run_directory import check_folders, check_stored_paths
 from voronerf.training.state import stored_values
 from voronerf.training.streaming import Pages, bytes_of
 
-#: Pictures of a run of more parts than these are rendered in so many squares along their longer side: a square meets
-#: the networks of few of them, which fit into a bound on memory. It does not depend on a bound, so pictures do not.
-FEW_PARTS, TILES = 8, 8
 #: File of a run's crop: the lowest and the highest corner.
 CROP = "crop.json"
 
@@ -423,7 +420,6 @@ def open_run(
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
     field = routers["field"]
     if isinstance(field, Parts):
-        renderer.tiles = TILES if len(field) > FEW_PARTS else 1
         restore_coarse(field, checkpoint)
         field.detail = detail
     if detail and not (isinstance(field, Parts) and any(part.coarse for part in field)):

@@ -35,8 +35,9 @@ def size_of(run: Path) -> int:
 
 def tell(made: Run) -> int:
     """Says what was written."""
-    parts = len(getattr(made.router, "parts", (0,)))
-    say(f"wrote {made.path}: {made.router.num_cells} cells in {parts} parts, {size_of(made.path) / 2**20:.1f} MiB")
+    counts = {"cell": made.router.num_cells, "part": len(getattr(made.router, "parts", (0,)))}
+    cells, parts = (f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items())
+    say(f"wrote {made.path}: {cells} in {parts}, {size_of(made.path) / 2**20:.1f} MiB")
     return 0
 
 

@@ -9,11 +9,12 @@ import inspect
 import itertools
 import os
 import re
+import signal
 import sys
 import threading
 import unicodedata
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
@@ -93,9 +94,31 @@ def main(args: list[str] | None = None) -> int:
         return _run(args, told)
 
 
+@contextlib.contextmanager
+def _exit_on_sigterm() -> Iterator[None]:
+    """A context in which SIGTERM unwinds the stack, so that a command takes away what it has half written."""
+    here = threading.current_thread() is threading.main_thread()
+    if not here or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
 def _run(args: list[str] | None, told: TextIO) -> int:
     """:func:`main`, which says on ``told`` what went wrong."""
     args = sys.argv[1:] if args is None else args
+    if args[:1] and args[0] in ("join", "cut", "place", "update"):
+        with _exit_on_sigterm():
+            return _run_command(args, told)
+    return _run_command(args, told)
+
+
+def _run_command(args: list[str], told: TextIO) -> int:
+    """:func:`_run` of given words."""
     try:
         for word in args:  # the parser shows what it does not take as it came
             if any(unicodedata.category(char) == "Cc" for char in word):

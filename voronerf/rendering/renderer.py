@@ -57,6 +57,10 @@ class RenderedImage(NamedTuple):
 #: Shows what rays of a picture see: rays, near [r], far [r], background, and whether to find the heaviest samples.
 Look = Callable[[Rays, Tensor, Tensor, Tensor | None, bool], Seen]
 
+#: Pictures that ask the networks of more parts than these are rendered in so many squares along their longer side: a
+#: square meets few of them, which fit into a bound on memory. It does not depend on a bound, so pictures do not.
+FEW_PARTS, TILES = 4, 8
+
 
 class Renderer:
     """Renders the rays of a scene: fields, asked where a sampler says.
@@ -65,8 +69,6 @@ class Renderer:
         fields: By name.
         sampler: Can be set at any time.
         look: How pictures are made; None for this process alone, without randomness. Ranks have a way of their own.
-        tiles: Squares along the longer side of a picture that are rendered one after the other; 1 for rows, which is
-            faster. In a square, rays meet few parts of a scene.
 
     Args:
         fields: By the names of the sampler's networks; "field" has the colours.
@@ -94,7 +96,6 @@ class Renderer:
             raise ValueError(f"Renderer: fields must be {' and '.join(wanted)}, got {sorted(fields)}")
         self.fields, self.sampler, self.backend = dict(fields), sampler, backend
         self.look: Look | None = None
-        self.tiles = 1
 
     @property
     def field(self) -> Field:
@@ -184,12 +185,13 @@ class Renderer:
         return Seen(last.colour, last.opacity, last.depth, places)
 
     def _tiles(self, hit: Tensor, size: tuple[int, int], chunk: int) -> Iterator[Tensor]:
-        """The rays of a picture that are to be rendered, int64, in pieces: rows, or squares with `tiles`."""
-        if self.tiles == 1:
+        """The rays of a picture that are to be rendered, int64, in pieces: rows, which is faster, or squares."""
+        field = self.field
+        if not isinstance(field, Parts) or len(field) - len(field.far) <= FEW_PARTS:
             yield from hit.nonzero()[:, 0].split(chunk)
             return
         width, height = size
-        side = max(-(-max(size) // self.tiles), 1)
+        side = max(-(-max(size) // TILES), 1)
         numbers = torch.arange(width * height, device=hit.device).reshape(height, width)
         for top, left in itertools.product(range(0, height, side), range(0, width, side)):
             rows = numbers[top : top + side, left : left + side].reshape(-1)

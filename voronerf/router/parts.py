@@ -16,9 +16,9 @@ import functools
 import inspect
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -235,6 +235,26 @@ class Solid:
         return cls(tuple(tuple(map(float, row)) for row in values["planes"]), ball, bool(values["outside"]))
 
 
+class Asked(NamedTuple):
+    """A router that is asked about some points.
+
+    Attributes:
+        router: With the networks.
+        rows: int64 [q], which of all points these are; None for all in their order.
+        points: [q, 3], in the space of the networks.
+        directions: [r, 3], as the networks see them.
+        ray_index: int32 [q].
+        scale: Of the part's frame, by which densities are divided.
+    """
+
+    router: VoronoiRouter
+    rows: Tensor | None
+    points: Tensor
+    directions: Tensor
+    ray_index: Tensor
+    scale: float
+
+
 class Part(nn.Module):
     """Networks that stand somewhere in a scene: a diagram in a frame of its own, whose leaves have networks.
 
@@ -361,6 +381,24 @@ class Part(nn.Module):
         routers[source] = routers[source].part((~inside).nonzero()[:, 0])
         return self.changed(routers=routers, owner=owner)
 
+    def divide(self, children: Mapping[int, Tensor]) -> tuple[Part, Tensor]:
+        """A part that looks the same, some cells of which are divided; what their routers share is copied.
+
+        Args:
+            children: The number of a cell, and centres [c, 3] in the space of the networks.
+
+        Returns:
+            The part, and int64 [its cells], the cell that each was of.
+        """
+        leaves = self.leaves
+        diagram, parents = self.diagram.refine({int(leaves[cell]): centres for cell, centres in children.items()})
+        owner, routers = self.owner[parents], list(self)
+        for index, router in enumerate(self):
+            before, after = ((owners == index).nonzero()[:, 0] for owners in (self.owner, owner))
+            if len(after) > len(before):
+                routers[index] = router.with_cells(diagram.part(after), torch.searchsorted(before, parents[after]))
+        return self.changed(routers=routers, diagram=diagram, owner=owner), self.number[parents[owner >= 0]].long()
+
     def keep(self, cells: Tensor) -> Part | None:
         """The part without the networks of other cells; None without any. Cells are numbers, int64 [c]."""
         kept = torch.zeros(self.num_cells, dtype=torch.bool, device=self.owner.device)
@@ -409,6 +447,22 @@ class Part(nn.Module):
         """Points [n, 3] of the part's frame in the space of the networks."""
         return own if self.contraction is None else self.contraction.points(own)
 
+    def asked(
+        self, own: Tensor, leaf: Tensor | None, directions: Tensor, ray_index: Tensor, backend: str = "auto"
+    ) -> list[Asked]:
+        """Which routers are asked about points that the part speaks for. Arguments are those of :meth:`evaluate`."""
+        points, directions = self.contracted(own), self.frame.inverse.directions(directions)
+        if len(self.routers) == 1 or leaf is None:
+            return [Asked(self[0], None, points, directions, ray_index, self.frame.scale)]
+        order, offsets = ops.cell_sort(self.owner[leaf], len(self.routers), backend=backend)
+        found, first = list[Asked](), 0
+        for router, last in zip(self, offsets[1:].tolist(), strict=True):
+            rows = order[first:last].long()
+            if len(rows):
+                found.append(Asked(router, rows, points[rows], directions, ray_index[rows], self.frame.scale))
+            first = last
+        return found
+
     def evaluate(
         self, own: Tensor, leaf: Tensor | None, directions: Tensor, ray_index: Tensor, backend: str = "auto"
     ) -> tuple[Tensor, Tensor]:
@@ -421,19 +475,14 @@ class Part(nn.Module):
             ray_index: int32 [m].
             backend: Of the sorting.
         """
-        points, directions = self.contracted(own), self.frame.inverse.directions(directions)
-        if len(self.routers) == 1 or leaf is None:
-            colour, density = _ask(self[0], points, directions, ray_index)
-        else:
-            order, offsets = ops.cell_sort(self.owner[leaf], len(self.routers), backend=backend)
-            pieces, first = [], 0
-            for router, last in zip(self, offsets[1:].tolist(), strict=True):
-                rows = order[first:last].long()
-                if len(rows):
-                    pieces.append((rows, *_ask(router, points[rows], directions, ray_index[rows])))
-                first = last
-            rows, *found = (torch.cat(tensors) for tensors in zip(*pieces, strict=True))
-            colour, density = (torch.zeros_like(x).index_copy(0, rows, x) for x in found)
+        asked = self.asked(own, leaf, directions, ray_index, backend)
+        pieces = [_ask(each.router, each.points, each.directions, each.ray_index) for each in asked]
+        colour, density = (
+            torch.cat(tensors) if len(pieces) > 1 else tensors[0] for tensors in zip(*pieces, strict=True)
+        )
+        if asked[0].rows is not None:
+            rows = torch.cat([cast(Tensor, each.rows) for each in asked])
+            colour, density = (torch.zeros_like(x).index_copy(0, rows, x) for x in (colour, density))
         return colour, density if self.frame.is_identity else density / self.frame.scale
 
 
@@ -642,7 +691,17 @@ class Parts(nn.Module):
             for _, taken, _, _, share in claims:
                 total.index_add_(0, taken, cast(Tensor, share))
             claims = [(i, rows, own, leaf, cast(Tensor, w) / total[rows]) for i, rows, own, leaf, w in claims]
-        return sorted((claim for claim in claims if len(claim[1])), key=lambda claim: claim[0])
+            return sorted((claim for claim in claims if len(claim[1])), key=lambda claim: claim[0])
+        merged = []
+        for index in sorted({claim[0] for claim in claims}):
+            same = [claim[1:4] for claim in claims if claim[0] == index and len(claim[1])]
+            if same:
+                rows, own, leaf = (torch.cat(column) for column in zip(*same, strict=True))
+                if len(same) > 1 and len(rows) == n:  # all of them are taken to be in their order
+                    order = rows.argsort()
+                    rows, own, leaf = rows[order], own[order], leaf[order]
+                merged.append((index, rows, own, leaf, None))
+        return cast(Any, merged)
 
     def _claim(
         self, index: int, positions: Tensor, rows: Tensor, weights: Tensor | None
@@ -667,6 +726,9 @@ class Parts(nn.Module):
         places = positions[rows][:, None]
         inside = ((places >= boxes[:, 0]) & (places <= boxes[:, 1])).all(-1)
         found = []
+        if not weighted and not bool((inside.sum(1) > 1).any()):  # nothing to compare
+            columns = inside.any(0).nonzero()[:, 0].tolist()
+            return [self._claim(of[column], positions, rows[inside[:, column]], None) for column in columns]
         for column in inside.any(0).nonzero()[:, 0].tolist():
             index, near = of[column], rows[inside[:, column]]
             claim = self._claim(index, positions, near, None)
@@ -741,6 +803,16 @@ class Parts(nn.Module):
             both = both.new_zeros(n, 4).index_add(0, rows, both)
             return None, both[:, :3], both[:, 3]
         return rows, colour, density
+
+    def asked(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> list[Asked]:
+        """Which routers are asked about positions of a scene of one layer. Arguments are those of :meth:`forward`."""
+        found = list[Asked]()
+        for index, rows, own, leaf, _ in self._claims(0, positions):
+            whole = len(rows) == len(positions)  # claims of several parts are in any order, that of one in theirs
+            for each in self[index].asked(own, leaf, directions, ray_index if whole else ray_index[rows], self.backend):
+                mine = each.rows if whole else rows if each.rows is None else rows[each.rows]
+                found.append(each._replace(rows=mine))
+        return found
 
     def explain(self) -> str:
         """What the parts are, and how their routers are carried out: some lines."""

@@ -244,11 +244,19 @@ class VoronoiRouter(nn.Module):
             >>> router.part(torch.tensor([2, 5])).module.weight.shape
             torch.Size([2, 1, 3])
         """
-        diagram = self.diagram.part(cells)
+        return self.with_cells(self.diagram.part(cells), cells)
+
+    def with_cells(self, diagram: VoronoiDiagram, parents: Tensor) -> VoronoiRouter:
+        """A copy with the cells of another diagram, each of which has the parameters of one of this router's.
+
+        Args:
+            diagram: c cells.
+            parents: int64 [c], numbers of this router's cells.
+        """
         taken = copy.deepcopy(self)
-        renew_cells(taken.module, cells, torch.zeros(len(cells), dtype=torch.bool))
+        renew_cells(taken.module, parents, torch.zeros(len(parents), dtype=torch.bool))
         taken.diagram = diagram
-        taken._set_frozen(self.frozen[cells])
+        taken._set_frozen(self.frozen[parents])
         return taken
 
     # Cells ------------------------------------------------------------------------------------------------------------

@@ -7,7 +7,9 @@ several territories.
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from voronerf.fields.radiance import activate_radiance
 from voronerf.ops.learn_outputs import learn_outputs
+from voronerf.ops.learn_outputs.reference import Loss
 from voronerf.ops.render_loss import RenderLoss, render_loss_gradient
 from voronerf.ops.sighting_gradient import sighting_gradient
 from voronerf.ops.sighting_gradient.reference import seen_there, sighting_loss
@@ -26,6 +29,10 @@ from voronerf.rendering.samplers import Occupancy
 from voronerf.rendering.sampling import colour_loss
 from voronerf.rendering.volume import Samples, gradient_shares
 from voronerf.router import Parts, VoronoiRouter
+from voronerf.router.parts import Asked
+
+#: What a network puts out where there is nothing: its density is 0.
+EMPTY = -1e4
 
 
 @dataclass(frozen=True)
@@ -118,19 +125,91 @@ class RayLoss(Protocol):
         ...
 
 
-def why_not_fused(renderer: Renderer) -> str | None:
+def why_not_fused(renderer: Renderer, sightings: float = 0.0) -> str | None:
     """What keeps networks, colours, loss and gradients from being one operation; None if nothing does."""
     field = renderer.field
     if not isinstance(renderer.sampler, Occupancy):
         return "empty space is not skipped"
-    if not isinstance(field, VoronoiRouter):
-        several = isinstance(field, Parts)
-        return "the run has several parts" if several else f"the field is a {type(field).__name__}, no router"
-    if getattr(type(field.module), "activate", None) is not activate_radiance:
-        return f"{type(field.module).__name__} does not say what its outputs mean (activate = activate_radiance)"
-    if field.coords not in (None, "first3"):
+    if isinstance(field, VoronoiRouter):
+        return _why_not_by_table(field)
+    if not isinstance(field, Parts):
+        return f"the field is a {type(field).__name__}, no router"
+    if len(field.layers) > 1 or field.hidden is not None:
+        return "densities of several layers add up" if len(field.layers) > 1 else "cells are hidden"
+    if sightings:
+        return "sightings are learnt from, and the run has several parts"
+    return next((obstacle for router in field.routers if (obstacle := _why_not_by_table(router))), None)
+
+
+def _why_not_by_table(router: VoronoiRouter) -> str | None:
+    if getattr(type(router.module), "activate", None) is not activate_radiance:
+        return f"{type(router.module).__name__} does not say what its outputs mean (activate = activate_radiance)"
+    if router.coords not in (None, "first3"):
         return "other positions than those of the samples decide the cells"
-    return None if field.by_table else f"{type(field.module).__name__} does more than its layer table says"
+    return None if router.by_table else f"{type(router.module).__name__} does more than its layer table says"
+
+
+class Networks:
+    """The networks that the samples of a step are asked of, for a loss that knows its gradient to what they put out.
+
+    Attributes:
+        density_scale: The factor on the densities, per scene unit.
+        deltas: [m], the lengths of the samples, times what the factor of a sample's own network differs by.
+
+    Args:
+        asked: The networks, and which samples they are asked about.
+        samples: m samples.
+    """
+
+    @staticmethod
+    def of(field: VoronoiRouter | Parts, samples: Samples, directions: Tensor) -> Networks:
+        """Those of a router, or of parts in one layer, for which :func:`why_not_fused` is None; directions [r, 3]."""
+        given = samples.inputs, directions, samples.ray_index
+        return Networks(
+            [Asked(field, None, *given, 1.0)] if isinstance(field, VoronoiRouter) else field.asked(*given), samples
+        )
+
+    def __init__(self, asked: Sequence[Asked], samples: Samples) -> None:
+        self.asked, self.samples, self.deltas = asked, samples, samples.deltas
+        factors = [density_scale(each.router) / each.scale for each in self.asked]
+        self.density_scale, self.factor = factors[0] if factors else 1.0, None
+        if any(factor != factors[0] for factor in factors):
+            self.factor = torch.ones_like(samples.deltas)
+            for each, factor in zip(self.asked, factors, strict=True):
+                self.factor[each.rows] = factor / factors[0]
+            self.deltas = self.deltas * self.factor
+
+    def density(self, found: RenderLoss) -> Tensor:
+        """[m], per scene unit."""
+        return found.density if self.factor is None else found.density * self.factor
+
+    def learn(self, loss: Loss, *, backward: bool, backend: str) -> Tensor:
+        """`learn_outputs` of all networks; a sample that none of them speaks for is empty. Arguments as of that."""
+        given: dict[str, Any] = {"backward": backward, "backend": backend}
+        tables = [each.router.table_arguments(each.points, each.directions, each.ray_index) for each in self.asked]
+        if len(tables) == 1 and self.asked[0].rows is None:
+            return learn_outputs({**cast(Any, tables[0]), "rows": self.samples.rows}, loss, **given)
+        raw, learnt = self.deltas.new_full((len(self.deltas), 4), EMPTY), list[Tensor]()
+
+        @torch.enable_grad()
+        def learn(index: int) -> Tensor:
+            """Puts out what this network and those after it say; the gradient of the loss of all of them."""
+            if index == len(tables):
+                total, gradient = loss(raw)
+                learnt.append(total)
+                return gradient
+            rows, found = self.asked[index].rows, list[Tensor]()
+
+            def own(out: Tensor) -> tuple[Tensor, Tensor]:
+                raw[rows] = out
+                found.append(learn(index + 1))
+                return out.new_zeros(()), found[0][rows]
+
+            learnt.append(learn_outputs(cast(Any, tables[index]), own, **given))
+            return found[0]
+
+        learn(0)
+        return functools.reduce(torch.add, learnt)
 
 
 class Fused:
@@ -147,31 +226,33 @@ class Fused:
     def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
         """As of :class:`RayLoss`."""
         renderer, directions, target, background = self.renderer, batch.rays.directions, batch.target, batch.background
-        field = cast(VoronoiRouter, renderer.field)
+        field = cast(VoronoiRouter | Parts, renderer.field)
         samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, jitter=True, generator=generator)
         all_rays = len(samples.ray_offsets) - 1
         seen = None
         if self.sightings and batch.seen is not None:
             seen = torch.nn.functional.pad(batch.seen, (len(batch.rays) - len(batch.seen), 0), value=math.nan)
-        if seen is not None or field.frozen_cells is not None:
+        frozen = isinstance(field, VoronoiRouter) and field.frozen_cells is not None
+        if seen is not None or frozen or isinstance(field, Parts):
             samples = samples.counted()
-        if field.frozen_cells is not None:
-            rays = _rays_to_learn(field, samples)
+        if frozen:
+            rays = _rays_to_learn(cast(VoronoiRouter, field), samples)
             samples, directions, target = samples.of_rays(rays), directions[rays], target[rays]
             if background is not None and background.dim() == 2:
                 background = background[rays]
             seen = None if seen is None else seen[rays]
+        networks = Networks.of(field, samples, directions)
         shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
         found: list[RenderLoss] = []
 
         def loss(raw: Tensor) -> tuple[Tensor, Tensor]:
             result, gradient = render_loss_gradient(
                 raw,
-                samples.deltas,
+                networks.deltas,
                 samples.ray_offsets,
                 target,
                 background=background,
-                density_scale=density_scale(field),
+                density_scale=networks.density_scale,
                 hidden=HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
                 backend=renderer.backend,
             )
@@ -187,11 +268,8 @@ class Fused:
                 total, gradient = (values * (len(target) / all_rays) for values in (total, gradient))
             return total, gradient
 
-        network = field.table_arguments(samples.inputs, directions, samples.ray_index)
-        assert network is not None
-        network["rows"] = samples.rows
-        total = learn_outputs(network, loss, backward=backward, backend=renderer.backend)
-        return Found(total, found[0].error, found[0].weights, found[0].density, samples)
+        total = networks.learn(loss, backward=backward, backend=renderer.backend)
+        return Found(total, found[0].error, found[0].weights, networks.density(found[0]), samples)
 
     def _learn_sightings(
         self, gradient: Tensor, found: RenderLoss, samples: Samples, seen: Tensor, factor: float

@@ -38,7 +38,7 @@ class Step:
     @property
     def way(self) -> RayLoss:
         """The fastest way to the loss; here alone it is chosen."""
-        if why_not_fused(self.renderer) is None:
+        if why_not_fused(self.renderer, self.sightings) is None:
             return Fused(self.renderer, self.sightings)
         return Composed(self.renderer, self.sightings)
 
@@ -61,7 +61,7 @@ class Step:
         if isinstance(sampler, Occupancy):
             lines[0] += f", of which {sampler.grid.share:.0%} of the grid are left"
         lines.append(f"loss: {self.way.explain()}")
-        obstacle = why_not_fused(renderer)
+        obstacle = why_not_fused(renderer, self.sightings)
         if obstacle is None:
             device, dtype = renderer.device, torch.float32
             chosen = backends.chosen("learn_outputs", device, dtype, backend=renderer.backend)
