@@ -618,10 +618,3 @@ def spherical_harmonics_backward(_0: Tensor | None, _1: Tensor | None, _2: Tenso
 # const float32*, const float32*, float32*, int64, int64, Cuda
 @overload
 def spherical_harmonics_backward(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: int, _4: int, _5: Cuda) -> None: ...
-
-# const float32*, const int32*, const float32*, float32*, uint8*, int64, int64, float32, float32, Cpu
-@overload
-def update_occupancy(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: float, _8: float, _9: Cpu) -> bool: ...
-# const float32*, const int32*, const float32*, float32*, uint8*, int64, int64, float32, float32, Cuda
-@overload
-def update_occupancy(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: float, _8: float, _9: Cuda) -> None: ...

@@ -56,7 +56,6 @@ from voronerf.ops import (
     resample,
     routed_mlp,
     spherical_harmonics,
-    update_occupancy,
 )
 from voronerf.rendering import OccupancyGrid
 from voronerf.router import VoronoiRouter
@@ -97,5 +96,4 @@ __all__ = [
     "spherical_harmonics",
     "split_diagram",
     "uniform_centres",
-    "update_occupancy",
 ]

@@ -1,4 +1,4 @@
-"""Cases of march_rays, update_occupancy, camera_rays and balance_centres.
+"""Cases of march_rays, camera_rays and balance_centres.
 
 r rays, s strata of a ray, n strata of all rays, cells, pixels or samples; k centres.
 """
@@ -41,11 +41,6 @@ def cases() -> list[Case]:
         work = functools.partial(_march_work, n, jitter)
         shown = ALL if base else ("native",)
         found.append(Case("march_rays", name, FULL, FORWARD, n, None, work, shown, base and not jitter))
-    for n in (1 << 16, 1 << 19):
-        base = n == 1 << 16
-        work = functools.partial(_update_work, n)
-        name = f"n={n} of {4 * n} cells"
-        found.append(Case("update_occupancy", name, FULL, FORWARD, n, None, work, ALL if base else ("native",), base))
     for n, bent in ((1 << 10, False), (1 << 18, False), (1 << 18, True)):
         base = n == 1 << 18
         work = functools.partial(_camera_work, n, bent)
@@ -143,63 +138,6 @@ def _march_masked(
     offsets = F.pad(kept.sum(1).cumsum(0), (1, 0)).int()
     ray = torch.arange(r, device=near.device, dtype=torch.int32)[:, None].expand(r, samples)[kept]
     return offsets, ray, depths[kept], (length / samples).expand(r, samples)[kept], positions[kept]
-
-
-def _update_work(n: int, device: torch.device) -> Work:
-    side = round((4 * n) ** (1 / 3))
-    shape = (4 * n // side // side, side, side)
-    total = shape[0] * side * side
-
-    def batch(seed: int) -> list[Tensor]:
-        random = generator(seed)
-        density = torch.rand(shape, generator=random) * 20
-        cells = torch.randperm(total, generator=random)[:n].int()
-        return [tensor.to(device) for tensor in (density, cells, torch.rand(n, generator=random) * 20)]
-
-    sets = [batch(seed) for seed in range(rotation(9 * total + 8 * n))]
-
-    def contender(function: Callable[..., Any]) -> Contender:
-        return Contender(lambda call: function(*sets[call % len(sets)], decay=0.6, threshold=10.0))
-
-    wide = [tensor.double() if tensor.is_floating_point() else tensor for tensor in sets[0]]
-    exact = _update_scatter(*wide, decay=0.6, threshold=10.0)
-
-    def error(found: Any) -> float:
-        # A density within rounding of the threshold may fall on either side.
-        clear = (exact[0] - 10.0).abs() > 1e-4
-        wrong = bool((found[1] != exact[1])[clear].any())
-        return float("inf") if wrong else relative_error(found[0], exact[0])
-
-    return Work(
-        lambda backend: contender(functools.partial(ops.update_occupancy, backend=backend)),
-        {
-            "torch index_select + index_put": lambda: contender(_update_gather),
-        },
-        error,
-        1e-5,
-        9.0 * total + 8.0 * n,
-        "copy",
-    )
-
-
-def _update_scatter(
-    density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float
-) -> tuple[Tensor, Tensor]:
-    """Right where a cell is named twice, too."""
-    flat, row = density.reshape(-1), cells.long()
-    faded = flat.scatter(0, row, flat[row] * decay)
-    result = faded.scatter_reduce(0, row, values, "amax").reshape(density.shape)
-    return result, result >= threshold
-
-
-def _update_gather(
-    density: Tensor, cells: Tensor, values: Tensor, *, decay: float, threshold: float
-) -> tuple[Tensor, Tensor]:
-    """As nerfacc updates its grid: right where every cell is named once."""
-    result = density.reshape(-1).clone()
-    result[cells] = torch.maximum(result[cells] * decay, values)
-    result = result.reshape(density.shape)
-    return result, result >= threshold
 
 
 def _camera_work(n: int, bent: bool, device: torch.device) -> Work:

@@ -200,7 +200,6 @@ def test_what_is_compared_is_right_in_every_small_case():
         "resample": sampling._resample_work(512, CPU),
         "march_rays": marching._march_work(1 << 13, False, CPU),
         "march_rays, jittered": marching._march_work(1 << 13, True, CPU),
-        "update_occupancy": marching._update_work(250, CPU),
         "camera_rays": marching._camera_work(300, False, CPU),
         "camera_rays, lens": marching._camera_work(300, True, CPU),
         "balance_centres": marching._balance_work(600, 5, CPU),
@@ -241,7 +240,6 @@ def test_wrong_answers_are_found():
         (lookup._sort_work(500, 7, CPU), lambda right: (right[0].flip(0), right[1]), 1e-6),
         (marched, lambda right: right._replace(depths=right.depths * 1.1), 0.05),
         (marched, lambda right: marched.ours("reference").run(1), 0.1),  # other rays
-        (marching._update_work(250, CPU), lambda right: (right[0], ~right[1]), infinite),
     ):
         right = work.ours("reference").run(0)
         assert work.error(right) < 1e-6 and work.error(spoilt(right)) >= least

@@ -129,12 +129,12 @@ def test_preload_compiles_into_the_cache_of_ones_choice(tmp_path):
     # In a process of its own, since Warp reads the place once; one file of kernels, since all take a while.
     code = (
         "import pkgutil, sys; every = pkgutil.iter_modules; "
-        "pkgutil.iter_modules = lambda path: [m for m in every(path) if m.name in ('update_occupancy', '_launch')]; "
+        "pkgutil.iter_modules = lambda path: [m for m in every(path) if m.name in ('observe_occupancy', '_launch')]; "
         "from voronerf.cli import main; sys.exit(main(['preload']))"
     )
     said = python("-c", code, env={**os.environ, "WARP_CACHE_PATH": str(tmp_path / "cache")})
-    assert "update_occupancy" in said and "1 files in" in said and str(tmp_path) in said
-    assert any("update_occupancy" in str(path) for path in (tmp_path / "cache").rglob("*"))
+    assert "observe_occupancy" in said and "1 files in" in said and str(tmp_path) in said
+    assert any("observe_occupancy" in str(path) for path in (tmp_path / "cache").rglob("*"))
 
 
 def test_resume_needs_no_setting_again(run, tmp_path):

@@ -38,7 +38,6 @@ from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.sighting_gradient import sighting_gradient
 from voronerf.ops.sparse_adam import Guard, Rule, adam, sparse_adam
 from voronerf.ops.spherical_harmonics import spherical_harmonics
-from voronerf.ops.update_occupancy import update_occupancy
 
 __all__ = [
     "MLP",
@@ -84,5 +83,4 @@ __all__ = [
     "sighting_gradient",
     "sparse_adam",
     "spherical_harmonics",
-    "update_occupancy",
 ]
