@@ -14,7 +14,7 @@ from torch import Tensor
 
 from voronerf import editing, updating
 from voronerf.data import Scene, load_scene
-from voronerf.data.record import placed, read_scene, within
+from voronerf.data.record import placed, read_scene, with_refined, within
 from voronerf.diagram import VoronoiDiagram
 from voronerf.editing import check_out
 from voronerf.evaluation.lpips import Lpips, find_lpips
@@ -225,6 +225,8 @@ class Run:
             OSError: When it cannot be written; nothing is left then.
         """
         check_out(Path(out))
+        if self.config.appearance:
+            raise ConfigError("--appearance must be off for a run that is updated: gains of new pictures are not known")
         source = editing.join([self.source], [Similarity()])
         checkpoint = last_checkpoint(self.path, keep=lambda name: name.startswith("errors."))
         usual = checkpoint.group("errors").get("usual")
@@ -415,6 +417,7 @@ def open_run(
     scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
     several = "parts" in checkpoint.values
     scene = within(scene, path) if several else scene
+    scene = with_refined(scene, path) if config.refine_cameras else scene
     if several and (config.territories or 1) > 1:  # as it was trained: its parts know their own settings
         config = joint_config(config, scene)
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)

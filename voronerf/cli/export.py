@@ -8,6 +8,7 @@ from typing import Literal
 from voronerf.cli.commands import given_path, say, tracked
 from voronerf.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
 from voronerf.evaluation.video import check_video
+from voronerf.export import cameras as camera_files
 from voronerf.export import cells as cell_files
 from voronerf.export import mesh as mesh_files
 from voronerf.export import points as point_files
@@ -24,6 +25,7 @@ def export(
     points: Path | None = None,
     mesh: Path | None = None,
     cells: Path | None = None,
+    cameras: Path | None = None,
     video: Path | None = None,
     count: int | None = None,
     fit: float = 60.0,
@@ -35,7 +37,7 @@ def export(
     spiral: bool = False,
     opening: Opening = AS_IN_TRAINING,
 ) -> int:
-    """Write a trained run as Gaussians, points, a mesh, the cells of its diagram, or a video, for other programs.
+    """Write a trained run as Gaussians, points, a mesh, the cells of its diagram, its cameras, or a video.
 
     Args:
         run: The run directory.
@@ -43,6 +45,8 @@ def export(
         points: Coloured points with normals on the surface, .ply.
         mesh: The surface as a coloured mesh, .ply, .glb or .obj.
         cells: The cells of the diagram, clipped to the box, an object of its own colour each, .glb.
+        cameras: Training and test cameras, as --refine-cameras has left them, as transforms.json. Images in the folder
+            images beside it are named with their sizes.
         video: A turntable, or the video of --spiral or --path, .mp4.
         count: Points or Gaussians at the most; default 200,000 points, 100,000 Gaussians.
         fit: Seconds for which the Gaussians are fitted.
@@ -63,9 +67,10 @@ def export(
         points: point_files.SUFFIXES,
         mesh: mesh_files.SUFFIXES,
         cells: cell_files.SUFFIXES,
+        cameras: camera_files.SUFFIXES,
     }
-    if not any((splat, points, mesh, cells, video)):
-        raise ConfigError("export needs a file: --splat, --points, --mesh, --cells or --video")
+    if not any((splat, points, mesh, cells, cameras, video)):
+        raise ConfigError("export needs a file: --splat, --points, --mesh, --cells, --cameras or --video")
     for file, suffixes in outputs.items():
         if file is not None:
             check_export(file, suffixes)
@@ -93,6 +98,8 @@ def export(
     if cells is not None:
         scene = cell_files.export_cells(opened, cells, box=box, to_files=to_files)
         say(f"wrote {cells}: {len(scene.geometry)} of {opened.diagram.num_cells} cells")
+    if cameras is not None:
+        say(f"wrote {cameras}: {camera_files.export_cameras(opened, cameras, to_files=to_files)} cameras")
     if video is not None:
         export_video(opened, video, flight=given, spiral=spiral, box=box, track=tracked)
         say(f"wrote {video}")

@@ -34,10 +34,10 @@ from voronerf.data.colmap import FILES, ColmapImage, depth_bounds, points_seen, 
 from voronerf.data.errors import SceneError
 from voronerf.data.folders import listed_images
 from voronerf.data.images import read_header, read_image
-from voronerf.data.lenses import COEFFICIENTS, MODELS
+from voronerf.data.lenses import MODELS
 from voronerf.data.soundness import camera_faults, lost_cameras
+from voronerf.data.transforms import Shot, write_transforms
 from voronerf.files import write_text
-from voronerf.ops.camera_rays.reference import FISHEYE, FOV
 
 #: Of a video. A playlist would name other files.
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
@@ -178,7 +178,14 @@ def process(
             f"another --camera-model, or more images; {work} has what was found"
         )
     _write_reduced(files, out)
-    _write_transforms(best.images, out)
+    shown = [
+        Shot(
+            f"images/{each.name}", torch.from_numpy(each.pose), each.camera.lens, each.camera.width, each.camera.height
+        )
+        for each in best.images
+    ]
+    with contextlib.suppress(SceneError):  # for a lens that only COLMAP has
+        write_transforms(out / "transforms.json", shown)
     (out / "sparse").mkdir(exist_ok=True)
     part = out / "sparse" / ".0"
     shutil.rmtree(part, ignore_errors=True)
@@ -466,21 +473,3 @@ def _write_reduced(files: Sequence[Path], out: Path) -> None:
                 quality = {} if path.suffix.lower() == ".png" else {"quality": 95}
                 image.reduce(factor).save(part / path.name, **quality)
         os.replace(part, folder)
-
-
-def _write_transforms(images: Sequence[ColmapImage], out: Path) -> None:
-    """Writes the cameras as nerfstudio and instant-ngp read them, unless the lens is none that they have."""
-    frames = []
-    for image in images:
-        (fx, fy, cx, cy), coefficients, model = image.camera.lens
-        values = {name: value for name, value in zip(COEFFICIENTS[model], coefficients) if value}
-        known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "p1", "p2", "k3")
-        if model == FOV or not values.keys() <= set(known):
-            return
-        lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": image.camera.width, "h": image.camera.height}
-        lens |= {name: values.get(name, 0.0) for name in known}
-        kind = {"camera_model": "OPENCV_FISHEYE" if model == FISHEYE else "OPENCV"}
-        frames.append({"file_path": f"images/{image.name}", "transform_matrix": image.pose.tolist(), **lens, **kind})
-    shared = {key: value for key, value in frames[0].items() if all(frame.get(key) == value for frame in frames)}
-    rest = [{key: value for key, value in frame.items() if key not in shared} for frame in frames]
-    write_text(out / "transforms.json", json.dumps({**shared, "frames": rest}, indent=1))

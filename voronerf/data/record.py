@@ -24,8 +24,13 @@ WORDS = {"spacing": ("linear", "disparity"), "background": ("white", None), "kin
 INTEGERS = {"sizes": torch.int64, "models": torch.int32}
 
 
-def write_scene(path: Path, scene: Scene) -> None:
+def write_scene(path: Path, scene: Scene, *, refined: Cameras | None = None) -> None:
     """Writes a scene without its images.
+
+    Args:
+        path: The file.
+        scene: The scene.
+        refined: The training cameras as a training has moved them; None for those of the scene.
 
     Raises:
         OSError: it cannot be written.
@@ -39,7 +44,30 @@ def write_scene(path: Path, scene: Scene) -> None:
     for part in ("train", "test"):
         split = getattr(scene, part)
         values[part] = {"names": list(split.names), **_of_fields(split.cameras)}
+    if refined is not None:
+        values["train"] |= _of_fields(refined)
     write_text(path, json_text(values) + "\n")
+
+
+def with_refined(scene: Scene, run: Path) -> Scene:
+    """A scene with the training cameras that a run has moved, where its pictures are those of the run.
+
+    Raises:
+        SceneError: the record in the run directory is damaged.
+    """
+    path = run / "scene.json"
+    if not path.is_file():
+        return scene
+    own, known = scene.train, read_scene(path).train
+    if own.names != known.names:
+        return scene
+    read, moved = own.cameras, known.cameras
+    # The principal points stay, and so they tell how much larger these images are.
+    intrinsics = torch.cat(
+        (moved.intrinsics[:, :2] * (read.intrinsics / moved.intrinsics)[:, 2:], read.intrinsics[:, 2:]), 1
+    )
+    cameras = replace(read, poses=moved.poses.to(read.poses), intrinsics=intrinsics)
+    return replace(scene, train=replace(own, cameras=cameras))
 
 
 def within(scene: Scene, run: Path) -> Scene:

@@ -5,6 +5,7 @@ Blender's `transforms_*.json` share its frames, poses and numbers. Poses are Ope
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import os
@@ -20,10 +21,10 @@ from torch import Tensor
 
 from voronerf.data.errors import SceneError
 from voronerf.data.images import read_header
-from voronerf.data.lenses import COEFFICIENTS, FISHEYE, PERSPECTIVE, Lens
+from voronerf.data.lenses import COEFFICIENTS, FISHEYE, FOV, PERSPECTIVE, Lens
 from voronerf.data.photographs import Photographs, Reading, View, hold_out, least_factor, photograph_scene
 from voronerf.data.scene import Scene
-from voronerf.files import leads_outside, read_json
+from voronerf.files import leads_outside, read_json, write_text
 
 log = logging.getLogger(__name__)
 
@@ -361,3 +362,36 @@ def _is_fisheye(values: dict[str, Any], path: Path) -> bool:
         known = "k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, k3, p1, p2"
         raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only {known}")
     return fisheye
+
+
+class Shot(NamedTuple):
+    """One image to be written: its file, its pose [4, 4] and its lens."""
+
+    file: str
+    pose: Tensor
+    lens: Lens
+    width: int
+    height: int
+
+
+def write_transforms(path: Path, shots: Sequence[Shot], **entries: Any) -> None:
+    """Writes cameras as nerfstudio and instant-ngp read them, with further entries of the file.
+
+    Raises:
+        SceneError: a lens is none that they have.
+        OSError: the file cannot be written.
+    """
+    frames = []
+    for shot in shots:
+        (fx, fy, cx, cy), coefficients, model = shot.lens
+        values = {name: value for name, value in zip(COEFFICIENTS[model], coefficients) if value}
+        known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "p1", "p2", "k3")
+        if model == FOV or not values.keys() <= set(known):
+            raise SceneError(f"{path}: the lens of {shot.file} is none that transforms.json has")
+        lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": shot.width, "h": shot.height}
+        lens |= {name: values.get(name, 0.0) for name in known}
+        kind = {"camera_model": "OPENCV_FISHEYE" if model == FISHEYE else "OPENCV"}
+        frames.append({"file_path": shot.file, "transform_matrix": shot.pose.tolist(), **lens, **kind})
+    shared = {key: value for key, value in frames[0].items() if all(frame.get(key) == value for frame in frames)}
+    rest = [{key: value for key, value in frame.items() if key not in shared} for frame in frames]
+    write_text(path, json.dumps({**shared, **entries, "frames": rest}, indent=1))

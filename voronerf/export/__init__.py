@@ -1,9 +1,18 @@
-"""Takes a trained run away: as coloured points, as a mesh, or as the cells of its diagram. Needs the extra `export`."""
+"""Takes a trained run away: coloured points, a mesh, the cells of its diagram, cameras. Needs the extra `export`."""
 
+from voronerf.export.cameras import export_cameras
 from voronerf.export.cells import cell_meshes, export_cells
 from voronerf.export.mesh import export_mesh
 from voronerf.export.points import export_points
 from voronerf.export.splats import export_splats
 from voronerf.export.video import export_video
 
-__all__ = ["cell_meshes", "export_cells", "export_mesh", "export_points", "export_splats", "export_video"]
+__all__ = [
+    "cell_meshes",
+    "export_cameras",
+    "export_cells",
+    "export_mesh",
+    "export_points",
+    "export_splats",
+    "export_video",
+]

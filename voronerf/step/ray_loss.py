@@ -46,6 +46,7 @@ class Batch:
         target: [r, 3], the colour of each ray's pixel over the background.
         background: [3], or [r, 3] where it was drawn; None for black.
         seen: [s], the distances of the points that the last s rays end at, or None.
+        view: int64 [r], the picture of each ray, or None where nobody asks.
 
     Examples:
         >>> import torch
@@ -61,6 +62,7 @@ class Batch:
     target: Tensor
     background: Tensor | None = None
     seen: Tensor | None = None
+    view: Tensor | None = None
 
 
 class Found(NamedTuple):
@@ -75,6 +77,7 @@ class Found(NamedTuple):
         weights: [m], contributions of the samples to their rays.
         density: [m].
         samples: Those of the last pass.
+        colour: [r, 3], as the field shows the rays; None where no process sees whole rays.
 
     Examples:
         >>> import torch
@@ -93,6 +96,7 @@ class Found(NamedTuple):
     weights: Tensor
     density: Tensor
     samples: Samples
+    colour: Tensor | None = None
 
     def importance(self) -> Tensor:
         """[m]: the weight of each sample times the error of its ray (Elsner et al. 2023, section 3.1)."""
@@ -241,7 +245,10 @@ class Fused:
             if background is not None and background.dim() == 2:
                 background = background[rays]
             seen = None if seen is None else seen[rays]
-        networks = Networks.of(field, samples, directions)
+        inputs, asked = samples.inputs, batch.rays.origins.requires_grad
+        if asked:
+            inputs, directions = inputs.detach().requires_grad_(), directions.detach().requires_grad_()
+        networks = Networks.of(field, samples._replace(inputs=inputs), directions)
         shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
         found: list[RenderLoss] = []
 
@@ -269,7 +276,31 @@ class Fused:
             return total, gradient
 
         total = networks.learn(loss, backward=backward, backend=renderer.backend)
-        return Found(total, found[0].error, found[0].weights, networks.density(found[0]), samples)
+        if asked:
+            assert inputs.grad is not None and directions.grad is not None
+            self._learn_rays(batch.rays, samples, inputs.grad, directions.grad)
+        return Found(total, found[0].error, found[0].weights, networks.density(found[0]), samples, found[0].colour)
+
+    def _learn_rays(self, rays: Rays, samples: Samples, of_inputs: Tensor, of_directions: Tensor) -> None:
+        """Gives rays the gradients to their origins and directions: samples move with them.
+
+        Args:
+            rays: r rays.
+            samples: Of the rays.
+            of_inputs: [m, 3], gradient to the positions as the field sees them.
+            of_directions: [r, 3], what the view direction adds.
+        """
+        ray, contraction = samples.ray_index.long(), self.renderer.contraction
+        if contraction is not None:
+            origins, directions = (tensor.detach().index_select(0, ray) for tensor in (rays.origins, rays.directions))
+            points = torch.addcmul(origins, samples.depths[:, None], directions).requires_grad_()
+            with torch.enable_grad():
+                (of_inputs,) = torch.autograd.grad(contraction.points(points), points, of_inputs)
+        every = torch.cat((of_inputs, of_inputs * samples.depths[:, None]), 1)
+        place = (ray * 6)[:, None] + torch.arange(6, device=ray.device)
+        sums = every.new_zeros(len(rays), 6)
+        sums.view(-1).index_add_(0, place.view(-1), every.view(-1))
+        rays.origins.grad, rays.directions.grad = sums[:, :3], sums[:, 3:] + of_directions
 
     def _learn_sightings(
         self, gradient: Tensor, found: RenderLoss, samples: Samples, seen: Tensor, factor: float
@@ -345,7 +376,7 @@ class Composed:
         if backward:
             loss.backward()
             loss = loss.detach()
-        return Found(loss, error, last.weights.detach(), last.density.detach(), samples)
+        return Found(loss, error, last.weights.detach(), last.density.detach(), samples, last.colour.detach())
 
     def explain(self) -> str:
         """As of :class:`RayLoss`."""

@@ -5,6 +5,8 @@ Letters: r rays of a batch. Colours are in 0..1.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -17,6 +19,8 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.occupancy import draw_seed
 from voronerf.rendering.rays import intersect_box
 from voronerf.step import Batch
+from voronerf.training.appearance import Appearance
+from voronerf.training.refinement import Refinement
 
 #: Share of the rays that are drawn from the sightings of points, where these are learnt from.
 SEEN = 0.25
@@ -35,6 +39,8 @@ class RayBatches:
         sightings: Whether a share of the rays, `SEEN`, are through sightings of points.
         views: int64, the training views to draw from; None for all.
         through: [2, 3], a box in that of the scene that rays must meet; None for all of it.
+        appearance: Of the pictures; batches have their colours without it.
+        refinement: Of the cameras, which change.
         backend: Of the ops.
     """
 
@@ -47,13 +53,15 @@ class RayBatches:
         sightings: bool = False,
         views: Tensor | None = None,
         through: Tensor | None = None,
+        appearance: Appearance | None = None,
+        refinement: Refinement | None = None,
         backend: str = "auto",
     ) -> None:
         self.scene, self.views, self.backend = scene, views, backend
-        self.cones = cones
+        self.cones, self.appearance, self.refinement = cones, appearance, refinement
         self.device = device
         self.place = torch.device("cpu") if scene.train.on_disk else device
-        self.cameras = scene.train.cameras.to(self.place)
+        self.cameras = (scene.train.cameras if refinement is None else refinement.cameras).to(self.place)
         self.images = scene.train.images.to(self.place)
         self.pages = Pages(self.images) if scene.train.on_disk else None
         self.background = scene.background_colour(self.place)
@@ -136,4 +144,9 @@ class RayBatches:
         origins, directions, near, far, colour = (tensor.to(self.device) for tensor in found)
         radii = None if radii is None else radii.to(self.device)
         background = None if background is None else background.to(self.device)
-        return Batch(Rays(origins, directions, radii), near, far, colour, background, seen)
+        batch = Batch(Rays(origins, directions, radii), near, far, colour, background, seen)
+        if self.appearance is None and self.refinement is None:
+            return batch
+        view = (index // (cameras.width * cameras.height)).to(self.device)
+        batch = replace(batch, view=view)
+        return batch if self.appearance is None else self.appearance.neutral(batch)

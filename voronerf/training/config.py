@@ -149,6 +149,13 @@ class TrainConfig:
     sightings: float | None = None
     """Factor of a loss on light that does not come from where the points of a sparse model were seen (Deng et al. 2022,
     "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points."""
+    appearance: bool = False
+    """Give each training picture a gain for each channel, for exposure and white balance that differ. The field has the
+    average look of all pictures, and held-out pictures are scored as it shows them. For pictures without transparency,
+    in one territory."""
+    refine_cameras: bool = False
+    """Let the poses and focal lengths of the training cameras learn with the field, where a step is one operation.
+    Held-out cameras stay as they were read."""
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
     """Space as the networks see it: unchanged; with all points outside a sphere mapped into a shell of twice its
     radius; or in normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for

@@ -123,6 +123,14 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(config.checkpoint_every > 0, "checkpoint_every", "be positive")
     need(config.territories is None or config.territories >= 1, "territories", "be at least 1")
     need(config.device.startswith("cuda") or not config.cuda_graph, "cuda_graph", "come with --device cuda")
+    for name in ("appearance", "refine_cameras"):
+        need(
+            not (getattr(config, name) and config.cuda_graph),
+            name,
+            "be off with --cuda-graph: it counts steps on the host",
+        )
+    half = config.precision != "fp32"
+    need(not (config.refine_cameras and half), "refine_cameras", "be off with --precision bf16 and fp16")
     need(all(k >= 2 for k in config.cells), "cells", "be at least 2 on every level (none for one network)")
     _check_splits(config, need)
     shares = "share" in config.field_type.router_options
@@ -190,6 +198,14 @@ def check_joint(config: TrainConfig, ranks: int) -> None:
         "blend": (
             config.blend == 0,
             "be 0 with several territories, which train apart; `voronerf eval RUN --blend` blends the finished run",
+        ),
+        "appearance": (
+            not config.appearance,
+            "be off with several territories: none of them sees whole rays, whose colours it compares",
+        ),
+        "refine_cameras": (
+            not config.refine_cameras,
+            "be off with several territories: none of them sees whole rays, which move with a camera",
         ),
         "cuda_graph": (
             not config.cuda_graph,

@@ -111,6 +111,8 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
     """
     if config.cuda_graph and scene.train.on_disk:
         raise ConfigError("--cuda-graph must be off with images on disk: --no-cuda-graph, or --images memory")
+    if config.appearance and scene.train.images.shape[-1] == 4:
+        raise ConfigError("--appearance must be off for pictures with transparent pixels: what is behind has no gain")
     kind = config.field_type
     if config.contraction == "auto":
         if kind.scene_options is None or scene.box is not None:

@@ -29,7 +29,9 @@ from voronerf.ops.sparse_adam.reference import judge
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.router import Parts, VoronoiRouter
 from voronerf.step import Batch, Cells, Found, Step
+from voronerf.step.ray_loss import why_not_fused
 from voronerf.training import state
+from voronerf.training.appearance import Appearance
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
 from voronerf.training.checkpoint import (
@@ -38,7 +40,7 @@ from voronerf.training.checkpoint import (
     CheckpointWriter,
     last_checkpoint,
 )
-from voronerf.training.config import TrainConfig
+from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.divergence import (
     PATIENCE,
@@ -60,6 +62,7 @@ from voronerf.training.networks import (
 )
 from voronerf.training.progress import Progress, Stage, TrainingError
 from voronerf.training.rates import learning_rate, next_rays
+from voronerf.training.refinement import EVERY, START, Refinement
 from voronerf.training.renderers import make_grid, make_renderer
 from voronerf.training.run_directory import read_metrics
 
@@ -122,6 +125,8 @@ class Trainer:
             self.device,
             cones=config.field_type.cones,
             sightings=bool(config.sightings),
+            appearance=Appearance(len(scene.train.names), self.device) if config.appearance else None,
+            refinement=Refinement(scene.train.cameras.to(self.device)) if config.refine_cameras else None,
             backend=config.backend,
         )
         self.routers = open_routers(config, self.device, checkpoint)
@@ -141,6 +146,9 @@ class Trainer:
             generator=self.generator,
         )
         self.learner = Step(self.renderer, sightings=config.sightings or 0.0)
+        obstacle = "the run has several parts" if isinstance(self.router, Parts) else why_not_fused(self.renderer)
+        if config.refine_cameras and obstacle is not None:
+            raise ConfigError(f"--refine-cameras must be off where a step is not one operation: {obstacle}")
         self.guard = Guard.on(self.device)  # of steps whose loss or gradients are not finite
         self.rate_factor = 1.0  # 0.5 after a divergence
         self.one_colour: float | None = None
@@ -184,6 +192,12 @@ class Trainer:
     def occupancy(self) -> OccupancyGrid | None:
         """The grid of what is empty."""
         return self.renderer.occupancy
+
+    @property
+    def learnt_of_pictures(self) -> dict[str, Appearance | Refinement]:
+        """What is learnt of each training picture beside the field, by the names of a checkpoint."""
+        learnt = {"appearance": self.batches.appearance, "cameras": self.batches.refinement}
+        return {name: each for name, each in learnt.items() if each is not None}
 
     @property
     def parameter_count(self) -> int:
@@ -369,10 +383,17 @@ class Trainer:
 
     def _forward_backward(self) -> tuple[Tensor, Tensor]:
         """Draws a batch and learns from it; returns what :meth:`learn` does."""
-        batch = self.draw()
+        batch, refinement = self.draw(), self.batches.refinement
+        moves = refinement is not None and self.step >= START and self.step % EVERY == 0
+        if moves:
+            batch = Refinement.asked(batch)
         self.optimizer.zero_grad(set_to_none=True)
         with self.precision():
             found = self.learner.run(batch, self.draws, backward=self.config.precision == "fp32")
+        if self.batches.appearance is not None and found.colour is not None:
+            self.batches.appearance.learn(batch, found.colour)
+        if moves and refinement is not None:
+            refinement.learn(batch, self.learning_rate() / float(self.config.lr or 1.0))
         return self.learn(found)
 
     def draw(self, share: float = 1.0) -> Batch:
@@ -553,10 +574,13 @@ class Trainer:
 
     def save(self, *, wait: bool = True) -> None:
         """Writes ``checkpoints/last.safetensors``; without ``wait`` it is begun, and :attr:`writer` ends it."""
+        refinement = self.batches.refinement
         if self.writes and not self.described:  # not earlier: a run whose first step fails leaves nothing
             write_text(self.out / "config.json", self.config.to_json())
-            write_scene(self.out / "scene.json", self.scene)
-            self.described = True
+        if self.writes and (refinement is not None or not self.described):
+            refined = None if refinement is None else refinement.cameras.to("cpu")
+            write_scene(self.out / "scene.json", self.scene, refined=refined)
+        self.described = True
         self.writer.write(self.state())
         self.saved_at = self.seconds
         if wait:
@@ -592,6 +616,8 @@ class Trainer:
             parts["errors"] = {"usual": self.errors}
         if self.occupancy is not None:
             parts["occupancy"] = self.occupancy.state_dict()
+        for name, learnt in self.learnt_of_pictures.items():
+            parts[name] = learnt.state_dict()
         if self.scaler.is_enabled():
             parts["scaler"] = self.scaler.state_dict()
         return state.collect(stored, self.routers, self.optimizer, parts)
@@ -610,6 +636,8 @@ class Trainer:
             self.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
             if self.occupancy is not None:
                 self.occupancy.load_state_dict(checkpoint.group("occupancy"))
+            for name, learnt in self.learnt_of_pictures.items():
+                learnt.load_state_dict(checkpoint.group(name))
             if (
                 stored.stages[0]["cells"] == 1 or stored.step
             ):  # else nothing was trained since it was made of other runs

@@ -26,7 +26,8 @@ def learn_outputs(network: Mapping[str, Any], loss: Loss, *, backward: bool = Fa
 
     Args:
         network: The arguments of `routed_mlp` by name, but for ``backend``, as ``VoronoiRouter.table_arguments`` gives
-            them. Gradients go to weights, biases and features.
+            them. Gradients go to weights, biases and features, and to positions and directions that ask
+            for them.
         loss: Called once with the outputs, float32 [n, out], without gradients; returns the loss [] and its gradient to
             the outputs, [n, out].
         backward: Whether the gradients are added to ``.grad`` of the parameters at once, as ``loss.backward()`` does.

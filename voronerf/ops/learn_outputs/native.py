@@ -33,7 +33,7 @@ def learn_outputs(network: Mapping[str, Any], loss: Loss, backward: bool) -> Ten
     rest = {name: value for name, value in network.items() if name not in (*names, "frozen")}
     call, _ = routed_mlp.prepared(**rest, where=where)
     taken = call.network
-    parameters = [*taken.weights, *taken.biases, taken.features]
+    parameters = [*taken.weights, *taken.biases, taken.features, taken.positions, taken.directions]
     if backward and all(map(_takes_gradients, parameters)):
         needs = [parameter is not None and parameter.requires_grad for parameter in parameters]
         with torch.no_grad():
@@ -59,7 +59,7 @@ def _takes_gradients(parameter: Tensor | None) -> bool:
 def _learn(
     call: routed_mlp.Call, loss: Loss, frozen: Tensor | None, needs: Sequence[bool]
 ) -> tuple[Tensor, list[Tensor]]:
-    """The loss, and gradients of weights, biases and features where any is needed."""
+    """The loss, and gradients of weights, biases, features, positions and directions where any is needed."""
     out, cells, order, offsets, encoded = routed_mlp.forward.inside(*call)
     rows = None if native.on_cuda(out) else call.where.rows  # CUDA has left out the others
     out, cells = routed_mlp.first_rows(out, cells if call.where.cells is None else call.where.cells, rows)
@@ -68,14 +68,14 @@ def _learn(
         gradient, _ = routed_mlp.first_rows(gradient, cells, rows)
     if frozen is not None:  # rows of zeros leave the backward pass
         gradient = gradient.masked_fill(of_samples(frozen, cells), 0)
-    *of_layers, of_features = needs
+    *of_layers, of_features, of_positions, of_directions = needs
     if not any(needs):
         return total, []
-    wanted = [any(of_layers), False, False, of_features]
+    wanted = [any(of_layers), of_positions, of_directions, of_features]
     sorted_by = order if order.numel() else None
     found = grouped_mlp.backward.inside(gradient, call.network, offsets, sorted_by, encoded, wanted)
-    *of_parameters, _, _, features = found
-    return total, [*of_parameters, features]
+    *of_parameters, positions, directions, features = found
+    return total, [*of_parameters, features, positions, directions]
 
 
 class _Learn(torch.autograd.Function):
