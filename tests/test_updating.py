@@ -43,7 +43,9 @@ def runs(tmp_path_factory, city):
     folder = tmp_path_factory.mktemp("runs")
     common = {"evaluations": 1, "final_views": 1, "panels": 0, "steps": 500, "cells": (8,), "rays": 256}
     made = {}
-    for name, options in {"hashgrid": {}, "nerf": {"field": "nerf", "width": 16, "depth": 1, "steps": 300}}.items():
+    # A regular grid of centres: where the others come to lie depends on the processor's rounding.
+    nerf = {"field": "nerf", "width": 16, "depth": 1, "steps": 300, "centres": "uniform"}
+    for name, options in {"hashgrid": {}, "nerf": nerf}.items():
         config = TrainConfig(out=folder / name, data="builtin-city:2x2", **{**common, **options})
         Trainer(config, city).run()
         made[name] = folder / name
