@@ -149,6 +149,8 @@ def test_broken_captures_are_one_line(tmp_path):
         (write_polycam, text(camera, '"t_00"', '"u_00"'), "t_00 to t_23 is not a matrix of numbers"),
         (write_polycam, text(camera, '"fx": 30.0', '"fx": "a"'), "fl_x must be a finite number"),
         (write_polycam, text(camera, '"width": 24', '"width": 25'), "is 24 x 16 pixels, but"),
+        (write_polycam, lambda folder: (folder / camera).write_text("[]"), "must be an object of JSON"),
+        (write_record3d, lambda folder: (folder / meta).write_text("{"), "metadata.json"),
         (write_record3d, text(meta, '"poses"', '"places"'), "poses must be lists of 7 numbers"),
         (write_record3d, text(meta, '"K": [30.0, ', '"K": ['), "K must be lists of 9 numbers"),
         (write_record3d, lambda folder: (folder / "rgb/8.png").rename(folder / "rgb/80.png"), "numbered to 80"),

@@ -14,8 +14,7 @@ from voronerf.data.errors import SceneError
 from voronerf.data.folders import listed_images, stay_inside
 from voronerf.data.photographs import Reading, hold_out
 from voronerf.data.scene import Scene
-from voronerf.data.transforms import Frame, Listed, capture_scene, pose_of
-from voronerf.files import read_json
+from voronerf.data.transforms import Frame, Listed, capture_scene, pose_of, read_object
 
 NAMES = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
 #: From y up to z up.
@@ -54,12 +53,7 @@ def load_polycam(folder: Path, reading: Reading) -> Scene:
 
 
 def _read(path: Path, image: Path) -> Listed:
-    try:
-        values = read_json(path)
-    except ValueError as error:
-        raise SceneError(str(error)) from None
-    if not isinstance(values, dict):
-        raise SceneError(f"{path}: must be an object of JSON")
+    values = read_object(path)
     rows = [[values.get(f"t_{row}{column}") for column in range(4)] for row in range(3)]
     entries = {key: values.get(name) for key, name in NAMES.items()}
     return Listed(path, {}, Frame(image, UPRIGHT @ pose_of(rows, str(path), "t_00 to t_23"), entries))

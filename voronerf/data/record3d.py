@@ -17,8 +17,7 @@ from voronerf.data.folders import listed_images, stay_inside
 from voronerf.data.photographs import Reading, hold_out
 from voronerf.data.polycam import UPRIGHT
 from voronerf.data.scene import Scene
-from voronerf.data.transforms import LARGEST, Frame, Listed, capture_scene, is_number, number
-from voronerf.files import read_json
+from voronerf.data.transforms import LARGEST, Frame, Listed, capture_scene, is_number, number, read_object
 from voronerf.rendering.paths import rotations
 
 FILE = "metadata.json"
@@ -37,12 +36,7 @@ def load_record3d(folder: Path, reading: Reading) -> Scene:
     """
     path = folder / FILE
     stay_inside(path, folder, reading.allow_outside)
-    try:
-        values = read_json(path)
-    except ValueError as error:
-        raise SceneError(str(error)) from None
-    if not isinstance(values, dict):
-        raise SceneError(f"{path}: must be an object of JSON")
+    values = read_object(path)
     poses = _rows(values.get("poses"), 7, f"{path}: poses")
     (matrix,) = _rows([values.get("K")], 9, f"{path}: K")
     images = {}

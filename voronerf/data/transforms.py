@@ -53,6 +53,27 @@ class Frame:
     mask: Path | None = None
 
 
+def read_object(path: Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        SceneError: the file cannot be read, or holds something else; names it.
+    """
+    values = _read(path)
+    if not isinstance(values, dict):
+        raise SceneError(f"{path}: must be an object of JSON")
+    return values
+
+
+def _read(path: Path) -> Any:
+    try:
+        return read_json(path)
+    except ValueError as error:
+        raise SceneError(str(error)) from None
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
+
+
 def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, Any], list[Frame]]:
     """Reads a transforms file and finds its images.
 
@@ -70,12 +91,7 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
         SceneError: the file does not parse, has no frames, no image of any frame exists, one lies outside of the
             folder, or a matrix is not a pose.
     """
-    try:
-        entries = read_json(path)
-    except ValueError as error:
-        raise SceneError(str(error)) from None
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
+    entries = _read(path)
     frames = entries.get("frames") if isinstance(entries, dict) else None
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path}: has no frames")
