@@ -6,7 +6,8 @@ A row in the file takes the place of one with the same options; others stay, so 
 ``--device cuda`` rank n has the n-th GPU of this machine, and nccl is measured.
 
 Each rank has one territory, with so many cells and rays whatever the number of ranks. Processor time is that of the
-whole process, its messages included; a rank that waits for others takes none. ``--ranks 4 --groups 8`` says what a rank
+whole process, its messages included; a rank that waits for others takes none. "inner" are the territories that touch no
+side of the city: none of 4, 4 of 16, 12 of 32. ``--ranks 4 --groups 8`` says what a rank
 takes only because 32 processes share this machine: the groups do not know of each other. With ``--territories 2``,
 ``--ranks 2`` and ``--ranks 1 --threads 2 --blocks 2 4`` train the same run.
 """
@@ -100,8 +101,11 @@ def rank(number: int, size: int, port: int, folder: Path, options: dict[str, Any
         result["private_mb"] = private / 1e3
         result["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         result["neighbours"] = result["to_light"] = 0
+        result["inner"] = False
         if isinstance(trainer, JointTrainer):
             own, known = list(trainer.trainers), trainer.joint.map
+            sides = (trainer.territories.boxes[own] - scene.box).abs()[..., :2]  # of the box of the city
+            result["inner"] = bool((sides > 1e-3).all())
             result["neighbours"] = max(len(known.goes_to(each, True)) for each in own)
             result["to_light"] = max(len(known.goes_to(each, False)) for each in own)
         result["loss"] = trainer.loss
@@ -131,9 +135,13 @@ def measure(size: int, options: dict[str, Any]) -> dict[str, Any]:
     row: dict[str, Any] = {"ranks": size, **options, "territories": territories, "blocks": blocks}
     row["wall_s"] = time.monotonic() - began
     row |= {name: found[0].pop(name) for name in ("psnr", "done", "scores") if name in found[0]}
+    inner = [each for each in found if each.pop("inner")]
+    row["inner"] = len(inner)
     for name in found[0]:
         row[name] = statistics.median(each[name] for each in found)
         row[f"{name}_largest"] = max(each[name] for each in found)
+        if inner:
+            row[f"{name}_inner"] = statistics.median(each[name] for each in inner)
     return row
 
 

@@ -157,3 +157,20 @@ def test_the_heaviest_rank_gives_territories_away():
     assert balanced([0, 0, 1], [5.0, 0.1, 5.0], 2) == [0, 0, 1], "no move would help"
     many = balanced([0] * 6 + [1, 2], [1.0] * 8, 3)
     assert sorted(many.count(rank) for rank in range(3)) == [2, 3, 3]
+
+
+def ask_early():
+    """Asks for two kinds of messages at once, and gets them in the other order, and more rows than fit."""
+    with joined(torch.device("cpu")) as group:
+        other = 1 - group.rank
+        for rows in (3, 0, 40):
+            for kind in ("first", "second"):
+                group.expect(kind, 2, {other: 1})
+            for kind, value in (("second", 2.0), ("first", 1.0)):
+                part = torch.full((rows, 2), value)
+                came = group.exchange(kind, 2, {other: [part]}, {other: 1})
+                assert torch.equal(came[other][0], part), (kind, rows)
+
+
+def test_messages_can_be_asked_for_early(tmp_path):
+    assert on_ranks(ask_early, folder=tmp_path)[0] == [0, 0]

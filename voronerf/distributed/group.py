@@ -11,6 +11,7 @@ import os
 import re
 import signal
 import time
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import timedelta
@@ -69,6 +70,7 @@ class Group:
         self.sent: Counter[str] = Counter()
         self.messages: Counter[str] = Counter()
         self._rooms: dict[tuple[str, str, int], int] = {}  # rows of a message of each kind, to and from each rank
+        self._expected: dict[str, tuple[dict[int, Tensor], list[dist.Work] | None]] = {}
         self.store: dist.Store | None = None
 
     def join(self) -> None:
@@ -155,6 +157,9 @@ class Group:
         heads = {rank: -(-count // width) for rank, count in sources.items()}
         room = {rank: self._rooms.get((kind, "from", rank), 0) for rank in sources}
         empty = torch.empty(0, width, device=self.device)
+        if kind not in self._expected:
+            self.expect(kind, width, sources)
+        expected, works = self._expected.pop(kind)
         messages, rests = {}, {}
         for rank, own in parts.items():
             message, end, total = _message(own, width, self._rooms.get((kind, "to", rank), 0))
@@ -162,7 +167,7 @@ class Group:
             if len(message) > end:
                 rests[rank] = message[end:]
             self._rooms[kind, "to", rank] = _room(total)
-        came = self.swap(kind, messages, {rank: empty.new_empty(heads[rank] + n, width) for rank, n in room.items()})
+        came = self.swap(kind, messages, expected, works)
         sizes = {
             rank: message[: heads[rank]].view(-1).view(torch.int32)[: sources[rank]].tolist()
             for rank, message in came.items()
@@ -179,13 +184,45 @@ class Group:
             self._rooms[kind, "from", rank] = _room(counts[rank])
         return found
 
-    def swap(self, kind: str, parts: Mapping[int, Tensor], came: Mapping[int, Tensor]) -> dict[int, Tensor]:
+    def expect(self, kind: str, width: int, sources: Mapping[int, int]) -> None:
+        """Asks for what the next :meth:`exchange` of a kind will bring, so that it comes while this rank computes.
+
+        Args:
+            kind: What the parts are.
+            width: c, as there.
+            sources: As there.
+        """
+        rows = {rank: -(-n // width) + self._rooms.get((kind, "from", rank), 0) for rank, n in sources.items()}
+        came = {rank: torch.empty(count, width, device=self.device) for rank, count in rows.items()}
+        self._expected[kind] = came, self._ask(kind, came)
+
+    def _ask(self, kind: str, came: Mapping[int, Tensor]) -> list[dist.Work] | None:
+        """Lets gloo fill tensors as soon as others send; nccl is asked together with what is sent."""
+        if self.device.type == "cuda" or not came:
+            return None
+        with self._waiting():
+            return [self._world.recv([tensor], rank, _tag(kind)) for rank, tensor in came.items()]
+
+    @property
+    def _world(self) -> dist.ProcessGroup:  # past the checks of torch.distributed, which take gloo as long again
+        world = dist.group.WORLD
+        assert world is not None
+        return world
+
+    def swap(
+        self,
+        kind: str,
+        parts: Mapping[int, Tensor],
+        came: Mapping[int, Tensor],
+        asked: Sequence[dist.Work] | None = None,
+    ) -> dict[int, Tensor]:
         """Sends some ranks a tensor each, and fills the tensors for what comes of others; returns these.
 
         Args:
             kind: What they are.
             parts: Contiguous, by rank.
             came: Of the sizes of what comes, by rank.
+            asked: What :meth:`expect` has begun for these.
         """
         self.sent[kind] += sum(tensor.numel() * tensor.element_size() for tensor in parts.values())
         self.messages[kind] += len(parts)
@@ -196,11 +233,9 @@ class Group:
                 calls = [dist.P2POp(dist.irecv, tensor, rank) for rank, tensor in came.items()]
                 calls += [dist.P2POp(dist.isend, tensor, rank) for rank, tensor in parts.items()]
                 works = dist.batch_isend_irecv(calls)
-            else:  # past the checks of torch.distributed, which take gloo as long again
-                world = dist.group.WORLD
-                assert world is not None
-                works = [world.recv([tensor], rank, 0) for rank, tensor in came.items()]
-                works += [world.send([tensor], rank, 0) for rank, tensor in parts.items()]
+            else:
+                works = list(asked or self._ask(kind, came) or ())
+                works += [self._world.send([tensor], rank, _tag(kind)) for rank, tensor in parts.items()]
             for work in works:
                 work.wait()
         return dict(came)
@@ -238,6 +273,11 @@ def _message(parts: Sequence[Tensor], width: int, room: int) -> tuple[Tensor, in
     header = torch.tensor(sizes + [0] * (head * width - len(sizes)), dtype=torch.int32).view(torch.float32)
     left = parts[0].new_empty(max(room - rows, 0), width)
     return torch.cat((header.view(head, width).to(left.device), *parts, left)), head + room, rows
+
+
+def _tag(kind: str) -> int:
+    """Keeps messages of several kinds apart that are asked for at once."""
+    return zlib.crc32(kind.encode()) % 2**16
 
 
 def _room(rows: int) -> int:

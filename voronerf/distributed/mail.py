@@ -59,17 +59,36 @@ def send(
         {(0, 1): tensor([[1.]])}
     """
     empty = torch.empty(0, width, device=group.device)
+    here = _coming(group, routes)
     there: dict[int, list[Tensor]] = defaultdict(list)
-    here: dict[int, list[Key]] = defaultdict(list)
     found: dict[Key, Tensor] = {}
     for source, target, key in routes:
         if source == target:
             found[key] = parts.get(key, empty)
         elif source == group.rank:
             there[target].append(parts.get(key, empty))
-        else:
-            here[source].append(key)
     came = group.exchange(kind, width, there, {source: len(keys) for source, keys in here.items()})
     for source, keys in here.items():
         found.update(zip(keys, came[source], strict=True))
     return {key: found[key] for _, target, key in routes if target == group.rank}  # in an order that no rank decides
+
+
+def expect(group: Group, kind: str, width: int, routes: Sequence[Route]) -> None:
+    """Asks for what the next :func:`send` of a kind brings, which then comes while this rank computes.
+
+    Args:
+        group: The ranks.
+        kind: As there.
+        width: c, as there.
+        routes: As there.
+    """
+    group.expect(kind, width, {source: len(keys) for source, keys in _coming(group, routes).items()})
+
+
+def _coming(group: Group, routes: Sequence[Route]) -> dict[int, list[Key]]:
+    """The keys of the parts that other ranks send this one, by rank."""
+    here: dict[int, list[Key]] = defaultdict(list)
+    for source, target, key in routes:
+        if source != target == group.rank:
+            here[source].append(key)
+    return here
