@@ -19,6 +19,7 @@ import functools
 import importlib
 import platform
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -185,6 +186,12 @@ def _import(module: str) -> ModuleType:
     """
     try:
         return importlib.import_module(module)
+@functools.cache
+def warn_once(line: str) -> None:
+    """Warns of what keeps a backend from being used, the first time in a process that it is asked for."""
+    warnings.warn(line, RuntimeWarning, stacklevel=2)
+
+
     except ModuleNotFoundError as error:
         if error.name != "voronerf.kernels":
             raise

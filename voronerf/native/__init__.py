@@ -56,9 +56,9 @@ try:
 except (ImportError, OSError) as error:
     raise BackendUnavailable(f"the compiled extension voronerf._C cannot be loaded ({error}); {_REMEDY}") from error
 if getattr(compiled, "interface", "none") != _interface():
-    raise BackendUnavailable(
-        "the compiled module is of another version of voronerf; build it again with `pip install -e .`"
-    )
+    _reason = "the compiled module is of another version of voronerf; build it again with `pip install -e .`"
+    backends.warn_once(f"{_reason}. Until then plain PyTorch runs in its place, many times slower.")
+    raise BackendUnavailable(_reason)
 
 DTYPES = {
     "float32": torch.float32,
