@@ -28,7 +28,7 @@ test: $(VENV)/.built
 
 # A few minutes; for figures to keep, run the scripts with --json and the settings they document.
 bench: $(VENV)/.built
-	@$(BIN)/python benchmarks/throughput.py --quick --targets
+	@$(BIN)/python benchmarks/throughput.py --quick
 	@$(BIN)/python benchmarks/time_to_quality.py --data builtin --budget 30 --eval-views 5
 
 # Every table and figure of the paper in small, on Lego and Ship where they are, into runs/paper-small; its report.md has all of them.

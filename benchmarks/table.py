@@ -3,7 +3,6 @@
 python benchmarks/table.py benchmarks/results/throughput.json                    the rows that docs/performance.md shows
 python benchmarks/table.py benchmarks/results/throughput.json --rows '^routed_mlp/'   any others
 python benchmarks/table.py benchmarks/results/throughput*.json                   the rows of several machines
-python benchmarks/table.py benchmarks/results/throughput.json --targets          the targets, and what is reached
 python benchmarks/table.py benchmarks/results/foreign_fields.json --foreign      times faster than the loop over masks
 """
 
@@ -16,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ops.targets import ELSEWHERE, Row, comparisons, reached, verdict
+Row = dict[str, Any]
 
 SHOWN = (
     r"^nearest_centre/n=262144 k=(16|512|4096 frozen)/float32",
@@ -120,28 +119,6 @@ def machines_markdown(machines: dict[str, list[Row]]) -> list[str]:
     return found
 
 
-def target_markdown(rows: list[Row]) -> list[str]:
-    """The targets and what the rows reach, then what kernels and architecture save."""
-    found = ["| | wanted | reached | |", "|---|---|---|---|"]
-    for target, value in reached(rows):
-        figure = "-" if value is None else f"{value:.2f}" if value < 10 else f"{value:.1f}"
-        sign = "at most" if target.most else "at least"
-        found.append(
-            f"| {target.what} | {sign} {target.wanted:g} {target.unit} | {figure} | {verdict(target, value)} |"
-        )
-    found += [f"| {what} | {wanted} | see `{script}` | |" for what, wanted, script in ELSEWHERE]
-    compared = comparisons(rows)
-    if compared:
-        columns = ("best alternative", "kernels here", "x by kernels", "16 cells of width 64", "x by architecture")
-        found += ["", f"| forward, n = 262,144 | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
-    for one in compared:
-        found.append(
-            f"| one network of width 256, {one.dtype} | {one.wide_torch_ms:.0f} ms | {one.wide_ms:.0f} ms "
-            f"| {one.kernel:.2f} | {one.cells_ms:.1f} ms | {one.architecture:.1f} |"
-        )
-    return found
-
-
 def foreign_markdown(rows: list[Row]) -> list[str]:
     """Rows of fields of other codebases: how many times faster than the loop over masks each way is."""
     known = ("fuse=True", "fused", "masks behind one encoding", "one module")
@@ -166,7 +143,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--rows", action="append", metavar="REGEX", help="rows whose op/case/dtype/direction it occurs in"
     )
-    parser.add_argument("--targets", action="store_true", help="the table of targets")
     parser.add_argument("--foreign", action="store_true", help="the table of fields of other codebases")
     options = parser.parse_args(arguments)
     try:
@@ -181,9 +157,6 @@ def main(arguments: list[str] | None = None) -> None:
             chosen = [row for row in native_rows(one) if any(pattern.search(key(row)) for pattern in patterns)]
             machines.setdefault(one["metadata"]["machine"], []).extend(chosen)
         print("\n".join(machines_markdown(machines)))
-        return
-    if options.targets:
-        print("\n".join(target_markdown(native)))
         return
     if options.foreign:
         print("\n".join(foreign_markdown([row for row in native if row["op"] == "foreign"])))

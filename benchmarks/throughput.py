@@ -2,7 +2,7 @@
 
     python benchmarks/throughput.py                                   everything, about twelve minutes on two cores
     python benchmarks/throughput.py --quick                           every operation once, under a minute
-    python benchmarks/throughput.py --filter '^grouped_mlp/w64d4.*bfloat16' --targets
+    python benchmarks/throughput.py --filter '^grouped_mlp/w64d4.*bfloat16'
     python benchmarks/throughput.py --foreign --filter 'siren .*k=16'  the router around fields of other codebases
     python benchmarks/throughput.py --json benchmarks/results/throughput.json
     python benchmarks/table.py benchmarks/results/throughput.json     the JSON as Markdown
@@ -41,7 +41,6 @@ from ops import cases_network as cases_network
 from ops import cases_sampling as cases_sampling
 from ops import cases_step as cases_step
 from ops.case import Case, Contender, NotApplicable, Work, dtype_name
-from ops.targets import architecture_lines, target_lines
 
 from voronerf import backends
 from voronerf.files import write_text
@@ -76,9 +75,6 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--filter", metavar="REGEX", help="rows whose op/case/dtype/direction it occurs in")
     parser.add_argument("--device", default="cpu", help="cpu or cuda; timings on cuda have not been run yet")
     parser.add_argument("--backends", nargs="+", default=list(backends.BACKENDS), metavar="NAME", help="rows of these")
-    parser.add_argument(
-        "--targets", action="store_true", help="what the rows reach of what the project set out to show"
-    )
     parser.add_argument("--foreign", action="store_true", help="the rows of fields of other codebases instead")
     parser.add_argument("--list", action="store_true", help="print op/case/dtype/direction of the rows and stop")
     options = parser.parse_args(arguments)
@@ -326,8 +322,6 @@ def main(arguments: list[str] | None = None) -> None:
         listed = ", ".join(f"{op} {seconds:.1f}" for op, seconds in cold.items())
         where = "the cache that is there" if options.quick else "an empty cache"
         print(f"\nfirst calls on Warp, seconds, with {where}: {listed}")
-    if options.targets:
-        print("\n".join(["", *target_lines(bench.rows), "", *architecture_lines(bench.rows)]))
     if options.json is not None:
         description = metadata(
             benchmark="throughput",

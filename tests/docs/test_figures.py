@@ -73,7 +73,6 @@ def test_figures_are_those_of_the_file(name: str, text: str) -> None:
     ("page", "arguments"),
     [
         ("performance", "throughput.json"),
-        ("performance", "throughput.json --targets"),
         ("foreign-fields", "foreign_fields.json --foreign"),
     ],
 )
