@@ -42,17 +42,11 @@ class BackendUnavailable(RuntimeError):
 
 @dataclass(frozen=True)
 class Implementation:
-    """What one implementation of an op takes, and where it lives.
+    """What one implementation of an op takes, and where it lives."""
 
-    Attributes:
-        devices: device types it runs on; empty means any.
-        dtypes: dtypes of the op's first tensor it takes; empty means any.
-        file: the op whose module has the function; None for its own.
-    """
-
-    devices: tuple[str, ...] = ()
-    dtypes: tuple[torch.dtype, ...] = ()
-    file: str | None = None
+    devices: tuple[str, ...] = ()  # device types it runs on; empty means any
+    dtypes: tuple[torch.dtype, ...] = ()  # dtypes of the op's first tensor it takes; empty means any
+    file: str | None = None  # the op whose module has the function; None for its own
 
 
 @dataclass(frozen=True)
@@ -186,16 +180,16 @@ def _import(module: str) -> ModuleType:
     """
     try:
         return importlib.import_module(module)
-@functools.cache
-def warn_once(line: str) -> None:
-    """Warns of what keeps a backend from being used, the first time in a process that it is asked for."""
-    warnings.warn(line, RuntimeWarning, stacklevel=2)
-
-
     except ModuleNotFoundError as error:
         if error.name != "voronerf.kernels":
             raise
         raise BackendUnavailable("the Warp kernels are not installed; run `pip install -e .`") from None
+
+
+@functools.cache
+def warn_once(line: str) -> None:
+    """Warns of what keeps a backend from being used, the first time in a process that it is asked for."""
+    warnings.warn(line, RuntimeWarning, stacklevel=2)
 
 
 class _Kept(threading.local):

@@ -25,23 +25,14 @@ class GridLevel(NamedTuple):
 
     A point x in 0..1 lies at ``x * scale + shift``, between integer corners. The corner (i, j, k) has the entry
     ``i + side * j + side**2 * k`` modulo ``entries``; or, where the level is hashed, the lowest bits of ``i ^
-    2654435761 j ^ 805459861 k`` in unsigned 32 bit numbers.
+    2654435761 j ^ 805459861 k`` in unsigned 32 bit numbers."""
 
-    Attributes:
-        scale: corners between the two sides of the box.
-        shift: of the corners.
-        side: stride of the second axis.
-        entries: of this level; a power of two where it is hashed.
-        offset: the level's first entry in the table.
-        hashed: whether corners share entries.
-    """
-
-    scale: float
-    shift: float
-    side: int
-    entries: int
-    offset: int
-    hashed: bool
+    scale: float  # corners between the two sides of the box
+    shift: float  # of the corners
+    side: int  # stride of the second axis
+    entries: int  # of this level; a power of two where it is hashed
+    offset: int  # the level's first entry in the table
+    hashed: bool  # whether corners share entries
 
 
 @dataclass(frozen=True)

@@ -130,25 +130,15 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Program:
-    """What is done with the rows of a cell.
+    """What is done with the rows of a cell."""
 
-    Attributes:
-        inputs: columns of each input.
-        parameters: shape for one cell of each parameter, (o, i) or (w,).
-        steps: in their order.
-        outputs: columns that are results, [n, w] each.
-        sums: shape for one cell of each result that is a sum over its rows.
-        text: the program as a string, which ops take.
-        orders: the highest derivative of a function in it.
-    """
-
-    inputs: tuple[int, ...]
-    parameters: tuple[tuple[int, ...], ...]
-    steps: tuple[Step, ...]
-    outputs: tuple[Columns, ...]
-    sums: tuple[tuple[int, ...], ...] = ()
-    text: str = field(init=False, compare=False)
-    orders: int = field(init=False, compare=False)
+    inputs: tuple[int, ...]  # columns of each input
+    parameters: tuple[tuple[int, ...], ...]  # shape for one cell of each parameter, (o, i) or (w,)
+    steps: tuple[Step, ...]  # in their order
+    outputs: tuple[Columns, ...]  # columns that are results, [n, w] each
+    sums: tuple[tuple[int, ...], ...] = ()  # shape for one cell of each result that is a sum over its rows
+    text: str = field(init=False, compare=False)  # the program as a string, which ops take
+    orders: int = field(init=False, compare=False)  # the highest derivative of a function in it
 
     def __post_init__(self) -> None:
         parts = [self.inputs, self.parameters, self.steps, self.outputs, self.sums]

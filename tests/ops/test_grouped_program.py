@@ -249,21 +249,6 @@ def test_instruction_sets(isa: str) -> None:
         check(random_program(7), [97, 0, 30])
 
 
-def test_results_do_not_depend_on_threads() -> None:
-    """Bit for bit."""
-    program, threads = every_step(), torch.get_num_threads()
-    given = arguments(program, [3000, 0, 5000, 17], torch.float32)
-    found = []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            found.append(derivatives(program, *given, "native"))
-    finally:
-        torch.set_num_threads(threads)
-    for others in found[1:]:
-        assert all(map(torch.equal, found[0], others))
-
-
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_types(dtype: torch.dtype) -> None:
     """By conversion: what float32 gives for the rounded arguments."""
@@ -274,23 +259,6 @@ def test_half_types(dtype: torch.dtype) -> None:
         grouped_program(rows, parameters, offsets, program=program), grouped_program(*wide, offsets, program=program)
     ):
         assert torch.equal(ours, exact.to(dtype))
-
-
-def test_compiled_whole() -> None:
-    """In a full graph of torch.compile, forward and backward."""
-    program = random_program(3)
-    rows, parameters, offsets = arguments(program, [40, 9], torch.float32)
-    parameters = [p.requires_grad_() for p in parameters]
-
-    def loss(parameters: list[Tensor]) -> Tensor:
-        return sum(r.square().sum() for r in grouped_program(rows, parameters, offsets, program=program))
-
-    expected = torch.autograd.grad(loss(parameters), parameters, allow_unused=True)
-    found = torch.autograd.grad(
-        torch.compile(loss, backend="aot_eager", fullgraph=True)(parameters), parameters, allow_unused=True
-    )
-    for ours, theirs in zip(found, expected):
-        torch.testing.assert_close(ours, theirs)
 
 
 def test_refuses_what_is_no_program() -> None:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import FLOATS, need, offsets_of, refused, strided
+from op_cases import FLOATS, need, offsets_of, refused
 from tolerances import assert_as_exact
 
 from voronerf.ops import RenderLoss, composite, render_loss
@@ -94,14 +94,6 @@ def test_what_little_light_reaches_has_no_gradient(device, backend, counts):
     assert torch.equal(found, whole * seen[:, None])
 
 
-def test_rows_apart_in_memory(device, backend):
-    raw, deltas, offsets, target, background = (t.to(device) for t in rays([4, 0, 9], torch.float32))
-    rest = {"density_scale": SCALE, "backend": backend}
-    plain = render_loss(raw, deltas, offsets, target, background=background, **rest)
-    apart = render_loss(strided(raw), strided(deltas), offsets, strided(target), background=strided(background), **rest)
-    assert all(torch.equal(a, b) for a, b in zip(plain, apart))
-
-
 def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend):
     raw, deltas, offsets, target, background = (t.to(device) for t in rays([4, 5, 3], torch.float32))
     spoiled = raw.clone()
@@ -158,18 +150,6 @@ def test_checked_gradient_of_the_reference():
         return render_loss(raw, deltas, offsets, target, **rest).loss
 
     assert torch.autograd.gradcheck(loss, raw)
-
-
-def test_in_a_compiled_function(device, backend):
-    raw, deltas, offsets, target, background = (t.to(device) for t in rays([4, 0, 9], torch.float32))
-    raw.requires_grad_()
-
-    def loss(raw):
-        rest = {"background": background, "density_scale": SCALE, "backend": backend}
-        return render_loss(raw, deltas, offsets, target, **rest).loss
-
-    found = torch.compile(loss, fullgraph=True, backend="aot_eager")(raw)
-    torch.testing.assert_close(found, loss(raw), rtol=1e-6, atol=1e-7)
 
 
 def test_bad_arguments():

@@ -98,11 +98,6 @@ def test_uniforms_at_and_beyond_the_ends(device, backend):
     assert depths[:2].tolist() == [1.5, 3.5] and depths[2].isnan()
 
 
-def test_no_rays(device, backend):
-    weights, edges = (tensor.to(device) for tensor in rays(0, 5))
-    assert resample(weights, edges, 7, backend=backend).shape == (0, 7)
-
-
 def test_carries_no_gradient(device, backend):
     weights, edges = (tensor.to(device).requires_grad_() for tensor in rays(2, 5))
     assert not resample(weights, edges, 3, backend=backend).requires_grad

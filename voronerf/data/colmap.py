@@ -59,19 +59,12 @@ class ColmapImage(NamedTuple):
 
 
 class ColmapModel(NamedTuple):
-    """A sparse model.
+    """A sparse model."""
 
-    Attributes:
-        path: of the file of images.
-        images: in the order of their names.
-        numbers: int64 [n], of the points that at least three images see, rising.
-        points: float64 [n, 3].
-    """
-
-    path: Path
-    images: list[ColmapImage]
-    numbers: Array
-    points: Array
+    path: Path  # of the file of images
+    images: list[ColmapImage]  # in the order of their names
+    numbers: Array  # int64 [n], of the points that at least three images see, rising
+    points: Array  # float64 [n, 3]
 
 
 def find_model(folder: Path) -> Path | None:

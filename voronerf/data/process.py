@@ -75,23 +75,14 @@ class Settings(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """What a mapper found.
+    """What a mapper found."""
 
-    Attributes:
-        folder: of its files.
-        mapper: "global" or "incremental".
-        images: in the order of their names.
-        placed: images whose camera lies with others.
-        error: mean distance of the points from where they were seen, in pixels.
-        faults: what is wrong with it, as parts of a line.
-    """
-
-    folder: Path
-    mapper: str
-    images: list[ColmapImage]
-    placed: int
-    error: float
-    faults: list[str]
+    folder: Path  # of its files
+    mapper: str  # "global" or "incremental"
+    images: list[ColmapImage]  # in the order of their names
+    placed: int  # images whose camera lies with others
+    error: float  # mean distance of the points from where they were seen, in pixels
+    faults: list[str]  # what is wrong with it, as parts of a line
 
 
 def process(
@@ -273,19 +264,12 @@ def _take_frames(video: Path, folder: Path, count: int) -> None:
 
 @dataclass(frozen=True)
 class Stages:
-    """What all stages work on.
+    """What all stages work on."""
 
-    Attributes:
-        colmap: the module pycolmap.
-        work: the folder of what the stages leave.
-        images: the folder of the images.
-        progress: as of :func:`process`.
-    """
-
-    colmap: Any
-    work: Path
-    images: Path
-    progress: Progress
+    colmap: Any  # the module pycolmap
+    work: Path  # the folder of what the stages leave
+    images: Path  # the folder of the images
+    progress: Progress  # as of :func:`process`
 
     @property
     def database(self) -> Path:

@@ -122,17 +122,11 @@ def ask(
 
 @dataclass(frozen=True)
 class Nodes:
-    """The nodes of a grid of cubes.
+    """The nodes of a grid of cubes."""
 
-    Attributes:
-        origin: [3], position of the first.
-        side: of a cube.
-        shape: nodes along each axis.
-    """
-
-    origin: Tensor
-    side: float
-    shape: tuple[int, int, int]
+    origin: Tensor  # [3], position of the first
+    side: float  # of a cube
+    shape: tuple[int, int, int]  # nodes along each axis
 
     @classmethod
     def fill(cls, box: Tensor, resolution: int) -> Nodes:
@@ -174,19 +168,12 @@ def density_at(run: Run, nodes: Nodes, track: Track) -> Tensor:
 
 @dataclass(frozen=True)
 class View:
-    """What one camera sees.
+    """What one camera sees."""
 
-    Attributes:
-        camera: the camera alone.
-        distance: [h, w], along the ray to the surface, infinite if it meets none.
-        colour: [h, w, 3].
-        surface: [h, w, 3], the point that each pixel shows.
-    """
-
-    camera: Cameras
-    distance: Tensor
-    colour: Tensor
-    surface: Tensor
+    camera: Cameras  # the camera alone
+    distance: Tensor  # [h, w], along the ray to the surface, infinite if it meets none
+    colour: Tensor  # [h, w, 3]
+    surface: Tensor  # [h, w, 3], the point that each pixel shows
 
 
 def training_views(run: Run, side: int = VIEW_SIDE, track: Track = in_silence) -> Iterator[View]:

@@ -31,20 +31,14 @@ _CORNERS = torch.tensor([*itertools.product((-1.0, 1.0), repeat=3)])
 class Coarse:
     """Voxels of a box, of which those that show nothing are left out.
 
-    Attributes:
-        box: [2, 3].
-        shape: int64 [3], voxels along each axis.
-        voxels: int32 [q], flat numbers, ascending.
-        values: uint8 [q, 4], colour and opacity of a ray through the voxel along an axis.
-
     Raises:
         ValueError: For other shapes or types.
     """
 
-    box: Tensor
-    shape: Tensor
-    voxels: Tensor
-    values: Tensor
+    box: Tensor  # [2, 3]
+    shape: Tensor  # int64 [3], voxels along each axis
+    voxels: Tensor  # int32 [q], flat numbers, ascending
+    values: Tensor  # uint8 [q, 4], colour and opacity of a ray through the voxel along an axis
 
     def __post_init__(self) -> None:
         q = len(self.voxels)

@@ -43,17 +43,11 @@ MOST_OFF, LEAST_MET = 0.5, 0.002
 
 @dataclass(frozen=True)
 class Voxels:
-    """Some of the voxels of a box.
+    """Some of the voxels of a box."""
 
-    Attributes:
-        box: [2, 3], in the space of the contraction.
-        chosen: bool [x, y, z].
-        contraction: Of the space that the box is in, or None.
-    """
-
-    box: Tensor
-    chosen: Tensor
-    contraction: Contraction | Perspective | None = None
+    box: Tensor  # [2, 3], in the space of the contraction
+    chosen: Tensor  # bool [x, y, z]
+    contraction: Contraction | Perspective | None = None  # of the space that the box is in, or None
 
     def numbers(self, positions: Tensor) -> Tensor:
         """The voxel of each position [n, 3] of the world, int64 [n]; -1 outside of the box."""
@@ -83,21 +77,13 @@ def along(voxels: Voxels, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Changes:
-    """What new pictures show.
+    """What new pictures show."""
 
-    Attributes:
-        cells: bool [k], those that have changed, or are worse in the new pictures than they were in training.
-        voxels: The space that has changed.
-        off: The share of those of the new rays that meet a cell that are off.
-        met: The share of the new rays that meet a cell.
-        shares: [k], the share of each cell's rays that are off and meet no changed voxel.
-    """
-
-    cells: Tensor
-    voxels: Voxels
-    off: float
-    met: float
-    shares: Tensor
+    cells: Tensor  # bool [k], those that have changed, or are worse in the new pictures than they were in training
+    voxels: Voxels  # the space that has changed
+    off: float  # the share of those of the new rays that meet a cell that are off
+    met: float  # the share of the new rays that meet a cell
+    shares: Tensor  # [k], the share of each cell's rays that are off and meet no changed voxel
 
 
 @torch.no_grad()

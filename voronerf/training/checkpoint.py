@@ -285,9 +285,6 @@ def _write_networks(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
             for name, tensor in own.items():
                 digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
                 digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
-            if not own and "file" in router:  # of a joint training, which has written it
-                routers.append(router)
-                continue
             path = folder / f"networks-{digest.hexdigest()}.safetensors"
             if not path.is_file():
                 save_checkpoint(path, Checkpoint(own, kind))

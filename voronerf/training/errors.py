@@ -36,17 +36,11 @@ class Cells(Protocol):
 
 
 class SeenErrors(NamedTuple):
-    """How far rays are off.
+    """How far rays are off."""
 
-    Attributes:
-        error: [r], the squared error of the colour, summed over the channels.
-        cell: int64 [r], the cell of the heaviest sample; k for rays that see the background.
-        depth: [r], the distance of the heaviest sample; that of the far end for rays that see the background.
-    """
-
-    error: Tensor
-    cell: Tensor
-    depth: Tensor
+    error: Tensor  # [r], the squared error of the colour, summed over the channels
+    cell: Tensor  # int64 [r], the cell of the heaviest sample; k for rays that see the background
+    depth: Tensor  # [r], the distance of the heaviest sample; that of the far end for rays that see the background
 
 
 @torch.no_grad()

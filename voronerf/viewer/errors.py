@@ -28,19 +28,12 @@ UNSEEN = (150, 160, 175)
 
 @dataclass(frozen=True, eq=False)
 class ViewError:
-    """A training view beside its picture.
+    """A training view beside its picture."""
 
-    Attributes:
-        number: of the view.
-        camera: of the reduced view.
-        error: [h, w, 3], rendered minus true colour.
-        image: what was rendered.
-    """
-
-    number: int
-    camera: Cameras
-    error: Tensor
-    image: RenderedImage
+    number: int  # of the view
+    camera: Cameras  # of the reduced view
+    error: Tensor  # [h, w, 3], rendered minus true colour
+    image: RenderedImage  # what was rendered
 
 
 class ViewErrors:

@@ -68,21 +68,13 @@ class Runs(NamedTuple):
 
 
 class Composed(NamedTuple):
-    """Rays made of runs.
+    """Rays made of runs."""
 
-    Attributes:
-        colour: [r, c], without a background.
-        through: [r], the light that passes all of them.
-        before: [q], the optical depth in front of each run.
-        place: int64 [q], where each run is in a table with a row for each ray.
-        width: The columns of the table.
-    """
-
-    colour: Tensor
-    through: Tensor
-    before: Tensor
-    place: Tensor
-    width: int
+    colour: Tensor  # [r, c], without a background
+    through: Tensor  # [r], the light that passes all of them
+    before: Tensor  # [q], the optical depth in front of each run
+    place: Tensor  # int64 [q], where each run is in a table with a row for each ray
+    width: int  # the columns of the table
 
     @property
     def front(self) -> Tensor:
