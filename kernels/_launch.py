@@ -31,10 +31,9 @@ def filled(struct: Any, **fields: Any) -> Any:
 
 
 def of_both_dtypes(kernel: Any) -> None:
-    """Has a kernel of points, centres and weights compiled for float32 and float64 when its file is."""
+    """Has a kernel of points and centres compiled for float32 and float64 when its file is."""
     for scalar in (wp.float32, wp.float64):
-        rows = wp.array2d(dtype=scalar)
-        wp.overload(kernel, {"points": rows, "centres": rows, "weights": wp.array(dtype=scalar)})
+        wp.overload(kernel, dict.fromkeys(("points", "centres"), wp.array2d(dtype=scalar)))
 
 
 def on_stream(tensor: Tensor) -> AbstractContextManager[Any]:

@@ -23,8 +23,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 def _locate_cell_kernel(
     points: wp.array2d(dtype=Any),
     centres: wp.array2d(dtype=Any),
-    weights: wp.array(dtype=Any),
-    weighted: wp.bool,
     child_offsets: wp.array(dtype=wp.int32),
     child: wp.array(dtype=wp.int32),
     depth: wp.int32,
@@ -47,8 +45,6 @@ def _locate_cell_kernel(
                 dy = y - wp.float64(centres[j, 1])
                 dz = z - wp.float64(centres[j, 2])
                 value = dx * dx + dy * dy + dz * dz
-                if weighted:
-                    value = value - wp.float64(weights[j])
                 # Strict: ties keep the lowest index, and a point that is not finite takes the first centre.
                 if value < best:
                     best = value
@@ -64,13 +60,10 @@ of_both_dtypes(_locate_cell_kernel)
 
 
 @custom_op("locate_cell_warp")
-def locate_cell(
-    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int, weights: Tensor | None
-) -> Iterator[Tensor]:
+def locate_cell(points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int) -> Iterator[Tensor]:
     """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
     leaves = points.new_empty(points.shape[0], dtype=torch.int32)
     yield leaves
-    given = [array(tensor, points, points.dtype) for tensor in (points, centres, weights)]
-    tables = [array(tensor, points) for tensor in (child_offsets, child)]
-    inputs = [*given, weights is not None, *tables, depth, array(leaves, points)]
+    given = [array(tensor, points) for tensor in (points, centres, child_offsets, child)]
+    inputs = [*given, depth, array(leaves, points)]
     launch(_locate_cell_kernel, points.shape[0], inputs, points)

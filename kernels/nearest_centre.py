@@ -23,8 +23,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 def _nearest_centre_kernel(
     points: wp.array2d(dtype=Any),
     centres: wp.array2d(dtype=Any),
-    weights: wp.array(dtype=Any),
-    weighted: wp.bool,
     cells: wp.array(dtype=wp.int32),
 ) -> None:
     i = wp.tid()
@@ -38,8 +36,6 @@ def _nearest_centre_kernel(
         dy = y - wp.float64(centres[j, 1])
         dz = z - wp.float64(centres[j, 2])
         value = dx * dx + dy * dy + dz * dz
-        if weighted:
-            value = value - wp.float64(weights[j])
         # Strict: ties keep the lowest index, and a non-finite point, whose values are NaN or infinite, gets cell 0.
         if value < best:
             best = value
@@ -51,9 +47,9 @@ of_both_dtypes(_nearest_centre_kernel)
 
 
 @custom_op("nearest_centre_warp")
-def nearest_centre(points: Tensor, centres: Tensor, weights: Tensor | None) -> Iterator[Tensor]:
-    """Index of the centre with the smallest ``|x - c|^2 - w`` for every point; see ``voronerf.ops.nearest_centre``."""
+def nearest_centre(points: Tensor, centres: Tensor) -> Iterator[Tensor]:
+    """Index of the nearest centre of every point; see ``voronerf.ops.nearest_centre``."""
     cells = points.new_empty(points.shape[0], dtype=torch.int32)
     yield cells
-    given = [array(tensor, points, points.dtype) for tensor in (points, centres, weights)]
-    launch(_nearest_centre_kernel, points.shape[0], [*given, weights is not None, array(cells, points)], points)
+    given = [array(tensor, points) for tensor in (points, centres, cells)]
+    launch(_nearest_centre_kernel, points.shape[0], given, points)

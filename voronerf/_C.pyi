@@ -45,7 +45,6 @@ class BalanceInputs(NamedTuple):
     steps: int  # int64
     alpha: float  # float64
     neighbours: int  # int64
-    of_all: bool
 
 CellSortWay: tuple[str, ...]  # automatic counting radix
 
@@ -359,13 +358,6 @@ class Sightings(NamedTuple):
     s: int  # int64
     m: int  # int64
 
-class SparseAdam(NamedTuple):
-    step_size: float  # float32
-    decay: float  # float32
-    decay_sq: float  # float32
-    epsilon: float  # float32
-    every: bool
-
 TableType: tuple[str, ...]  # float32 bfloat16 float16
 
 # AdamRule[], AdamGuard, const float32**, float32**, float32**, float32**, int64[], Cpu
@@ -401,8 +393,8 @@ def cell_sort_workspace(_0: int, _1: int) -> int: ...
 @overload
 def cell_sort_workspace(_0: int, _1: int, _2: str, _3: Cuda) -> int: ...
 
-# const float64*, const float64*, int64, Cpu
-def centre_grid_build(_0: Tensor | None, _1: Tensor | None, _2: int, _3: Cpu) -> CentreGridTables: ...
+# const float64*, int64, Cpu
+def centre_grid_build(_0: Tensor | None, _1: int, _2: Cpu) -> CentreGridTables: ...
 
 # CentreGridTables, int32, float32*, int32*, int32*
 def centre_grid_copy(_0: CentreGridTables, _1: int, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None) -> bool: ...
@@ -513,14 +505,14 @@ def isa_supported(_0: str) -> bool: ...
 # 
 def keep_freed_memory() -> None: ...
 
-# const float32*, const float32*, const float32*, const int32*, const int32*, int32*, int32*, int64, int64, int32, Cpu
+# const float32*, const float32*, const int32*, const int32*, int32*, int32*, int64, int64, int32, Cpu
 @overload
-def locate_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: int, _8: int, _9: int, _10: Cpu) -> bool: ...
-# const float64*, const float64*, const float64*, const int32*, const int32*, int32*, int32*, int64, int64, int32, Cpu
-# const float32*, const float32*, const float32*, const int32*, const int32*, const int32*, int32*, int64, int64, int64, int32, Cuda
+def locate_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: int, _7: int, _8: int, _9: Cpu) -> bool: ...
+# const float64*, const float64*, const int32*, const int32*, int32*, int32*, int64, int64, int32, Cpu
+# const float32*, const float32*, const int32*, const int32*, const int32*, int32*, int64, int64, int64, int32, Cuda
 @overload
-def locate_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: Tensor | None, _7: int, _8: int, _9: int, _10: int, _11: Cuda) -> None: ...
-# const float64*, const float64*, const float64*, const int32*, const int32*, const int32*, int32*, int64, int64, int64, int32, Cuda
+def locate_cell(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Tensor | None, _6: int, _7: int, _8: int, _9: int, _10: Cuda) -> None: ...
+# const float64*, const float64*, const int32*, const int32*, const int32*, int32*, int64, int64, int64, int32, Cuda
 
 # const int32*, const int32*, int64, int64
 def locate_cell_fault(_0: Tensor | None, _1: Tensor | None, _2: int, _3: int) -> str | None: ...
@@ -545,18 +537,18 @@ def march_rays_fill(_0: MarchInputs, _1: Tensor | None, _2: Tensor | None, _3: i
 # Peak, Cpu
 def measure_peak(_0: str, _1: Cpu) -> float: ...
 
-# const float32*, const float32*, const float32*, int32*, int64, int64, Cpu
+# const float32*, const float32*, int32*, int64, int64, Cpu
 @overload
-def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: int, _5: int, _6: Cpu) -> None: ...
-# const float64*, const float64*, const float64*, int32*, int64, int64, Cpu
-# const float32*, const float32*, const float32*, const int32*, int32*, int64, int64, Cuda
+def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: int, _4: int, _5: Cpu) -> None: ...
+# const float64*, const float64*, int32*, int64, int64, Cpu
+# const float32*, const float32*, const int32*, int32*, int64, int64, Cuda
 @overload
-def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: int, _7: Cuda) -> None: ...
-# const float64*, const float64*, const float64*, const int32*, int32*, int64, int64, Cuda
+def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: int, _5: int, _6: Cuda) -> None: ...
+# const float64*, const float64*, const int32*, int32*, int64, int64, Cuda
 
-# const float32*, const float32*, const float32*, CentreGrid, int32*, int64, int64, Cpu
-def nearest_centre_grid(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: CentreGrid, _4: Tensor | None, _5: int, _6: int, _7: Cpu) -> None: ...
-# const float64*, const float64*, const float64*, CentreGrid, int32*, int64, int64, Cpu
+# const float32*, const float32*, CentreGrid, int32*, int64, int64, Cpu
+def nearest_centre_grid(_0: Tensor | None, _1: Tensor | None, _2: CentreGrid, _3: Tensor | None, _4: int, _5: int, _6: Cpu) -> None: ...
+# const float64*, const float64*, CentreGrid, int32*, int64, int64, Cpu
 
 # ObservedSamples, float32*, uint8*, int32*, float32*, Cpu
 @overload
@@ -597,13 +589,6 @@ def run_sums(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3: Ten
 
 # Sightings, float32*, float32*, float32*, Cpu
 def sighting_gradient(_0: Sightings, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Cpu) -> None: ...
-
-# SparseAdam, const float32*, float32*, float32*, float32*, int64, Cpu
-@overload
-def sparse_adam(_0: SparseAdam, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: Cpu) -> None: ...
-# SparseAdam, const float32*, float32*, float32*, float32*, int64, Cuda
-@overload
-def sparse_adam(_0: SparseAdam, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: int, _6: Cuda) -> None: ...
 
 # const float32*, float32*, int64, int64, Cpu
 @overload

@@ -387,7 +387,7 @@ def step(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
     compare(f"render_loss b={rays} m={n}", functools.partial(loss_work, rays, n), "torch, sums over all samples")
     compare(f"observe_occupancy m={n}", functools.partial(observe_work, n), "torch, as nerfacc")
     for entries, touched in ((n >> 4, 1.0), (n, 1 / 64)):
-        name = f"sparse_adam {2 * entries} numbers, {touched:.0%} with a gradient"
+        name = f"adam {2 * entries} numbers, {touched:.0%} with a gradient"
         compare(name, functools.partial(adam_work, entries, touched), "torch.optim.Adam, fused")
     for direction in (FORWARD, BACKWARD):
         for log2_entries in (15, 19):

@@ -1,6 +1,6 @@
-"""Cases of march_rays, camera_rays and balance_centres.
+"""Cases of march_rays and balance_centres.
 
-r rays, s strata of a ray, n strata of all rays, cells, pixels or samples; k centres.
+r rays, s strata of a ray, n strata of all rays or samples; k centres.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from torch import Tensor
 from ops.case import FORWARD, Case, Contender, NotApplicable, Work, generator, optional, relative_error, rotation
 from ops.cases_lookup import FLOPS
 from voronerf import ops
-from voronerf.ops.camera_rays.reference import camera_rays as reference_camera_rays
-from voronerf.rendering.cameras import look_at
 
 FULL = torch.float32
 ALL = ("native", "reference", "warp")
@@ -27,9 +25,6 @@ GRID = 64
 """Cells of the grid that is marched through, along each axis."""
 STEPS = 500
 """Of a balance."""
-"""Heaviest samples of a batch: 10,000 over 500 batches."""
-LENS = (-0.08, 0.02, 1e-3, -5e-4, 0.0, 0.0, 0.0, 0.0)
-"""A lens that bends the corner of a picture by some ten pixels."""
 
 
 def cases() -> list[Case]:
@@ -41,15 +36,22 @@ def cases() -> list[Case]:
         work = functools.partial(_march_work, n, jitter)
         shown = ALL if base else ("native",)
         found.append(Case("march_rays", name, FULL, FORWARD, n, None, work, shown, base and not jitter))
-    for n, bent in ((1 << 10, False), (1 << 18, False), (1 << 18, True)):
-        base = n == 1 << 18
-        work = functools.partial(_camera_work, n, bent)
-        name = f"{'lens' if bent else 'pinhole'} n={n}"
-        found.append(Case("camera_rays", name, FULL, FORWARD, n, None, work, ("reference", "warp"), base))
     for n, k in ((10_000, 16), (10_000, 256)):
         work = functools.partial(_balance_work, n, k)
         name = f"n={n} k={k} {STEPS} steps"
-        found.append(Case("balance_centres", name, FULL, FORWARD, n, k, work, ALL if k == 16 else ("native",), k == 16))
+        found.append(
+            Case(
+                "balance_centres",
+                name,
+                FULL,
+                FORWARD,
+                n,
+                k,
+                work,
+                ("native", "reference") if k == 16 else ("native",),
+                k == 16,
+            )
+        )
     return found
 
 
@@ -138,67 +140,6 @@ def _march_masked(
     offsets = F.pad(kept.sum(1).cumsum(0), (1, 0)).int()
     ray = torch.arange(r, device=near.device, dtype=torch.int32)[:, None].expand(r, samples)[kept]
     return offsets, ray, depths[kept], (length / samples).expand(r, samples)[kept], positions[kept]
-
-
-def _camera_work(n: int, bent: bool, device: torch.device) -> Work:
-    count, side = 100, 400
-    around = F.normalize(torch.randn(count, 3, generator=generator(1)), dim=1)
-    poses = look_at(4 * around, torch.zeros(3), torch.tensor((0.0, 0.0, 1.0))).to(device)
-    intrinsics = torch.tensor((555.0, 550.0, side / 2, side / 2)).repeat(count, 1).to(device)
-    distortion = torch.tensor(LENS).repeat(count, 1).to(device) if bent else None
-
-    def batch(seed: int) -> list[Tensor]:
-        random = generator(seed)
-        places = torch.rand(2, n, generator=random) * side
-        return [tensor.to(device) for tensor in (*places, torch.randint(0, count, (n,), generator=random).int())]
-
-    sets = [batch(seed) for seed in range(rotation(12 * n))]
-
-    def contender(function: Callable[..., Any]) -> Contender:
-        def run(call: int) -> Any:
-            x, y, camera = sets[call % len(sets)]
-            return function(poses, intrinsics, x, y, camera=camera, distortion=distortion)
-
-        return Contender(run)
-
-    x, y, camera = sets[0]
-    wide = [tensor.double() for tensor in (poses, intrinsics, x, y)]
-    lens = None if distortion is None else distortion.double()
-    exact = reference_camera_rays(*wide, camera=camera, distortion=lens, models=None)
-    alternative = "torch, Newton in float32" if bent else "torch, gathered poses + einsum"
-    return Work(
-        lambda backend: contender(functools.partial(ops.camera_rays, backend=backend)),
-        {alternative: lambda: contender(_camera_torch)},
-        lambda found: max(relative_error(a, b) for a, b in zip(found, exact)),
-        1e-4,
-        36.0 * n,
-        "copy",
-    )
-
-
-def _camera_torch(
-    poses: Tensor, intrinsics: Tensor, x: Tensor, y: Tensor, *, camera: Tensor, distortion: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """As nerf-pytorch's get_rays for any pixels of any cameras; the lens as nerfstudio undoes it, ten steps."""
-    fx, fy, cx, cy = intrinsics[camera].unbind(-1)
-    u, v = (x - cx) / fx, (y - cy) / fy
-    if distortion is not None:
-        k1, k2, p1, p2 = distortion[camera, :4].unbind(-1)
-        a, b = u, v
-        for _ in range(10):
-            r2 = a * a + b * b
-            radial, slope = 1 + r2 * (k1 + r2 * k2), 2 * k1 + 4 * r2 * k2
-            fa = radial * a + 2 * p1 * a * b + p2 * (r2 + 2 * a * a) - u
-            fb = radial * b + 2 * p2 * a * b + p1 * (r2 + 2 * b * b) - v
-            aa = radial + slope * a * a + 2 * p1 * b + 6 * p2 * a
-            ab = slope * a * b + 2 * p1 * a + 2 * p2 * b
-            bb = radial + slope * b * b + 2 * p2 * a + 6 * p1 * b
-            determinant = aa * bb - ab * ab
-            a, b = a - (fa * bb - fb * ab) / determinant, b - (fb * aa - fa * ab) / determinant
-        u, v = a, b
-    pose = poses[camera]
-    local = torch.stack((u, -v, -torch.ones_like(u)), -1)
-    return pose[:, :3, 3], F.normalize(torch.einsum("nij,nj->ni", pose[:, :3, :3], local), dim=-1)
 
 
 def _balance_work(n: int, k: int, device: torch.device) -> Work:

@@ -1,4 +1,4 @@
-"""Cases of what surrounds the networks in a training step: pixel_rays, render_loss, observe_occupancy and sparse_adam.
+"""Cases of what surrounds the networks in a training step: pixel_rays, render_loss, observe_occupancy and adam.
 
 b rays of a batch, m samples of all rays, n rows of the table: rays, samples or entries. The sizes of its rows are those
 of a step on Lego at 100 x 100. One thread.
@@ -42,7 +42,7 @@ def cases() -> list[Case]:
     for log2_entries, touched in ((15, 1.0), (19, 1 / 64)):
         entries = 8 << log2_entries
         name = f"8 x 2^{log2_entries} entries, {touched:.0%} with a gradient"
-        rows.append(("sparse_adam", name, FORWARD, entries, functools.partial(adam_work, entries, touched)))
+        rows.append(("adam", name, FORWARD, entries, functools.partial(adam_work, entries, touched)))
     backends = ("native", "reference")
     return [
         Case(op, name, torch.float32, direction, n, None, work, backends, "2^19" not in name, threads=1)
@@ -228,9 +228,11 @@ def adam_work(entries: int, touched: float, device: torch.device) -> Work:
 
     def ours(backend: str) -> Contender:
         state = [table.clone(), torch.zeros_like(table), torch.zeros_like(table)]
+        rule = ops.Rule(torch.zeros((), device=device), 1e-2, every=False)
 
         def run(call: int) -> Results:
-            ops.sparse_adam(state[0], gradient, *state[1:], step=call + 1, learning_rate=1e-2, backend=backend)
+            lists = ([tensor] for tensor in (state[0], gradient, *state[1:]))
+            ops.adam([rule], *lists, backend=backend)
             return state[:1]
 
         return Contender(run)

@@ -4,7 +4,7 @@
 
 namespace voronerf {
 
-VN_STRUCT(BalanceInputs, samples, masses, m, k, steps, alpha, neighbours, of_all);
+VN_STRUCT(BalanceInputs, samples, masses, m, k, steps, alpha, neighbours);
 
 VN_BINDINGS(module) {
   module.cpu("balance_centres", VN_CPU(balance_centres_cpu));

@@ -1,10 +1,10 @@
-// Adam on several parameters in one call. Apart from sparse_adam.h, which the files of each instruction set read.
+// A step of Adam of several parameters in one call; the formula is in voronerf/ops/adam.
 #pragma once
 
 #include <cstdint>
 #include <vector>
 
-#include "encoding/sparse_adam.h"
+#include "encoding/adam_isa.h"
 
 namespace voronerf {
 
@@ -14,7 +14,7 @@ struct AdamRule {
   const float* rate_at;  // [1], or null
   float* step;           // [1], steps done; goes up by one unless the step is left out
   double decay, decay_sq, epsilon;
-  bool every;  // as of SparseAdam
+  bool every;  // as of AdamStep
 };
 
 // When a step is left out: where `found` is not 0. With a loss, it is set first: to whether the loss or a gradient of a

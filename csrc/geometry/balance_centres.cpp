@@ -16,7 +16,7 @@ constexpr int64_t kSerial = 1 << 20;  // pairs of sample and centre below which 
 
 void weigh(const BalanceInputs& in, const float* centres, double* weights, int32_t* cells, Isa isa, int threads) {
   const int team = in.m * in.k < kSerial ? 1 : threads;
-  nearest_centre_cpu<float>(in.samples, centres, nullptr, cells, in.m, in.k, isa, team);
+  nearest_centre_cpu<float>(in.samples, centres, cells, in.m, in.k, isa, team);
   std::fill_n(weights, in.k, 0.0);
   for (int64_t i = 0; i < in.m; ++i) weights[cells[i]] += in.masses[i];
 }
@@ -58,7 +58,6 @@ void balance_centres_cpu(const BalanceInputs& in, float* centres, double* weight
   double *moved = workspace, *distances = moved + 3 * in.k, *others = distances + in.k;
   weigh(in, centres, weights, cells, isa, threads);
   for (int64_t step = 0; step < in.steps && in.k > 1; ++step) {
-    const double heaviest_of_all = *std::max_element(weights, weights + in.k);
     for (int64_t i = 0; i < in.k; ++i) {
       find_neighbours(in, centres, i, distances, others);
       double heaviest = weights[i], shift[3] = {0.0, 0.0, 0.0};
@@ -70,7 +69,6 @@ void balance_centres_cpu(const BalanceInputs& in, float* centres, double* weight
           shift[axis] += way * (weights[j] - weights[i]);
         }
       }
-      if (in.of_all) heaviest = heaviest_of_all;
       // A neighbourhood without any weight has only zero differences.
       const double scale = heaviest > 0.0 ? in.alpha / (heaviest * static_cast<double>(in.neighbours)) : 0.0;
       for (int axis = 0; axis < 3; ++axis) moved[3 * i + axis] = centres[3 * i + axis] + scale * shift[axis];

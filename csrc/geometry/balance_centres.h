@@ -15,7 +15,6 @@ struct BalanceInputs {
   int64_t steps;
   double alpha;
   int64_t neighbours;  // 1 <= neighbours < k, or k == 1
-  bool of_all;         // normalise by the heaviest of all cells instead of the neighbourhood's
 };
 
 // Doubles of workspace.

@@ -36,7 +36,7 @@ struct List {
 };
 
 struct Scene {
-  std::vector<double> centres;  // [k,4] with weights
+  const double* centres;  // [k,3]
   double middle[3], inverse[3];
   int bits;
   Isa isa;
@@ -60,7 +60,7 @@ struct Scene {
   }
 
   int32_t run(const double* corners, const List& list, int32_t* out, double* workspace) const {
-    VN_FOR_ISA(isa, centre_grid_prune(corners, centres.data(), list.candidates, list.count, out, workspace))
+    VN_FOR_ISA(isa, centre_grid_prune(corners, centres, list.candidates, list.count, out, workspace))
   }
 };
 
@@ -179,11 +179,11 @@ class Task {
   }
 };
 
-// Indices of the centres that no other at the same place makes superfluous, rising.
-std::vector<int32_t> distinct(const std::vector<double>& centres, int32_t k) {
+// Indices of the first centre at each place, rising.
+std::vector<int32_t> distinct(const double* centres, int32_t k) {
   std::vector<int32_t> order(k), kept;
   std::iota(order.begin(), order.end(), 0);
-  const auto key = [&](int32_t i) { return &centres[4 * static_cast<int64_t>(i)]; };
+  const auto key = [&](int32_t i) { return centres + 3 * static_cast<int64_t>(i); };
   std::sort(order.begin(), order.end(), [&](int32_t a, int32_t b) {
     for (int d = 0; d < 3; ++d) {
       if (key(a)[d] != key(b)[d]) return key(a)[d] < key(b)[d];
@@ -192,9 +192,7 @@ std::vector<int32_t> distinct(const std::vector<double>& centres, int32_t k) {
   });
   int32_t before = -1;
   for (const int32_t i : order) {
-    // The lower index wins against the same weight and less.
-    const bool same = before >= 0 && std::equal(key(i), key(i) + 3, key(before));
-    if (same && key(i)[3] <= key(before)[3]) continue;
+    if (before >= 0 && std::equal(key(i), key(i) + 3, key(before))) continue;
     kept.push_back(i);
     before = i;
   }
@@ -244,23 +242,20 @@ const int32_t* find_list(const CentreGrid& grid, const double* point) {
   }
 }
 
-void query(const float* points, const float* centres, const float* weights, float weight_bound, const CentreGrid& grid,
-           int32_t* cells, int64_t n, Isa isa) {
-  VN_FOR_ISA(isa, nearest_centre_grid(points, centres, weights, weight_bound, grid, cells, n))
+void query(const float* points, const float* centres, const CentreGrid& grid, int32_t* cells, int64_t n, Isa isa) {
+  VN_FOR_ISA(isa, nearest_centre_grid(points, centres, grid, cells, n))
 }
 
-void query(const double* points, const double* centres, const double* weights, float, const CentreGrid& grid,
-           int32_t* cells, int64_t n, Isa) {
+void query(const double* points, const double* centres, const CentreGrid& grid, int32_t* cells, int64_t n, Isa) {
   for (int64_t i = 0; i < n; ++i) {
     const int32_t* list = find_list(grid, points + 3 * i);
-    cells[i] = list == nullptr ? -1 : nearest_of_list(points + 3 * i, centres, weights, list);
+    cells[i] = list == nullptr ? -1 : nearest_of_list(points + 3 * i, centres, list);
   }
 }
 
 }  // namespace
 
-std::unique_ptr<CentreGridTables> centre_grid_build(const double* centres, const double* weights, int64_t k, Isa isa,
-                                                    int threads) {
+std::unique_ptr<CentreGridTables> centre_grid_build(const double* centres, int64_t k, Isa isa, int threads) {
   auto tables = std::make_unique<CentreGridTables>();
   Scene scene;
   scene.isa = isa;
@@ -268,12 +263,9 @@ std::unique_ptr<CentreGridTables> centre_grid_build(const double* centres, const
   while (scene.bits < 6 && int64_t{1} << 3 * scene.bits < 8 * k) ++scene.bits;
   tables->bits = scene.bits;
   set_frame(centres, k, *tables, scene);
-  for (int64_t i = 0; i < k; ++i) {
-    scene.centres.insert(scene.centres.end(), centres + 3 * i, centres + 3 * i + 3);
-    scene.centres.push_back(weights == nullptr ? 0.0 : weights[i]);
-  }
+  scene.centres = centres;
 
-  std::vector<std::vector<int32_t>> level = {distinct(scene.centres, static_cast<int32_t>(k))};
+  std::vector<std::vector<int32_t>> level = {distinct(centres, static_cast<int32_t>(k))};
   for (int depth = 1; depth <= kTop; ++depth) {
     const int side = 1 << depth;
     std::vector<std::vector<int32_t>> next(int64_t{1} << 3 * depth);
@@ -326,12 +318,11 @@ std::unique_ptr<CentreGridTables> centre_grid_build(const double* centres, const
 }
 
 template <typename T>
-void nearest_centre_grid_cpu(const T* points, const T* centres, const T* weights, const CentreGrid& grid,
-                             int32_t* cells, int64_t n, int64_t k, Isa isa, int threads) {
-  const float weight_bound = nearest_centre_weight_bound(weights, k);
+void nearest_centre_grid_cpu(const T* points, const T* centres, const CentreGrid& grid, int32_t* cells, int64_t n,
+                             int64_t k, Isa isa, int threads) {
   parallel_for(ceil_div(n, kBlock), 1, threads, [&](int64_t b) {
     const int64_t start = b * kBlock, rows = std::min(kBlock, n - start);
-    query(points + 3 * start, centres, weights, weight_bound, grid, cells + start, rows, isa);
+    query(points + 3 * start, centres, grid, cells + start, rows, isa);
     // What the grid does not reach goes through all centres together.
     T far[3 * kBlock];
     int32_t where[kBlock], found[kBlock];
@@ -342,14 +333,14 @@ void nearest_centre_grid_cpu(const T* points, const T* centres, const T* weights
       where[count++] = static_cast<int32_t>(i - start);
     }
     if (count == 0) return;
-    nearest_centre_serial(far, centres, weights, weight_bound, found, count, k, isa);
+    nearest_centre_serial(far, centres, found, count, k, isa);
     for (int64_t i = 0; i < count; ++i) cells[start + where[i]] = found[i];
   });
 }
 
-template void nearest_centre_grid_cpu(const float*, const float*, const float*, const CentreGrid&, int32_t*, int64_t,
-                                      int64_t, Isa, int);
-template void nearest_centre_grid_cpu(const double*, const double*, const double*, const CentreGrid&, int32_t*, int64_t,
-                                      int64_t, Isa, int);
+template void nearest_centre_grid_cpu(const float*, const float*, const CentreGrid&, int32_t*, int64_t, int64_t, Isa,
+                                      int);
+template void nearest_centre_grid_cpu(const double*, const double*, const CentreGrid&, int32_t*, int64_t, int64_t, Isa,
+                                      int);
 
 }  // namespace voronerf

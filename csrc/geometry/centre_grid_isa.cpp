@@ -20,7 +20,7 @@ constexpr int kCorners = 8;
 constexpr int kVectors = kCorners / kDoubles;
 // Pairs are compared up to this many survivors of the first round: it is short lists that queries wait for.
 constexpr int32_t kPairs = 32;
-// Above twice 6 * 2^-53, the error of a value in |x - c|^2 + |w|, for two values, here and in the definition; and above
+// Above twice 6 * 2^-53, the error of a value in |x - c|^2, for two values, here and in the definition; and above
 // the underflow of squares.
 constexpr double kValueMargin = 4e-15;
 constexpr double kValueFloor = 1e-300;
@@ -41,10 +41,6 @@ VN_INLINE bool all_above(const double* a, const double* b) {
 #endif
 }
 
-VN_INLINE double size_of(double a) {
-  return a < 0.0 ? -a : a;
-}
-
 // Cells along an axis, kCellBits each; `near` is where the grid reaches.
 VN_INLINE I32 cells_of(F32 x, float middle, float inverse, Mask& near) {
   const F32 u = mul(sub(x, splat(middle)), splat(inverse)), size = abs(u), one = splat(1.0f);
@@ -57,9 +53,7 @@ VN_INLINE I32 cells_of(F32 x, float middle, float inverse, Mask& near) {
   return truncate(max(min(scaled, splat(static_cast<float>((1 << kCellBits) - 1))), splat(0.0f)));
 }
 
-template <bool Weighted>
-VN_INLINE void lanes(const float* points, const float* centres, const float* weights, float weight_bound,
-                     const CentreGrid& grid, int32_t* cells) {
+VN_INLINE void lanes(const float* points, const float* centres, const CentreGrid& grid, int32_t* cells) {
   F32 x, y, z;
   load_points(points, x, y, z);
   Mask near[3];
@@ -90,7 +84,6 @@ VN_INLINE void lanes(const float* points, const float* centres, const float* wei
     const F32 dx = sub(x, gather(grid.table, row)), dy = sub(y, gather(grid.table + 1, row));
     const F32 dz = sub(z, gather(grid.table + 2, row));
     F32 v = fma(dz, dz, fma(dy, dy, mul(dx, dx)));
-    if (Weighted) v = sub(v, gather(grid.table + 3, row));
     v = as_float(select(active, as_integer(v), as_integer(splat(__builtin_huge_valf()))));
     // min and max return their second operand if one is NaN: a NaN leaves `best` alone.
     second = min(max(v, best), second);
@@ -98,7 +91,7 @@ VN_INLINE void lanes(const float* points, const float* centres, const float* wei
     best = min(v, best);
   }
   store(cells, cell);
-  const F32 margin = add(mul(splat(kMargin), add(abs(best), splat(weight_bound))), splat(kFloor));
+  const F32 margin = add(mul(splat(kMargin), best), splat(kFloor));
   const unsigned all = (1u << kLanes) - 1u, reached = bits(near[0]) & bits(near[1]) & bits(near[2]) & all;
   unsigned uncertain = ~bits(less(add(best, margin), second)) & reached;
   if (uncertain != 0) {
@@ -106,36 +99,25 @@ VN_INLINE void lanes(const float* points, const float* centres, const float* wei
     store(places, entry);
     for (; uncertain != 0; uncertain &= uncertain - 1) {
       const int lane = __builtin_ctz(uncertain);
-      cells[lane] = nearest_of_list(points + 3 * lane, centres, weights, grid.lists + places[lane]);
+      cells[lane] = nearest_of_list(points + 3 * lane, centres, grid.lists + places[lane]);
     }
   }
   for (unsigned far = ~reached & all; far != 0; far &= far - 1) cells[__builtin_ctz(far)] = -1;
 }
 
-template <bool Weighted>
-VN_INLINE void run(const float* points, const float* centres, const float* weights, float weight_bound,
-                   const CentreGrid& grid, int32_t* cells, int64_t n) {
+}  // namespace
+
+void nearest_centre_grid(const float* points, const float* centres, const CentreGrid& grid, int32_t* cells, int64_t n) {
   int64_t i = 0;
   for (; i + kLanes <= n; i += kLanes) {
-    lanes<Weighted>(points + 3 * i, centres, weights, weight_bound, grid, cells + i);
+    lanes(points + 3 * i, centres, grid, cells + i);
   }
   if (i == n) return;
   float padded[3 * kLanes] = {};
   int32_t found[kLanes];
   __builtin_memcpy(padded, points + 3 * i, sizeof(float) * 3 * (n - i));
-  lanes<Weighted>(padded, centres, weights, weight_bound, grid, found);
+  lanes(padded, centres, grid, found);
   __builtin_memcpy(cells + i, found, sizeof(int32_t) * (n - i));
-}
-
-}  // namespace
-
-void nearest_centre_grid(const float* points, const float* centres, const float* weights, float weight_bound,
-                         const CentreGrid& grid, int32_t* cells, int64_t n) {
-  if (weights == nullptr) {
-    run<false>(points, centres, weights, weight_bound, grid, cells, n);
-  } else {
-    run<true>(points, centres, weights, weight_bound, grid, cells, n);
-  }
 }
 
 int32_t centre_grid_prune(const double* box, const double* centres, const int32_t* in, int32_t count, int32_t* out,
@@ -159,11 +141,10 @@ int32_t centre_grid_prune(const double* box, const double* centres, const int32_
   I64 nearest[kVectors] = {};
   int64_t strong[kCorners + 1] = {};
   for (int32_t i = 0; i < count; ++i) {
-    const double* c = centres + 4 * static_cast<int64_t>(in[i]);
+    const double* c = centres + 3 * static_cast<int64_t>(in[i]);
     for (int v = 0; v < kVectors; ++v) {
       const F64 dx = xs[v] - c[0], dy = ys[v] - c[1], dz = zs[v] - c[2];
-      const F64 squared = dx * dx + dy * dy + dz * dz, value = squared - c[3];
-      const F64 margin = (squared + size_of(c[3])) * kValueMargin + kValueFloor;
+      const F64 value = dx * dx + dy * dy + dz * dz, margin = value * kValueMargin + kValueFloor;
       const F64 a = value - margin, b = value + margin;
       __builtin_memcpy(lower + kCorners * static_cast<int64_t>(i) + kDoubles * v, &a, sizeof a);
       __builtin_memcpy(upper + kCorners * static_cast<int64_t>(i) + kDoubles * v, &b, sizeof b);
@@ -172,7 +153,7 @@ int32_t centre_grid_prune(const double* box, const double* centres, const int32_
       nearest[v] = less ? I64{} + i : nearest[v];
       lowest[v] = less ? value : lowest[v];
     }
-    const double inside = power_distance(mx, my, mz, c, c[3]);
+    const double inside = squared_distance(mx, my, mz, c);
     if (i == 0 || inside < least) {
       least = inside;
       strong[0] = i;

@@ -37,14 +37,13 @@ VN_HD int32_t grid_cell(double x, double middle, double inverse) {
 
 // nearest_by_definition among the candidates of a list: their number, then their indices, rising.
 template <typename T>
-VN_HD int32_t nearest_of_list(const T* point, const T* centres, const T* weights, const int32_t* list) {
+VN_HD int32_t nearest_of_list(const T* point, const T* centres, const int32_t* list) {
   double best = 1.7976931348623157e308;
   int32_t cell = 0;
   for (int32_t i = 1; i <= list[0]; ++i) {
     const int32_t j = list[i];
-    const double w = weights == nullptr ? 0.0 : static_cast<double>(weights[j]);
-    const double v = power_distance(static_cast<double>(point[0]), static_cast<double>(point[1]),
-                                    static_cast<double>(point[2]), centres + 3 * static_cast<int64_t>(j), w);
+    const double v = squared_distance(static_cast<double>(point[0]), static_cast<double>(point[1]),
+                                      static_cast<double>(point[2]), centres + 3 * static_cast<int64_t>(j));
     if (v < best) {
       best = v;
       cell = j;

@@ -23,21 +23,18 @@ int64_t locate_cell_workspace(int64_t m, int threads) {
 }
 
 template <typename T>
-bool locate_cell_cpu(const T* points, const T* centres, const T* weights, const int32_t* child_offsets,
-                     const int32_t* child, int32_t* leaves, int32_t* workspace, int64_t n, int64_t m, int depth,
-                     Isa isa, int threads) {
-  const float weight_bound = nearest_centre_weight_bound(weights, m);
+bool locate_cell_cpu(const T* points, const T* centres, const int32_t* child_offsets, const int32_t* child,
+                     int32_t* leaves, int32_t* workspace, int64_t n, int64_t m, int depth, Isa isa, int threads) {
   const auto find = [&](const T* at, const int32_t*, int32_t count, int32_t first, int32_t size, int, int32_t* found,
                         int64_t, int) {
-    nearest_centre_serial(at, centres + 3 * static_cast<int64_t>(first), weights == nullptr ? nullptr : weights + first,
-                          weight_bound, found, count, size, isa);
+    nearest_centre_serial(at, centres + 3 * static_cast<int64_t>(first), found, count, size, isa);
   };
   return descend({child_offsets, child, depth}, points, leaves, workspace, n, m, threads, find);
 }
 
-template bool locate_cell_cpu(const float*, const float*, const float*, const int32_t*, const int32_t*, int32_t*,
-                              int32_t*, int64_t, int64_t, int, Isa, int);
-template bool locate_cell_cpu(const double*, const double*, const double*, const int32_t*, const int32_t*, int32_t*,
-                              int32_t*, int64_t, int64_t, int, Isa, int);
+template bool locate_cell_cpu(const float*, const float*, const int32_t*, const int32_t*, int32_t*, int32_t*, int64_t,
+                              int64_t, int, Isa, int);
+template bool locate_cell_cpu(const double*, const double*, const int32_t*, const int32_t*, int32_t*, int32_t*, int64_t,
+                              int64_t, int, Isa, int);
 
 }  // namespace voronerf

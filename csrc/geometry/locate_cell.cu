@@ -11,32 +11,29 @@ namespace {
 
 constexpr int kThreads = 256;
 
-__device__ int32_t nearest_in_diagram(const float* point, const float* centres, const float* weights, int32_t k) {
+__device__ int32_t nearest_in_diagram(const float* point, const float* centres, int32_t k) {
   const float x = point[0], y = point[1], z = point[2];
-  float best = INFINITY, second = INFINITY, weight_bound = 0.0f;
+  float best = INFINITY, second = INFINITY;
   int32_t cell = 0;
   for (int32_t j = 0; j < k; ++j) {
     const float dx = x - centres[3 * j], dy = y - centres[3 * j + 1], dz = z - centres[3 * j + 2];
-    const float w = weights == nullptr ? 0.0f : weights[j];
-    const float v = fmaf(dz, dz, fmaf(dy, dy, dx * dx)) - w;
-    weight_bound = fmaxf(weight_bound, fabsf(w));
+    const float v = fmaf(dz, dz, fmaf(dy, dy, dx * dx));
     second = fminf(second, fmaxf(v, best));
     if (v < best) {
       best = v;
       cell = j;
     }
   }
-  const bool screened = weight_bound <= 1e30f && nearest_is_certain(best, second, weight_bound);
-  return screened ? cell : nearest_by_definition(point, centres, weights, k);
+  return nearest_is_certain(best, second) ? cell : nearest_by_definition(point, centres, k);
 }
 
-__device__ int32_t nearest_in_diagram(const double* point, const double* centres, const double* weights, int32_t k) {
-  return nearest_by_definition(point, centres, weights, k);
+__device__ int32_t nearest_in_diagram(const double* point, const double* centres, int32_t k) {
+  return nearest_by_definition(point, centres, k);
 }
 
 template <typename T>
 __global__ void __launch_bounds__(kThreads)
-    locate_cell_kernel(const T* __restrict__ points, const T* __restrict__ centres, const T* __restrict__ weights,
+    locate_cell_kernel(const T* __restrict__ points, const T* __restrict__ centres,
                        const int32_t* __restrict__ child_offsets, const int32_t* __restrict__ child,
                        const int32_t* __restrict__ rows, int32_t* __restrict__ leaves, int64_t n, int64_t m, int64_t g,
                        int depth) {
@@ -51,9 +48,7 @@ __global__ void __launch_bounds__(kThreads)
     if (state >= g) break;
     const int32_t first = child_offsets[state], end = child_offsets[state + 1];
     if (first < 0 || end <= first || end > m) break;
-    const T* local_weights = weights == nullptr ? nullptr : weights + first;
-    const int32_t found =
-        nearest_in_diagram(points + 3 * i, centres + 3 * static_cast<int64_t>(first), local_weights, end - first);
+    const int32_t found = nearest_in_diagram(points + 3 * i, centres + 3 * static_cast<int64_t>(first), end - first);
     state = child[first + found];
   }
   leaves[i] = ~state;  // -state - 1, which could overflow; negative where the walk has reached no leaf
@@ -62,18 +57,17 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 template <typename T>
-void locate_cell_cuda(const T* points, const T* centres, const T* weights, const int32_t* child_offsets,
-                      const int32_t* child, const int32_t* rows, int32_t* leaves, int64_t n, int64_t m, int64_t g,
-                      int depth, void* stream) {
+void locate_cell_cuda(const T* points, const T* centres, const int32_t* child_offsets, const int32_t* child,
+                      const int32_t* rows, int32_t* leaves, int64_t n, int64_t m, int64_t g, int depth, void* stream) {
   if (n == 0) return;
   const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(n, kThreads));
-  VN_LAUNCH((locate_cell_kernel<T>), blocks, kThreads, 0, stream, points, centres, weights, child_offsets, child, rows,
-            leaves, n, m, g, depth);
+  VN_LAUNCH((locate_cell_kernel<T>), blocks, kThreads, 0, stream, points, centres, child_offsets, child, rows, leaves,
+            n, m, g, depth);
 }
 
-template void locate_cell_cuda(const float*, const float*, const float*, const int32_t*, const int32_t*, const int32_t*,
-                               int32_t*, int64_t, int64_t, int64_t, int, void*);
-template void locate_cell_cuda(const double*, const double*, const double*, const int32_t*, const int32_t*,
-                               const int32_t*, int32_t*, int64_t, int64_t, int64_t, int, void*);
+template void locate_cell_cuda(const float*, const float*, const int32_t*, const int32_t*, const int32_t*, int32_t*,
+                               int64_t, int64_t, int64_t, int, void*);
+template void locate_cell_cuda(const double*, const double*, const int32_t*, const int32_t*, const int32_t*, int32_t*,
+                               int64_t, int64_t, int64_t, int, void*);
 
 }  // namespace voronerf

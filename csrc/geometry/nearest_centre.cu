@@ -10,16 +10,13 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kTile = 512;  // centres: 8 KiB of shared memory with their weights
+constexpr int kTile = 512;  // centres: 8 KiB of shared memory, 16 bytes each, which are read at once
 constexpr int kPoints = 2;  // of a thread
 
-template <bool kWeighted>
 __global__ void __launch_bounds__(kThreads, 4)
     nearest_screened_kernel(const float* __restrict__ points, const float* __restrict__ centres,
-                            const float* __restrict__ weights, const int32_t* __restrict__ rows,
-                            int32_t* __restrict__ cells, int64_t n, int64_t k) {
+                            const int32_t* __restrict__ rows, int32_t* __restrict__ cells, int64_t n, int64_t k) {
   VN_SHARED(tile, float4[kTile]);
-  VN_SHARED(bounds, float[kThreads / 32]);
   const int64_t first = static_cast<int64_t>(blockIdx.x) * kPoints * kThreads + threadIdx.x;
   const int64_t counted = rows == nullptr ? n : *rows;
   float at[kPoints][3], best[kPoints], second[kPoints];
@@ -33,15 +30,12 @@ __global__ void __launch_bounds__(kThreads, 4)
     best[p] = second[p] = INFINITY;
     cell[p] = 0;
   }
-  float weight_bound = 0.0f;  // of the weights that this thread copies
   for (int64_t start = 0; start < k; start += kTile) {
     const int count = static_cast<int>(k - start < kTile ? k - start : kTile);
     __syncthreads();  // the tile before is read by all
     for (int j = threadIdx.x; j < count; j += kThreads) {
       const float* c = centres + 3 * (start + j);
-      const float w = kWeighted ? weights[start + j] : 0.0f;
-      if constexpr (kWeighted) weight_bound = fmaxf(weight_bound, fabsf(w));
-      tile[j] = make_float4(c[0], c[1], c[2], w);
+      tile[j] = make_float4(c[0], c[1], c[2], 0.0f);
     }
     __syncthreads();
     const int32_t number = static_cast<int32_t>(start);
@@ -51,38 +45,28 @@ __global__ void __launch_bounds__(kThreads, 4)
 #pragma unroll
       for (int p = 0; p < kPoints; ++p) {
         const float dx = at[p][0] - c.x, dy = at[p][1] - c.y, dz = at[p][2] - c.z;
-        const float distance = fmaf(dz, dz, fmaf(dy, dy, dx * dx)), v = kWeighted ? distance - c.w : distance;
+        const float v = fmaf(dz, dz, fmaf(dy, dy, dx * dx));
         second[p] = fminf(second[p], fmaxf(v, best[p]));
         cell[p] = v < best[p] ? number + j : cell[p];
         best[p] = fminf(v, best[p]);
       }
     }
   }
-  if constexpr (kWeighted) {
-    for (int step = 16; step > 0; step /= 2) {
-      weight_bound = fmaxf(weight_bound, __shfl_xor_sync(kAllLanes, weight_bound, step));
-    }
-    if (threadIdx.x % 32 == 0) bounds[threadIdx.x / 32] = weight_bound;
-    __syncthreads();
-    for (float bound : bounds) weight_bound = fmaxf(weight_bound, bound);
-  }
 #pragma unroll
   for (int p = 0; p < kPoints; ++p) {
     const int64_t i = first + p * kThreads;
     if (i >= n) return;
-    // Beyond 1e30 a value can overflow while its difference from the weight does not; see nearest_centre_weight_bound.
-    const bool screened = weight_bound <= 1e30f && nearest_is_certain(best[p], second[p], weight_bound);
-    const int32_t found = screened ? cell[p] : nearest_by_definition(points + 3 * i, centres, weights, k);
+    const bool screened = nearest_is_certain(best[p], second[p]);
+    const int32_t found = screened ? cell[p] : nearest_by_definition(points + 3 * i, centres, k);
     cells[i] = i < counted ? found : -1;
   }
 }
 
 __global__ void __launch_bounds__(kThreads)
     nearest_centre_kernel(const double* __restrict__ points, const double* __restrict__ centres,
-                          const double* __restrict__ weights, const int32_t* __restrict__ rows,
-                          int32_t* __restrict__ cells, int64_t n, int64_t k) {
+                          const int32_t* __restrict__ rows, int32_t* __restrict__ cells, int64_t n, int64_t k) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < n) cells[i] = rows == nullptr || i < *rows ? nearest_by_definition(points + 3 * i, centres, weights, k) : -1;
+  if (i < n) cells[i] = rows == nullptr || i < *rows ? nearest_by_definition(points + 3 * i, centres, k) : -1;
 }
 
 unsigned blocks_of(int64_t n, int64_t points) {
@@ -92,22 +76,17 @@ unsigned blocks_of(int64_t n, int64_t points) {
 }  // namespace
 
 template <>
-void nearest_centre_cuda(const float* points, const float* centres, const float* weights, const int32_t* rows,
-                         int32_t* cells, int64_t n, int64_t k, void* stream) {
+void nearest_centre_cuda(const float* points, const float* centres, const int32_t* rows, int32_t* cells, int64_t n,
+                         int64_t k, void* stream) {
   if (n == 0) return;
-  const unsigned blocks = blocks_of(n, kPoints);
-  if (weights == nullptr) {
-    VN_LAUNCH(nearest_screened_kernel<false>, blocks, kThreads, 0, stream, points, centres, weights, rows, cells, n, k);
-  } else {
-    VN_LAUNCH(nearest_screened_kernel<true>, blocks, kThreads, 0, stream, points, centres, weights, rows, cells, n, k);
-  }
+  VN_LAUNCH(nearest_screened_kernel, blocks_of(n, kPoints), kThreads, 0, stream, points, centres, rows, cells, n, k);
 }
 
 template <>
-void nearest_centre_cuda(const double* points, const double* centres, const double* weights, const int32_t* rows,
-                         int32_t* cells, int64_t n, int64_t k, void* stream) {
+void nearest_centre_cuda(const double* points, const double* centres, const int32_t* rows, int32_t* cells, int64_t n,
+                         int64_t k, void* stream) {
   if (n == 0) return;
-  VN_LAUNCH(nearest_centre_kernel, blocks_of(n, 1), kThreads, 0, stream, points, centres, weights, rows, cells, n, k);
+  VN_LAUNCH(nearest_centre_kernel, blocks_of(n, 1), kThreads, 0, stream, points, centres, rows, cells, n, k);
 }
 
 }  // namespace voronerf

@@ -27,9 +27,9 @@ VN_INLINE int index_bits(int64_t k) {
 }
 
 // Smallest and second smallest key of each lane over the centres of a chunk.
-template <int U, bool Weighted>
-VN_INLINE void search(const F32* x, const F32* y, const F32* z, const float* centres, const float* weights,
-                      float weight_bound, I32 kept, int32_t count, I32* near, I32* next) {
+template <int U>
+VN_INLINE void search(const F32* x, const F32* y, const F32* z, const float* centres, I32 kept, int32_t count,
+                      I32* near, I32* next) {
   for (int u = 0; u < U; ++u) {
     near[u] = splat(int32_t{0x7fffffff});
     next[u] = splat(int32_t{0x7f800000});  // infinity
@@ -39,25 +39,21 @@ VN_INLINE void search(const F32* x, const F32* y, const F32* z, const float* cen
     const I32 index = splat(j);
     for (int u = 0; u < U; ++u) {
       const F32 dx = sub(x[u], cx), dy = sub(y[u], cy), dz = sub(z[u], cz);
-      F32 v = fma(dz, dz, fma(dy, dy, mul(dx, dx)));
-      // No weight is above the bound, so what is added is not negative.
-      if (Weighted) v = add(v, sub(splat(weight_bound), splat(weights[j])));
-      const I32 key = tag(as_integer(v), kept, index);
+      const I32 key = tag(as_integer(fma(dz, dz, fma(dy, dy, mul(dx, dx)))), kept, index);
       next[u] = min(max(key, near[u]), next[u]);
       near[u] = min(key, near[u]);
     }
   }
 }
 
-template <int U, bool Weighted>
-VN_INLINE void tile(const float* points, const float* centres, const float* weights, float weight_bound, int bits_taken,
-                    int32_t* cells, int64_t k) {
+template <int U>
+VN_INLINE void tile(const float* points, const float* centres, int bits_taken, int32_t* cells, int64_t k) {
   F32 x[U], y[U], z[U], best[U], second[U];
   I32 near[U], next[U], cell[U];
   for (int u = 0; u < U; ++u) load_points(points + 3 * kLanes * u, x[u], y[u], z[u]);
   const I32 taken = splat((1 << bits_taken) - 1), kept = splat(-(1 << bits_taken));
   const int32_t first = static_cast<int32_t>(k < kChunk ? k : kChunk);
-  search<U, Weighted>(x, y, z, centres, weights, weight_bound, kept, first, near, next);
+  search<U>(x, y, z, centres, kept, first, near, next);
   for (int u = 0; u < U; ++u) {
     best[u] = as_float(near[u]);
     second[u] = as_float(next[u]);
@@ -65,8 +61,7 @@ VN_INLINE void tile(const float* points, const float* centres, const float* weig
   }
   for (int64_t start = kChunk; start < k; start += kChunk) {
     const int32_t count = static_cast<int32_t>(k - start < kChunk ? k - start : kChunk);
-    search<U, Weighted>(x, y, z, centres + 3 * start, Weighted ? weights + start : nullptr, weight_bound, kept, count,
-                        near, next);
+    search<U>(x, y, z, centres + 3 * start, kept, count, near, next);
     for (int u = 0; u < U; ++u) {
       // A best or second value that is NaN or infinite, as an infinity with an index is, leaves the lane to float64.
       const F32 v = as_float(near[u]);
@@ -79,47 +74,35 @@ VN_INLINE void tile(const float* points, const float* centres, const float* weig
   for (int u = 0; u < U; ++u) {
     int32_t* out = cells + kLanes * u;
     store(out, cell[u]);
-    const F32 margin = add(mul(relative, add(abs(best[u]), splat(weight_bound))), splat(kFloor));
+    const F32 margin = add(mul(relative, best[u]), splat(kFloor));
     unsigned uncertain = ~bits(less(add(best[u], margin), second[u])) & ((1u << kLanes) - 1u);
     for (; uncertain != 0; uncertain &= uncertain - 1) {
       const int lane = __builtin_ctz(uncertain);
-      out[lane] = nearest_by_definition(points + 3 * (kLanes * u + lane), centres, weights, k);
+      out[lane] = nearest_by_definition(points + 3 * (kLanes * u + lane), centres, k);
     }
   }
 }
 
-template <bool Weighted>
-VN_INLINE void run(const float* points, const float* centres, const float* weights, float weight_bound, int32_t* cells,
-                   int64_t n, int64_t k) {
+}  // namespace
+
+void nearest_centre(const float* points, const float* centres, int32_t* cells, int64_t n, int64_t k) {
   const int bits_taken = index_bits(k);
   int64_t i = 0;
   for (; i + kTile * kLanes <= n; i += kTile * kLanes) {
-    tile<kTile, Weighted>(points + 3 * i, centres, weights, weight_bound, bits_taken, cells + i, k);
+    tile<kTile>(points + 3 * i, centres, bits_taken, cells + i, k);
   }
   for (; i < n; i += kLanes) {
     const int rest = n - i < kLanes ? static_cast<int>(n - i) : kLanes;
     float padded[3 * kLanes] = {};
     int32_t found[kLanes];
     __builtin_memcpy(padded, points + 3 * i, sizeof(float) * 3 * rest);
-    tile<1, Weighted>(padded, centres, weights, weight_bound, bits_taken, found, k);
+    tile<1>(padded, centres, bits_taken, found, k);
     __builtin_memcpy(cells + i, found, sizeof(int32_t) * rest);
   }
 }
 
-}  // namespace
-
-void nearest_centre(const float* points, const float* centres, const float* weights, float weight_bound, int32_t* cells,
-                    int64_t n, int64_t k) {
-  if (weights == nullptr) {
-    run<false>(points, centres, weights, weight_bound, cells, n, k);
-  } else {
-    run<true>(points, centres, weights, weight_bound, cells, n, k);
-  }
-}
-
-// Float64 is the definition itself (power_distance, here on vectors), with the same layout.
-void nearest_centre(const double* points, const double* centres, const double* weights, float, int32_t* cells,
-                    int64_t n, int64_t k) {
+// Float64 is the definition itself (squared_distance, here on vectors), with the same layout.
+void nearest_centre(const double* points, const double* centres, int32_t* cells, int64_t n, int64_t k) {
   constexpr int kVectors = 2, kRows = kVectors * kDoubles;
   for (int64_t i = 0; i < n; i += kRows) {
     const int rows = n - i < kRows ? static_cast<int>(n - i) : kRows;
@@ -133,10 +116,9 @@ void nearest_centre(const double* points, const double* centres, const double* w
     for (int u = 0; u < kVectors; ++u) best[u] = F64{} + 1.7976931348623157e308;
     for (int64_t j = 0; j < k; ++j) {
       const double* c = centres + 3 * j;
-      const double w = weights == nullptr ? 0.0 : weights[j];
       for (int u = 0; u < kVectors; ++u) {
         const F64 dx = x[u] - c[0], dy = y[u] - c[1], dz = z[u] - c[2];
-        const F64 v = dx * dx + dy * dy + dz * dz - w;
+        const F64 v = dx * dx + dy * dy + dz * dz;
         const I64 less = v < best[u];
         cell[u] = less ? I64{} + j : cell[u];
         best[u] = less ? v : best[u];

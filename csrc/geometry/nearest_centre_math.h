@@ -1,19 +1,18 @@
 // Arithmetic of nearest_centre, shared by its CPU and CUDA kernels.
 //
-// The answer is defined in float64: the lowest index that minimises |x - c|^2 - w, evaluated as ((dx^2 + dy^2) + dz^2)
-// - w with every operation rounded on its own (no contraction to fma), so that all backends agree to the last bit.
+// The answer is defined in float64: the lowest index that minimises |x - c|^2, evaluated as (dx^2 + dy^2) + dz^2 with
+// every operation rounded on its own (no contraction to fma), so that all backends agree to the last bit.
 //
-// Float32 input is screened in float32 and decided in float64 only where float32 cannot. Let u = 2^-24, D the squared
-// distance and v = D - w. A difference, a product and two sums round, so float32 finds D up to 5u D, and v up to
-// g (|v| + W), where g = 6u + O(u^2) < 3.6e-7 and W = max |w|; fused multiply-adds only round less. Let b be the index
-// of the smallest computed value. Whatever beats b has v <= v_b (up to 1e-15, float64's own error), hence a computed
-// value of at most v_b + 2 g (|v_b| + W) in terms of the computed v_b. If the second smallest computed value is above
-// v_b + kMargin (|v_b| + W) + kFloor, nothing beats b: kMargin = 2e-6 covers 2g and the roundings of this sum (3u),
-// kFloor the underflow of the squares, flushed to zero or not. NaN and overflow fail the comparison and are decided in
-// float64.
+// Float32 input is screened in float32 and decided in float64 only where float32 cannot. Let u = 2^-24 and D the
+// squared distance. A difference, a product and two sums round, so float32 finds D up to g D, where g = 5u + O(u^2)
+// < 3.6e-7; fused multiply-adds only round less. Let b be the index of the smallest computed value. Whatever beats b
+// has D <= D_b (up to 1e-15, float64's own error), hence a computed value of at most D_b + 2 g D_b in terms of the
+// computed D_b. If the second smallest computed value is above D_b + kMargin D_b + kFloor, nothing beats b: kMargin =
+// 2e-6 covers 2g and the roundings of this sum (3u), kFloor the underflow of the squares, flushed to zero or not. NaN
+// and overflow fail the comparison and are decided in float64.
 //
-// The CPU takes v + W instead, which is not negative, at one more rounding of at most 2u W, and keeps an index in its
-// lowest b bits, which changes it by less than t = 2^(b-23) of itself: nearest_margin adds 2.5 t >= (1+t)/(1-t) - 1.
+// The CPU keeps an index in a value's lowest b bits, which changes it by less than t = 2^(b-23) of itself:
+// nearest_margin adds 2.5 t >= (1+t)/(1-t) - 1.
 #pragma once
 
 #include <cstdint>
@@ -31,37 +30,35 @@ VN_HD float nearest_margin(int index_bits) {
 }
 
 // Whether float32 decides: `second` is the smallest computed value except that of the best index.
-VN_HD bool nearest_is_certain(float best, float second, float weight_bound) {
-  const float magnitude = best < 0.0f ? -best : best;
-  return best + (kMargin * (magnitude + weight_bound) + kFloor) < second;
+VN_HD bool nearest_is_certain(float best, float second) {
+  return best + (kMargin * best + kFloor) < second;
 }
 
 // The defining value for one centre (c points to its three coordinates). On the host -ffp-contract=off keeps the
 // roundings.
 template <typename T>
-VN_HD double power_distance(double x, double y, double z, const T* c, double w) {
+VN_HD double squared_distance(double x, double y, double z, const T* c) {
   const double dx = x - static_cast<double>(c[0]);
   const double dy = y - static_cast<double>(c[1]);
   const double dz = z - static_cast<double>(c[2]);
 #ifdef __CUDA_ARCH__
-  return __dsub_rn(__dadd_rn(__dadd_rn(__dmul_rn(dx, dx), __dmul_rn(dy, dy)), __dmul_rn(dz, dz)), w);
+  return __dadd_rn(__dadd_rn(__dmul_rn(dx, dx), __dmul_rn(dy, dy)), __dmul_rn(dz, dz));
 #else
-  return dx * dx + dy * dy + dz * dz - w;
+  return dx * dx + dy * dy + dz * dz;
 #endif
 }
 
 // The definition: strict comparison keeps the lowest of equals; NaN and infinity win over nothing, so that a non-finite
-// point gets cell 0. `weights` may be null.
+// point gets cell 0.
 template <typename T>
-VN_HD int32_t nearest_by_definition(const T* point, const T* centres, const T* weights, int64_t k) {
+VN_HD int32_t nearest_by_definition(const T* point, const T* centres, int64_t k) {
   const double x = static_cast<double>(point[0]);
   const double y = static_cast<double>(point[1]);
   const double z = static_cast<double>(point[2]);
   double best = 1.7976931348623157e308;
   int32_t cell = 0;
   for (int64_t j = 0; j < k; ++j) {
-    const double w = weights == nullptr ? 0.0 : static_cast<double>(weights[j]);
-    const double v = power_distance(x, y, z, centres + 3 * j, w);
+    const double v = squared_distance(x, y, z, centres + 3 * j);
     if (v < best) {
       best = v;
       cell = static_cast<int32_t>(j);

@@ -29,7 +29,7 @@ VARIANTS = (
     *FIELDS.values(),
     ["--field", "mipnerf", "--no-occupancy"],
     [*FIELDS["nerf"], "--sampling", "hierarchical", "--fine-samples", "6"],
-    [*FIELDS["nerf"], "--balance", "transport", "--assignment", "stochastic"],
+    [*FIELDS["nerf"], "--assignment", "stochastic"],
     [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6", "--init", "random"],
 )
 #: What ends a training; None is a full disk.

@@ -200,13 +200,11 @@ def test_what_is_compared_is_right_in_every_small_case():
         "resample": sampling._resample_work(512, CPU),
         "march_rays": marching._march_work(1 << 13, False, CPU),
         "march_rays, jittered": marching._march_work(1 << 13, True, CPU),
-        "camera_rays": marching._camera_work(300, False, CPU),
-        "camera_rays, lens": marching._camera_work(300, True, CPU),
         "balance_centres": marching._balance_work(600, 5, CPU),
         "pixel_rays": cases_step.pixel_work(300, CPU),
         "render_loss": cases_step.loss_work(100, 800, CPU),
         "observe_occupancy": cases_step.observe_work(800, CPU),
-        "sparse_adam": cases_step.adam_work(1000, 0.1, CPU),
+        "adam": cases_step.adam_work(1000, 0.1, CPU),
     }
     for direction in ("forward", "forward+backward"):
         for op in ("frequency_encode", "integrated_encode"):

@@ -9,7 +9,7 @@
 
 #include "cases.h"
 #include "encoding/encode.h"
-#include "encoding/sparse_adam.h"
+#include "encoding/adam.h"
 #include "encoding/spherical_harmonics.h"
 #include "geometry/cell_sort.h"
 #include "geometry/centre_grid.h"
@@ -31,32 +31,30 @@ void search(Isa isa) {
   const int64_t n = some_rows(), k = counts[below(8)];
   const Array<T> points = below(2) == 0 ? uniform<T>(3 * n) : lattice<T>(3 * n);
   const bool was_wild = wild;
-  wild = false;  // centres and weights are finite
+  wild = false;  // centres are finite
   const Array<T> centres = below(2) == 0 ? uniform<T>(3 * k) : lattice<T>(3 * k);
-  const Array<T> weights = below(2) == 0 ? Array<T>() : uniform<T>(k);
   wild = was_wild;
   Array<int32_t> found(n, -7), again(n, -7), by_grid(n, -7);
-  voronerf::nearest_centre_cpu(points.data(), centres.data(), or_null(weights), found.data(), n, k, isa, 1);
-  voronerf::nearest_centre_cpu(points.data(), centres.data(), or_null(weights), again.data(), n, k, isa, 3);
+  voronerf::nearest_centre_cpu(points.data(), centres.data(), found.data(), n, k, isa, 1);
+  voronerf::nearest_centre_cpu(points.data(), centres.data(), again.data(), n, k, isa, 3);
   same(found, again, "nearest_centre");
   within(found, k, "nearest_centre");
   like_portable(found, "nearest_centre");
 
-  const Array<double> exact(centres.begin(), centres.end()), power(weights.begin(), weights.end());
-  const auto tables = voronerf::centre_grid_build(exact.data(), or_null(power), k, isa, 1);
-  const auto others = voronerf::centre_grid_build(exact.data(), or_null(power), k, isa, 3);
+  const Array<double> exact(centres.begin(), centres.end());
+  const auto tables = voronerf::centre_grid_build(exact.data(), k, isa, 1);
+  const auto others = voronerf::centre_grid_build(exact.data(), k, isa, 3);
   same(tables->entries, others->entries, "centre_grid");
   same(tables->lists, others->lists, "centre_grid");
   Array<float> table;
   for (int64_t i = 0; i < k; ++i) {
     for (int a = 0; a < 3; ++a) table.push_back(static_cast<float>(centres[3 * i + a]));
-    table.push_back(weights.empty() ? 0.0f : static_cast<float>(weights[i]));
+    table.push_back(0.0f);
   }
   const voronerf::CentreGrid grid{tables->frame, tables->entries.data(), tables->lists.data(), table.data(),
                                   tables->bits};
   for (const int threads : {1, 3}) {
-    voronerf::nearest_centre_grid_cpu(points.data(), centres.data(), or_null(weights), grid, by_grid.data(), n, k, isa,
-                                      threads);
+    voronerf::nearest_centre_grid_cpu(points.data(), centres.data(), grid, by_grid.data(), n, k, isa, threads);
     if (by_grid != found) fail("nearest_centre_grid: not what all centres give");
   }
 }
@@ -79,7 +77,6 @@ void locate(Isa isa) {
   }
   const int64_t m = offsets.back();
   const Array<T> points = uniform<T>(3 * n), centres = lattice<T>(3 * m);
-  const Array<T> weights = below(2) == 0 ? Array<T>() : lattice<T>(m);
   if (voronerf::locate_cell_fault(offsets.data(), child.data(), static_cast<int64_t>(offsets.size()) - 1, m)) {
     fail("locate_cell: a sound tree refused");
   }
@@ -88,8 +85,8 @@ void locate(Isa isa) {
     const int threads = 1 + 2 * i;
     results[i].assign(n, -7);
     Array<int32_t> workspace(voronerf::locate_cell_workspace(m, threads));
-    if (!voronerf::locate_cell_cpu(points.data(), centres.data(), or_null(weights), offsets.data(), child.data(),
-                                   results[i].data(), workspace.data(), n, m, 2, isa, threads)) {
+    if (!voronerf::locate_cell_cpu(points.data(), centres.data(), offsets.data(), child.data(), results[i].data(),
+                                   workspace.data(), n, m, 2, isa, threads)) {
       fail("locate_cell: did not arrive");
     }
   }
@@ -384,10 +381,13 @@ void adam(Isa isa) {
   for (int i = 0; i < 2; ++i) {
     Array<float> parameter = start[0], mean = start[1], square = start[2];
     for (float& value : square) value = std::fabs(value);
-    voronerf::sparse_adam_cpu({1e-2f, 0.9f, 0.99f, 1e-8f, every}, gradient.data(), parameter.data(), mean.data(),
-                              square.data(), n, isa, 1 + 2 * i);
-    like_portable(parameter, "sparse_adam");
-    like_portable(mean, "sparse_adam");
+    float step = 2.0f;
+    const std::vector<voronerf::AdamRule> rules = {{1e-2, nullptr, &step, 0.9, 0.99, 1e-8, every}};
+    const float* gradients[] = {gradient.data()};
+    float *parameters[] = {parameter.data()}, *means[] = {mean.data()}, *squares[] = {square.data()};
+    voronerf::adam_cpu(rules, {}, gradients, parameters, means, squares, {n}, isa, 1 + 2 * i);
+    like_portable(parameter, "adam");
+    like_portable(mean, "adam");
   }
 }
 

@@ -1,11 +1,10 @@
-"""The built-in city: what grows, what stays, and that both ways to cast its rays see the same."""
+"""The built-in city: what grows, what stays, and that its rays see the first of all solids."""
 
 import numpy as np
 import pytest
 import torch
 from helpers import refuses
 
-from voronerf import backends
 from voronerf.data import SceneError, city_scene, load_scene
 from voronerf.data.builtin.city import block_caster, city_cameras, city_views
 from voronerf.data.builtin.city_solids import TALLEST, city
@@ -30,10 +29,7 @@ def test_other_cameras_see_the_same_city(scene):
     assert torch.equal(city_views(cameras, (2, 2)).images[0], scene.test.images[0])
 
 
-@pytest.mark.parametrize("way", ["numpy", pytest.param("warp", marks=pytest.mark.warp)])
-def test_rays_see_the_first_of_all_solids(way, monkeypatch):
-    if way == "numpy":
-        monkeypatch.setattr(backends, "missing", lambda backend, device: "left out")
+def test_rays_see_the_first_of_all_solids():
     groups = city((2, 2))
     origins, directions = street_rays(2, 1500)
     depth, which = first_hits([solid for group in groups for solid in group], origins, directions)

@@ -13,25 +13,23 @@ from voronerf.diagram.blending import blend_cells
 def diagram_of(kind):
     generator = seeded()
 
-    def of(k, power=None):
-        centres = torch.rand(k, 3, generator=generator) * 2 - 1
-        return VoronoiDiagram(centres, weights=None if power is None else power * torch.rand(k, generator=generator))
+    def of(k):
+        return VoronoiDiagram(torch.rand(k, 3, generator=generator) * 2 - 1)
 
     if kind == "nested":
-        nested, _ = of(5).refine({0: of(3), 2: of(4, 0.1), 4: of(2)})
+        nested, _ = of(5).refine({0: of(3), 2: of(4), 4: of(2)})
         return nested.refine({1: of(3)})[0]
     if kind == "same":
         return VoronoiDiagram(of(3).centres.repeat(2, 1))
-    return of(1) if kind == "one" else of(12, 0.3 if kind == "power" else None)
+    return of(1 if kind == "one" else 12)
 
 
-KINDS = ("flat", "power", "same", "nested")
+KINDS = ("flat", "same", "nested")
 
 
 def slow_leaves(diagram, x, margin):
     """Weights of all leaves of one point, by the definition."""
     offsets, child = diagram.child_offsets.tolist(), diagram.child.tolist()
-    power = [0.0] * len(child) if diagram.power is None else diagram.power.tolist()
     centres = diagram.centres.double().tolist()
     point = x.double().tolist()
     found = {}
@@ -41,7 +39,7 @@ def slow_leaves(diagram, x, margin):
         least = math.inf
         for j in rows:
             apart = math.dist(centres[i], centres[j])
-            lead = math.dist(point, centres[j]) ** 2 - power[j] - math.dist(point, centres[i]) ** 2 + power[i]
+            lead = math.dist(point, centres[j]) ** 2 - math.dist(point, centres[i]) ** 2
             if apart > 0:
                 least = min(least, lead / (2 * apart))
             elif i != j and (lead, j) < (0, i):

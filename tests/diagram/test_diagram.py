@@ -15,11 +15,10 @@ def slow_locate(diagram, point):
     """Descends the tables of a diagram with Python numbers; ties to the first centre."""
     offsets, child = diagram.child_offsets.tolist(), diagram.child.tolist()
     centres = diagram.centres.double().tolist()
-    power = [0.0] * len(centres) if diagram.power is None else diagram.power.double().tolist()
     node = 0
     while True:
         rows = range(offsets[node], offsets[node + 1])
-        costs = [sum((float(a) - b) ** 2 for a, b in zip(point, centres[row])) - power[row] for row in rows]
+        costs = [sum((float(a) - b) ** 2 for a, b in zip(point, centres[row])) for row in rows]
         row = rows[costs.index(min(costs))]
         if child[row] < 0:
             return -1 - child[row]
@@ -50,15 +49,11 @@ def test_flat_diagram_gives_the_nearest_centre_with_ties_to_the_first():
 
 
 def test_nested_locate_equals_a_slow_descent():
-    """With power weights on some levels too."""
     diagram, points = uneven_diagram(), integer_points(400)
     assert (diagram.depth, diagram.num_cells) == (3, 10)
-    root, centres = VoronoiDiagram(integer_points(4)), integer_points(7)[4:]
-    plain, _ = root.refine({1: centres})
-    weighted, _ = root.refine({1: VoronoiDiagram(centres, weights=torch.tensor([150.0, 0.0, -90.0]))})
-    for each in (diagram, plain, weighted):
+    other, _ = VoronoiDiagram(integer_points(4)).refine({1: integer_points(7)[4:]})
+    for each in (diagram, other):
         assert each.locate(points).tolist() == [slow_locate(each, point) for point in points]
-    assert not torch.equal(weighted.locate(points), plain.locate(points))
 
 
 def test_locate_keeps_leading_shapes_and_takes_any_layout_and_dtype():
@@ -142,20 +137,18 @@ def test_refine_leaves_the_diagram_it_is_called_on_alone():
 
 
 @pytest.mark.parametrize(
-    ("centres", "weights", "error", "message"),
+    ("centres", "error", "message"),
     [
-        (torch.zeros(0, 3), None, ValueError, "at least one centre"),
-        (torch.zeros(4, 2), None, ValueError, "shape [k, 3], got [4, 2]"),
-        (torch.zeros(3), None, ValueError, "shape [k, 3], got [3]"),
-        (torch.tensor([[0.0, float("nan"), 0.0]]), None, ValueError, "must be finite"),
-        (torch.zeros(4, 3, dtype=torch.int32), None, TypeError, "floating-point"),
-        ([[0.0, 0.0, 0.0]], None, TypeError, "floating-point tensor, got list"),
-        (torch.zeros(4, 3), torch.zeros(3), ValueError, "weights must have shape [4], got [3]"),
-        (torch.zeros(2, 3), torch.tensor([0.0, float("inf")]), ValueError, "weights must be finite"),
+        (torch.zeros(0, 3), ValueError, "at least one centre"),
+        (torch.zeros(4, 2), ValueError, "shape [k, 3], got [4, 2]"),
+        (torch.zeros(3), ValueError, "shape [k, 3], got [3]"),
+        (torch.tensor([[0.0, float("nan"), 0.0]]), ValueError, "must be finite"),
+        (torch.zeros(4, 3, dtype=torch.int32), TypeError, "floating-point"),
+        ([[0.0, 0.0, 0.0]], TypeError, "floating-point tensor, got list"),
     ],
 )
-def test_what_is_no_diagram_is_refused(centres, weights, error, message):
-    refuses(message, VoronoiDiagram, centres, weights=weights, error=error)
+def test_what_is_no_diagram_is_refused(centres, error, message):
+    refuses(message, VoronoiDiagram, centres, error=error)
 
 
 def test_refine_refuses_what_is_no_leaf():
@@ -174,13 +167,11 @@ def test_points_of_another_shape_or_type_are_refused():
     refuses("floating-point, got torch", diagram.sample_cell, wrong, temperature=1.0, error=TypeError)
 
 
-@pytest.mark.parametrize("weights", [None, torch.tensor([1.0, 2.0, 3.0])])
-def test_copies_pickles_and_states_are_the_same_diagram(weights):
-    inner = VoronoiDiagram(integer_points(3), weights=weights)
-    diagram, _ = uneven_diagram().refine({7: inner})
+def test_copies_pickles_and_states_are_the_same_diagram():
+    diagram, _ = uneven_diagram().refine({7: integer_points(3)})
     points = integer_points(200)
     expected = diagram.locate(points)
-    other = VoronoiDiagram(torch.zeros(2, 3), weights=torch.zeros(2))
+    other = VoronoiDiagram(torch.zeros(2, 3))
     other.load_state_dict(diagram.state_dict())
     holder = torch.nn.ModuleDict({"diagram": VoronoiDiagram(torch.zeros(1, 3))})
     holder.load_state_dict({f"diagram.{name}": table for name, table in diagram.state_dict().items()})
@@ -193,7 +184,6 @@ def test_copies_pickles_and_states_are_the_same_diagram(weights):
     for same in (*copies, other, holder["diagram"], loaded, prefixed):
         assert torch.equal(same.locate(points), expected)
         assert (same.depth, same.num_cells) == (diagram.depth, diagram.num_cells)
-        assert (same.power is None) == (weights is None)
 
 
 def test_damaged_states_are_refused():
@@ -212,13 +202,12 @@ def test_damaged_states_are_refused():
 
 
 def test_centres_are_not_rounded_when_a_model_changes_its_dtype():
-    diagram = VoronoiDiagram(torch.rand(5, 3), weights=torch.rand(5))
-    centres, power = diagram.centres.clone(), diagram.power.clone()
+    diagram = VoronoiDiagram(torch.rand(5, 3))
+    centres = diagram.centres.clone()
     for convert in (lambda d: d.half(), lambda d: d.to(torch.bfloat16), lambda d: d.double(), lambda d: d.to("cpu")):
         moved = convert(diagram)
         assert moved.centres.dtype == torch.float32
         assert torch.equal(moved.centres, centres)
-        assert torch.equal(moved.power, power)
 
 
 def test_stochastic_assignment_is_the_softmax_of_the_distances_along_the_path():
@@ -265,16 +254,6 @@ def test_stochastic_assignment_on_cuda_with_a_generator_of_the_cpu():
     assert int((drawn.cpu() != expected).sum()) <= 2
     own = torch.Generator("cuda").manual_seed(4)
     assert diagram.sample_cell(points.cuda(), temperature=2.0, generator=own).is_cuda
-
-
-def test_stochastic_assignment_with_power_weights():
-    centres, points = integer_points(6), torch.randn(300, 3) * 5
-    weights = torch.tensor([0.0, 5.0, -3.0, 2.0, 0.0, 9.0])
-    diagram = VoronoiDiagram(centres, weights=weights)
-    assert torch.equal(diagram.sample_cell(points, temperature=1e-6), diagram.locate(points))
-    equal = VoronoiDiagram(centres, weights=torch.full((6,), 7.0))
-    plain = VoronoiDiagram(centres).sample_cell(points, temperature=1.0, generator=seeded(6))
-    assert torch.equal(equal.sample_cell(points, temperature=1.0, generator=seeded(6)), plain)
 
 
 @pytest.mark.parametrize(

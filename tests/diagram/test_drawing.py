@@ -32,7 +32,7 @@ def draw(points, centres, uniforms, temperature):
     return draw_cell(points, centres, *flat(centres.shape[0], centres.device), uniforms[:, None], temperature)
 
 
-def slow(points, centres, tables, uniforms, temperature, depth, weights=None):
+def slow(points, centres, tables, uniforms, temperature, depth):
     """Leaves by the formula in float64, a point at a time, and how far each number is from where another is drawn."""
     offsets, child = tables
     leaves, margins = [], []
@@ -41,8 +41,6 @@ def slow(points, centres, tables, uniforms, temperature, depth, weights=None):
         for level in range(depth):
             rows = slice(int(offsets[diagram]), int(offsets[diagram + 1]))
             squared = (point - centres[rows].double()).square().sum(-1)
-            if weights is not None:
-                squared = squared + weights[rows].double().max() - weights[rows].double()
             sums = torch.softmax(-squared.sqrt() / temperature, 0).cumsum(0)
             drawn = min(int((sums < 1 - own[level]).sum()), len(sums) - 1)
             margin = min([margin, *((sums[:-1] - (1 - own[level])).abs().tolist())])
@@ -74,16 +72,11 @@ def chi_square(counts, probabilities):
 
 
 @pytest.mark.parametrize("n", [0, 1, 257])
-@pytest.mark.parametrize("weighted", [False, True])
-def test_uneven_tree_is_the_formula(device, n, weighted):
+def test_uneven_tree_is_the_formula(device, n):
     points, centres, uniforms = torch.randn(n, 3), torch.randn(10, 3), torch.rand(n, DEPTH)
-    weights = torch.rand(10) if weighted else None
-    leaves = draw_cell(
-        *(tensor.to(device) for tensor in (points, centres, CHILD_OFFSETS, CHILD, uniforms)),
-        temperature=0.4,
-        weights=None if weights is None else weights.to(device),
-    )
-    expected = slow(points, centres, (CHILD_OFFSETS, CHILD), uniforms, 0.4, DEPTH, weights)
+    given = (tensor.to(device) for tensor in (points, centres, CHILD_OFFSETS, CHILD, uniforms))
+    leaves = draw_cell(*given, temperature=0.4)
+    expected = slow(points, centres, (CHILD_OFFSETS, CHILD), uniforms, 0.4, DEPTH)
     agree(leaves.cpu(), *expected, tolerance=1e-5)
 
 

@@ -107,17 +107,15 @@ def test_points_of_a_contracted_scene_lie_in_the_world(run, tmp_path):
 def diagrams():
     centres = 2 * torch.rand(8, 3, generator=seeded(1)) - 1
     nested, _ = VoronoiDiagram(centres).refine({i: centres[i] + 0.2 * torch.randn(4, 3) for i in (1, 5)})
-    weights = 0.3 * torch.rand(8, generator=seeded(2))
     far = torch.cat((centres, torch.tensor([[50.0, 0, 0]])))
     return {
         "nested": nested,
-        "power": VoronoiDiagram(centres, weights=weights),
         "one": VoronoiDiagram(torch.zeros(1, 3)),
         "far": VoronoiDiagram(far),
     }
 
 
-@pytest.mark.parametrize("name", ["nested", "power", "one", "far"])
+@pytest.mark.parametrize("name", ["nested", "one", "far"])
 def test_cells_fill_the_box_and_hold_their_points(name):
     diagram = diagrams()[name]
     meshes = cell_meshes(diagram, BOX)

@@ -30,16 +30,16 @@ BLOCK = 2048
 DTYPES = (torch.float32, torch.float64)
 
 
-def chosen(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tensor:
+def chosen(points: Tensor, centres: Tensor) -> Tensor:
     """Cells, checked against the definition: at the float64 minimum, and the reference's very index."""
-    cells = nearest_centre(points, centres, weights=weights, backend="native")
+    cells = nearest_centre(points, centres, backend="native")
     assert cells.dtype == torch.int32
-    table = distances(points, centres, weights)
+    table = distances(points, centres)
     own = table.gather(1, cells.long()[:, None])[:, 0]
     least = table.amin(dim=1)
-    bound = 8 * torch.finfo(torch.float64).eps * (least.abs() + (0 if weights is None else weights.abs().max()))
+    bound = 8 * torch.finfo(torch.float64).eps * least
     assert (own <= least + bound).all()
-    assert torch.equal(cells, reference_nearest(points, centres, weights=weights))
+    assert torch.equal(cells, reference_nearest(points, centres))
     return cells
 
 
@@ -49,13 +49,9 @@ def test_nearest_of_random_points(isa: str, dtype: torch.dtype, k: int) -> None:
     rows = (1, 65) if k == 4096 else ROWS
     for shift in (0.0, 1000.0):
         centres = (4 * torch.rand(k, 3, dtype=dtype) - 2) + shift
-        weights = torch.rand(k, dtype=dtype) - 0.5
         for n in rows:
             points = (4 * torch.rand(n, 3, dtype=dtype) - 2) + shift
             chosen(points, centres) if n else nearest_centre(points, centres, backend="native")
-            chosen(points, centres, weights) if n else nearest_centre(
-                points, centres, weights=weights, backend="native"
-            )
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -63,13 +59,10 @@ def test_nearest_breaks_ties_to_the_lowest_index(isa: str, dtype: torch.dtype) -
     for k in (2, 16, 17, 257):
         centres = torch.randint(-2, 3, (k, 3)).to(dtype)
         points = torch.randint(-4, 5, (BLOCK + 1, 3)).to(dtype) / 2
-        weights = torch.randint(0, 3, (k,)).to(dtype)
-        for power in (None, weights):
-            cells = chosen(points, centres, power)
-            table = distances(points, centres, power)
-            ties = table == table.amin(dim=1, keepdim=True)
-            assert (ties.sum(dim=1) > 1).any()
-            assert torch.equal(cells.long(), ties.int().argmax(dim=1))
+        table = distances(points, centres)
+        ties = table == table.amin(dim=1, keepdim=True)
+        assert (ties.sum(dim=1) > 1).any()
+        assert torch.equal(chosen(points, centres).long(), ties.int().argmax(dim=1))
 
 
 def test_nearest_decides_in_float64_what_float32_cannot(isa: str) -> None:
@@ -98,9 +91,7 @@ def test_nearest_far_from_the_origin_and_at_the_ends_of_the_range(isa: str) -> N
     for scale in (1e-42, 1e-38, 1e-30, 1e-19, 1e18, 1e19, 1e20, 3e38):
         points, centres = (2 * torch.rand(70, 3) - 1) * scale, (2 * torch.rand(33, 3) - 1) * scale
         chosen(points, centres)
-        chosen(points, centres, weights=torch.rand(33) * scale)
-    centres, weights = torch.tensor([[2e19, 0, 0], [1.5e19, 0, 0]]), torch.tensor([3e38, 0.0])
-    chosen(torch.zeros(17, 3), centres, weights)
+    chosen(torch.zeros(17, 3), torch.tensor([[2e19, 0, 0], [1.5e19, 0, 0]]))
 
 
 def test_nearest_sends_non_finite_points_to_cell_0(isa: str) -> None:
@@ -114,12 +105,12 @@ def test_nearest_sends_non_finite_points_to_cell_0(isa: str) -> None:
 
 
 def test_nearest_of_mixed_and_half_types_and_strided_tensors(isa: str) -> None:
-    points, centres, weights = torch.rand(100, 6)[:, ::2], torch.rand(3, 40).T, torch.rand(80)[::2]
+    points, centres = torch.rand(100, 6)[:, ::2], torch.rand(3, 40).T
     assert not points.is_contiguous()
-    chosen(points, centres, weights)
+    chosen(points, centres)
     for dtype in (torch.float16, torch.bfloat16, torch.float64):
         chosen(points.to(dtype), centres)
-        chosen(points, centres.to(dtype), weights)
+        chosen(points, centres.to(dtype))
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 255, 256, 257, 5000])
@@ -176,15 +167,13 @@ def random_tree(sizes: tuple[int, ...], uneven: bool = True) -> dict[str, Tensor
 @pytest.mark.parametrize("uneven", [False, True])
 def test_locate(isa: str, sizes: tuple[int, ...], uneven: bool) -> None:
     tree = random_tree(sizes, uneven)
-    weights = torch.rand(tree["centres"].shape[0]) / 10
     for n in (0, 1, 33, BLOCK - 1, BLOCK + 1):
         for dtype in DTYPES:
             points = torch.rand(n, 3, dtype=dtype)
             if n > 30:
                 points[30] = torch.nan
-            for power in (None, weights):
-                leaves = locate_cell(points, **tree, weights=power, backend="native")
-                assert torch.equal(leaves, reference_locate(points, **tree, weights=power))
+            leaves = locate_cell(points, **tree, backend="native")
+            assert torch.equal(leaves, reference_locate(points, **tree))
 
 
 def test_locate_breaks_ties_as_nearest_centre_does(isa: str) -> None:

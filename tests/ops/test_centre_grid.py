@@ -76,14 +76,9 @@ def test_finds_what_all_centres_give(backend, scene, dtype):
         pytest.skip("slow, and the same code for all centres and types")
     centres = SCENES[scene]().to(dtype)
     points = points_around(centres)
-    lightest = centres.double().diff(dim=0).square().sum(1).mean().item() if len(centres) > 1 else 0.0
-    weights = (torch.rand(len(centres)) * min(lightest, 1e38)).to(dtype)
-    for power in (None, weights):
-        # Warp asks the tables of others.
-        grid = centre_grid(centres, weights=power, backend="auto" if backend == "warp" else backend)
-        found = nearest_centre(points, centres, weights=power, grid=grid, backend=backend)
-        assert found.dtype == torch.int32
-        assert torch.equal(found, nearest_centre(points, centres, weights=power, backend="reference"))
+    found = nearest_centre(points, centres, grid=centre_grid(centres, backend=backend), backend=backend)
+    assert found.dtype == torch.int32
+    assert torch.equal(found, nearest_centre(points, centres, backend="reference"))
 
 
 @native
@@ -106,18 +101,18 @@ def test_ties_of_a_regular_grid(k):
 def test_instruction_sets_and_threads_build_the_same_grid(isa):
     from voronerf import native
 
-    centres, weights = clustered(700), torch.rand(700) / 100
+    centres = clustered(700)
     points = points_around(centres)[:-1].repeat(3, 1)
     with native.using_isa(native.SUPPORTED_ISAS[-1]):
-        expected = centre_grid(centres, weights=weights)
-    cells = nearest_centre(points, centres, weights=weights, backend="reference")
+        expected = centre_grid(centres)
+    cells = nearest_centre(points, centres, backend="reference")
     sizes = (0, 1, 15, 17, len(points))
 
     def run():
-        grid = centre_grid(centres, weights=weights)
+        grid = centre_grid(centres)
         return [
             *grid.tables[:4],
-            *(nearest_centre(points[:n], centres, weights=weights, grid=grid) for n in sizes),
+            *(nearest_centre(points[:n], centres, grid=grid) for n in sizes),
         ]
 
     assert same(on_any_number_of_threads(run), [*expected.tables[:4], *(cells[:n] for n in sizes)])
@@ -131,7 +126,7 @@ def test_lists_hold_every_centre_that_is_nearest_somewhere(scene):
     points = points_around(centres)
     own, plain = centre_grid(centres, backend="native"), centre_grid(centres, backend="reference")
     expected = nearest_centre(points, centres, backend="reference")
-    swapped = CentreGrid(centres, None, plain.tables)
+    swapped = CentreGrid(centres, plain.tables)
     assert torch.equal(nearest_centre(points, centres, grid=swapped, backend="native"), expected)
     assert torch.equal(nearest_centre(points, centres, grid=own, backend="reference"), expected)
     assert mean_length(own.tables) <= mean_length(plain.tables)
@@ -164,15 +159,14 @@ def test_memory_is_bounded_where_no_centre_can_be_left_out(scale):
 
 
 def test_errors():
-    points, centres, weights = torch.rand(4, 3), torch.rand(5, 3), torch.rand(5)
+    points, centres = torch.rand(4, 3), torch.rand(5, 3)
     refuses = refusals(nearest_centre, points=points, centres=centres, grid=centre_grid(centres))
-    for others in ({"centres": centres + 1}, {"centres": centres[:4]}, {"weights": weights}):
-        refuses("grid must be made from these centres and weights, got that of others", **others)
+    for others in (centres + 1, centres[:4]):
+        refuses("grid must be made from these centres, got that of others", centres=others)
     refuses("grid must be a CentreGrid, got Tensor", grid=centres)
     refuses = refusals(centre_grid, centres=centres)
     refuses("centres must hold at least one centre, got none", centres=centres[:0])
     refuses("centres must be finite, got NaN or infinity", centres=torch.full((2, 3), torch.inf))
-    refuses("weights must be finite, got NaN or infinity", weights=torch.full((5,), torch.nan))
 
 
 def write(tensor, at, value):
@@ -212,7 +206,7 @@ def test_forged_grids():
         forged = pickle.loads(pickled)
         object.__setattr__(forged, "tables", tables._replace(**changed))
         kinds = (ValueError, TypeError)
-        refuses(f"CentreGrid: {message}", CentreGrid, centres, None, forged.tables, error=kinds)
+        refuses(f"CentreGrid: {message}", CentreGrid, centres, forged.tables, error=kinds)
         refuses(f"CentreGrid: {message}", pickle.loads, pickle.dumps(forged), error=kinds)
     copy = pickle.loads(pickled)
     points = points_around(centres)
@@ -236,13 +230,10 @@ def test_grid_keeps_its_own_centres():
 @native
 def test_a_grid_is_not_that_of_rounded_centres():
     centres = torch.rand(100, 3, dtype=torch.float64) + 1e6
-    weights = torch.rand(100, dtype=torch.float64) * 1e-3
-    points, of_others = torch.rand(50, 3) + 1e6, "grid must be made from these centres and weights"
+    points, of_others = torch.rand(50, 3) + 1e6, "grid must be made from these centres"
     with pytest.raises(ValueError, match=of_others):
         nearest_centre(points, centres.float(), grid=centre_grid(centres))
     exact = centres.float().double()
-    with pytest.raises(ValueError, match=of_others):
-        nearest_centre(points, exact.float(), weights=weights.float(), grid=centre_grid(exact, weights=weights))
     found = nearest_centre(points, exact.float(), grid=centre_grid(exact))
     assert torch.equal(found, nearest_centre(points, exact.float(), backend="reference"))
 
@@ -251,40 +242,35 @@ def test_a_grid_is_not_that_of_rounded_centres():
 def test_compiled_graphs_refuse_grids_of_another_size():
     # Such a grid names centres behind the end of those that are given.
     points, grid = torch.rand(5, 3), centre_grid(torch.rand(70, 3))
-    for centres, weights in ((torch.rand(2, 3), None), (grid.centres, torch.rand(70))):
-        compiled = torch.compile(
-            lambda p, c, w: nearest_centre(p, c, weights=w, grid=grid), fullgraph=True, backend="eager"
-        )
-        with pytest.raises(Exception, match="grid must be made from these centres and weights"):
-            compiled(points, centres, weights)
+    compiled = torch.compile(lambda p, c: nearest_centre(p, c, grid=grid), fullgraph=True, backend="eager")
+    with pytest.raises(Exception, match="grid must be made from these centres"):
+        compiled(points, torch.rand(2, 3))
 
 
 @native
 def test_the_custom_op_passes_opcheck():
-    weights = torch.rand(70)
-    centre_grid(torch.rand(70, 3), weights=weights)  # which registers it
-    torch.library.opcheck(torch.ops.voronerf.centre_grid.default, (torch.rand(70, 3).double(), weights.double()))
+    centre_grid(torch.rand(70, 3))  # which registers it
+    torch.library.opcheck(torch.ops.voronerf.centre_grid.default, (torch.rand(70, 3).double(),))
 
 
 @native
 def test_diagrams_make_a_grid_where_it_pays(monkeypatch):
     monkeypatch.setattr("voronerf.diagram.voronoi._GRID_POINTS", 1500)
     points = 4 * torch.rand(1000, 3) - 2
-    for weights in (None, torch.rand(512) / 100):
-        diagram = VoronoiDiagram(2 * torch.rand(512, 3) - 1, weights=weights)
-        expected = diagram.locate(points, backend="reference")
-        assert torch.equal(diagram.locate(points), expected) and diagram._grid is None
-        for dtype in (torch.float32, torch.float64):
-            assert torch.equal(diagram.locate(points.to(dtype)), diagram.locate(points.to(dtype), backend="reference"))
-        assert diagram._grid is not None
-        kept = diagram._grid
-        diagram.locate(points)
-        assert diagram._grid is kept
-        # Whoever writes to the buffers gets the cells of what is written.
-        with torch.no_grad():
-            diagram.centres.copy_(diagram.centres.flip(0))
-        assert torch.equal(diagram.locate(points), diagram.locate(points, backend="reference"))
-        assert "_grid" not in diagram.__getstate__()
+    diagram = VoronoiDiagram(2 * torch.rand(512, 3) - 1)
+    expected = diagram.locate(points, backend="reference")
+    assert torch.equal(diagram.locate(points), expected) and diagram._grid is None
+    for dtype in (torch.float32, torch.float64):
+        assert torch.equal(diagram.locate(points.to(dtype)), diagram.locate(points.to(dtype), backend="reference"))
+    assert diagram._grid is not None
+    kept = diagram._grid
+    diagram.locate(points)
+    assert diagram._grid is kept
+    # Whoever writes to the buffers gets the cells of what is written.
+    with torch.no_grad():
+        diagram.centres.copy_(diagram.centres.flip(0))
+    assert torch.equal(diagram.locate(points), diagram.locate(points, backend="reference"))
+    assert "_grid" not in diagram.__getstate__()
     small = VoronoiDiagram(torch.rand(64, 3))
     for _ in range(3):
         small.locate(points)

@@ -36,7 +36,7 @@ RUNS = [
     for backend in backends.implemented(op)
     for device in ("cpu", "cuda")
 ]
-NETWORKS = ("grouped_mlp", "grouped_program", "learn_outputs", "routed_mlp", "sparse_adam", "adam")
+NETWORKS = ("grouped_mlp", "grouped_program", "learn_outputs", "routed_mlp", "adam")
 """Ops that check their tensors in ways of their own."""
 
 
@@ -62,7 +62,7 @@ def prepare(name, backend, device):
 
     def ready(tensor):
         # Warp's camera rays have no gradients.
-        return tensor.to(device).detach().requires_grad_(tensor.is_floating_point() and op != "camera_rays")
+        return tensor.to(device).detach().requires_grad_(tensor.is_floating_point())
 
     def make(n):
         given = tree_map_only(Tensor, ready, case.make(Draw(n, **case.kinds[kind]), n))

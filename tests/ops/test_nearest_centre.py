@@ -10,13 +10,11 @@ from voronerf.ops import nearest_centre
 pytestmark = pytest.mark.op("nearest_centre")
 
 
-def slow(points, centres, weights=None):
+def slow(points, centres):
     """One point and one centre at a time, in float64."""
     cells = []
     for point in points.double().tolist():
         distances = [sum((a - b) ** 2 for a, b in zip(point, centre)) for centre in centres.double().tolist()]
-        if weights is not None:
-            distances = [distance - weight for distance, weight in zip(distances, weights.double().tolist())]
         cells.append(distances.index(min(distances)))
     return torch.tensor(cells, dtype=torch.int32)
 
@@ -26,13 +24,10 @@ def slow(points, centres, weights=None):
 def test_matches_a_slow_loop_on_integers_ties_included(device, backend, n, k):
     points = torch.randint(-2, 3, (n, 3)).float()
     centres = torch.randint(-2, 3, (k, 3)).float()
-    weights = torch.randint(0, 3, (k,)).float()
-    for w in (None, weights):
-        on_device = None if w is None else w.to(device)
-        cells = nearest_centre(points.to(device), centres.to(device), weights=on_device, backend=backend)
-        assert cells.dtype == torch.int32
-        assert cells.device.type == device.type
-        assert torch.equal(cells.cpu(), slow(points, centres, w))
+    cells = nearest_centre(points.to(device), centres.to(device), backend=backend)
+    assert cells.dtype == torch.int32
+    assert cells.device.type == device.type
+    assert torch.equal(cells.cpu(), slow(points, centres))
 
 
 @pytest.mark.parametrize("shift", [0.0, 10.0, 1000.0])
@@ -47,22 +42,11 @@ def test_chosen_centre_is_nearest_in_float64_wherever_the_scene_is(device, backe
     assert (chosen <= distances.min(dim=1).values + bound).all()
 
 
-def test_weights_make_a_power_diagram(device, backend):
-    points = torch.tensor([[0.4, 0, 0], [0.6, 0, 0]], device=device)
-    centres = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]], device=device)
-    assert nearest_centre(points, centres, backend=backend).tolist() == [0, 1]
-    # The plane between two centres one apart moves by half the difference of their weights.
-    weights = torch.tensor([0.0, 0.3], device=device)
-    assert nearest_centre(points, centres, weights=weights, backend=backend).tolist() == [1, 1]
-
-
 def test_points_that_are_not_finite_go_to_cell_0(device, backend):
     nan, inf = float("nan"), float("inf")
     points = torch.tensor([[nan, 1, 1], [inf, 1, 1], [1, -inf, 1], [inf, -inf, nan], [1, 1, 1]], device=device)
     centres = torch.tensor([[9.0, 9, 9], [5, 5, 5], [1, 1, 1]], device=device)
-    weights = torch.tensor([0.0, 4.0, 0.0], device=device)
     assert nearest_centre(points, centres, backend=backend).tolist() == [0, 0, 0, 0, 2]
-    assert nearest_centre(points, centres, weights=weights, backend=backend).tolist() == [0, 0, 0, 0, 2]
 
 
 @pytest.mark.parametrize("dtype", FLOATS)

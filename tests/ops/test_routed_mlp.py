@@ -146,11 +146,6 @@ def test_output_cells_and_gradients(device, backend, name, source):
     assert out.shape == (61, case.table.out_features)
 
 
-@pytest.mark.parametrize("n", [0, 1, 2, 95, 97, 2500])
-def test_any_number_of_samples(device, backend, n):
-    Case.make(n=n).check(device, backend)
-
-
 def test_directions_of_each_sample(device, backend):
     Case.make(rays=None).check(device, backend)
 
@@ -187,15 +182,6 @@ def test_coordinates_beside_encoded_positions(device, backend):
         assert torch.equal(cells.cpu(), case.expected_cells)
     _, elsewhere = case.run([encoded, *leaves[1:]], coords=leaves[0] + 9, backend=backend)
     assert not torch.equal(elsewhere.cpu(), case.expected_cells)
-
-
-def test_power_diagram(device, backend):
-    case = Case.make()
-    weights = torch.tensor([5.0, 0, 0, 0, 0, 0])
-    _, cells = case.run(
-        [tensor.to(device) for tensor in case.leaves], centre_weights=weights.to(device), backend=backend
-    )
-    assert (cells == 0).all()
 
 
 def test_samples_nowhere_go_to_the_first_cell(device, backend):

@@ -104,7 +104,7 @@ def test_random_initialisation_is_fresh_and_reproducible(field: NeRF, generator:
 
 
 def test_state_dict_round_trips_across_subdivisions(field: NeRF, generator: torch.Generator) -> None:
-    inner = VoronoiDiagram(torch.randn(6, 3, generator=generator), weights=torch.rand(6, generator=generator))
+    inner = VoronoiDiagram(torch.randn(6, 3, generator=generator))
     diagram, _ = inner.refine({2: torch.randn(3, 3, generator=generator)})
     source = perturb(VoronoiRouter(field, diagram), generator)
     buffer = io.BytesIO()
@@ -131,14 +131,12 @@ def test_copies_and_the_wrapped_field_are_independent(field: NeRF, generator: to
     torch.testing.assert_close(field(positions, directions)[0], before)
 
 
-@pytest.mark.parametrize("kind", ["one", "flat", "nested", "power", "many"])
+@pytest.mark.parametrize("kind", ["one", "flat", "nested", "many"])
 def test_every_kind_of_diagram_equals_the_loop(kind: str, field: NeRF, generator: torch.Generator) -> None:
     cells = {"one": 1, "many": 300}.get(kind, 4)  # a diagram of many centres looks cells up by itself
     diagram = VoronoiDiagram(torch.randn(cells, 3, generator=generator))
     if kind == "nested":
         diagram, _ = diagram.refine({1: torch.randn(3, 3, generator=generator)})
-    if kind == "power":
-        diagram = VoronoiDiagram(diagram.centres, weights=torch.rand(4, generator=generator))
     router = perturb(VoronoiRouter(field, diagram), generator)
     positions, directions = samples(50, generator)
     positions.requires_grad_()

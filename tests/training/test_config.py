@@ -101,7 +101,7 @@ def test_bad_settings(settings, message):
 
 
 def test_every_choice_of_words_is_checked():
-    names = "format kind images split centres balance init assignment contraction precision background"
+    names = "format kind images split centres init assignment contraction precision background"
     assert set(CHOICES) == set(names.split())
     for name in CHOICES:
         with pytest.raises(ConfigError, match=f"--{name} must be .* or .*, got 'nonsense'"):

@@ -166,11 +166,9 @@ def test_centres_are_balanced_or_not(tmp_path, scene):
     for name, stage in stages.items():
         assert (stage.balance_before == stage.balance_after) == (name != "balanced")
     assert stages["balanced"].balance_before == stages["random"].balance_before  # the same draw, moved or not
-    assert trainers["balanced"].router.diagram.power is None
-    transport = after_the_split(tmp_path / "transport", scene, balance="transport", init="random")
-    assert transport.router.diagram.power is not None
+    afresh = after_the_split(tmp_path / "afresh", scene, init="random")
     # Children inherit or start afresh.
-    inherited, random = (weight_of(trainer) for trainer in (trainers["balanced"], transport))
+    inherited, random = (weight_of(trainer) for trainer in (trainers["balanced"], afresh))
     spread = [float((weight[0] - weight[1]).abs().mean()) for weight in (inherited, random)]
     assert 0 < spread[0] < 0.05 < 0.1 < spread[1]
 

@@ -47,7 +47,7 @@ CELLS = {
     "alone": {"cells": ()},
     "uniform": {"cells": (4,), "centres": "uniform"},
     "centroidal": {"cells": (4,), "centres": "centroidal"},
-    "nested centroidal": {"cells": (3, 2), "centres": "centroidal", "balance": "transport", "min_cell_samples": 2},
+    "nested centroidal": {"cells": (3, 2), "centres": "centroidal", "min_cell_samples": 2},
     "nested uniform": {"cells": (3, 2), "centres": "uniform", "min_cell_samples": 2},
     "nested": {"cells": (3, 2, 2)},
     "random init": {"cells": (4,), "init": "random"},

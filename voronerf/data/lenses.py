@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.ops.camera_rays.reference import FISHEYE, FOV, PERSPECTIVE, distort, undistort
+from voronerf.ops.pixel_rays.lens import FISHEYE, FOV, PERSPECTIVE, distort, undistort
 from voronerf.rendering.cameras import Cameras
 
 

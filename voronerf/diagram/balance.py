@@ -10,18 +10,18 @@ machine. For ten thousand samples a GPU would not help. Coordinates are in scene
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from voronerf import ops
-from voronerf.diagram.transport import transport
 from voronerf.diagram.voronoi import VoronoiDiagram
 
 _STEPS = 200  # of Lloyd's iteration at most
 _TOLERANCE = 1e-5  # it ends when a step lowers the energy by less than this part of it
 
-METHODS = ("published", "transport", "centroidal", "centroidal-transport")
+METHODS = ("published", "centroidal")
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,6 @@ class Balance:
 
     Attributes:
         centres: float32 [k, 3], on the device of the samples.
-        power: float32 [k] power weights, or None for a plain Voronoi diagram.
         before: float64 [k], importance of each cell with the first centres.
         after: float64 [k], importance of each cell with the returned centres.
         imbalance_before: std(W / max W) of `before`.
@@ -43,11 +42,10 @@ class Balance:
         >>> int(result.after.sum())  # the importance of all cells together
         500
         >>> result.diagram()
-        VoronoiDiagram(Voronoi, cells=4, depth=1)
+        VoronoiDiagram(cells=4, depth=1)
     """
 
     centres: Tensor
-    power: Tensor | None
     before: Tensor
     after: Tensor
     imbalance_before: float
@@ -55,7 +53,7 @@ class Balance:
 
     def diagram(self) -> VoronoiDiagram:
         """The balanced centres as a flat diagram."""
-        return VoronoiDiagram(self.centres, weights=self.power)
+        return VoronoiDiagram(self.centres)
 
 
 def imbalance(weights: Tensor) -> float:
@@ -115,17 +113,15 @@ def balance(
         points: floating [m, 3], finite.
         importance: floating [m], finite, >= 0, not all 0.
         k: number of cells, 1 <= k <= number of distinct points.
-        method: "published" (a plain Voronoi diagram); "transport" (a power diagram of equal importance); "centroidal"
-            (a plain Voronoi diagram whose centres are the centroids of their cells, weighted by importance: compact
-            cells, which hold unequal importance; Du, Faber and Gunzburger 1999); or "centroidal-transport" (a power
-            diagram of both, equal importance and compact cells; Balzer, Schloemer and Deussen 2009, de Goes et al.
-            2012).
+        method: "published", or "centroidal": centres are the centroids of their cells, weighted by importance, which
+            makes compact cells of unequal importance (Du, Faber and Gunzburger 1999).
         steps: number of updates; 0 keeps the first centres.
         alpha: step size, no unit.
         neighbours: size of N(i), >= 1.
         init: the first centres. "random": distinct samples, all equally likely (as in the paper; default of
             "published"). "weighted": distinct samples drawn one by one with probability proportional to importance
-            (default of the other methods). "uniform": `uniform_centres` over the bounding box of the samples.
+            (default of
+            "centroidal"). "uniform": `uniform_centres` over the bounding box of the samples.
         uniform_scale: factor > 0 on the size of that box about its middle.
         generator: CPU generator of the draws; None for torch's global one.
         backend: of the ops, see `voronerf.backends`.
@@ -163,34 +159,20 @@ def balance(
     samples = points.detach().to("cpu", torch.float32).contiguous()
     masses = importance.detach().to("cpu", torch.float64)
 
-    def weigh(centres: Tensor, power: Tensor | None = None) -> Tensor:
-        return cell_weights(ops.nearest_centre(samples, centres, weights=power, backend=backend), masses, k)
+    def weigh(centres: Tensor) -> Tensor:
+        return cell_weights(ops.nearest_centre(samples, centres, backend=backend), masses, k)
 
     centres = first_centres(samples, masses, k, init=init, generator=generator, uniform_scale=uniform_scale)
-    power = None
     before = after = weigh(centres)
-    if "centroidal" in method:
+    if method == "centroidal":
         centres = lloyd(samples, masses, centres, backend=backend)
         after = weigh(centres)
-    if "transport" in method and k > 1:
-        centres, power = transport(
-            samples, masses, centres, centroidal=method == "centroidal-transport", generator=generator
-        )
-        after = weigh(centres, power)
-    elif method == "published" and k > 1:
-        centres, after = ops.balance_centres(
-            samples,
-            masses,
-            centres,
-            steps=steps,
-            alpha=alpha,
-            neighbours=neighbours,
-            backend=backend,
-        )
+    elif k > 1:
+        settings: dict[str, Any] = {"steps": steps, "alpha": alpha, "neighbours": neighbours, "backend": backend}
+        centres, after = ops.balance_centres(samples, masses, centres, **settings)
     device = points.device
     return Balance(
         centres=centres.to(device),
-        power=None if power is None else power.to(device),
         before=before.to(device),
         after=after.to(device),
         imbalance_before=imbalance(before),

@@ -2,9 +2,9 @@
 
 Letters: n points, m entries (a point and one of its leaves), k siblings, the centres of one diagram of a tree.
 
-The border between siblings i and j is a plane, power weights included, and the signed distance of a point x to it is
+The border between siblings i and j is a plane, and the signed distance of a point x to it is
 
-    d_ij(x) = (|x - v_j|^2 - w_j - |x - v_i|^2 + w_i) / (2 |v_i - v_j|),
+    d_ij(x) = (|x - v_j|^2 - |x - v_i|^2) / (2 |v_i - v_j|),
 
 positive on the side of i. With the margin M, the weight of a sibling falls linearly: 1 at a distance M inside its cell,
 1/2 on its border, 0 at a distance M outside its nearest plane:
@@ -34,17 +34,11 @@ _CHUNK_ELEMENTS = 1 << 20  # distances held at once: 4 MiB in float32, a few tim
 
 
 class Blend(NamedTuple):
-    """The points within a margin, and their leaves.
+    """The points within a margin, and their leaves."""
 
-    Attributes:
-        rows: int64 [m], the point of each entry, ascending; a point outside all margins has no entry.
-        cells: int32 [m], a leaf of that point, from the heaviest to the lightest.
-        weights: floating [m], > 0; the weights of a point sum to 1.
-    """
-
-    rows: Tensor
-    cells: Tensor
-    weights: Tensor
+    rows: Tensor  # int64 [m], the point of each entry, ascending; a point outside all margins has no entry
+    cells: Tensor  # int32 [m], a leaf of that point, from the heaviest to the lightest
+    weights: Tensor  # floating [m], > 0; the weights of a point sum to 1
 
 
 @torch.no_grad()
@@ -52,7 +46,7 @@ def blend_cells(diagram: VoronoiDiagram, points: Tensor, margin: float, *, most:
     """The leaves that contribute to points near borders, and their weights. Not differentiable.
 
     Args:
-        diagram: of any depth, plain or power.
+        diagram: of any depth.
         points: floating [n, 3]; half types are compared in float32. A point that is not finite is in no margin.
         margin: M, in scene units, the same on every level; 0 blends nothing.
         most: largest number of leaves of a point, at least 1.
@@ -90,7 +84,6 @@ def _soft_leaves(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(rows, leaves, weights) of all leaves with a weight, level by level; `apart` is what `_apart` gives."""
     centres = diagram.centres.to(points.dtype)
-    power = None if diagram.power is None else diagram.power.to(points.dtype)
     offsets, child = diagram.child_offsets.long(), diagram.child
     rows = torch.arange(points.shape[0], device=points.device)
     node, weights = torch.zeros_like(rows), torch.ones_like(points[:, 0])
@@ -99,14 +92,12 @@ def _soft_leaves(
         if level == 0:  # the same siblings for all points
             siblings = torch.arange(int(offsets[1]), device=points.device)[None]
             squared = torch.cdist(points, centres[siblings[0]], compute_mode="donot_use_mm_for_euclid_dist").square_()
-            squared = squared if power is None else squared - power[siblings]
             siblings = siblings.expand(len(rows), -1)
         else:
             siblings = offsets[node][:, None] + torch.arange(apart.shape[1], device=points.device)
             absent = siblings >= offsets[node + 1][:, None]
             siblings = siblings.clamp(max=centres.shape[0] - 1)
             squared = (points[rows][:, None] - centres[siblings]).square().sum(2)
-            squared = squared if power is None else squared - power[siblings]
             squared = squared.masked_fill(absent, float("inf"))
         entry, member, share = _soft_siblings(squared, siblings, apart, margin)
         weights = weights[entry] * share
@@ -135,7 +126,7 @@ def _soft_siblings(squared: Tensor, siblings: Tensor, apart: Tensor, margin: flo
     """The weights of siblings.
 
     Args:
-        squared: [e, k], squared distances less power weights; infinite for entries that are not siblings.
+        squared: [e, k], squared distances; infinite for entries that are not siblings.
         siblings: int64 [e, k], rows of the centres.
         apart: [m, >= k], what `_apart` gives.
         margin: M.

@@ -21,7 +21,6 @@ def draw_cell(
     child: Tensor,
     uniforms: Tensor,
     temperature: float,
-    weights: Tensor | None = None,
 ) -> Tensor:
     """A leaf for every point, drawn at random by its distances to the centres, level by level.
 
@@ -37,7 +36,6 @@ def draw_cell(
         child: int32 [m]: the tree, as in `ops.locate_cell`.
         uniforms: [n, levels of the tree], in 0 to 1; other values are clamped, and NaN counts as 0.
         temperature: above 0, finite, in scene units.
-        weights: [m] of power diagrams, or None.
 
     Returns:
         leaf int32 [n].
@@ -48,11 +46,7 @@ def draw_cell(
     owner = torch.searchsorted(child_offsets, table, right=True) - 1
 
     def run(points: Tensor, uniforms: Tensor) -> Tensor:
-        squared = (points[:, None] - centres).square().sum(2)
-        if weights is not None:
-            lowest = weights.new_full((child_offsets.shape[0] - 1,), -torch.inf)
-            squared = squared + (lowest.scatter_reduce(0, owner, weights, "amax")[owner] - weights)
-        distance = squared.sqrt()
+        distance = (points[:, None] - centres).square().sum(2).sqrt()
         # How much of the distribution the drawn centre and those before it must hold: more than nothing, at most all.
         wanted = (1 - uniforms.nan_to_num(0.0)).clamp(torch.finfo(torch.float32).eps / 2, 1)
         # `state` is the diagram a point is in, or (negative) the leaf it has reached.

@@ -68,8 +68,8 @@ def split_diagram(
         min_samples: number of distinct samples that a cell needs to be split.
         centres: "balanced": moved by `balance`; "random": samples drawn at random and not moved; "uniform":
             `uniform_centres` over the bounding box of the samples in the cell, not moved (some may lie outside the cell
-            and have no samples); "centroidal": the centroids of their cells, weighted by importance, with
-            method="transport" those of cells of equal importance. "random" and "uniform" are ablations of the paper.
+            and have no samples); "centroidal": the centroids of their cells, weighted by importance. "random" and
+            "uniform" are ablations of the paper.
         uniform_scale: factor > 0 on the size of the box of "uniform", or of init="uniform", about its middle.
         generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
         backend: of the cell queries, see `voronerf.backends`.
@@ -91,12 +91,12 @@ def split_diagram(
         >>> coarse = VoronoiDiagram(torch.zeros(1, 3))
         >>> split = split_diagram(coarse, points, importance, 4, generator=generator)
         >>> split.diagram
-        VoronoiDiagram(Voronoi, cells=4, depth=1)
+        VoronoiDiagram(cells=4, depth=1)
         >>> split.parents
         tensor([0, 0, 0, 0])
         >>> nested = split_diagram(split.diagram, points, importance, 4, generator=generator)
         >>> nested.diagram
-        VoronoiDiagram(Voronoi, cells=16, depth=2)
+        VoronoiDiagram(cells=16, depth=2)
     """
     check_samples("split_diagram", points, importance)
     if k < 1:
@@ -120,7 +120,7 @@ def split_diagram(
         chosen = [max(chosen, key=lambda cell: float(accumulated[cell]))]
 
     if centres == "centroidal":
-        options["method"] = "centroidal-transport" if options.get("method") == "transport" else "centroidal"
+        options["method"] = "centroidal"
     elif centres != "balanced":
         options = {"method": "published", "steps": 0, "init": centres}
     balances: dict[int, Balance] = {}

@@ -7,10 +7,6 @@ Voronoi NeRFs", section 3). A centre may be refined by a diagram of its own, and
 until it reaches a centre that is not refined, a leaf. The leaves are the cells that own networks. They are numbered
 depth-first, so the leaves of one refined cell are contiguous and stand where their parent stood.
 
-With power weights the nearest centre is the one with the smallest `|x - v_i|^2 - w_i` among its siblings. Adding a
-constant to the weights of one diagram changes nothing. A heavy weight can leave a sibling without any points, and a
-centre may then lie outside of its own cell.
-
 Coordinates are in scene units, in the world frame of the query points.
 """
 
@@ -32,7 +28,7 @@ _GRID_POINTS = 1 << 17
 
 
 class VoronoiDiagram(nn.Module):
-    """A Voronoi or power diagram of any depth, as flat tables that `ops.locate_cell` reads.
+    """A Voronoi diagram of any depth, as flat tables that `ops.locate_cell` reads.
 
     No method changes a diagram in place: `refine` returns a new one. Its buffers stay float32 when a module around it
     is converted to another dtype, because rounded centres would move samples to networks that never saw them.
@@ -41,7 +37,6 @@ class VoronoiDiagram(nn.Module):
         centres: float32 [m, 3], the centres of all diagrams, diagram after diagram; diagram 0 is the root.
         child_offsets: int32 [g + 1]; diagram j owns rows `child_offsets[j] : child_offsets[j + 1]` of `centres`.
         child: int32 [m]; a value c >= 0 says that diagram c refines this centre, c < 0 that it is leaf number `-c - 1`.
-        power: float32 [m] power weights in squared scene units, or None for a plain Voronoi diagram.
         depth: number of levels; 1 for a flat diagram.
         num_cells: number of leaves.
 
@@ -53,7 +48,7 @@ class VoronoiDiagram(nn.Module):
         tensor([0, 1], dtype=torch.int32)
         >>> nested, parents = diagram.refine({1: torch.tensor([[0.8, 0, 0], [1.2, 0, 0]])})
         >>> nested
-        VoronoiDiagram(Voronoi, cells=3, depth=2)
+        VoronoiDiagram(cells=3, depth=2)
         >>> parents  # the old cell of each new one
         tensor([0, 1, 1])
         >>> nested.paths()  # the cell on each level; -1 where a branch ends sooner
@@ -65,52 +60,44 @@ class VoronoiDiagram(nn.Module):
     centres: Tensor
     child_offsets: Tensor
     child: Tensor
-    power: Tensor | None
     depth: int
     num_cells: int
     _grid: ops.CentreGrid | None = None
     _points_located: int = 0
 
-    def __init__(self, centres: Tensor, *, weights: Tensor | None = None) -> None:
+    def __init__(self, centres: Tensor) -> None:
         """Makes a flat diagram. A single centre is allowed: one cell, all of space.
 
         Args:
             centres: floating [k, 3], k >= 1, finite; copied to float32.
-            weights: floating [k] power weights in squared scene units, or None.
 
         Raises:
             ValueError: wrong shape, no centre, or a value that is not finite.
             TypeError: not a floating-point tensor.
         """
         super().__init__()
-        _check_table("centres", centres)
+        _check_centres(centres)
         k = centres.shape[0]
         if k == 0:
             raise ValueError("VoronoiDiagram: centres must hold at least one centre, got shape [0, 3]")
-        if weights is not None:
-            _check_table("weights", weights, k)
         device = centres.device
         self._set_tables(
             centres.detach().to(torch.float32, copy=True).contiguous(),
             torch.tensor([0, k], dtype=torch.int32, device=device),
             -1 - torch.arange(k, dtype=torch.int32, device=device),
-            None if weights is None else weights.detach().to(device, torch.float32, copy=True).contiguous(),
         )
 
-    def _set_tables(self, centres: Tensor, child_offsets: Tensor, child: Tensor, power: Tensor | None) -> None:
-        self.depth, self.num_cells = _check_tree(centres, child_offsets, child, power)
+    def _set_tables(self, centres: Tensor, child_offsets: Tensor, child: Tensor) -> None:
+        self.depth, self.num_cells = _check_tree(centres, child_offsets, child)
         self.register_buffer("centres", centres)
         self.register_buffer("child_offsets", child_offsets)
         self.register_buffer("child", child)
-        self.register_buffer("power", power)
 
     @classmethod
-    def _from_tables(
-        cls, centres: Tensor, child_offsets: Tensor, child: Tensor, power: Tensor | None
-    ) -> "VoronoiDiagram":
+    def _from_tables(cls, centres: Tensor, child_offsets: Tensor, child: Tensor) -> "VoronoiDiagram":
         diagram = cls.__new__(cls)
         nn.Module.__init__(diagram)
-        diagram._set_tables(centres, child_offsets, child, power)
+        diagram._set_tables(centres, child_offsets, child)
         return diagram
 
     @classmethod
@@ -128,9 +115,7 @@ class VoronoiDiagram(nn.Module):
         missing = [prefix + name for name in names if prefix + name not in state]
         if missing:
             raise ValueError(f"VoronoiDiagram: state must hold {', '.join(missing)}, got {len(state)} other entries")
-        centres, child_offsets, child = (state[prefix + name].detach().clone() for name in names)
-        power = state.get(prefix + "power")
-        return cls._from_tables(centres, child_offsets, child, None if power is None else power.detach().clone())
+        return cls._from_tables(*(state[prefix + name].detach().clone() for name in names))
 
     @property
     def leaf_rows(self) -> Tensor:
@@ -182,14 +167,12 @@ class VoronoiDiagram(nn.Module):
         flat = self._flatten("locate", points)
         dtype = torch.float64 if flat.dtype == torch.float64 else torch.float32
         flat, centres = flat.to(dtype), self.centres.to(dtype)
-        weights = None if self.power is None else self.power.to(dtype)
         if self.depth == 1:
             grid = self._centre_grid(flat.shape[0], backend)
-            cells = ops.nearest_centre(flat, centres, weights=weights, grid=grid, backend=backend)
+            cells = ops.nearest_centre(flat, centres, grid=grid, backend=backend)
         else:
-            cells = ops.locate_cell(
-                flat, centres, self.child_offsets, self.child, depth=self.depth, weights=weights, backend=backend
-            )
+            tree = self.child_offsets, self.child
+            cells = ops.locate_cell(flat, centres, *tree, depth=self.depth, backend=backend)
         return cells.reshape(points.shape[:-1])
 
     def _centre_grid(self, n: int, backend: str) -> ops.CentreGrid | None:
@@ -201,11 +184,11 @@ class VoronoiDiagram(nn.Module):
         # One reading of the attribute, which another thread may set at any time.
         grid = self._grid
         # Buffers may be written to from outside, as by DistributedDataParallel.
-        if grid is not None and not grid.belongs_to(self.centres, self.power):
+        if grid is not None and not grid.belongs_to(self.centres):
             grid = self._grid = None
         self._points_located += n
         if grid is None and self._points_located >= _GRID_POINTS:
-            grid = self._grid = ops.centre_grid(self.centres, weights=self.power)
+            grid = self._grid = ops.centre_grid(self.centres)
             self._points_located = 0
         return grid
 
@@ -229,10 +212,8 @@ class VoronoiDiagram(nn.Module):
             p_i = exp(-d_i / temperature) / sum_j exp(-d_j / temperature),     d_i = |x - v_i|.
 
         The probability of a leaf is the product of these along its path. The temperature is the same on every level: a
-        length in scene units, about the width of the band along the borders in which cells mix. With power weights,
-        `d_i = sqrt(|x - v_i|^2 + max_j w_j - w_i)` over the siblings j. That is the plain distance if all weights are
-        equal, and does not depend on a constant added to them. A temperature of 0 gives `locate`. One uniform number in
-        0 to 1 is drawn for each point and level (`diagram.drawing`).
+        length in scene units, about the width of the band along the borders in which cells mix. A temperature of 0
+        gives `locate`. One uniform number in 0 to 1 is drawn for each point and level (`diagram.drawing`).
 
         Args:
             points: floating [..., 3]; compared in float32.
@@ -255,7 +236,7 @@ class VoronoiDiagram(nn.Module):
         drawn_on = flat.device if generator is None else generator.device
         uniforms = torch.rand(flat.shape[0], self.depth, generator=generator, device=drawn_on, dtype=torch.float32)
         tables = self.centres, self.child_offsets, self.child
-        cells = draw_cell(flat, *tables, uniforms.to(flat.device), temperature, self.power)
+        cells = draw_cell(flat, *tables, uniforms.to(flat.device), temperature)
         return cells.reshape(points.shape[:-1])
 
     def refine(self, children: Mapping[int, "Tensor | VoronoiDiagram"]) -> tuple["VoronoiDiagram", Tensor]:
@@ -291,17 +272,14 @@ class VoronoiDiagram(nn.Module):
         parents = torch.repeat_interleave(torch.arange(self.num_cells), counts).to(device)
         if self.num_cells == 1 and grafts:
             graft = grafts[0]
-            power = None if graft.power is None else graft.power.to(device, copy=True)
-            centres, offsets, child = (
-                t.to(device, copy=True) for t in (graft.centres, graft.child_offsets, graft.child)
-            )
-            return VoronoiDiagram._from_tables(centres, offsets, child, power), parents
+            own = (table.to(device, copy=True) for table in (graft.centres, graft.child_offsets, graft.child))
+            return VoronoiDiagram._from_tables(*own), parents
 
         # The grafts' rows and diagrams go behind the present ones; only leaf numbers and links have to be shifted.
         first_leaf = (counts.cumsum(0) - counts).to(device, torch.int32)
         child = torch.where(self.child < 0, -1 - first_leaf[(-1 - self.child).clamp(min=0)], self.child)
         leaf_rows = self.leaf_rows.tolist()
-        tables, offsets_all, links, powers = [self.centres], [self.child_offsets], [child], [self._power_or_zero()]
+        tables, offsets_all, links = [self.centres], [self.child_offsets], [child]
         rows, nodes = self.centres.shape[0], self.child_offsets.shape[0] - 1
         for leaf, graft in sorted(grafts.items()):
             if graft.num_cells == 1:
@@ -311,19 +289,14 @@ class VoronoiDiagram(nn.Module):
             links.append(torch.where(inner < 0, inner - first_leaf[leaf], inner + nodes))
             offsets_all.append(graft.child_offsets[1:].to(device) + rows)
             tables.append(graft.centres.to(device))
-            powers.append(graft._power_or_zero().to(device))
             rows, nodes = rows + graft.centres.shape[0], nodes + graft.child_offsets.shape[0] - 1
-        weighted = self.power is not None or any(graft.power is not None for graft in grafts.values())
-        refined = VoronoiDiagram._from_tables(
-            torch.cat(tables), torch.cat(offsets_all), torch.cat(links), torch.cat(powers) if weighted else None
-        )
-        return refined, parents
+        return VoronoiDiagram._from_tables(torch.cat(tables), torch.cat(offsets_all), torch.cat(links)), parents
 
     @classmethod
     def join(cls, diagrams: Sequence["VoronoiDiagram"]) -> "VoronoiDiagram":
         """The diagram of all centres of the first levels; below them each keeps the levels that it has.
 
-        Leaves are numbered diagram after diagram. Power weights of flat diagrams are compared as they are.
+        Leaves are numbered diagram after diagram.
 
         Args:
             diagrams: at least one, on one device.
@@ -347,19 +320,16 @@ class VoronoiDiagram(nn.Module):
             child, first = diagram.child, int(diagram.child_offsets[1])
             # A root's own number, 0, is none of the links.
             links = torch.where(child < 0, child - leaves, child + nodes)
-            table = torch.cat((diagram.centres, diagram._power_or_zero()[:, None]), 1)
-            roots.append(table[:first])
-            inner.append(table[first:])
+            roots.append(diagram.centres[:first])
+            inner.append(diagram.centres[first:])
             root_rows.append(links[:first])
             inner_rows.append(links[first:])
             ends.append(diagram.child_offsets[1:].diff())
             nodes, leaves = nodes + diagram.child_offsets.shape[0] - 2, leaves + diagram.num_cells
-        table = torch.cat((*roots, *inner))
-        counts = torch.cat((torch.tensor([sum(map(len, roots))], device=table.device), *ends))
+        centres = torch.cat((*roots, *inner))
+        counts = torch.cat((torch.tensor([sum(map(len, roots))], device=centres.device), *ends))
         offsets = torch.cat((counts.new_zeros(1), counts.cumsum(0))).to(torch.int32)
-        weighted = any(diagram.power is not None for diagram in diagrams)
-        centres, power = table[:, :3].contiguous(), table[:, 3].contiguous()
-        return cls._from_tables(centres, offsets, torch.cat((*root_rows, *inner_rows)), power if weighted else None)
+        return cls._from_tables(centres, offsets, torch.cat((*root_rows, *inner_rows)))
 
     def part(self, cells: Tensor) -> "VoronoiDiagram":
         """The diagram of some of the cells. A point that lies in one of them is located in it again.
@@ -390,17 +360,13 @@ class VoronoiDiagram(nn.Module):
         kept = [row for found in rows for row in found]
         links = [nodes[child[row]] if child[row] >= 0 else -1 - number[-child[row] - 1] for row in kept]
         ends = torch.tensor([0, *(len(found) for found in rows if found)]).cumsum(0)
-        power, device = None if self.power is None else self.power[kept], self.centres.device
+        device = self.centres.device
         table = torch.tensor(links, dtype=torch.int32, device=device)
-        return VoronoiDiagram._from_tables(self.centres[kept], ends.to(device, torch.int32), table, power)
+        return VoronoiDiagram._from_tables(self.centres[kept], ends.to(device, torch.int32), table)
 
     def extra_repr(self) -> str:
         """What `print` shows."""
-        kind = "Voronoi" if self.power is None else "power"
-        return f"{kind}, cells={self.num_cells}, depth={self.depth}"
-
-    def _power_or_zero(self) -> Tensor:
-        return torch.zeros_like(self.centres[:, 0]) if self.power is None else self.power
+        return f"cells={self.num_cells}, depth={self.depth}"
 
     def _flatten(self, op: str, points: Tensor) -> Tensor:
         if points.dim() == 0 or points.shape[-1] != 3:
@@ -410,12 +376,10 @@ class VoronoiDiagram(nn.Module):
         return points.detach().reshape(-1, 3)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "VoronoiDiagram":
-        kept = {name: getattr(self, name) for name in ("centres", "power")}
+        kept = self.centres
         super()._apply(fn, recurse)
-        for name, table in kept.items():
-            moved = getattr(self, name)
-            if table is not None and moved.dtype != table.dtype:
-                setattr(self, name, table.to(moved.device))
+        if self.centres.dtype != kept.dtype:
+            self.centres = kept.to(self.centres.device)
         return self
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
@@ -423,39 +387,34 @@ class VoronoiDiagram(nn.Module):
         if prefix + "centres" in state_dict:
             device = self.centres.device
             loaded = VoronoiDiagram.from_state(state_dict, prefix)
-            power = None if loaded.power is None else loaded.power.to(device)
-            self._set_tables(loaded.centres.to(device), loaded.child_offsets.to(device), loaded.child.to(device), power)
+            self._set_tables(loaded.centres.to(device), loaded.child_offsets.to(device), loaded.child.to(device))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
-def _check_table(name: str, table: Tensor, k: int | None = None) -> None:
-    """Checks a table of centres [any number, 3] or, where ``k`` is given, one of weights [k].
+def _check_centres(centres: Tensor) -> None:
+    """Checks a table of centres [any number, 3].
 
     Raises:
         ValueError: a wrong shape, or a value that is not finite.
         TypeError: not a floating-point tensor.
     """
-    if not isinstance(table, Tensor) or not table.is_floating_point():
-        got = table.dtype if isinstance(table, Tensor) else type(table).__name__
-        raise TypeError(f"VoronoiDiagram: {name} must be a floating-point tensor, got {got}")
-    if k is None and (table.dim() != 2 or table.shape[1] != 3):
-        raise ValueError(f"VoronoiDiagram: {name} must have shape [k, 3], got {list(table.shape)}")
-    if k is not None and table.shape != (k,):
-        raise ValueError(f"VoronoiDiagram: {name} must have shape [{k}], got {list(table.shape)}")
-    if not bool(torch.isfinite(table).all()):
-        raise ValueError(f"VoronoiDiagram: {name} must be finite, got NaN or infinity")
+    if not isinstance(centres, Tensor) or not centres.is_floating_point():
+        got = centres.dtype if isinstance(centres, Tensor) else type(centres).__name__
+        raise TypeError(f"VoronoiDiagram: centres must be a floating-point tensor, got {got}")
+    if centres.dim() != 2 or centres.shape[1] != 3:
+        raise ValueError(f"VoronoiDiagram: centres must have shape [k, 3], got {list(centres.shape)}")
+    if not bool(torch.isfinite(centres).all()):
+        raise ValueError("VoronoiDiagram: centres must be finite, got NaN or infinity")
 
 
-def _check_tree(centres: Tensor, child_offsets: Tensor, child: Tensor, power: Tensor | None) -> tuple[int, int]:
+def _check_tree(centres: Tensor, child_offsets: Tensor, child: Tensor) -> tuple[int, int]:
     """Checks the tables of a tree, which may come from a damaged file; returns its depth and number of leaves."""
 
     def refuse(rule: str) -> ValueError:
         return ValueError(f"VoronoiDiagram: tables of a tree must {rule}")
 
-    _check_table("centres", centres)
+    _check_centres(centres)
     m = centres.shape[0]
-    if power is not None:
-        _check_table("power", power, m)
     if any(table.dtype != torch.int32 or table.dim() != 1 for table in (child_offsets, child)):
         raise refuse("hold child_offsets and child as int32 vectors")
     offsets, links = child_offsets.tolist(), child.tolist()

@@ -1,7 +1,7 @@
 """The cells of a diagram as coloured polyhedra.
 
 A cell is where its centre is the nearest one among its siblings, on each level of the diagram. Each of these conditions
-is a half-space, `2 (b - a) . x <= |b|^2 - |a|^2 - w_b + w_a` for a centre a and its sibling b with power weights w, and
+is a half-space, `2 (b - a) . x <= |b|^2 - |a|^2` for a centre a and its sibling b, and
 the box adds six. Their intersection is convex.
 """
 
@@ -107,7 +107,6 @@ def cell_meshes(diagram: VoronoiDiagram, box: Tensor) -> dict[int, Any]:
 def _half_spaces(diagram: VoronoiDiagram) -> list[NDArray[np.float64]]:
     """For each leaf the rows (n, d) of unit normals and offsets with n . x + d <= 0 inside of it."""
     centres = diagram.centres.double().cpu().numpy()
-    power = np.zeros(len(centres)) if diagram.power is None else diagram.power.double().cpu().numpy()
     offsets, paths = diagram.child_offsets.tolist(), diagram.paths().tolist()
     child = diagram.child.tolist()
     leaves = []
@@ -119,7 +118,7 @@ def _half_spaces(diagram: VoronoiDiagram) -> list[NDArray[np.float64]]:
             rows = np.arange(offsets[node], offsets[node + 1])
             mine, others = rows[number], np.delete(rows, number)
             normals = 2 * (centres[others] - centres[mine])
-            shift = (centres[mine] ** 2).sum() - power[mine] - (centres[others] ** 2).sum(-1) + power[others]
+            shift = (centres[mine] ** 2).sum() - (centres[others] ** 2).sum(-1)
             length = np.linalg.norm(normals, axis=-1)
             apart = length > 0  # of two centres in one place, one has no points, or both the same
             planes.append(np.concatenate((normals, shift[:, None]), 1)[apart] / length[apart, None])

@@ -10,9 +10,8 @@ Each raises ValueError for shapes, devices, numbers out of range and an unknown 
 
 from voronerf.grids import HashGrid
 from voronerf.layers import MLP, Layer
+from voronerf.ops.adam import Guard, Rule, adam
 from voronerf.ops.balance_centres import balance_centres
-from voronerf.ops.camera_rays import camera_rays
-from voronerf.ops.cast_solids import cast_solids
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.centre_grid import CentreGrid, centre_grid
 from voronerf.ops.composite import Composite, composite
@@ -36,7 +35,6 @@ from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradie
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.sighting_gradient import sighting_gradient
-from voronerf.ops.sparse_adam import Guard, Rule, adam, sparse_adam
 from voronerf.ops.spherical_harmonics import spherical_harmonics
 
 __all__ = [
@@ -54,8 +52,6 @@ __all__ = [
     "Runs",
     "adam",
     "balance_centres",
-    "camera_rays",
-    "cast_solids",
     "cell_sort",
     "centre_grid",
     "compose_runs",
@@ -81,6 +77,5 @@ __all__ = [
     "run_gradients",
     "run_sums",
     "sighting_gradient",
-    "sparse_adam",
     "spherical_harmonics",
 ]

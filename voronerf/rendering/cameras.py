@@ -19,8 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.ops.camera_rays import camera_rays
-from voronerf.ops.camera_rays.reference import FISHEYE, PERSPECTIVE, distort, undistort
+from voronerf.ops.pixel_rays.lens import FISHEYE, PERSPECTIVE, camera_rays, distort, undistort
 
 __all__ = [
     "Cameras",

@@ -121,7 +121,7 @@ def freeze_cells(module: nn.Module, frozen: Tensor | None) -> None:
 
     A stacked parameter is one tensor to an optimiser, which moves all of its cells: by weight decay and momentum also
     those without a gradient. What it changed in frozen cells is therefore put back after its step; an optimiser with
-    ``leaves_frozen()`` passes them over by itself.
+    ``leaves_frozen`` passes them over by itself.
     """
     if frozen is None:
         _FROZEN.pop(module, None)
@@ -148,7 +148,7 @@ def _of_cells(optimizer: torch.optim.Optimizer, parameter: Tensor) -> list[Tenso
 
 
 def _before_step(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-    if not _FROZEN or (hasattr(optimizer, "leaves_frozen") and optimizer.leaves_frozen()):
+    if not _FROZEN or (getattr(optimizer, "leaves_frozen", False)):
         return
     held = []
     for parameter, frozen in _frozen_parameters(optimizer):

@@ -236,23 +236,14 @@ class Solid:
 
 
 class Asked(NamedTuple):
-    """A router that is asked about some points.
+    """A router that is asked about some points."""
 
-    Attributes:
-        router: With the networks.
-        rows: int64 [q], which of all points these are; None for all in their order.
-        points: [q, 3], in the space of the networks.
-        directions: [r, 3], as the networks see them.
-        ray_index: int32 [q].
-        scale: Of the part's frame, by which densities are divided.
-    """
-
-    router: VoronoiRouter
-    rows: Tensor | None
-    points: Tensor
-    directions: Tensor
-    ray_index: Tensor
-    scale: float
+    router: VoronoiRouter  # with the networks
+    rows: Tensor | None  # int64 [q], which of all points these are; None for all in their order
+    points: Tensor  # [q, 3], in the space of the networks
+    directions: Tensor  # [r, 3], as the networks see them
+    ray_index: Tensor  # int32 [q]
+    scale: float  # of the part's frame, by which densities are divided
 
 
 class Part(nn.Module):

@@ -575,8 +575,7 @@ class VoronoiRouter(nn.Module):
             given.update(directions=directions, direction_index=ray_index)
         where = self._where(positions, None)
         if "centres" in where:
-            compared = of_one_dtype(positions, where["centres"], where["centre_weights"])
-            where.update(zip(("coords", "centres", "centre_weights"), compared))
+            where["coords"], where["centres"] = of_one_dtype(positions, where["centres"])
         return {**given, **where}
 
     def last_output(self, positions: Tensor) -> Tensor | None:
@@ -688,7 +687,8 @@ class VoronoiRouter(nn.Module):
             return known.grouping
         flat, k = positions.detach().reshape(-1, 3), self.num_cells
         if flat.shape[0]:
-            locate = functools.partial(self.assign, flat) if k > 1 else None
+            nearest = functools.partial(self.diagram.locate, flat, backend=self.backend)
+            locate = None if k == 1 else functools.partial(self.assign, flat) if drawn else nearest
             grouping = Grouping(self._where(flat, flat), flat.shape[0], k, flat.device, self.backend, locate)
         else:  # the module runs on placeholders, since it may not take an empty batch
             where = {"cells": torch.zeros(2, dtype=torch.int32, device=flat.device)}
@@ -705,7 +705,7 @@ class VoronoiRouter(nn.Module):
         drawn = self.assignment == "stochastic" and self.training
         if drawn or (diagram.depth == 1 and self.num_cells > _MANY):
             return {"cells": self.assign((positions[:, :3] if coords is None else coords).detach())}
-        tables = {"centres": diagram.centres, "centre_weights": diagram.power, "coords": coords}
+        tables = {"centres": diagram.centres, "coords": coords}
         if diagram.depth == 1:
             return tables
         return {**tables, "child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}

@@ -42,7 +42,6 @@ class SplitRule:
     Attributes:
         centres: Of the new cells, see `split_diagram`, like the next two.
         uniform_scale: Of a regular grid of centres.
-        balance: "published" or "transport".
         min_samples: A cell with fewer kept samples is not split further.
         inherit: Whether new cells start as copies of their parent, else from random parameters.
         reservoir: Samples that are kept.
@@ -56,7 +55,6 @@ class SplitRule:
 
     centres: str = "centroidal"
     uniform_scale: float = 1.0
-    balance: str = "published"
     min_samples: int = 64
     inherit: bool = True
     reservoir: int = 10_000
@@ -209,7 +207,6 @@ class Cells:
             cells=planned.cells,
             centres=rule.centres,
             uniform_scale=rule.uniform_scale,
-            method=rule.balance,
             min_samples=0 if self.diagram.num_cells == 1 else rule.min_samples,
             generator=self.generator,
             backend=self.renderer.backend,

@@ -8,18 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.ops.sparse_adam import Guard, Rule, adam, sparse_adam
-from voronerf.ops.sparse_adam.reference import judge
+from voronerf.ops.adam import Guard, Rule, adam
 from voronerf.router.optimizers import trained_parts
 
 
 class Adam(torch.optim.Adam):
     """``torch.optim.Adam``, with groups of parameters whose entries without a gradient stay as they are.
 
-    A group says ``sparse=True``; see :func:`voronerf.ops.sparse_adam`. Its state has the same names as that of the
-    other groups, which are torch's. All float32 parameters are updated by one operation, since torch's own step takes
-    longer to prepare than to compute for networks of this size.
+    A group says ``sparse=True``. The state has the names of torch's. All parameters, which are float32 and contiguous,
+    are updated by one operation, since torch's own step takes longer to prepare than to compute for networks of this
+    size.
 
     Args:
         params: Parameters or groups of them, as ``torch.optim.Adam`` takes them.
@@ -29,6 +27,9 @@ class Adam(torch.optim.Adam):
         capturable: Whether a CUDA graph can record a step.
         backend: Of the operations.
     """
+
+    #: Whether it passes over frozen cells (`VoronoiRouter.freeze`) by itself.
+    leaves_frozen = True
 
     def __init__(
         self,
@@ -61,42 +62,18 @@ class Adam(torch.optim.Adam):
                 loss = closure()
         # A scaler leaves these to an optimiser that can be fused, as torch's: the scale, and whether one overflowed.
         scale, overflow = getattr(self, "grad_scale", None), getattr(self, "found_inf", None)
-        if self.leaves_frozen():
-            # Without a loss nothing is counted.
-            self._together(None if overflow is None else Guard(overflow, overflow, overflow, scale), None)
-            return loss
-        tables = self._step_tables(scale, overflow)
-        super().step()
-        for parameter, gradient in tables:
-            parameter.grad = gradient
+        # Without a loss nothing is counted.
+        self.update(None if overflow is None else Guard(overflow, overflow, overflow, scale))
         return loss
 
     @torch.no_grad()
-    def update(self, guard: Guard, loss: Tensor | None = None) -> None:
+    def update(self, guard: Guard | None, loss: Tensor | None = None) -> None:
         """:meth:`step` without its hooks, which take as long as a layer of a small network.
 
         Args:
-            guard: Leaves out the step, see :func:`voronerf.ops.adam`.
+            guard: Leaves out the step, see :func:`voronerf.ops.adam`; None for never.
             loss: [], of the step; with it the guard judges first.
         """
-        if self.leaves_frozen():
-            self._together(guard, loss)
-            return
-        dense = (p.grad for group in self.param_groups if not group.get("sparse") for p in group["params"])
-        judge(guard, loss, [gradient for gradient in dense if gradient is not None])
-        self.found_inf = guard.found
-        self.step()
-        del self.found_inf
-
-    def leaves_frozen(self) -> bool:
-        """Whether one operation takes all parameters, and passes over frozen cells (`VoronoiRouter.freeze`)."""
-        held = [p for group in self.param_groups for p in group["params"] if p.grad is not None]
-        if not held or not all(p.dtype is torch.float32 and p.is_contiguous() for p in held):
-            return False
-        chosen = backends.chosen("adam", held[0].device, torch.float32, backend=self.backend)
-        return chosen == "native" or self.backend == "reference"  # torch's own step is faster than the reference
-
-    def _together(self, guard: Guard | None, loss: Tensor | None) -> None:
         rules, tensors = [], []
         held = [(p, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
         for (parameter, group), parts in zip(held, trained_parts([entry[0] for entry in held]), strict=True):
@@ -109,30 +86,6 @@ class Adam(torch.optim.Adam):
                 tensors.append(own if part is ... else tuple(tensor[part] for tensor in own))
         if rules:
             adam(rules, *zip(*tensors, strict=True), guard=guard, loss=loss, backend=self.backend)
-
-    def _step_tables(self, scale: Tensor | None, overflow: Tensor | None) -> list[tuple[Tensor, Tensor]]:
-        """Updates tables by entries, and takes their gradients, so that torch's step passes them over."""
-        taken = []
-        for group in self.param_groups if overflow is None or not overflow.item() else ():
-            for parameter in group["params"] if group.get("sparse", False) else ():
-                if parameter.grad is None:
-                    continue
-                state, gradient = self._state(parameter), parameter.grad
-                state["step"].add_(1)
-                sparse_adam(
-                    parameter,
-                    gradient if scale is None else gradient / scale,
-                    state["exp_avg"],
-                    state["exp_avg_sq"],
-                    step=int(state["step"]),
-                    learning_rate=float(group["lr"]),
-                    betas=group["betas"],
-                    epsilon=group["eps"],
-                    backend=self.backend,
-                )
-                taken.append((parameter, gradient))
-                parameter.grad = None
-        return taken
 
     def _state(self, parameter: Tensor) -> dict[str, Tensor]:
         """The state of a parameter, on its device: a checkpoint has the steps done on the CPU."""

@@ -111,11 +111,9 @@ class TrainConfig:
     spaced between the two times of --split-at."""
     centres: Literal["balanced", "random", "uniform", "centroidal"] = "centroidal"
     """Centres of the new cells: balanced by importance (as published), drawn from the samples, a regular grid, or
-    centroids of their cells, which makes cells compact (with --balance transport, of equal importance as well)."""
+    centroids of their cells, which makes cells compact."""
     uniform_scale: float = 1.0
     """Size of the grid of --centres uniform along each axis, relative to the box of the kept samples."""
-    balance: Literal["published", "transport"] = "published"
-    """How centres are balanced: the paper's update, or power weights from optimal transport."""
     init: Literal["inherit", "random"] = "inherit"
     """New cells start as copies of their parent, or from random parameters."""
     assignment: Literal["nearest", "stochastic"] = "nearest"
@@ -277,7 +275,6 @@ class TrainConfig:
         return SplitRule(
             centres=self.centres,
             uniform_scale=self.uniform_scale,
-            balance=self.balance,
             min_samples=self.min_cell_samples,
             inherit=self.init == "inherit",
             reservoir=self.reservoir,
@@ -324,6 +321,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
 PATHS = ("out", "lpips")
 #: Settings of older versions that are gone, with what is always done in their place.
 REMOVED: dict[str, Any] = {
+    "balance": "published",
     "split_proposal": False,
     "proposal_rounds": 1,
     "proposal_anneal": 0.0,

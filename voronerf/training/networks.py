@@ -338,16 +338,13 @@ def make_optimizer(routers: Mapping[str, VoronoiRouter | Parts], config: TrainCo
     parent would set its step sizes for a thousand steps. The change is worth 0.7 dB after 800 steps of Lego at
     100 x 100.
 
-    Entries of the field's tables that have no gradient stay as they are, except in a CUDA graph without the native
-    backend, whose steps are torch's.
+    Entries of the field's tables that have no gradient stay as they are.
     """
     assert config.lr is not None
     dense, tables = parameter_groups(routers, config)
     groups = [{"params": dense, "sparse": False}]
     if tables:
-        device = tables[0].device
-        native = backends.chosen("adam", device, torch.float32, backend=config.backend) == "native"
-        groups.append({"params": tables, "sparse": native or not config.cuda_graph})
+        groups.append({"params": tables, "sparse": True})
     options: dict[str, Any] = {"lr": config.lr}
     if config.cuda_graph:  # a graph reads the learning rate and the step count from tensors
         options = {"lr": torch.tensor(config.lr, device=dense[0].device), "capturable": True}

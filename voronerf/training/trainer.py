@@ -25,7 +25,7 @@ from voronerf.evaluation.lpips import Lpips, find_lpips
 from voronerf.evaluation.scores import ViewScore, evaluate, mean_scores
 from voronerf.files import json_text, write_bytes, write_text
 from voronerf.ops import Guard
-from voronerf.ops.sparse_adam.reference import judge
+from voronerf.ops.adam.reference import judge
 from voronerf.rendering.occupancy import OccupancyGrid
 from voronerf.router import Parts, VoronoiRouter
 from voronerf.step import Batch, Cells, Found, Step

@@ -1,8 +1,7 @@
 """The built-in city: blocks x blocks of streets, for scenes that grow while their detail stays as fine.
 
 Facades with windows, ledges and bricks, shops, trees, lamps and parked cars; some 90 solids on each block, which is one
-scene unit wide. Each block adds the same number of views from its streets and from above, on white. Rays are cast by
-`voronerf.ops.cast_solids` with Warp where it is installed, else by NumPy, block by block.
+scene unit wide. Each block adds the same number of views from its streets and from above, on white.
 """
 
 from __future__ import annotations
@@ -18,10 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from voronerf import backends
 from voronerf.data.builtin.city_solids import city
 from voronerf.data.builtin.opaque import SUPERSAMPLES, Hits, bounds, render_views, see
-from voronerf.data.builtin.rich import caster
 from voronerf.data.builtin.solids import Array, Rows, Solid, first_hits, rotation, slab
 from voronerf.data.errors import SceneError
 from voronerf.data.scene import Scene, Split
@@ -164,9 +161,7 @@ def _above(random: np.random.Generator) -> tuple[Array, Array]:
 
 
 def block_caster(groups: Sequence[Sequence[Solid]]) -> Hits:
-    """What finds the first solid on a ray, numbered through all groups."""
-    if not backends.why_not("cast_solids", "warp", torch.device("cpu")):
-        return caster([solid for group in groups for solid in group], "warp")
+    """What finds the first solid on a ray, block by block; solids are numbered through all groups."""
     boxes = [bounds(group) for group in groups]
     starts = np.cumsum([0, *(len(group) for group in groups)])
 

@@ -1,9 +1,7 @@
 """The built-in rich scene: hundreds of solids, for ground truth with more detail than a small network holds.
 
 On a mosaic plinth a brick tower in staggered courses under a globe, a helix of marbles around it, a chain of linked
-rings, a fence of posts, and small crates. Light, cameras and views are those of the built-in scene. Rays are cast by
-`voronerf.ops.cast_solids`: by Warp where it is installed, which takes seconds on the CPU, else by NumPy, which takes
-several times as long; the two round differently, so that single pixels may differ by a level.
+rings, a fence of posts, and small crates. Light, cameras and views are those of the built-in scene.
 """
 
 from __future__ import annotations
@@ -11,50 +9,34 @@ from __future__ import annotations
 import colorsys
 import functools
 import math
-from collections.abc import Sequence
 
-import numpy as np
-import torch
-
-from voronerf import backends
 from voronerf.data.builtin.opaque import (
     SUPERSAMPLES,
     TEST_VIEWS,
     TRAIN_VIEWS,
-    Hits,
     bounds,
     builtin_cameras,
     render_scene,
     see,
 )
 from voronerf.data.builtin.opaque_solids import FLOOR, bricks, checker, diagonals, globe, mosaic, plain, spiral
-from voronerf.data.builtin.solids import Array, Box, Cylinder, Rows, Solid, Sphere, Torus, first_hits, rotation
+from voronerf.data.builtin.solids import Box, Cylinder, Solid, Sphere, Torus, rotation
 from voronerf.data.scene import Scene
-from voronerf.ops.cast_solids import cast_solids
 
-KINDS: tuple[type[Solid], ...] = (Sphere, Box, Cylinder, Torus)  # in the order of the op's numbers
 COURSES, BRICKS = 16, 12  # of the tower
 COURSE, TOWER = 0.06, 0.36  # height of a course and the tower's radius
 
 
-def rich_scene(
-    size: int = 100,
-    *,
-    train_views: int = TRAIN_VIEWS,
-    test_views: int = TEST_VIEWS,
-    backend: str = "auto",
-) -> Scene:
+def rich_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views: int = TEST_VIEWS) -> Scene:
     """Computes the scene.
 
     Args:
         size: of the square images, pixels.
         train_views: spread over the upper hemisphere on a spherical Fibonacci lattice.
         test_views: on an orbit that rises and falls twice, apart from the training views.
-        backend: "warp", "reference" (the op's), "numpy", or "auto": Warp where it is installed, else NumPy.
 
     Raises:
-        ValueError: a size or number of views below 1, or an unknown backend.
-        BackendUnavailable: the named backend cannot run here.
+        ValueError: a size or number of views below 1.
 
     Examples:
         >>> from voronerf.data import rich_scene
@@ -63,51 +45,7 @@ def rich_scene(
         torch.Size([4, 4])
     """
     cameras = builtin_cameras("rich_scene", size, train_views, test_views)
-    look = functools.partial(see, solids=SOLIDS, hits=caster(SOLIDS, backend))
-    return render_scene("builtin-rich", cameras, look, bounds(SOLIDS), SUPERSAMPLES)
-
-
-def caster(solids: Sequence[Solid], backend: str = "auto") -> Hits:
-    """What finds the first solid on a ray.
-
-    Args:
-        solids: of the kinds of `KINDS`.
-        backend: as of `rich_scene`.
-    """
-    if backend == "auto":
-        backend = "numpy" if backends.why_not("cast_solids", "warp", torch.device("cpu")) else "warp"
-    if backend == "numpy":
-        return functools.partial(first_hits, solids)
-    tables = tables_of(solids)
-
-    def hits(origins: Array, directions: Array) -> tuple[Array, Rows]:
-        rays = (torch.from_numpy(np.ascontiguousarray(v)) for v in np.broadcast_arrays(origins, directions))
-        depths, found = cast_solids(*tables, *rays, backend=backend)
-        return depths.numpy(), found.clamp(min=0).numpy().astype(np.int64)
-
-    # Compile kernels before several threads need them.
-    hits(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
-    return hits
-
-
-def tables_of(solids: Sequence[Solid]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(kinds, frames, sizes) of solids, as `voronerf.ops.cast_solids` takes them."""
-    kinds = [KINDS.index(type(solid)) for solid in solids]
-    turns = [np.eye(3, dtype=np.float32) if solid.turn is None else solid.turn for solid in solids]
-    frames = [np.vstack((turn, np.array(solid.centre))) for turn, solid in zip(turns, solids)]
-    sizes = torch.tensor([_size(solid) for solid in solids], dtype=torch.float32)
-    return torch.tensor(kinds, dtype=torch.int32), torch.from_numpy(np.stack(frames).astype(np.float32)), sizes
-
-
-def _size(solid: Solid) -> tuple[float, float, float]:
-    if isinstance(solid, Sphere):
-        return solid.radius, 0.0, 0.0
-    if isinstance(solid, Box):
-        return solid.half
-    if isinstance(solid, Cylinder):
-        return solid.radius, solid.half_height, 0.0
-    assert isinstance(solid, Torus)
-    return solid.ring, solid.tube, 0.0
+    return render_scene("builtin-rich", cameras, functools.partial(see, solids=SOLIDS), bounds(SOLIDS), SUPERSAMPLES)
 
 
 def _hue(share: float, value: float = 0.9, saturation: float = 0.7) -> tuple[float, float, float]:

@@ -1,8 +1,8 @@
 """Solids that rays are cast against: spheres, boxes, cylinders and tori, each in its own frame.
 
 r rays, n points. Distances are along unit directions, infinite where a ray misses. Rays start outside of every
-solid; one that starts inside of the box around a torus does not see it. `voronerf.ops.cast_solids.reference` is the
-same for many solids of any kind at once, in torch. NumPy, so that views can be cast in parallel threads.
+solid; one that starts inside of the box around a torus does not see it. NumPy, so that views can be cast in parallel
+threads.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from voronerf.ops.cast_solids.reference import SURFACE, TRACE_STEPS
+TRACE_STEPS = 40
+SURFACE = 5e-4  # a traced ray closer than this to a torus has hit it
 
 Array = NDArray[np.float32]
 Rows = NDArray[np.int64]

@@ -6,13 +6,12 @@ import torch
 from torch import Tensor
 
 from voronerf import backends
-from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import Checked, check_flag, check_integer, check_number
+from voronerf.backends import Implementation
+from voronerf.checks import Checked, check_integer, check_number
 
 _OP = backends.declare(
     "balance_centres",
     native=Implementation(("cpu",), (torch.float32,)),
-    warp=Implementation(EVERYWHERE, (torch.float32,)),
 )
 
 
@@ -24,14 +23,14 @@ def balance_centres(
     steps: int = 500,
     alpha: float = 0.05,
     neighbours: int = 8,
-    global_norm: bool = False,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """Moves all centres `steps` times towards cells of equal mass; see ``voronerf.diagram.balance``.
 
     ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i`` (Elsner et al. 2023, section 3.2). N(i)
-    are the `neighbours` closest centres, or all others if there are fewer; at equal distance, the first ones. Updates
-    are computed in float64 and stored in float32. The result is the same at every call. Not differentiable.
+    are the `neighbours` closest centres, or all others if there are fewer; at equal distance, the first ones. norm_i is
+    the largest W of i and N(i). Updates are computed in float64 and stored in float32. The result is the same at every
+    call. Not differentiable.
 
     Args:
         samples: float32 [m, 3], finite.
@@ -40,8 +39,7 @@ def balance_centres(
         steps: number of updates, >= 0.
         alpha: step size, no unit.
         neighbours: size of N(i), >= 1.
-        global_norm: norm_i is the largest W of all cells, instead of the largest of i and N(i).
-        backend: "auto", "reference", "native" or "warp".
+        backend: "auto", "reference" or "native".
 
     Returns:
         (centres float32 [k, 3], weights float64 [k], the mass in each cell of the returned centres).
@@ -63,10 +61,9 @@ def balance_centres(
     check_integer(_OP, "steps", steps, 0)
     check_integer(_OP, "neighbours", neighbours, 1)
     check_number(_OP, "alpha", alpha)
-    check_flag(_OP, "global_norm", global_norm)
     if given.sizes["k"] < 1:
         raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
     run = backends.resolve(_OP, backend=backend, device=samples.device, dtype=samples.dtype)
     tensors = samples.detach(), masses.detach(), centres.detach()
-    moved, weights = run(*tensors, steps, float(alpha), neighbours, global_norm)
+    moved, weights = run(*tensors, steps, float(alpha), neighbours)
     return moved, weights

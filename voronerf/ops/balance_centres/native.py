@@ -13,7 +13,7 @@ from voronerf.custom_op import custom_op
 
 @custom_op("balance_centres_native", devices=("cpu",))
 def balance_centres(
-    samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int, global_norm: bool
+    samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """The published update, repeated; see ``voronerf.ops.balance_centres``."""
     m, k = samples.shape[0], centres.shape[0]
@@ -28,7 +28,6 @@ def balance_centres(
         steps=steps,
         alpha=alpha,
         neighbours=min(neighbours, k - 1),
-        of_all=global_norm,
     )
     cells = samples.new_empty(m, dtype=torch.int32)
     workspace = masses.new_empty(compiled.balance_centres_workspace(k))

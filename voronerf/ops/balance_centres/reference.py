@@ -10,12 +10,12 @@ from voronerf.ops.nearest_centre.reference import nearest_centre
 
 @torch.no_grad()
 def balance_centres(
-    samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int, global_norm: bool
+    samples: Tensor, masses: Tensor, centres: Tensor, steps: int, alpha: float, neighbours: int
 ) -> tuple[Tensor, Tensor]:
     """The published update, repeated; see ``voronerf.ops.balance_centres``."""
     weights = cell_masses(samples, masses, centres)
     for _ in range(steps if centres.shape[0] > 1 else 0):
-        centres = published_step(centres, weights, alpha=alpha, neighbours=neighbours, global_norm=global_norm)
+        centres = published_step(centres, weights, alpha=alpha, neighbours=neighbours)
         weights = cell_masses(samples, masses, centres)
     return centres.clone(), weights
 
@@ -26,16 +26,14 @@ def cell_masses(samples: Tensor, masses: Tensor, centres: Tensor) -> Tensor:
     return torch.zeros(centres.shape[0], dtype=masses.dtype, device=masses.device).index_add(0, cells, masses)
 
 
-def published_step(centres: Tensor, weights: Tensor, *, alpha: float, neighbours: int, global_norm: bool) -> Tensor:
+def published_step(centres: Tensor, weights: Tensor, *, alpha: float, neighbours: int) -> Tensor:
     """One update of all centres [k, 3], k >= 2, from the mass [k] of their cells."""
     wide = centres.double()
     nearby = min(neighbours, centres.shape[0] - 1)
     distances = (wide[:, None] - wide[None]).square().sum(-1).fill_diagonal_(float("inf"))
     # Stable: of centres equally far the first count.
     others = distances.sort(dim=1, stable=True).indices[:, :nearby]
-    heaviest = weights.max()
-    if not global_norm:
-        heaviest = torch.maximum(weights[others].amax(1), weights)[:, None]
+    heaviest = torch.maximum(weights[others].amax(1), weights)[:, None]
     # A neighbourhood without any weight has only zero differences: any positive divisor does.
     pull = (weights[others] - weights[:, None]) / heaviest.clamp(min=torch.finfo(weights.dtype).tiny)
     shift = ((wide[others] - wide[:, None]) * pull[:, :, None]).mean(1)

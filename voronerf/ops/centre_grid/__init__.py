@@ -10,7 +10,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import COORDINATES, Implementation
-from voronerf.checks import FLOATING, LIKE_FIRST, Checked
+from voronerf.checks import FLOATING, Checked
 from voronerf.ops.centre_grid.reference import BRICK_BITS, CELL_BITS, GridTables, centre_table, root_bits
 
 _OP = backends.declare(
@@ -29,7 +29,6 @@ class CentreGrid:
 
     Attributes:
         centres: float32 or float64 [k, 3], a copy of the centres that the grid was made from.
-        weights: [k] in the same dtype, or None.
         tables: the lists and their index; csrc/geometry/centre_grid.h describes them.
 
     Raises:
@@ -40,16 +39,15 @@ class CentreGrid:
         >>> from voronerf import centre_grid
         >>> centres = torch.eye(3)
         >>> grid = centre_grid(centres)
-        >>> grid.belongs_to(centres, None), grid.belongs_to(centres + 1, None)
+        >>> grid.belongs_to(centres), grid.belongs_to(centres + 1)
         (True, False)
     """
 
     centres: Tensor
-    weights: Tensor | None
     tables: GridTables
 
     def __post_init__(self) -> None:
-        _check_tables(self.centres, self.weights, self.tables)
+        _check_tables(self.centres, self.tables)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -60,26 +58,21 @@ class CentreGrid:
         """Memory of the tables."""
         return sum(tensor.nbytes for tensor in self.tables[:4])
 
-    def fits(self, centres: Tensor, weights: Tensor | None) -> bool:
-        """Whether as many centres have a place in the tables, and weights as well; reads shapes alone."""
-        return centres.shape == self.centres.shape and (weights is None) == (self.weights is None)
+    def fits(self, centres: Tensor) -> bool:
+        """Whether as many centres have a place in the tables; reads shapes alone."""
+        return centres.shape == self.centres.shape
 
-    def belongs_to(self, centres: Tensor, weights: Tensor | None) -> bool:
-        """Whether the grid was made from these very centres and weights. Reads them, on CUDA from the host."""
-        if not self.fits(centres, weights):
-            return False
+    def belongs_to(self, centres: Tensor) -> bool:
+        """Whether the grid was made from these very centres. Reads them, on CUDA from the host."""
         # In float64, which holds all of them: centres that were rounded since have other borders.
-        if not torch.equal(centres.double(), self.centres.double()):
-            return False
-        return weights is None or self.weights is None or torch.equal(weights.double(), self.weights.double())
+        return self.fits(centres) and torch.equal(centres.double(), self.centres.double())
 
 
-def _check_tables(centres: Tensor, weights: Tensor | None, tables: GridTables) -> None:
+def _check_tables(centres: Tensor, tables: GridTables) -> None:
     """Raises unless every walk through the tables ends at a list of centres that are there."""
     kind = "CentreGrid"
     given = Checked(kind)
     given.tensor("centres", centres, (torch.float32, torch.float64), "k", 3)
-    given.optional("weights", weights, LIKE_FIRST, "k")
     frame, entries, lists, table, bits = tables
     given.tensor("tables.frame", frame, (torch.float32,), 2, 3)
     given.tensor("tables.entries", entries, (torch.int32,), "e")
@@ -88,8 +81,8 @@ def _check_tables(centres: Tensor, weights: Tensor | None, tables: GridTables) -
     k, root, brick = len(centres), 8 ** root_bits(len(centres)), 8**BRICK_BITS
     if bits != root_bits(k):
         raise ValueError(f"{kind}: tables.bits must be {root_bits(k)} for {k} centres, got {bits}")
-    if not torch.equal(table, centre_table(centres, weights)):
-        raise ValueError(f"{kind}: tables.table must hold the centres and weights, got others")
+    if not torch.equal(table, centre_table(centres)):
+        raise ValueError(f"{kind}: tables.table must hold the centres, got others")
     if entries.numel() < root or (entries.numel() - root) % brick:
         raise ValueError(f"{kind}: tables.entries must be {root} and bricks of {brick}, got {entries.numel()}")
     # From the root down: a place of a list ends the walk; another number is a brick, which belongs to one cell.
@@ -116,7 +109,7 @@ def _check_tables(centres: Tensor, weights: Tensor | None, tables: GridTables) -
         raise ValueError(f"{kind}: tables.lists must hold centres 0 to {k - 1}, got others")
 
 
-def centre_grid(centres: Tensor, *, weights: Tensor | None = None, backend: str = "auto") -> CentreGrid:
+def centre_grid(centres: Tensor, *, backend: str = "auto") -> CentreGrid:
     """A grid that makes ``nearest_centre(points, centres, grid=grid)`` fast for many fixed centres.
 
     Space is cut into grid cells, small among the centres and larger outside. Each has a list of all centres that are
@@ -130,7 +123,6 @@ def centre_grid(centres: Tensor, *, weights: Tensor | None = None, backend: str 
 
     Args:
         centres: [k, 3] floating point, finite, k >= 1.
-        weights: [k] floating point, finite, or None: a power diagram (squared scene units).
         backend: "auto", "native" (CPU) or "reference" (slow, for comparison).
 
     Raises:
@@ -148,16 +140,11 @@ def centre_grid(centres: Tensor, *, weights: Tensor | None = None, backend: str 
     given.tensor("centres", centres, FLOATING, "k", 3)
     if centres.is_meta:
         raise ValueError(f"{_OP}: centres must have values, got a tensor on the device meta")
-    given.optional("weights", weights, FLOATING, "k")
     if len(centres) < 1:
         raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
     dtype = torch.promote_types(centres.dtype, torch.float32)
-    if weights is not None:
-        dtype = torch.promote_types(dtype, weights.dtype)
-        weights = weights.detach().to(dtype, copy=True).contiguous()
     centres = centres.detach().to(dtype, copy=True).contiguous()
-    for name, tensor in (("centres", centres), ("weights", weights)):
-        if tensor is not None and not bool(torch.isfinite(tensor).all()):
-            raise ValueError(f"{_OP}: {name} must be finite, got NaN or infinity")
+    if not bool(torch.isfinite(centres).all()):
+        raise ValueError(f"{_OP}: centres must be finite, got NaN or infinity")
     run = backends.resolve(_OP, backend=backend, device=centres.device, dtype=dtype)
-    return CentreGrid(centres, weights, run(centres, weights=weights))
+    return CentreGrid(centres, run(centres))

@@ -9,8 +9,7 @@ from voronerf.ops.cases import Arguments, Case, Draw
 
 def _make(draw: Draw, n: int) -> Arguments:
     centres = draw.points(n + 1, draw.dtype(torch.float32, torch.float64))
-    weights = draw.uniform(n + 1, dtype=centres.dtype) if draw.among("weighted", False, True) else None
-    return {"centres": centres, "weights": weights}
+    return {"centres": centres}
 
 
 CASE = Case(

@@ -12,14 +12,13 @@ from voronerf.custom_op import custom_op
 from voronerf.ops.centre_grid.reference import GridTables, centre_table, root_bits
 
 
-def centre_grid(centres: Tensor, *, weights: Tensor | None = None) -> GridTables:
+def centre_grid(centres: Tensor) -> GridTables:
     """A grid over all of space; see ``voronerf.ops.centre_grid``."""
-    double = None if weights is None else weights.detach().double()
-    frame, entries, lists = _centre_grid(centres.detach().double(), double)
-    return GridTables(frame, entries, lists, centre_table(centres.detach(), weights), root_bits(centres.shape[0]))
+    frame, entries, lists = _centre_grid(centres.detach().double())
+    return GridTables(frame, entries, lists, centre_table(centres.detach()), root_bits(centres.shape[0]))
 
 
-def _unknown_sizes(centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _unknown_sizes(centres: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """How large the tables become depends on where the centres are."""
     context = torch.library.get_ctx()
     entries, lists = (centres.new_empty(context.new_dynamic_size(), dtype=torch.int32) for _ in range(2))
@@ -27,9 +26,9 @@ def _unknown_sizes(centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Ten
 
 
 @custom_op("centre_grid", devices=("cpu",), fake=_unknown_sizes)
-def _centre_grid(centres: Tensor, weights: Tensor | None) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+def _centre_grid(centres: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     compiled, k = native.compiled, centres.shape[0]
-    built = compiled.centre_grid_build(centres, weights, k, native.cpu())
+    built = compiled.centre_grid_build(centres, k, native.cpu())
     entries = centres.new_empty(compiled.centre_grid_entries(built), dtype=torch.int32)
     lists = centres.new_empty(compiled.centre_grid_lists(built), dtype=torch.int32)
     frame = centres.new_empty(2, 3, dtype=torch.float32)

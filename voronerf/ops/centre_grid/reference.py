@@ -18,33 +18,24 @@ BRICK_BITS = 2
 REACH, EDGE = 1024.0, 1100.0
 _WIDEN = 2e-6
 _MARGIN = 4e-15
-"""More than the rounding of two float64 values, in units of their squared distances and weights."""
+"""More than the rounding of two float64 values, in units of their squared distances."""
 _PIECE = 1 << 20
 
 
 class GridTables(NamedTuple):
-    """What a grid consists of.
+    """What a grid consists of."""
 
-    Attributes:
-        frame: float32 [2, 3], the middle of the box of the cells and the inverse of half its width.
-        entries: int32, the root grid, then the bricks.
-        lists: int32, candidates behind their number.
-        table: float32 [k, 4], centre and weight side by side.
-        bits: the root grid has ``2**bits`` cells along an axis.
-    """
-
-    frame: Tensor
-    entries: Tensor
-    lists: Tensor
-    table: Tensor
-    bits: int
+    frame: Tensor  # float32 [2, 3], the middle of the box of the cells and the inverse of half its width
+    entries: Tensor  # int32, the root grid, then the bricks
+    lists: Tensor  # int32, candidates behind their number
+    table: Tensor  # float32 [k, 4], centres and a column of zeros
+    bits: int  # the root grid has ``2**bits`` cells along an axis
 
 
-def centre_grid(centres: Tensor, *, weights: Tensor | None = None) -> GridTables:
+def centre_grid(centres: Tensor) -> GridTables:
     """A grid over all of space; see ``voronerf.ops.centre_grid``."""
-    table = centre_table(centres, weights)
+    table = centre_table(centres)
     centres = centres.detach().double()
-    power = torch.zeros_like(centres[:, 0]) if weights is None else weights.detach().double()
     k, bits = centres.shape[0], root_bits(centres.shape[0])
     frame = _frame(centres)
     side = 2**bits
@@ -53,7 +44,7 @@ def centre_grid(centres: Tensor, *, weights: Tensor | None = None) -> GridTables
     high = _coordinate((steps + 1 / side + _WIDEN).clamp(max=1)[:, None], frame)
     entries, pieces, place = [], [], 0
     for cells in torch.arange(side**3, device=centres.device).split(max(1, _PIECE // (8 * k))):
-        kept = _candidates(_corners(cells, side, low, high), centres, power)
+        kept = _candidates(_corners(cells, side, low, high), centres)
         counts = kept.sum(dim=1)
         starts = place + torch.arange(len(cells), device=cells.device) + counts.cumsum(0) - counts
         lists = torch.empty(int(counts.sum()) + len(cells), dtype=torch.int32, device=cells.device)
@@ -72,10 +63,9 @@ def root_bits(k: int) -> int:
     return next(bits for bits in (3, 4, 5, 6) if bits == 6 or 8**bits >= 8 * k)
 
 
-def centre_table(centres: Tensor, weights: Tensor | None) -> Tensor:
-    """float32 [k, 4]: centre and weight side by side."""
-    power = torch.zeros_like(centres[:, 0]) if weights is None else weights
-    return torch.cat([centres, power[:, None]], dim=1).float()
+def centre_table(centres: Tensor) -> Tensor:
+    """float32 [k, 4]: centres and a column of zeros, so that a row is 16 bytes."""
+    return torch.nn.functional.pad(centres.float(), (0, 1))
 
 
 def _frame(centres: Tensor) -> Tensor:
@@ -103,14 +93,13 @@ def _corners(cells: Tensor, side: int, low: Tensor, high: Tensor) -> Tensor:
     return ends[choice[:, None], torch.arange(len(cells), device=cells.device)[None, :, None], axes].transpose(0, 1)
 
 
-def _candidates(corners: Tensor, centres: Tensor, power: Tensor) -> Tensor:
+def _candidates(corners: Tensor, centres: Tensor) -> Tensor:
     """Which centres stay, bool [n, k]: those that the centre nearest to the middle does not beat at all corners.
 
-    The difference of two power distances is linear in the point, so what holds at the corners holds in the cell.
+    The difference of two squared distances is linear in the point, so what holds at the corners holds in the cell.
     """
     squared = (corners[:, :, None] - centres).square().sum(dim=3)
-    value, margin = squared - power, _MARGIN * (squared + power.abs()) + 1e-300
-    inside = (corners.mean(dim=1)[:, None] - centres).square().sum(dim=2) - power
+    margin = _MARGIN * squared + 1e-300
+    inside = (corners.mean(dim=1)[:, None] - centres).square().sum(dim=2)
     best = inside.argmin(dim=1)[:, None, None].expand(-1, 8, 1)
-    beaten = (value - margin > (value + margin).gather(2, best)).all(dim=1)
-    return ~beaten
+    return ~(squared - margin > (squared + margin).gather(2, best)).all(dim=1)

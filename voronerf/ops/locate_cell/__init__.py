@@ -24,7 +24,6 @@ def locate_cell(
     child: Tensor,
     *,
     depth: int,
-    weights: Tensor | None = None,
     backend: str = "auto",
 ) -> Tensor:
     """Leaf of every point in a tree of diagrams: on each level, the nearest centre of the diagram that holds the point.
@@ -44,7 +43,6 @@ def locate_cell(
         child: int32 [m]. ``child[c] >= 0``: centre c is refined by diagram ``child[c]``; ``child[c] < 0``: centre c is
             leaf number ``-child[c] - 1``.
         depth: levels of the tree, 1 for a flat diagram.
-        weights: [m] floating point or None: power diagrams (squared scene units).
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
@@ -63,31 +61,16 @@ def locate_cell(
         >>> locate_cell(points, centres, child_offsets, child, depth=2)
         tensor([0, 1, 2], dtype=torch.int32)
     """
-    check_tree(_OP, points, centres, child_offsets, child, depth, weights)
-    points, centres, weights = of_one_dtype(points, centres, weights)
-    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
-    leaf: Tensor = run(points, centres, child_offsets, child, depth, weights)
-    return leaf
-
-
-def check_tree(
-    op: str,
-    points: Tensor,
-    centres: Tensor,
-    child_offsets: Tensor,
-    child: Tensor,
-    depth: int,
-    weights: Tensor | None,
-) -> Checked:
-    """Checks points and the tables of a tree."""
-    given = Checked(op)
+    given = Checked(_OP)
     given.tensor("points", points, FLOATING, "n", 3)
     given.tensor("centres", centres, FLOATING, "m", 3)
     given.tensor("child_offsets", child_offsets, INDEX, "g+1")
     given.tensor("child", child, INDEX, "m")
-    given.optional("weights", weights, FLOATING, "m")
-    check_integer(op, "depth", depth, 1)
+    check_integer(_OP, "depth", depth, 1)
     if given.sizes["m"] < 1 or given.sizes["g"] < 1:
         count = f"{given.sizes['m']} centres in {given.sizes['g']} diagrams"
-        raise ValueError(f"{op}: centres must hold at least one centre of one diagram, got {count}")
-    return given
+        raise ValueError(f"{_OP}: centres must hold at least one centre of one diagram, got {count}")
+    points, centres = of_one_dtype(points, centres)
+    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
+    leaf: Tensor = run(points, centres, child_offsets, child, depth)
+    return leaf

@@ -37,8 +37,7 @@ def tree(draw: Draw) -> tuple[Arguments, int]:
 
 def _make(draw: Draw, n: int) -> Arguments:
     tables, _ = tree(draw)
-    weights = draw.uniform(len(tables["child"])) if draw.among("weighted", True, False, False) else None
-    return {"points": draw.points(n, draw.dtype()), **tables, "weights": weights}
+    return {"points": draw.points(n, draw.dtype()), **tables}
 
 
 CASE = Case(_make, refused={"depth must be at most 2147483647, got 1099511627776": {"depth": 2**40}})

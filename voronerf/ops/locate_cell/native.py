@@ -12,13 +12,11 @@ from voronerf.custom_op import custom_op
 
 
 @custom_op("locate_cell")
-def locate_cell(
-    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int, weights: Tensor | None
-) -> Iterator[Tensor]:
+def locate_cell(points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int) -> Iterator[Tensor]:
     """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
     leaves = points.new_empty(points.shape[0], dtype=torch.int32)
     yield leaves
-    find(leaves, points, centres, (child_offsets, child, depth), weights, "locate_cell")
+    find(leaves, points, centres, (child_offsets, child, depth), "locate_cell")
 
 
 def find(
@@ -26,16 +24,15 @@ def find(
     points: Tensor,
     centres: Tensor,
     tree: tuple[Tensor, Tensor, int],
-    weights: Tensor | None,
     caller: str,
     rows: Tensor | None = None,
 ) -> None:
-    """Fills ``leaves``, int32 [n], on CUDA with -1 from ``rows`` on; coordinates and weights are of one dtype.
+    """Fills ``leaves``, int32 [n], on CUDA with -1 from ``rows`` on; coordinates are of one dtype.
     ``tree``: child_offsets, child and depth. ``caller``: whom errors name."""
     child_offsets, child, depth = tree
     compiled, machine = native.compiled, native.machine(points)
     n, m, g = points.shape[0], centres.shape[0], child_offsets.shape[0] - 1
-    given = points, centres, weights, child_offsets, child
+    given = points, centres, child_offsets, child
     if isinstance(machine, compiled.Cuda):
         compiled.locate_cell(*given, rows, leaves, n, m, g, depth, machine)
         return

@@ -22,11 +22,10 @@ def nearest_centre(
     points: Tensor,
     centres: Tensor,
     *,
-    weights: Tensor | None = None,
     grid: CentreGrid | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """Index of the nearest centre of every point: ``argmin_c |x - v_c|^2 - w_c``.
+    """Index of the nearest centre of every point: ``argmin_c |x - v_c|``.
 
     Exact: the direct form of the distance is used, and ties go to the lowest index. A point that is not finite goes to
     cell 0. Not differentiable.
@@ -34,17 +33,15 @@ def nearest_centre(
     Args:
         points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are compared in float32.
         centres: [k, 3] floating point, finite, k >= 1.
-        weights: [k] floating point or None: a power diagram, in which larger weights give larger cells (squared scene
-            units).
-        grid: made by ``centre_grid`` from these centres and weights, or None. The result is the same, and faster for
-            hundreds of centres. With a grid, "native" runs on the CPU only.
+        grid: made by ``centre_grid`` from these centres, or None. The result is the same, and faster for hundreds of
+            centres. With a grid there are "native", on the CPU, and "reference".
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
         cells int32 [n], in 0 to k - 1.
 
     Raises:
-        ValueError: a grid of other centres or weights.
+        ValueError: a grid of other centres.
 
     Examples:
         >>> import torch
@@ -53,27 +50,21 @@ def nearest_centre(
         >>> centres = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
         >>> nearest_centre(points, centres)
         tensor([0, 1, 0], dtype=torch.int32)
-        >>> nearest_centre(points, centres, weights=torch.tensor([0.0, 0.5]))  # the second cell is larger
-        tensor([0, 1, 1], dtype=torch.int32)
     """
     given = Checked(_OP)
     given.tensor("points", points, FLOATING, "n", 3)
     given.tensor("centres", centres, FLOATING, "k", 3)
-    given.optional("weights", weights, FLOATING, "k")
     if given.sizes["k"] < 1:
         raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
-    points, centres, weights = of_one_dtype(points, centres, weights)
+    points, centres = of_one_dtype(points, centres)
     if grid is not None:
-        return nearest_centre_grid(points, centres, weights, grid, backend)
+        return nearest_centre_grid(points, centres, grid, backend)
     run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
-    cells: Tensor = run(points, centres, weights)
+    cells: Tensor = run(points, centres)
     return cells
 
 
-def of_one_dtype(points: Tensor, centres: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """What is compared, in one type for all backends: float64 where any is, float32 otherwise."""
+def of_one_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+    """What is compared, in one type for all backends: float64 where either is, float32 otherwise."""
     dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
-    if weights is not None:
-        dtype = torch.promote_types(dtype, weights.dtype)
-        weights = weights.detach().to(dtype)
-    return points.detach().to(dtype), centres.detach().to(dtype), weights
+    return points.detach().to(dtype), centres.detach().to(dtype)

@@ -10,16 +10,15 @@ from voronerf.ops.cases import Arguments, Case, Draw
 def _make(draw: Draw, n: int) -> Arguments:
     k = draw.among("k", 7, 1, 2, 9, 33, 300)
     centres = draw.points(k, draw.dtype())
-    weights = draw.uniform(k, dtype=draw.dtype()) if draw.among("weighted", True, False) else None
-    return {"points": draw.points(n, draw.dtype()), "centres": centres, "weights": weights}
+    return {"points": draw.points(n, draw.dtype()), "centres": centres}
 
 
 CASE = Case(
     _make,
     refused={
         "points must be a tensor, got list": {"points": [1.0]},
-        "weights must have shape [k] with k = 7, got [1]": {"weights": torch.zeros(1)},
+        "centres must have shape [k, 3], got [1]": {"centres": torch.zeros(1)},
         "grid must be a CentreGrid, got int": {"grid": 3},
     },
-    alternatives={"torch cdist": lambda points, centres, weights: torch.cdist(points, centres).argmin(1)},
+    alternatives={"torch cdist": lambda points, centres: torch.cdist(points, centres).argmin(1)},
 )

@@ -12,18 +12,18 @@ from voronerf.custom_op import custom_op
 
 
 @custom_op("nearest_centre")
-def nearest_centre(points: Tensor, centres: Tensor, weights: Tensor | None) -> Iterator[Tensor]:
-    """Index of the centre with the smallest ``|x - c|^2 - w`` for every point; see ``voronerf.ops.nearest_centre``."""
+def nearest_centre(points: Tensor, centres: Tensor) -> Iterator[Tensor]:
+    """Index of the nearest centre of every point; see ``voronerf.ops.nearest_centre``."""
     cells = points.new_empty(points.shape[0], dtype=torch.int32)
     yield cells
-    find(cells, points, centres, weights)
+    find(cells, points, centres)
 
 
-def find(cells: Tensor, points: Tensor, centres: Tensor, weights: Tensor | None, rows: Tensor | None = None) -> None:
-    """Fills ``cells``, int32 [n]; coordinates and weights are of one dtype. On CUDA with -1 from ``rows`` on."""
+def find(cells: Tensor, points: Tensor, centres: Tensor, rows: Tensor | None = None) -> None:
+    """Fills ``cells``, int32 [n]; coordinates are of one dtype. On CUDA with -1 from ``rows`` on."""
     compiled, machine = native.compiled, native.machine(points)
     n, k = points.shape[0], centres.shape[0]
     if isinstance(machine, compiled.Cuda):
-        compiled.nearest_centre(points, centres, weights, rows, cells, n, k, machine)
+        compiled.nearest_centre(points, centres, rows, cells, n, k, machine)
     else:
-        compiled.nearest_centre(points, centres, weights, cells, n, k, machine)
+        compiled.nearest_centre(points, centres, cells, n, k, machine)

@@ -11,9 +11,9 @@ _PIECE = 1 << 17
 """Distances evaluated at a time: 1 MiB of float64, what a core's second-level cache holds."""
 
 
-def nearest_centre(points: Tensor, centres: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Index of the centre with the smallest ``|x - c|^2 - w`` for every point; see ``voronerf.ops.nearest_centre``."""
-    run = lambda points: distances(points, centres, weights).argmin(dim=1).to(torch.int32)  # noqa: E731
+def nearest_centre(points: Tensor, centres: Tensor) -> Tensor:
+    """Index of the nearest centre of every point; see ``voronerf.ops.nearest_centre``."""
+    run = lambda points: distances(points, centres).argmin(dim=1).to(torch.int32)  # noqa: E731
     return in_pieces(run, _PIECE // centres.shape[0], points)
 
 
@@ -24,8 +24,8 @@ def in_pieces(run: Callable[..., Tensor], rows: int, *tensors: Tensor) -> Tensor
     return torch.cat([run(*piece) for piece in zip(*(tensor.split(max(1, rows)) for tensor in tensors))])
 
 
-def distances(points: Tensor, centres: Tensor, weights: Tensor | None) -> Tensor:
-    """Float64 power distances [n, k] in the direct form, whose error does not grow with the distance from the origin.
+def distances(points: Tensor, centres: Tensor) -> Tensor:
+    """Float64 squared distances [n, k] in the direct form, whose error does not grow with the distance from the origin.
 
     ``x^2 - 2 x.c + c^2`` cancels: in float32 it misplaces one point in ten for a scene 100 units from the origin. What
     is not a number or overflows becomes the largest finite value, so that a non-finite point is equally far from every
@@ -35,6 +35,4 @@ def distances(points: Tensor, centres: Tensor, weights: Tensor | None) -> Tensor
     total = (points[:, None, 0] - centres[None, :, 0]).square()
     for axis in (1, 2):
         total = total + (points[:, None, axis] - centres[None, :, axis]).square()
-    if weights is not None:
-        total = total - weights.detach().double()
     return total.nan_to_num(nan=torch.finfo(torch.float64).max)

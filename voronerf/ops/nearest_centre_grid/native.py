@@ -13,10 +13,10 @@ from voronerf.ops.centre_grid.reference import GridTables
 
 
 @custom_op("nearest_centre_grid", devices=("cpu",))
-def nearest_centre_grid(points: Tensor, centres: Tensor, weights: Tensor | None, grid: GridTables) -> Iterator[Tensor]:
+def nearest_centre_grid(points: Tensor, centres: Tensor, grid: GridTables) -> Iterator[Tensor]:
     """Index of the nearest centre by the candidates of a point's cell; see ``voronerf.ops.nearest_centre``."""
     cells = points.new_empty(points.shape[0], dtype=torch.int32)
     yield cells
     n, k = points.shape[0], centres.shape[0]
     given = native.compiled.CentreGrid(**grid._asdict())
-    native.compiled.nearest_centre_grid(points, centres, weights, given, cells, n, k, native.cpu())
+    native.compiled.nearest_centre_grid(points, centres, given, cells, n, k, native.cpu())

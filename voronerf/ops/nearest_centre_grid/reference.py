@@ -9,7 +9,7 @@ from voronerf.ops.centre_grid.reference import BRICK_BITS, CELL_BITS, REACH, Gri
 from voronerf.ops.nearest_centre.reference import distances, nearest_centre
 
 
-def nearest_centre_grid(points: Tensor, centres: Tensor, weights: Tensor | None, grid: GridTables) -> Tensor:
+def nearest_centre_grid(points: Tensor, centres: Tensor, grid: GridTables) -> Tensor:
     """Index of the nearest centre of every point by the candidates of its cell; see ``voronerf.ops.nearest_centre``."""
     cells, reached = _cells(points.detach().double(), grid.frame)
     entries, lists, shift = grid.entries, grid.lists, CELL_BITS - grid.bits
@@ -24,10 +24,9 @@ def nearest_centre_grid(points: Tensor, centres: Tensor, weights: Tensor | None,
     for place in entry[reached].unique().tolist():
         rows = (reached & (entry == place)).nonzero()[:, 0]
         candidates = lists[place + 1 : place + 1 + int(lists[place])].long()
-        power = None if weights is None else weights[candidates]
-        found[rows] = candidates[distances(points[rows], centres[candidates], power).argmin(dim=1)].int()
+        found[rows] = candidates[distances(points[rows], centres[candidates]).argmin(dim=1)].int()
     if not bool(reached.all()):
-        found[~reached] = nearest_centre(points[~reached], centres, weights)
+        found[~reached] = nearest_centre(points[~reached], centres)
     return found
 
 

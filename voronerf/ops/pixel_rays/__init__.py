@@ -7,14 +7,12 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import LIKE_FIRST, Checked, check_number, detached
-from voronerf.ops.camera_rays import check_lenses
+from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_number, check_range, detached
 from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
 
 _OP = backends.declare(
     "pixel_rays",
     native=Implementation(EVERYWHERE, (torch.float32,)),
-    warp=Implementation(EVERYWHERE, (torch.float32,)),
 )
 
 
@@ -34,7 +32,8 @@ def pixel_rays(
 ) -> PixelRays:
     """The rays of a training step: through the centres of pixels, cut to a box, with the colours of the pixels.
 
-    `camera_rays` for the rays, the slab method (Kay and Kajiya 1986) for the box. Not differentiable.
+    Lens distortion is undone by Newton's method in float64; the box is met by the slab method (Kay and Kajiya 1986).
+    Not differentiable.
 
     Args:
         poses: float32 [c, 4, 4], camera to world, OpenGL axes.
@@ -45,11 +44,14 @@ def pixel_rays(
         near: nearest distance of interest, >= 0.
         far: farthest.
         box: float32 [2, 3], lowest and highest corner, or None for all of space.
-        distortion: float32 [c, 8] of the lenses, see `camera_rays`, or None.
-        models: int32 [c], the camera model of each, see `camera_rays`, or None.
+        distortion: float32 [c, 8], (k1, k2, p1, p2, k3, k4, k5, k6) of OpenCV's rational model, or None for none.
+        models: int32 [c], the model of each lens, which comes with distortion; None is 0 for all. 0 is perspective. 1
+            is a fisheye, and distortion is (k1, k2, p1, p2, k3, k4, s1, s2) of COLMAP's THIN_PRISM_FISHEYE, whose k1 to
+            k4 are those of OpenCV's fisheye model. 2 is COLMAP's FOV, and distortion is (omega, 0, ...). Others are an
+            error on the CPU, and perspective on CUDA.
         background: float32 [3] or [b, 3], the colour behind images with an alpha channel; None leaves their
             colours as they are.
-        backend: "auto", "reference", "native" or "warp".
+        backend: "auto", "reference" or "native".
 
     Returns:
         PixelRays(origins, directions, near, far, colour). A ray that misses the box has far == near.
@@ -75,7 +77,12 @@ def pixel_rays(
     given.tensor("images", images, (torch.uint8,), "c", "h", "w", "channels")
     given.tensor("index", index, (torch.int64,), "b")
     given.optional("box", box, LIKE_FIRST, 2, 3)
-    check_lenses(given, distortion, models)
+    given.optional("distortion", distortion, LIKE_FIRST, "c", 8)
+    given.optional("models", models, INDEX, "c")
+    if models is not None:
+        check_range(_OP, "models", models, 3)
+        if distortion is None:
+            raise ValueError(f"{_OP}: distortion must be given with models, got None")
     given.each_or_all("background", background, LIKE_FIRST, "b", 3)
     if given.sizes["channels"] not in (3, 4):
         raise ValueError(f"{_OP}: images must have 3 or 4 channels, got {given.sizes['channels']}")

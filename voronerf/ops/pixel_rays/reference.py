@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from voronerf.checks import check_range
-from voronerf.ops.camera_rays.reference import camera_rays
+from voronerf.ops.pixel_rays.lens import camera_rays
 
 
 class PixelRays(NamedTuple):
@@ -39,31 +39,18 @@ class PixelRays(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """What ``pixel_rays`` reads; ``voronerf.ops.pixel_rays`` says what each is.
+    """What ``pixel_rays`` reads; ``voronerf.ops.pixel_rays`` says what each is."""
 
-    Attributes:
-        poses: [c, 4, 4].
-        intrinsics: [c, 4].
-        images: uint8 [c, h, w, 3 or 4].
-        numbers: int64 [b], of the pixels.
-        box: [2, 3] or None.
-        distortion: [c, 8] or None.
-        models: int32 [c] or None.
-        background: [3], [b, 3] or None.
-        near: nearest distance.
-        far: farthest.
-    """
-
-    poses: Tensor
-    intrinsics: Tensor
-    images: Tensor
-    numbers: Tensor
-    box: Tensor | None
-    distortion: Tensor | None
-    models: Tensor | None
-    background: Tensor | None
-    near: float
-    far: float
+    poses: Tensor  # [c, 4, 4]
+    intrinsics: Tensor  # [c, 4]
+    images: Tensor  # uint8 [c, h, w, 3 or 4]
+    numbers: Tensor  # int64 [b], of the pixels
+    box: Tensor | None  # [2, 3] or None
+    distortion: Tensor | None  # [c, 8] or None
+    models: Tensor | None  # int32 [c] or None
+    background: Tensor | None  # [3], [b, 3] or None
+    near: float  # nearest distance
+    far: float  # farthest
 
 
 @torch.no_grad()
@@ -94,9 +81,11 @@ def meet_box(origins: Tensor, directions: Tensor, box: Tensor, near: float, far:
     first, last = torch.minimum(low, high), torch.maximum(low, high)
     # 0 / 0 and +-inf: a ray parallel to a slab is inside it at all distances or at none
     parallel = directions == 0
-    inside = (origins >= box[0]) & (origins <= box[1])
-    infinity = torch.full_like(first, float("inf"))
-    first = torch.where(parallel, torch.where(inside, -infinity, infinity), first)
-    last = torch.where(parallel, torch.where(inside, infinity, -infinity), last)
-    enter = first.amax(-1).clamp(near, far)
-    return enter, torch.maximum(enter, last.amin(-1).clamp(near, far))
+    if not parallel.is_cpu or torch.compiler.is_compiling() or bool(parallel.any()):
+        inside = (origins >= box[0]) & (origins <= box[1])
+        infinity = torch.full_like(first, float("inf"))
+        first = torch.where(parallel, torch.where(inside, -infinity, infinity), first)
+        last = torch.where(parallel, torch.where(inside, infinity, -infinity), last)
+    (a, b, c), (x, y, z) = first.unbind(-1), last.unbind(-1)  # in half the time of amax and amin
+    enter = a.maximum(b).maximum(c).clamp(near, far)
+    return enter, torch.maximum(enter, x.minimum(y).minimum(z).clamp(near, far))

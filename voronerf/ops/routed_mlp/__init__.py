@@ -48,7 +48,6 @@ def routed_mlp(
     child_offsets: Tensor | None = None,
     child: Tensor | None = None,
     depth: int = 1,
-    centre_weights: Tensor | None = None,
     cells: Tensor | None = None,
     coords: Tensor | None = None,
     directions: Tensor | None = None,
@@ -77,7 +76,6 @@ def routed_mlp(
         child_offsets: int32 [g + 1], or None for a flat diagram.
         child: int32 [m], or None for a flat diagram. The leaves are the cells, 0 to k - 1.
         depth: levels of the tree.
-        centre_weights: [m] or None: power diagrams.
         cells: int32 [n], the cell of each sample, 0 to k - 1, instead of the tables: a stochastic assignment, or one
             that is reused.
         coords: [n, 3] floating point, the locations of the samples; None uses the first three features of the
@@ -123,7 +121,6 @@ def routed_mlp(
         child_offsets=child_offsets,
         child=child,
         depth=depth,
-        centre_weights=centre_weights,
         cells=cells,
         coords=coords,
         directions=directions,
@@ -174,7 +171,7 @@ def check_routed(
     network = {**_DEFAULTS, **given}
     if network.keys() != _DEFAULTS.keys():
         raise TypeError(f"{op}: unknown arguments {', '.join(network.keys() - _DEFAULTS.keys())}")
-    tables = {name: network[name] for name in ("centres", "child_offsets", "child", "centre_weights", "cells")}
+    tables = {name: network[name] for name in ("centres", "child_offsets", "child", "cells")}
     frozen = network["frozen"]
     read = {name: network[name] for name in ("directions", "direction_index", "features")}
     coords, centres = network["coords"], network["centres"]
@@ -214,8 +211,7 @@ def check_routed(
         check_no_inference(op, **tensors)
     if centres is not None:
         points = positions[:, :3] if coords is None else coords
-        compared = of_one_dtype(points, centres, network["centre_weights"])
-        network.update(zip(("coords", "centres", "centre_weights"), compared))
+        network["coords"], network["centres"] = of_one_dtype(points, centres)
     return {"positions": positions, "weights": weights, "biases": biases, **network}
 
 
@@ -225,7 +221,6 @@ def _check_tables(
     child_offsets: Tensor | None,
     child: Tensor | None,
     depth: int,
-    centre_weights: Tensor | None,
     cells: Tensor | None,
     sizes: dict[str, int],
 ) -> None:
@@ -235,8 +230,7 @@ def _check_tables(
         check_shape(op, "cells", cells, ("n",), sizes)
         check_dtype(op, "cells", cells, INDEX)
     if centres is None:
-        others = {"child_offsets": child_offsets, "child": child, "centre_weights": centre_weights}
-        for name, value in others.items():
+        for name, value in (("child_offsets", child_offsets), ("child", child)):
             if value is not None:
                 raise ValueError(f"{op}: {name} must come with centres, got no centres")
         if cells is None and sizes["k"] != 1:
@@ -247,9 +241,6 @@ def _check_tables(
         raise ValueError(f"{op}: child_offsets and child must come together, got no {missing}")
     check_shape(op, "centres", centres, ("k" if child is None else "m", 3), sizes)
     check_dtype(op, "centres", centres)
-    if centre_weights is not None:
-        check_shape(op, "centre_weights", centre_weights, ("k" if child is None else "m",), sizes)
-        check_dtype(op, "centre_weights", centre_weights)
     check_integer(op, "depth", depth, 1)
     if child_offsets is None or child is None:
         if depth != 1:

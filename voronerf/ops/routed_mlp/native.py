@@ -75,16 +75,16 @@ def prepared(
     features: Tensor | None = None,
 ) -> tuple[Call, torch.dtype]:
     """The arguments of ``forward``, and the type of the result."""
-    centres, child_offsets, child, depth, centre_weights, cells, coords, rows = where
+    centres, child_offsets, child, depth, cells, coords, rows = where
     own = features is not None and features.dim() == 3
     given = Given(positions, weights, biases, layers, directions, direction_index, features)
     before = grouped_mlp.hashes_before(given)
     if own and before and weights[0].shape[0] > 1 and cells is None:
         assert coords is not None and centres is not None
         if child_offsets is None or child is None:
-            cells = nearest_centre.nearest_centre(coords, centres, centre_weights)
+            cells = nearest_centre.nearest_centre(coords, centres)
         else:
-            cells = locate_cell.locate_cell(coords, centres, child_offsets, child, depth, centre_weights)
+            cells = locate_cell.locate_cell(coords, centres, child_offsets, child, depth)
         centres = None
     if features is not None and own and weights[0].shape[0] == 1:
         given = given._replace(features=features[0])
@@ -104,7 +104,7 @@ def forward(network: Network, where: Where, keep: bool) -> Iterator[tuple[Tensor
 
     With neither cells nor centres there is one cell.
     """
-    centres, child_offsets, child, depth, centre_weights, cells, coords, rows = where
+    centres, child_offsets, child, depth, cells, coords, rows = where
     positions = network.positions
     n, k = positions.shape[0], network.weights[0].shape[0]
     alone = cells is None and centres is None
@@ -125,10 +125,9 @@ def forward(network: Network, where: Where, keep: bool) -> Iterator[tuple[Tensor
     else:
         if coords is not None and centres is not None:
             if child_offsets is None or child is None:
-                nearest_centre.find(found, coords, centres, centre_weights, rows)
+                nearest_centre.find(found, coords, centres, rows)
             else:
-                tree = child_offsets, child, depth
-                locate_cell.find(found, coords, centres, tree, centre_weights, "routed_mlp", rows)
+                locate_cell.find(found, coords, centres, (child_offsets, child, depth), "routed_mlp", rows)
         cell_sort.sort(found if cells is None else cells, order, offsets, "routed_mlp")
     grouped_mlp.run(out, encoded, network, offsets, None if alone else order)
 

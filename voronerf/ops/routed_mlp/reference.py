@@ -41,7 +41,6 @@ class Where(NamedTuple):
     child_offsets: Tensor | None = None
     child: Tensor | None = None
     depth: int = 1
-    centre_weights: Tensor | None = None
     cells: Tensor | None = None
     coords: Tensor | None = None
     rows: Tensor | None = None
@@ -60,7 +59,7 @@ def routed_mlp(
     **where: Any,
 ) -> tuple[Tensor, Tensor]:
     """Output [n, out] in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
-    centres, child_offsets, child, depth, centre_weights, cells, coords, rows = Where(**where)
+    centres, child_offsets, child, depth, cells, coords, rows = Where(**where)
     k, n = weights[0].shape[0], positions.shape[0]
     check_direction_index("routed_mlp", directions, direction_index)
     read: dict[str, Any] = {"layers": layers, "directions": directions, "direction_index": direction_index}
@@ -72,9 +71,9 @@ def routed_mlp(
     if cells is None:
         assert coords is not None and centres is not None
         if child_offsets is None or child is None:
-            cells = operations.nearest_centre(coords, centres, centre_weights)
+            cells = operations.nearest_centre(coords, centres)
         else:
-            cells = operations.locate_cell(coords, centres, child_offsets, child, depth, centre_weights)
+            cells = operations.locate_cell(coords, centres, child_offsets, child, depth)
     check_range("routed_mlp", "cells", cells, k)
     order, offsets = operations.cell_sort(cells, k)
     if direction_index is not None:

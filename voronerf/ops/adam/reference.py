@@ -1,4 +1,4 @@
-"""Adam on the entries that have a gradient, in place."""
+"""A step of Adam, in place."""
 
 from __future__ import annotations
 
@@ -60,24 +60,6 @@ class Guard(NamedTuple):
         """A guard that has left out so many steps."""
         found, in_a_row = torch.zeros((), device=device), torch.zeros((), device=device)
         return Guard(found, torch.full((), float(skipped), device=device), in_a_row)
-
-
-def sparse_adam(
-    parameter: Tensor,
-    gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    rate: float,
-    first: float,
-    second: float,
-    epsilon: float,
-) -> None:
-    """The formula of ``voronerf.ops.sparse_adam``; ``rate`` and ``epsilon`` are corrected for the moments' start."""
-    present = gradient != 0
-    mean.copy_(torch.where(present, first * mean + (1 - first) * gradient, mean))
-    square.copy_(torch.where(present, second * square + (1 - second) * gradient.square(), square))
-    moved = parameter - rate * mean / (square.sqrt() + epsilon)
-    parameter.copy_(torch.where(present, moved, parameter))
 
 
 def adam(

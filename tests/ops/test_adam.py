@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from adam_steps import assert_adam
-from op_cases import refused
+from op_cases import refused, strided
 
+from voronerf import native
 from voronerf.ops import Guard, Rule, adam
 
 pytestmark = pytest.mark.op("adam")
@@ -63,6 +66,9 @@ def test_refuses_what_would_be_read_out_of_bounds():
         "adam: loss must have shape [], got [1]": {"guard": Guard.on("cpu"), "loss": torch.ones(1)},
         "adam: epsilon must be positive, got 0.0": {"rules": [rule._replace(epsilon=0.0)]},
         "adam: betas must lie in [0, 1), got (0.9, 1.0)": {"rules": [rule._replace(betas=(0.9, 1.0))]},
+        "adam: square must be a tensor of its own (clone), got a negative view": {
+            "squares": [torch._neg_view(torch.ones(()))]
+        },
     }
     for message, changed in wrong.items():
         with refused(ValueError, message):
@@ -75,6 +81,11 @@ def test_refuses_what_would_be_read_out_of_bounds():
         "adam: rules must hold a Rule for each parameter, got tuple": {"rules": [tuple(rule)]},
         "adam: guard must be a Guard, got Tensor": {"guard": torch.ones(())},
         "adam: learning_rate must be a number, got str": {"rules": [rule._replace(learning_rate="x")]},
+        "adam: betas must be a number, got Tensor": {"rules": [rule._replace(betas=(0.9, torch.tensor(0.9)))]},
+        **{
+            f"adam: betas must be a pair of numbers, got {betas!r}": {"rules": [rule._replace(betas=betas)]}
+            for betas in (0.9, (0.9,), "ab")
+        },
     }.items():
         with refused(TypeError, message):
             call(**changed)
@@ -86,3 +97,72 @@ def test_refuses_what_would_be_read_out_of_bounds():
         lists = [[torch.ones(4), torch.ones(4)] for _ in range(4)]
         lists[1][1] = torch.ones(3)
         adam(two, *lists)
+
+
+# --- entries without a gradient stay as they are -------------------------------------------------------------------
+
+
+def table(shape, share, seed=0):
+    """A parameter, its gradient, of which a share is not zero, and both moments."""
+    generator = torch.Generator().manual_seed(seed)
+    parameter, gradient, mean = (torch.randn(shape, generator=generator) for _ in range(3))
+    gradient *= torch.rand(shape, generator=generator) < share
+    return parameter, gradient, mean, torch.rand(shape, generator=generator)
+
+
+def loop(parameter, gradient, mean, square, step, rate, betas, epsilon):
+    """Kingma and Ba 2015, algorithm 1, one entry at a time in float64."""
+    p, g, m, v = (t.double().flatten().tolist() for t in (parameter, gradient, mean, square))
+    for i in range(len(p)):
+        if g[i] != 0:
+            m[i] = betas[0] * m[i] + (1 - betas[0]) * g[i]
+            v[i] = betas[1] * v[i] + (1 - betas[1]) * g[i] ** 2
+            corrected = math.sqrt(v[i] / (1 - betas[1] ** step))
+            p[i] -= rate * m[i] / (1 - betas[0] ** step) / (corrected + epsilon)
+    return [torch.tensor(t, dtype=torch.float64).reshape(parameter.shape) for t in (p, m, v)]
+
+
+@pytest.mark.parametrize("shape", [(0, 2), (1,), (15,), (17, 1), (331, 2), (4, 33, 8)])
+@pytest.mark.parametrize("share", [0.0, 0.05, 1.0])
+def test_a_table_equals_a_slow_loop(device, backend, shape, share):
+    given = table(shape, share)
+    found = [t.to(device).clone() for t in given]
+    rule = Rule(torch.tensor(2.0, device=device), 0.01, (0.9, 0.99), 1e-10, every=False)
+    adam([rule], *([tensor] for tensor in (found[0], strided(found[1]), *found[2:])), backend=backend)
+    expected = loop(*given, 3, 0.01, (0.9, 0.99), 1e-10)
+    untouched = given[1] == 0
+    for result, wanted, before in zip((found[0], *found[2:]), expected, (given[0], *given[2:]), strict=True):
+        torch.testing.assert_close(result.cpu().double(), wanted, rtol=1e-5, atol=1e-6)
+        assert torch.equal(result.cpu()[untouched], before[untouched])
+    assert torch.equal(found[1].cpu(), given[1])
+
+
+def test_gradients_of_minus_zero_are_none_and_nan_spreads(device, backend):
+    found = [t.to(device) for t in table((40,), 1.0)]
+    before = [t.clone() for t in found]
+    found[1].fill_(-0.0)
+    found[1][5] = torch.nan
+    rule = Rule(torch.zeros((), device=device), 0.1, every=False)
+    adam([rule], *([tensor] for tensor in found), backend=backend)
+    for now, then in zip((found[0], *found[2:]), (before[0], *before[2:]), strict=True):
+        assert bool(now[5].isnan())
+        now[5] = then[5]
+        assert torch.equal(now, then)
+
+
+@pytest.mark.native
+def test_native_bits_depend_neither_on_threads_nor_on_instructions():
+    given, results, threads = table((70_001,), 0.1), [], torch.get_num_threads()
+    try:
+        for isa in native.SUPPORTED_ISAS:
+            for count in (1, 3):
+                torch.set_num_threads(count)
+                found = [t.clone() for t in given]
+                with native.using_isa(isa):
+                    rule = Rule(torch.tensor(6.0), 0.01, every=False)
+                    adam([rule], *([tensor] for tensor in found), backend="native")
+                results.append(found)
+    finally:
+        torch.set_num_threads(threads)
+    for found in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found, results[0], strict=True))

@@ -1,10 +1,11 @@
 // Blocks of entries over threads. An entry depends on itself alone, so results do not depend on the threads.
+#include "encoding/adam.h"
+
 #include <algorithm>
 #include <cmath>
 
 #include "common/parallel.h"
-#include "encoding/adam.h"
-#include "encoding/sparse_adam_isa.h"
+#include "encoding/adam_isa.h"
 
 namespace voronerf {
 
@@ -12,13 +13,13 @@ namespace {
 
 constexpr int64_t kBlock = 1 << 14;  // entries of a task, 64 KiB of the gradient
 
-void run_block(Isa isa, const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
+void run_block(Isa isa, const AdamStep& rule, const float* gradient, float* parameter, float* mean, float* square,
                int64_t begin, int64_t end) {
-  VN_FOR_ISA(isa, sparse_adam_block(rule, gradient, parameter, mean, square, begin, end))
+  VN_FOR_ISA(isa, adam_block(rule, gradient, parameter, mean, square, begin, end))
 }
 
 bool all_below(Isa isa, float limit, const float* gradient, int64_t n) {
-  VN_FOR_ISA(isa, sparse_adam_all_below(limit, gradient, n))
+  VN_FOR_ISA(isa, adam_all_below(limit, gradient, n))
 }
 
 // Whether a step is left out, which is counted.
@@ -37,7 +38,7 @@ bool left_out(const std::vector<AdamRule>& rules, const AdamGuard& guard, const 
 }
 
 // What a step of a rule is, which is counted.
-SparseAdam corrected(const AdamRule& rule) {
+AdamStep corrected(const AdamRule& rule) {
   const double step = static_cast<double>(*rule.step += 1.0f);
   const double root = std::pow(1.0 - std::pow(rule.decay_sq, step), 0.5);
   const double rate = rule.rate_at == nullptr ? rule.rate : *rule.rate_at;
@@ -47,18 +48,11 @@ SparseAdam corrected(const AdamRule& rule) {
 
 }  // namespace
 
-void sparse_adam_cpu(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
-                     int64_t n, Isa isa, int threads) {
-  parallel_for((n + kBlock - 1) / kBlock, 1, threads, [&](int64_t block) {
-    run_block(isa, rule, gradient, parameter, mean, square, block * kBlock, std::min(n, (block + 1) * kBlock));
-  });
-}
-
 void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
               float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
               Isa isa, int threads) {
   if (left_out(rules, guard, gradients, sizes, isa)) return;
-  std::vector<SparseAdam> steps;
+  std::vector<AdamStep> steps;
   for (const AdamRule& rule : rules) steps.push_back(corrected(rule));
   struct Block {
     size_t tensor;

@@ -2,13 +2,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import refusals, strided
+from helpers import refuses
 
-from voronerf.ops import camera_rays
+from voronerf.ops.pixel_rays.lens import camera_rays
 from voronerf.rendering.cameras import Cameras, look_at
 
 LENS = torch.tensor([0.05, 0.02, 0.005, 0.005, 0.01, 0.01, 0.005, 0.005])
-pytestmark = pytest.mark.op("camera_rays")
 
 
 def cameras(count, lens):
@@ -24,18 +23,13 @@ def cameras(count, lens):
 
 @pytest.mark.parametrize("lens", [None, "bent", "mixed"])
 @pytest.mark.parametrize("b", [0, 1, 300])
-def test_rays_pass_through_their_pixels(device, backend, b, lens):
+def test_rays_pass_through_their_pixels(b, lens):
     some = cameras(3, lens)
     camera = torch.randint(0, 3, (b,), dtype=torch.int32)
     x, y = 64 * torch.rand(b), 48 * torch.rand(b)
 
     def run(given, index):
-        tensors = (strided(tensor.to(device)) for tensor in (given.poses, given.intrinsics, x, y))
-        bent = None if given.distortion is None else strided(given.distortion.to(device))
-        models = None if given.models is None else strided(given.models.to(device))
-        which = None if index is None else strided(index.to(device))
-        options = {"camera": which, "distortion": bent, "models": models, "backend": backend}
-        return [part.cpu() for part in camera_rays(*tensors, **options)]
+        return camera_rays(given.poses, given.intrinsics, x, y, index, given.distortion, given.models)
 
     origins, directions = run(some, camera)
     assert origins.shape == directions.shape == (b, 3)
@@ -51,12 +45,7 @@ def test_rays_pass_through_their_pixels(device, backend, b, lens):
         torch.testing.assert_close(found, want, atol=1e-6, rtol=0)
 
 
-def test_refuses_what_makes_no_sense():
-    some, x = cameras(2, "bent"), torch.rand(5)
-    refuses = refusals(camera_rays, poses=some.poses, intrinsics=some.intrinsics, x=x, y=x)
-    wrong = torch.tensor([0, 1, 2, 0, 0], dtype=torch.int32)
-    refuses("camera must lie in 0 to 1, got values from 0 to 2", camera=wrong)
-    models = torch.tensor([0, 2], dtype=torch.int32)
-    refuses("distortion must be given with models, got None", models=models)
-    refuses("models must lie in 0 to 2, got values from 1 to 3", models=models + 1)
-    refuses("poses must hold at least one camera, got none", poses=some.poses[:0], intrinsics=some.intrinsics[:0])
+def test_cameras_out_of_range_are_refused():
+    some, x, wrong = cameras(2, "bent"), torch.rand(3), torch.tensor([0, 1, 2], dtype=torch.int32)
+    given = some.poses, some.intrinsics, x, x, wrong, some.distortion, None
+    refuses("camera_rays: camera must lie in 0 to 1, got values from 0 to 2", camera_rays, *given)

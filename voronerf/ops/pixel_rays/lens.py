@@ -1,4 +1,5 @@
-"""Rays through pixels. c cameras, b pixels. Frames and the lens model are those of ``voronerf.rendering.cameras``."""
+"""Rays through positions in images, and the lenses that bend them. c cameras, b positions. Frames are those of
+``voronerf.rendering.cameras``."""
 
 from __future__ import annotations
 
@@ -6,6 +7,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from voronerf.checks import check_range
 
 NEWTON_STEPS = 12
 #: The camera models, by their numbers in ``models``.
@@ -24,7 +27,25 @@ def camera_rays(
     distortion: Tensor | None,
     models: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Origins and unit directions; see ``voronerf.ops.camera_rays``."""
+    """Rays through positions in images. Lens distortion is undone by Newton's method in float64. Not differentiable.
+
+    Args:
+        poses: float32 [c, 4, 4], camera to world, OpenGL axes.
+        intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
+        x: float32 [b], to the right, in pixels; the centre of the first column is at 0.5.
+        y: float32 [b], downwards.
+        camera: int32 [b], the camera of each position, 0 to c - 1; None for the first camera.
+        distortion: [c, 8], see `distort`, or None.
+        models: int32 [c], the model of each lens, PERSPECTIVE, FISHEYE or FOV; None for PERSPECTIVE.
+
+    Returns:
+        (origins float32 [b, 3], directions float32 [b, 3] of unit length).
+
+    Raises:
+        ValueError: on the CPU cameras out of range.
+    """
+    if camera is not None:
+        check_range("camera_rays", "camera", camera, len(poses))
     index = 0 if camera is None else camera
     lens = intrinsics[index]
     if distortion is None:

@@ -1,4 +1,4 @@
-"""``sparse_adam`` of the compiled module: no custom op, because it works in place on what no graph holds."""
+"""``adam`` of the compiled module: no custom op, because it works in place on what no graph holds."""
 
 from __future__ import annotations
 
@@ -7,23 +7,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from voronerf import native
-from voronerf.ops.sparse_adam.reference import Guard, Rule
-
-
-def sparse_adam(
-    parameter: Tensor,
-    gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    rate: float,
-    first: float,
-    second: float,
-    epsilon: float,
-) -> None:
-    """The formula of ``voronerf.ops.sparse_adam``; ``rate`` and ``epsilon`` are corrected for the moments' start."""
-    machine = native.machine(parameter)
-    rule = native.compiled.SparseAdam(rate, first, second, epsilon, False)
-    native.compiled.sparse_adam(rule, gradient, parameter.detach(), mean, square, parameter.numel(), machine)
+from voronerf.ops.adam.reference import Guard, Rule
 
 
 def adam(

@@ -2,7 +2,7 @@
 // table's lines have none. A line is 16 floats, whatever an entry's number of features. Its update has no branches: an
 // entry of the line without a gradient is written back as it was. Each operation is rounded on its own (the build has
 // contraction off), so that all instruction sets give the same bits.
-#include "encoding/sparse_adam_isa.h"
+#include "encoding/adam_isa.h"
 
 #include "common/memory_tile.h"
 
@@ -31,7 +31,7 @@ VN_INLINE int any(const float* gradient) {
 }
 
 // kLanes entries.
-VN_INLINE void update(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square) {
+VN_INLINE void update(const AdamStep& rule, const float* gradient, float* parameter, float* mean, float* square) {
   const F32 g = load(gradient), p = load(parameter), m = load(mean), v = load(square);
   const auto present = (g != F32{}) | (rule.every ? -1 : 0);
   const F32 new_m = rule.decay * m + (1.0f - rule.decay) * g;
@@ -44,8 +44,8 @@ VN_INLINE void update(const SparseAdam& rule, const float* gradient, float* para
 
 }  // namespace
 
-void sparse_adam_block(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
-                       int64_t begin, int64_t end) {
+void adam_block(const AdamStep& rule, const float* gradient, float* parameter, float* mean, float* square,
+                int64_t begin, int64_t end) {
   int64_t line = begin;
   int32_t found[kLines];
   while (line + kLine <= end) {
@@ -82,7 +82,7 @@ void sparse_adam_block(const SparseAdam& rule, const float* gradient, float* par
   __builtin_memcpy(square + line, rest[3], bytes);
 }
 
-bool sparse_adam_all_below(float limit, const float* gradient, int64_t n) {
+bool adam_all_below(float limit, const float* gradient, int64_t n) {
   int beyond = 0;
   for (int64_t i = 0; i < n; ++i) beyond |= !(__builtin_fabsf(gradient[i]) < limit);  // true for NaN
   return beyond == 0;

@@ -18,20 +18,13 @@ constexpr int kPrepareThreads = 1024;
 constexpr int kRun = 4 * kThreads;  // entries of a block
 constexpr int kMost = 36;           // parameters of a launch: their pointers are its arguments, of which 4 KB fit
 
-__device__ __forceinline__ void update_entry(const SparseAdam& rule, float g, float* parameter, float* mean,
+__device__ __forceinline__ void update_entry(const AdamStep& rule, float g, float* parameter, float* mean,
                                              float* square, int64_t i) {
   const float m = rule.decay * mean[i] + (1.0f - rule.decay) * g;
   const float v = rule.decay_sq * square[i] + (1.0f - rule.decay_sq) * (g * g);
   mean[i] = m;
   square[i] = v;
   parameter[i] -= rule.step_size * (m / (sqrtf(v) + rule.epsilon));
-}
-
-__global__ void __launch_bounds__(kThreads)
-    sparse_adam_kernel(SparseAdam rule, const float* __restrict__ gradient, float* __restrict__ parameter,
-                       float* __restrict__ mean, float* __restrict__ square, int64_t n) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < n && gradient[i] != 0.0f) update_entry(rule, gradient[i], parameter, mean, square, i);
 }
 
 struct AdamTensor {
@@ -85,8 +78,8 @@ __global__ void __launch_bounds__(kThreads)
   int number = 0;
   while (number + 1 < tensors.count && blockIdx.x >= tensors.of[number + 1].first) ++number;
   const AdamTensor& tensor = tensors.of[number];
-  const SparseAdam rule{corrected[2 * number], static_cast<float>(tensor.rule.decay),
-                        static_cast<float>(tensor.rule.decay_sq), corrected[2 * number + 1], tensor.rule.every};
+  const AdamStep rule{corrected[2 * number], static_cast<float>(tensor.rule.decay),
+                      static_cast<float>(tensor.rule.decay_sq), corrected[2 * number + 1], tensor.rule.every};
   const float scale = guard.scale == nullptr ? 1.0f : *guard.scale;
   const unsigned block = blockIdx.x - tensor.first;
   for (int part = 0; part < kRun / kThreads; ++part) {
@@ -100,13 +93,6 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 }  // namespace
-
-void sparse_adam_cuda(const SparseAdam& rule, const float* gradient, float* parameter, float* mean, float* square,
-                      int64_t n, void* stream) {
-  if (n == 0) return;
-  VN_LAUNCH(sparse_adam_kernel, static_cast<unsigned>(ceil_div<int64_t>(n, kThreads)), kThreads, 0, stream, rule,
-            gradient, parameter, mean, square, n);
-}
 
 void adam_cuda(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
                float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,

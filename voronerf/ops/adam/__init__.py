@@ -1,0 +1,173 @@
+"""A step of Adam, of whole parameters or of the entries of a table that have a gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf import backends
+from voronerf.backends import EVERYWHERE, Implementation
+from voronerf.checks import (
+    check_dtype,
+    check_number,
+    check_same_device,
+    check_shape,
+    check_tensor,
+    check_writable,
+)
+from voronerf.ops.adam.reference import Guard, Rule
+
+_OP = backends.declare("adam", native=Implementation(EVERYWHERE, (torch.float32,)))
+
+
+@torch.no_grad()
+def adam(
+    rules: Sequence[Rule],
+    parameters: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    means: Sequence[Tensor],
+    squares: Sequence[Tensor],
+    *,
+    guard: Guard | None = None,
+    loss: Tensor | None = None,
+    backend: str = "auto",
+) -> None:
+    """A step of Adam of several parameters, in place; no device value is read.
+
+    With the step number s that is counted from 1 (Kingma and Ba 2015, algorithm 1):
+
+        mean    <- b1 mean + (1 - b1) g
+        square  <- b2 square + (1 - b2) g^2
+        p       <- p - rate / (1 - b1^s) mean / (sqrt(square) / sqrt(1 - b2^s) + epsilon)
+
+    Where a rule does not have ``every``, an entry without a gradient keeps its value and both moments, as tiny-cuda-nn
+    does it with its hash grids. An entry that gets its first gradient late then moves by less than the rate at first,
+    by (1 - b1) / sqrt(1 - b2) of it.
+
+    Args:
+        rules: One for each parameter.
+        parameters: float32, any shapes, contiguous.
+        gradients: float32, of the same shapes. Not differentiable.
+        means: float32, of the same shapes, contiguous: the first moments.
+        squares: float32, of the same shapes, contiguous, >= 0: the second moments.
+        guard: Leaves the step out where it has ``found`` something; None for never.
+        loss: float32 [], of the step. With it the guard judges first: the step is left out, and counted as such, unless
+            the magnitudes of the loss, and of the gradients whose rule has ``every``, are all below the limit.
+        backend: "auto", "reference" or "native".
+
+    Raises:
+        ValueError: a tensor that is not contiguous, lists of other lengths, a loss without a guard.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import Rule, adam
+        >>> steps, weight, mean, square = torch.zeros(()), torch.zeros(2), torch.zeros(2), torch.zeros(2)
+        >>> adam([Rule(steps, 0.25)], [weight], [torch.tensor([0.5, -2.0])], [mean], [square])
+        >>> weight, steps
+        (tensor([-0.2500,  0.2500]), tensor(1.))
+        >>> table = [torch.zeros(3)]  # of whose entries one has a gradient
+        >>> adam([Rule(steps, 0.25, every=False)], table, [torch.tensor([0.0, 1, 0])], [torch.ones(3)], [torch.ones(3)])
+        >>> (table[0] != 0).tolist()
+        [False, True, False]
+    """
+    lists = {"parameters": parameters, "gradients": gradients, "means": means, "squares": squares}
+    for name, given in {"rules": rules, **lists}.items():
+        if not isinstance(given, Sequence):
+            raise TypeError(f"{_OP}: {name} must be a list, got {type(given).__name__}")
+        if len(given) != len(rules):
+            raise ValueError(f"{_OP}: {name} must be as many as the {len(rules)} rules, got {len(given)}")
+    if not rules:
+        return
+    before: Any = None
+    for rule in rules:
+        if not isinstance(rule, Rule):
+            raise TypeError(f"{_OP}: rules must hold a Rule for each parameter, got {type(rule).__name__}")
+        if before is None or rule[1:] != before[1:]:  # a training has the same rule many times
+            _check_rule(rule)
+        before = rule
+    steps = [rule.step for rule in rules]
+    if not _are_plain(parameters, gradients, means, squares) or not _are_scalars(steps, parameters[0].device):
+        for own in zip(*lists.values(), strict=True):
+            _check(dict(zip(lists, own, strict=True)))
+        check_same_device(_OP, **{f"parameters[{index}]": tensor for index, tensor in enumerate(parameters)})
+        for step in steps:
+            _check_scalar("step", step, parameters[0])
+    if guard is not None:
+        if not isinstance(guard, Guard):
+            raise TypeError(f"{_OP}: guard must be a Guard, got {type(guard).__name__}")
+        check_number(_OP, "limit", guard.limit)
+        for name, scalar in zip(guard._fields, guard[:4]):
+            if scalar is not None:
+                _check_scalar(name, scalar, parameters[0])
+    if loss is not None:
+        if guard is None:
+            raise ValueError(f"{_OP}: loss must come with a guard, got none")
+        _check_scalar("loss", loss, parameters[0])
+        loss = loss.detach()
+    run = backends.resolve(_OP, backend=backend, device=parameters[0].device, dtype=torch.float32)
+    run(rules, [gradient.contiguous() for gradient in gradients], parameters, means, squares, guard, loss)
+
+
+def _are_plain(*lists: Sequence[Any]) -> bool:
+    """Whether the tensors of all parameters keep all rules, found in one pass without names for messages."""
+    if not isinstance(lists[0][0], Tensor):
+        return False
+    device = lists[0][0].device
+    for own in zip(*lists, strict=True):
+        shape: torch.Size | None = None
+        for tensor in own:
+            if not isinstance(tensor, Tensor) or tensor.layout is not torch.strided or tensor.is_nested:
+                return False
+            shape = tensor.shape if shape is None else shape
+            if tensor.dtype is not torch.float32 or tensor.shape != shape or tensor.device != device:
+                return False
+            if not tensor.is_contiguous() or tensor.is_neg():
+                return False
+    return True
+
+
+def _check(tensors: dict[str, Tensor]) -> None:
+    """Checks the tensors of one parameter, named after their lists."""
+    check_tensor(_OP, "parameter", tensors["parameters"])
+    shape = tensors["parameters"].shape
+    for name, tensor in tensors.items():
+        one = name[:-1]
+        check_tensor(_OP, one, tensor)
+        check_dtype(_OP, one, tensor, (torch.float32,))
+        if tensor.shape != shape:
+            raise ValueError(f"{_OP}: {one} must have shape {list(shape)}, got {list(tensor.shape)}")
+        if one != "gradient":
+            check_writable(_OP, one, tensor)
+    check_same_device(_OP, **{name[:-1]: tensor for name, tensor in tensors.items()})
+
+
+def _are_scalars(steps: Sequence[Any], device: torch.device) -> bool:
+    """Whether the steps keep all rules."""
+    return all(
+        isinstance(step, Tensor) and step.dtype is torch.float32 and not step.shape and step.device == device
+        for step in steps
+    )
+
+
+def _check_scalar(name: str, tensor: Tensor, parameter: Tensor) -> None:
+    check_shape(_OP, name, tensor, ())
+    check_dtype(_OP, name, tensor, (torch.float32,))
+    check_same_device(_OP, **{"parameters[0]": parameter, name: tensor})
+
+
+def _check_rule(rule: Rule) -> None:
+    if not isinstance(rule.learning_rate, Tensor):
+        check_number(_OP, "learning_rate", rule.learning_rate)
+    check_number(_OP, "epsilon", rule.epsilon)
+    betas = rule.betas
+    if not isinstance(betas, (tuple, list)) or len(betas) != 2:
+        raise TypeError(f"{_OP}: betas must be a pair of numbers, got {betas!r:.60}")
+    for beta in betas:
+        check_number(_OP, "betas", beta)
+        if not 0 <= beta < 1:
+            raise ValueError(f"{_OP}: betas must lie in [0, 1), got {betas}")
+    if not rule.epsilon > 0:
+        raise ValueError(f"{_OP}: epsilon must be positive, got {rule.epsilon}")

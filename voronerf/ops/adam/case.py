@@ -1,0 +1,28 @@
+"""The case of ``adam``."""
+
+from __future__ import annotations
+
+import torch
+
+from voronerf.ops.adam import Guard, Rule
+from voronerf.ops.cases import Arguments, Case, Draw
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    lists: Arguments = {"parameters": [], "gradients": [], "means": [], "squares": []}
+    for size in (n, 3):
+        for name in ("parameters", "means"):
+            lists[name].append(draw.normal(size, 2).contiguous())
+        lists["gradients"].append(draw.normal(size, 2).contiguous() * (draw.uniform(size, 1) < 0.5))
+        lists["squares"].append(draw.uniform(size, 2).contiguous())
+    guard = draw.among("guard", Guard.on("cpu"), None)
+    loss = None if guard is None else torch.tensor(draw.among("loss", 0.5, torch.nan))
+    rules = [Rule(torch.tensor(2.0), 0.01), Rule(torch.tensor(0.0), 0.02, every=False)]
+    return {"rules": rules, **lists, "guard": guard, "loss": loss}
+
+
+CASE = Case(
+    _make,
+    refused={"loss must come with a guard, got none": {"guard": None}},
+    in_place=True,
+)
