@@ -9,8 +9,8 @@ namespace voronerf {
 struct PixelRaysInputs {
   const float* poses;       // [c,4,4], camera to world
   const float* intrinsics;  // [c,4]: fx, fy, cx, cy
-  const float* distortion;  // [c,8], voronerf/ops/camera_rays/reference.py; or null
-  const int32_t* models;    // [c], camera models, voronerf/ops/camera_rays/reference.py; or null
+  const float* distortion;  // [c,8], voronerf/ops/pixel_rays/lens.py; or null
+  const int32_t* models;    // [c], camera models, voronerf/ops/pixel_rays/lens.py; or null
   const uint8_t* images;    // [c,h,w,channels]
   const int64_t* pixels;    // [b], numbered through all images
   const float* box;         // [2,3], or null for all of space

@@ -13,7 +13,7 @@ constexpr int kNewtonSteps = 12;
 constexpr double kSettled = 1e-6, kTiny = 1e-12;
 constexpr int32_t kPerspective = 0, kFisheye = 1, kFov = 2;
 
-// The point that the lens puts at (u, v): Newton's method and the models of voronerf/ops/camera_rays/reference.py.
+// The point that the lens puts at (u, v): Newton's method and the models of voronerf/ops/pixel_rays/lens.py.
 VN_HD void undistort(const float* lens, int32_t model, double u, double v, double& a, double& b) {
   if (model == kFov) {
     const double omega = lens[0], radius = fmax(sqrt(u * u + v * v), kTiny);
