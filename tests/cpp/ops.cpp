@@ -8,8 +8,8 @@
 #include <cstdlib>
 
 #include "cases.h"
-#include "encoding/encode.h"
 #include "encoding/adam.h"
+#include "encoding/encode.h"
 #include "encoding/spherical_harmonics.h"
 #include "geometry/cell_sort.h"
 #include "geometry/centre_grid.h"

@@ -28,6 +28,6 @@ def test_locate_cell_stays_inside_unsound_tables() -> None:
         ([0, 1, 3], [1, 1, 0], 4),  # a walk that ends at no leaf
     ):
         tables = (torch.tensor(table, dtype=torch.int32) for table in (offsets, child))
-        leaves = torch.ops.voronerf.locate_cell_warp(points, centres, *tables, depth, None)
+        leaves = torch.ops.voronerf.locate_cell_warp(points, centres, *tables, depth)
         assert bool((leaves < 3).all())
         assert bool((leaves < 0).all()) == (offsets != [0, 2_000_000_000])
