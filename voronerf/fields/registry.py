@@ -9,7 +9,8 @@ have these attributes, all of which are optional:
     learning_rate(**options) static method: Adam's rate at the start of a training; default ``LEARNING_RATE``
     router_options           further arguments of ``VoronoiRouter``, such as {"fuse": True} or {"share": ["encoder.*"]}
     sparse_parameters        names of tables, as patterns, of which a step of training reads few entries. Their
-                             entries without a gradient stay as they are, see ``voronerf.ops.adam``
+                             entries without a gradient do not move, see ``voronerf.ops.adam``, but for the
+                             weight decay that tables have
     ray_growth               the most rays of a training step, as a multiple of ``--rays``, where space is empty:
                              more than 1, the default, for a field whose samples cost little beside the rest of a step
     lr_hold                  fraction of a training for which the learning rate stays before it falls; default 0

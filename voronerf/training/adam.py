@@ -15,9 +15,9 @@ from voronerf.router.optimizers import trained_parts
 class Adam(torch.optim.Adam):
     """``torch.optim.Adam``, with groups of parameters whose entries without a gradient stay as they are.
 
-    A group says ``sparse=True``. The state has the names of torch's. All parameters, which are float32 and contiguous,
-    are updated by one operation, since torch's own step takes longer to prepare than to compute for networks of this
-    size.
+    A group says ``sparse=True``, and ``shrink=RATE`` for weight decay, see :meth:`shrink`. The state has the names of
+    torch's. All parameters, which are float32 and contiguous, are updated by one operation, since torch's own step
+    takes longer to prepare than to compute for networks of this size.
 
     Args:
         params: Parameters or groups of them, as ``torch.optim.Adam`` takes them.
@@ -65,6 +65,21 @@ class Adam(torch.optim.Adam):
         # Without a loss nothing is counted.
         self.update(None if overflow is None else Guard(overflow, overflow, overflow, scale))
         return loss
+
+    @torch.no_grad()
+    def shrink(self, steps: int) -> None:
+        """Weight decay apart from the gradients (Loshchilov and Hutter 2019), of groups that say ``shrink=RATE``.
+
+        Their weights are multiplied by 1 - steps * lr * RATE. Parameters without a gradient and frozen cells stay.
+
+        Args:
+            steps: For which this stands.
+        """
+        for group in self.param_groups:
+            held = [p for p in group["params"] if p.grad is not None] if group.get("shrink") else []
+            for parameter, parts in zip(held, trained_parts(held), strict=True):
+                for part in parts:
+                    parameter[part].mul_(1 - steps * group["lr"] * group["shrink"])
 
     @torch.no_grad()
     def update(self, guard: Guard | None, loss: Tensor | None = None) -> None:

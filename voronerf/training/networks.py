@@ -30,6 +30,10 @@ from voronerf.training.streaming import Pages
 
 #: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
+#: Weight decay of tables: of what nothing asks for again, such as noise that early steps have left in empty space.
+TABLE_DECAY = 0.1
+#: Steps from one decay to the next, since a large table takes time to read.
+SHRINK_EVERY = 16
 #: Factor of the loss on the sightings of points.
 SIGHTINGS = 0.003
 #: Cells of the occupancy grid along each axis, of a box and of contracted space, which is all the world.
@@ -338,13 +342,13 @@ def make_optimizer(routers: Mapping[str, VoronoiRouter | Parts], config: TrainCo
     parent would set its step sizes for a thousand steps. The change is worth 0.7 dB after 800 steps of Lego at
     100 x 100.
 
-    Entries of the field's tables that have no gradient stay as they are.
+    Tables have weight decay; otherwise their entries that have no gradient stay as they are.
     """
     assert config.lr is not None
     dense, tables = parameter_groups(routers, config)
     groups = [{"params": dense, "sparse": False}]
     if tables:
-        groups.append({"params": tables, "sparse": True})
+        groups.append({"params": tables, "sparse": True, "shrink": TABLE_DECAY})
     options: dict[str, Any] = {"lr": config.lr}
     if config.cuda_graph:  # a graph reads the learning rate and the step count from tensors
         options = {"lr": torch.tensor(config.lr, device=dense[0].device), "capturable": True}

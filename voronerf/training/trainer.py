@@ -52,6 +52,7 @@ from voronerf.training.divergence import (
 )
 from voronerf.training.errors import usual_errors
 from voronerf.training.networks import (
+    SHRINK_EVERY,
     check_backend,
     check_memory,
     computes_natively,
@@ -430,6 +431,8 @@ class Trainer:
 
     def finish(self, kept: Tensor) -> None:
         """What comes after a step that :meth:`learn` made."""
+        if self.step % SHRINK_EVERY == 0:
+            self.optimizer.shrink(SHRINK_EVERY)
         if self.config.average:
             update_averages(self.optimizer, self.config.average, self.step)
         if len(kept):
