@@ -1,11 +1,13 @@
 """A scene that changes: `Run.update` against training everything again, at equal process CPU time.
 
-    python benchmarks/updating.py city --seconds 120 --share 0.1 --seeds 0 1
-    python benchmarks/updating.py lego --data LEGO --seconds 90
-    python benchmarks/updating.py fox --data FOX --seconds 90
+    python -m benchmarks.updating city --runs DIR
+    python -m benchmarks.updating city --runs DIR --data builtin-city:3x3 --seconds 60 --seeds 1
+    python -m benchmarks.updating lego --runs DIR --data LEGO --seconds 45 --downscale 4
+    python -m benchmarks.updating fox --runs DIR --data FOX --seconds 25 --downscale 1 --seeds 0 1
 
 city: `builtin-city:4x4` with a block rebuilt. lego: the loader's bucket recoloured, in pictures edited by where a
-trained run sees their pixels. fox: every other view first, the others later.
+trained run sees their pixels. fox: every other view first, the others later. Trainings that are in DIR already are not
+made again; rows are added to the JSON.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import tempfile
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -31,11 +33,14 @@ from voronerf.run import Run, open_run
 from voronerf.training.config import TrainConfig
 from voronerf.training.trainer import Trainer
 
+RESULT = Path(__file__).parent / "results" / "updating.json"
 #: Where the bucket of Lego's loader is, and the most views of which pictures are compared.
 BUCKET, VIEWS = torch.tensor([[-0.75, -1.25, 0.4], [0.75, -0.5, 1.2]]), 48
 
 
 def train(scene: Scene, data: str, seconds: float, seed: int, downscale: int, out: Path) -> Run:
+    if (out / "summary.json").is_file():
+        return open_run(out, scene=scene)
     config = TrainConfig(data=data, downscale=downscale, out=out, budget=seconds, seed=seed, lpips=Path("off"))
     config = replace(config, evaluations=1, final_views=1, panels=0)
     Trainer(config, scene, clock=time.process_time).run()
@@ -100,20 +105,31 @@ def measure(
     else:
         before = load_scene(data, downscale=downscale)
         after = load_scene(f"{data},rebuilt=5", downscale=downscale) if kind == "city" else before
-    old = train(before, data, seconds, seed, downscale, folder / "old")
+    name = f"{Path(data).name.replace(':', '-')}-{seconds:g}-{seed}"
+    old = train(before, data, seconds, seed, downscale, folder / f"{name}-old")
     if kind == "lego":
         after = recoloured(before, old)
     began = time.process_time()
+    shutil.rmtree(folder / f"{name}-made", ignore_errors=True)
     made = old.update(
-        after, folder / "made", seconds=share * seconds, clock=time.process_time, say=said.append, seed=seed
+        after, folder / f"{name}-made", seconds=share * seconds, clock=time.process_time, say=said.append, seed=seed
     )
     spent = time.process_time() - began
     total = (1 + share) * seconds if kind == "fox" else seconds
-    again = train(
-        whole if kind == "fox" else replace(after, box=before.box), data, total, seed, downscale, folder / "again"
-    )
+    every = whole if kind == "fox" else replace(after, box=before.box)
+    again = train(every, data, total, seed, downscale, folder / f"{name}-again")
     rows = {name: scores(run, after, before) for name, run in (("old", old), ("updated", made), ("again", again))}
-    return {"seed": seed, "said": said, "seconds": {"old": seconds, "updated": spent, "again": total}, "psnr": rows}
+    cells = {"before": old.router.num_cells, "after": made.router.num_cells}
+    size = old.scene.train.cameras.smallest
+    return {
+        "data": Path(data).name,
+        "size": size,
+        "seed": seed,
+        "said": said,
+        "cells": cells,
+        "seconds": {"old": seconds, "updated": spent, "again": total},
+        "psnr": rows,
+    }
 
 
 def main() -> None:
@@ -124,17 +140,20 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=0.1)
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--runs", type=Path, required=True)
     given = parser.parse_args()
     torch.set_num_threads(1)
-    results = []
+    stored = json.loads(RESULT.read_text())
+    known, kinds = stored["results"], stored["metadata"].get("kinds", {})
     for seed in given.seeds:
-        with tempfile.TemporaryDirectory() as folder:
-            args = given.kind, given.data, given.seconds, given.share, seed, given.downscale, Path(folder)
-            results.append(measure(*args))
-        print(json.dumps(results[-1], indent=1))
-    if given.out is not None:
-        given.out.write_text(json.dumps({"metadata": metadata(), "results": {given.kind: results}}, indent=1) + "\n")
+        args = given.kind, given.data, given.seconds, given.share, seed, given.downscale, given.runs
+        row = measure(*args)
+        print(json.dumps(row, indent=1))
+        same = ("data", "seed")
+        rest = [old for old in known.get(given.kind, []) if [old.get(k) for k in same] != [row[k] for k in same]]
+        known[given.kind] = [*rest, row]
+        kinds[given.kind] = metadata(command=__doc__)  # each of a machine of its own
+        RESULT.write_text(json.dumps({"metadata": {"kinds": kinds}, "results": known}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -87,23 +87,27 @@ def test_what_has_changed_learns_and_the_rest_keeps_its_bits(tmp_path, runs, cit
     assert len(made.router) == 1 and len(part.routers) == 2 and "cells learn" in said[0]
     # The cells that learnt lie on the block; all others have the parameters of the run, shared tables too.
     new = part.diagram.leaf_centres[part.owner == 1]
-    assert 1 <= len(new) <= 4
     assert ((new[:, :2] > BLOCK[0, :2] - 0.5) & (new[:, :2] < BLOCK[1, :2] + 0.5)).all(1).any()
     kept = (part.owner == 0).nonzero()[:, 0]
+    parents = run.router.assign(part.diagram.leaf_centres).long()[kept]  # cells are divided, so that some of one stays
     other = dict(run.router.module.named_parameters())
     for name, parameter in part[0].module.named_parameters():
-        whole = other[name].shape == parameter.shape and other[name].shape[0] != len(part.owner)
-        assert torch.equal(parameter, other[name] if whole else other[name][kept]), name
-    # Space outside of these cells is seen as before, bit for bit.
+        whole = other[name].shape[0] != run.router.num_cells
+        assert torch.equal(parameter, other[name] if whole else other[name][parents]), name
+    # Space outside of these cells is seen as before, bit for bit. Each cell is asked alone: the number of rows that a
+    # kernel is called with decides in which order it adds.
     points = torch.rand(4000, 3) * (city.box[1] - city.box[0]) + city.box[0]
-    points = points[torch.isin(run.router.assign(points).long(), kept)]
-    directions, index = torch.tensor([[0.0, 0.6, -0.8]]), torch.zeros(len(points), dtype=torch.int32)
-    with torch.no_grad():
-        for ours, theirs in zip(made.router(points, directions, index), run.router(points, directions, index)):
-            assert torch.equal(ours, theirs)
+    leaf, direction = part.diagram.locate(points).long(), torch.tensor([[0.0, 0.6, -0.8]])
+    assert 0.5 < torch.isin(leaf, kept).float().mean() < 1
+    for cell in kept.tolist():
+        own = points[leaf == cell]
+        index = torch.zeros(len(own), dtype=torch.int32)
+        with torch.no_grad():
+            for ours, theirs in zip(made.router(own, direction, index), run.router(own, direction, index), strict=True):
+                assert torch.equal(ours, theirs)
     grids = [r.renderer.occupancy for r in (run, made)]
     every = grids[0].points(torch.arange(grids[0].occupied.numel()))
-    same = torch.isin(run.router.assign(every).long(), kept)
+    same = torch.isin(part.diagram.locate(every).long(), kept)
     for name in ("density", "occupied"):
         assert torch.equal(*(getattr(grid, name).view(-1)[same] for grid in grids))
     (was, around), (now, after) = (error_of(r, rebuilt, city) for r in (run, made))
@@ -113,6 +117,54 @@ def test_what_has_changed_learns_and_the_rest_keeps_its_bits(tmp_path, runs, cit
     # What was updated can be updated again.
     third = again.update(city, tmp_path / "third", seconds=1.0, clock=ticking())
     assert all(router.num_cells for router in third.router.routers)
+
+
+def test_a_cell_that_has_changed_in_part_is_divided(runs, city):
+    """The parts look the same; of the cells in its place those learn that have some of what has changed."""
+    run = voronerf.open_run(runs["hashgrid"], scene=city)
+    source = voronerf.editing.join([run.source], [Similarity()])
+    voxels = updating.space_voxels(city.box)
+    every = replace(voxels, chosen=~voxels.chosen).centres()
+    voxels = replace(voxels, chosen=((every > BLOCK[0]) & (every < BLOCK[1])).all(1).reshape(voxels.chosen.shape))
+    k = run.router.num_cells
+    counts = run.router.assign(voxels.centres()).long().bincount(minlength=k)
+    none, rebuilt = torch.zeros(k, dtype=torch.bool), counts > 20
+    assert rebuilt.any()
+    changes = updating.Changes(none, rebuilt, voxels, 0.1, 1.0, torch.zeros(k))
+    parts, cells = updating.divide(source, changes, torch.Generator().manual_seed(0))
+    assert parts.num_cells > k and cells.any() and (~cells).any()
+    points = torch.rand(3000, 3) * (city.box[1] - city.box[0]) + city.box[0]
+    for cell in range(parts.num_cells):
+        inside = points[parts.assign(points) == cell]
+        asked = inside, torch.tensor([[0.0, 0.6, -0.8]]), torch.zeros(len(inside), dtype=torch.int32)
+        with torch.no_grad():
+            for ours, theirs in zip(parts.eval()(*asked), source.parts.eval()(*asked), strict=True):
+                assert torch.equal(ours, theirs)
+    own = cells[parts.assign(voxels.centres()).long()]
+    assert own[rebuilt[run.router.assign(voxels.centres()).long()]].float().mean() > 0.9
+    before = run.router.assign(points).long()
+    assert not (cells[parts.assign(points).long()] & ~rebuilt[before]).any()
+
+
+def test_a_shadow_is_found_though_no_ray_is_off(runs, city):
+    """A place that all pictures show a little darker has changed; without it nothing has."""
+    run = voronerf.open_run(runs["hashgrid"], scene=city)
+    low, high = torch.tensor([-0.4, -0.4, -0.1]), torch.tensor([0.4, 0.4, 0.1])
+    images = [city.train.images.clone() for _ in range(2)]
+    for view in range(VIEWS):
+        image = render_camera(run.renderer, city, city.train.cameras, view)
+        shade = ((image.heaviest > low) & (image.heaviest < high)).all(-1) & (image.opacity > 0.9)
+        for pictures, dark in zip(images, (0.12, 0.0), strict=True):  # the run itself, so that nothing else differs
+            colour = (image.colour - dark * shade[..., None]).clamp(0, 1)
+            pictures[view, ..., :3], pictures[view, ..., 3:] = (colour * 255).round().to(pictures.dtype), 255
+    darker, shown = (replace(city, train=replace(city.train, images=pictures)) for pictures in images)
+    source, usual = run.source, torch.full((run.router.num_cells + 1,), 0.2)
+    batches = [updating.RayBatches(scene, torch.device("cpu")) for scene in (darker, shown)]
+    space = updating.space_voxels(city.box)
+    found = updating.find_changes(run.renderer, source.parts, batches[0], usual, space, batches[1])
+    assert found.off < 0.01 and found.rebuilt.any() and not found.worse.any()
+    places = found.voxels.centres()
+    assert ((places > low - 0.2) & (places < high + 0.2)).all()
 
 
 def test_training_keeps_the_errors_of_cells(runs, city):
@@ -175,16 +227,18 @@ def test_a_ray_is_the_light_before_of_and_behind_the_cells_that_learn(tmp_path, 
     cells = torch.zeros(run.router.num_cells, dtype=torch.bool)
     cells[:3] = True
     parts, learners = updating.split_off(source.parts, cells)
-    voxels = updating.space_voxels(city.box)
-    changes = updating.Changes(cells, voxels, 0.1, 1.0, torch.zeros(len(cells)))
-    session = updating.Session(replace(source, parts=parts), learners, changes, 0)
+    voxels, generator = updating.space_voxels(city.box), torch.Generator().manual_seed(0)
+    session = updating.Session(
+        replace(source, parts=parts), source.parts, cells, learners, torch.arange(0), voxels, generator
+    )
     pool = session.pool(updating.RayBatches(city, torch.device("cpu")), 2000)
     assert len(pool) > 100
     sampler = session.renderer.sampler
     samples = sampler.sample(pool.rays, pool.near, pool.far)
-    own = samples.part(session.learns(samples.positions))
+    shown = samples.depths < pool.end[samples.ray_index.long()]
+    own = samples.part(shown & session.learns(samples.positions))
     with torch.no_grad():
-        seen = updating.render_samples(session.field, pool.rays, pool.far, own, sampler.space, background=pool.behind)
+        seen = updating.render_samples(session.parts, pool.rays, pool.far, own, sampler.space, background=pool.behind)
         whole = updating.render_samples(source.parts, pool.rays, pool.far, samples, sampler.space)
     colour = pool.before + pool.light * seen.colour
     # The background is in `behind`: without it the two differ by what passes all samples.

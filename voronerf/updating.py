@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from voronerf.data import Scene
+from voronerf.diagram import balance
 from voronerf.editing import Source
-from voronerf.fields.radiance import activate_radiance
-from voronerf.ops.learn_outputs import learn_outputs
 from voronerf.ops.render_loss import RenderLoss, render_loss_gradient
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.contraction import Contraction
@@ -26,8 +25,9 @@ from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid
 from voronerf.rendering.sampling import colour_loss
 from voronerf.rendering.volume import Samples, render_samples
 from voronerf.router import Part, Parts, VoronoiRouter
+from voronerf.router.parts import Asked
 from voronerf.step.cells import DECAY, REVISIT_EVERY, REVISITED
-from voronerf.step.ray_loss import density_scale
+from voronerf.step.ray_loss import Networks, why_not_fused
 from voronerf.training.adam import Adam
 from voronerf.training.average import averages_in_place, update_averages
 from voronerf.training.batches import RayBatches
@@ -36,18 +36,19 @@ from voronerf.training.config import ConfigError
 from voronerf.training.errors import usual_errors
 from voronerf.training.parts import grouped_parameters
 from voronerf.training.rates import learning_rate
-from voronerf.training.renderers import as_field, make_contraction, make_renderer
+from voronerf.training.renderers import make_contraction, make_renderer
 
-#: Rays of a step, in multiples of ``--rays``.
-RAYS = 1
 #: Rays that are drawn at a time to find those that meet cells that learn, how many of these there are to be, and the
 #: share of an update that is spent on it before the first step at most, and the share that is left for steps at least.
 DRAWN, POOL, FINDING, LEARNING = 1 << 15, 1 << 17, 0.3, 0.25
 #: How often a ray is learnt from before others are found.
 AGAIN = 4
-#: Rays learn if this share of the light reaches the cells that learn, and no more than that optical depth of others
-#: lies between them.
+#: Rays learn if this share of the light reaches the cells that learn; they end where, behind the first of these, others
+#: of more than that optical depth begin, unless this share of the light reaches cells that learn behind them.
 LEAST_LIGHT, MOST_BETWEEN = 0.05, 0.05
+#: A cell whose space has changed in part is divided into at most so many cells for what has changed, and for what has
+#: not; each has so many places.
+CHILDREN, PLACES = 8, 8
 
 
 @dataclass(frozen=True)
@@ -56,12 +57,14 @@ class Update:
 
     Attributes:
         source: The run that it makes.
+        cells: bool [k], those of its cells that learnt.
         changes: What the new pictures showed.
         steps: Steps of training.
         seconds: Of training, finding the changes included.
     """
 
     source: Source
+    cells: Tensor
     changes: Changes
     steps: int
     seconds: float
@@ -106,25 +109,37 @@ def update(
             raise ConfigError("the run has no errors to compare with, as its training keeps them; give --old DIR")
         usual = usual_errors(renderer, source.parts, RayBatches(old, device, backend=source.config.backend))
     # Rays are drawn from all pixels here; those that miss the box show the background.
-    every = RayBatches(replace(new, box=None), device, backend=source.config.backend)
-    every.box = new.box
-    changes = find_changes(renderer, source.parts, every, usual, space_voxels(box, contraction))
+    pictures = list[RayBatches]()
+    for scene in (new, old):
+        if scene is not None:
+            pictures.append(RayBatches(replace(scene, box=None), device, backend=source.config.backend))
+            pictures[-1].box = scene.box
+    changes = find_changes(renderer, source.parts, pictures[0], usual, space_voxels(box, contraction), *pictures[1:])
     if changes.met < LEAST_MET:
         raise ConfigError(f"--data must show the scene of the run, {changes.met:.2%} of its rays meet it")
     if changes.off > MOST_OFF:
         raise ConfigError(
             f"--data shows another scene, or this one in another frame: {changes.off:.0%} of what it shows differs"
         )
-    count, k = int(changes.cells.sum()), source.parts.num_cells
+    generator = torch.Generator().manual_seed(seed)
+    count, k = int((changes.worse | changes.rebuilt).sum()), source.parts.num_cells
     say(f"{changes.off:.1%} of the new rays that meet the scene are off: {count} of {k} cells learn")
     if not count:
         raise ConfigError(
             f"--data shows nothing new: {changes.off:.1%} of the rays that meet the scene are off, as in training"
         )
-    parts, learners = split_off(source.parts, changes.cells)
-    grid = None if source.grid is None else opened(source.grid, source.parts, changes.cells)
-    session = Session(replace(source, parts=parts, grid=grid), learners, changes, seed)
-    through, backend = bounds(source, changes), source.config.backend
+    divided, cells = divide(source, changes, generator)
+    if divided.num_cells > k:
+        say(f"these are divided, so that what has not changed in them stays: {int(cells.sum())} smaller ones learn")
+    parts, learners = split_off(divided, cells)
+    grid, own, through = source.grid, torch.empty(0, dtype=torch.int64), None
+    if grid is not None:
+        own = voxels_of(grid, parts, cells)
+        through, grid = bounds(grid, own, changes.voxels), opened(grid, own)
+    session = Session(
+        replace(source, parts=parts, grid=grid), source.parts, cells, learners, own, changes.voxels, generator
+    )
+    backend = source.config.backend
     given = [scene for scene in (new, old) if scene is not None]
     pictures = [RayBatches(scene, device, through=through, backend=backend) for scene in given]
     count = DRAWN if grid is not None else DRAWN // 4  # of rays that skip nothing
@@ -152,9 +167,9 @@ def update(
             pool, drawn = draw(), 0
         drawn += session.step(pool, steps, done)
         steps += 1
-    if grid is not None and source.grid is not None and session.own_voxels is not None:
+    if grid is not None and source.grid is not None:
         # Voxels across a border have seen samples of cells that learn.
-        others = torch.ones_like(grid.occupied).view(-1).index_fill(0, session.own_voxels, False).view_as(grid.occupied)
+        others = torch.ones_like(grid.occupied).view(-1).index_fill(0, own, False).view_as(grid.occupied)
         grid.density[others], grid.occupied[others] = source.grid.density[others], source.grid.occupied[others]
     learnt = [parameter for router in learners for parameter in router.parameters()]
     with averages_in_place(session.optimizer):
@@ -163,7 +178,40 @@ def update(
         parameter.data = average
     for router in learners:
         router.eval()
-    return Update(session.source, changes, steps, clock() - began)
+    return Update(session.source, cells, changes, steps, clock() - began)
+
+
+def divide(source: Source, changes: Changes, generator: torch.Generator) -> tuple[Parts, Tensor]:
+    """Divides the cells whose space has changed in part, into some for what has changed and some for what has not.
+
+    Returns:
+        The parts, which look the same, and which of their cells are to learn, bool [k].
+    """
+    parts, voxels, grid = source.parts, changes.voxels, source.grid
+    moved, still = voxels.centres(), replace(voxels, chosen=~voxels.chosen).centres()
+    if grid is not None:  # what is empty needs no cell
+        still = grid.points(grid.occupied.view(-1).nonzero()[:, 0])
+        still = still[~voxels.has(still)]
+    owners = [(places, parts.assign(places).long()) for places in (moved, still)]
+    made, parents = list[Part](), list[Tensor]()
+    for part, first in zip(parts, parts.starts, strict=False):
+        children: dict[int, Tensor] = {}
+        for cell in changes.rebuilt[first : first + part.num_cells].nonzero()[:, 0].tolist():
+            centres = []
+            for places, owner in owners:
+                own = part.contracted(part.own_points(places[owner == first + cell]))
+                if count := min(CHILDREN, len(own) // PLACES):
+                    found = balance(own, own.new_ones(len(own)), count, method="centroidal", generator=generator)
+                    centres.append(found.centres.to(own))
+            if len(centres) > 1:
+                children[cell] = torch.cat(centres)
+        part, of = part.divide(children)
+        made.append(part)
+        parents.append(of + first)
+    divided, of = Parts(made, backend=parts.backend, blend=parts.blend), torch.cat(parents)
+    owner = divided.assign(moved).long()
+    changed = owner[owner >= 0].bincount(minlength=len(of)) > 0
+    return divided, changes.worse[of] | (changes.rebuilt[of] & changed)
 
 
 def split_off(parts: Parts, cells: Tensor) -> tuple[Parts, list[VoronoiRouter]]:
@@ -190,11 +238,10 @@ def split_off(parts: Parts, cells: Tensor) -> tuple[Parts, list[VoronoiRouter]]:
     return Parts(made, backend=parts.backend, blend=parts.blend), learners
 
 
-def opened(grid: OccupancyGrid, parts: Parts, cells: Tensor) -> OccupancyGrid:
-    """A grid in which all voxels of some cells, bool [k], may be occupied; the others are as they were."""
-    again = OccupancyGrid.from_state(grid.state_dict(), contraction=grid.contraction, device=grid.box.device)
-    rows = voxels_of(again, parts, cells)
-    again.density.view(-1)[rows] = again.density.view(-1)[rows].maximum(torch.tensor(again.threshold / DECAY**8))
+def opened(grid: OccupancyGrid, rows: Tensor) -> OccupancyGrid:
+    """A grid in which some voxels, int64 [q], may be occupied; the others are as they were."""
+    again = type(grid).from_state(grid.state_dict(), contraction=grid.contraction, device=grid.box.device)
+    again.density.view(-1)[rows] = again.density.view(-1)[rows].clamp(min=again.threshold / DECAY**8)
     again.occupied.view(-1)[rows] = True
     return again
 
@@ -206,14 +253,10 @@ def voxels_of(grid: OccupancyGrid, parts: Parts, cells: Tensor) -> Tensor:
     return every[cells[owner.clamp(min=0)] & (owner >= 0)]
 
 
-def bounds(source: Source, changes: Changes) -> Tensor | None:
-    """A box [2, 3] around what is and what was seen in the cells that learn; None where that is not known."""
-    grid = source.grid
-    if grid is None:
-        return None
-    rows = voxels_of(grid, source.parts, changes.cells)
-    middles = torch.cat((grid.points(rows[grid.occupied.view(-1)[rows]]), changes.voxels.centres()))
-    fewest = [min(pair) for pair in zip(grid.occupied.shape, changes.voxels.chosen.shape, strict=True)]
+def bounds(grid: OccupancyGrid, rows: Tensor, changed: Voxels) -> Tensor | None:
+    """A box [2, 3] around what is in some voxels of the grid, int64 [q], and what has changed; None for nothing."""
+    middles = torch.cat((grid.points(rows[grid.occupied.view(-1)[rows]]), changed.centres()))
+    fewest = [min(pair) for pair in zip(grid.occupied.shape, changed.chosen.shape, strict=True)]
     side = (grid.box[1] - grid.box[0]) / torch.tensor(fewest, device=middles.device)
     return torch.stack((middles.amin(0) - side, middles.amax(0) + side)) if len(middles) else None
 
@@ -232,6 +275,7 @@ class Pool:
         before: [p, 3], the light that comes from before the first sample in the cells.
         light: [p, 1], the share of the light that passes there.
         behind: [p, 3], the colour behind the last sample in the cells, background included.
+        end: [p], the depth from which cells that learn are hidden by others, or infinity.
     """
 
     rays: Rays
@@ -241,6 +285,7 @@ class Pool:
     before: Tensor
     light: Tensor
     behind: Tensor
+    end: Tensor
 
     def __len__(self) -> int:
         return len(self.rays)
@@ -249,7 +294,7 @@ class Pool:
     def joined(pools: Sequence[Pool]) -> Pool:
         """The rays of several pools."""
         rays = Rays(*(torch.cat([getattr(pool.rays, name) for pool in pools]) for name in ("origins", "directions")))
-        names = ("near", "far", "target", "before", "light", "behind")
+        names = ("near", "far", "target", "before", "light", "behind", "end")
         return Pool(rays, *(torch.cat([getattr(pool, name) for pool in pools]) for name in names))
 
 
@@ -262,20 +307,31 @@ class Session:
 
     Args:
         source: Parts of which some routers learn, and the grid, which changes in their cells alone.
-        learners: These routers.
-        changes: What is known of the scene.
-        seed: Of random numbers.
+        before: The parts before they were divided and began to learn.
+        cells: bool [k], those that learn.
+        learners: Their routers.
+        own: int64 [q], the voxels of the grid in these cells.
+        changed: The space that has changed.
+        generator: Of random numbers.
     """
 
-    def __init__(self, source: Source, learners: list[VoronoiRouter], changes: Changes, seed: int) -> None:
-        self.source, self.cells, self.config, self.parts = source, changes.cells, source.config, source.parts
-        self.learners = learners
+    def __init__(
+        self,
+        source: Source,
+        before: Parts,
+        cells: Tensor,
+        learners: list[VoronoiRouter],
+        own: Tensor,
+        changed: Voxels,
+        generator: torch.Generator,
+    ) -> None:
+        self.source, self.before, self.cells, self.learners, self.own_voxels = source, before, cells, learners, own
+        self.config, self.parts, self.generator = source.config, source.parts, generator
         if len(source.parts) == 1:
             part = source.parts[0]
             self.leaves = torch.zeros_like(part.owner, dtype=torch.bool)
-            self.leaves[part.leaves] = changes.cells
+            self.leaves[part.leaves] = cells
         self.renderer = make_renderer(self.config, source.scene, {"field": source.parts}, occupancy=source.grid)
-        self.generator = torch.Generator().manual_seed(seed)
         for router in learners:
             router.requires_grad_().train()
         dense, tables = grouped_parameters(learners)
@@ -283,33 +339,28 @@ class Session:
         assert self.config.lr is not None
         given: dict[str, Any] = {"betas": (0.9, 0.99), "eps": 1e-15, "backend": self.config.backend}
         self.optimizer = Adam([group for group in groups if group["params"]], lr=self.config.lr, **given)
-        voxels = changes.voxels
-        self.contradicting = Voxels(voxels.box, near_by(voxels.chosen) > 0, voxels.contraction)
-        self.own_voxels = None if source.grid is None else voxels_of(source.grid, source.parts, changes.cells)
+        self.contradicting = replace(changed, chosen=near_by(changed.chosen) > 0)
+        self.is_fused = why_not_fused(self.renderer) is None
 
     def learns(self, positions: Tensor) -> Tensor:
         """Which positions [n, 3] lie in cells that learn."""
         if len(self.parts) == 1:  # whose region is the scene
-            leaf = self.parts[0].diagram.locate(self.own_points(positions), backend=self.parts.backend)
+            part = self.parts[0]
+            leaf = part.diagram.locate(part.contracted(part.own_points(positions)), backend=self.parts.backend)
             return self.leaves.index_select(0, leaf)
         owner = self.parts.assign(positions).long()
         return self.cells[owner.clamp(min=0)] & (owner >= 0)
 
-    def field(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
-        """What the cells that learn say of positions in them: colours [n, 3] and densities [n]."""
+    def asked(self, samples: Samples, directions: Tensor) -> list[Asked]:
+        """Which routers are asked about samples in cells that learn."""
         if len(self.parts) > 1 or len(self.learners) > 1:
-            colour, density = self.parts(positions, directions, ray_index)
-            return colour, density
-        frame, ask = self.parts[0].frame, as_field(self.learners[0])
-        if frame.is_identity:
-            return ask(self.own_points(positions), directions, ray_index)
-        colour, density = ask(self.own_points(positions), frame.inverse.directions(directions), ray_index)
-        return colour, density / frame.scale
-
-    def own_points(self, positions: Tensor) -> Tensor:
-        """Positions [n, 3] as the networks of the only part see them."""
+            return self.parts.asked(samples.positions, directions, samples.ray_index)
         part = self.parts[0]
-        return part.contracted(positions if part.frame.is_identity else part.own_points(positions))
+        points, directions = (
+            part.contracted(part.own_points(samples.positions)),
+            part.frame.inverse.directions(directions),
+        )
+        return [Asked(self.learners[0], None, points, directions, samples.ray_index, part.frame.scale)]
 
     @torch.no_grad()
     def pool(self, batches: RayBatches, count: int, *, agree: bool = False) -> Pool:
@@ -328,40 +379,57 @@ class Session:
         meets[index[own]] = True
         rays = meets.nonzero()[:, 0]
         own, samples = own[meets[index]], samples.of_rays(rays)
-        index, r = samples.ray_index.long(), len(rays)
-        rgb, density = self.parts(samples.inputs, batch.rays.directions[rays], samples.ray_index)
-        thick = density * samples.deltas  # optical depths
-        total = thick.double().cumsum(0)
-        starts = samples.ray_offsets[:-1].long()
-        until = total - thick  # up to each sample, and of the rays before
-        number = torch.arange(len(own), device=device)
+        index, r, number = samples.ray_index.long(), len(rays), torch.arange(len(own), device=device)
+        starts, ends = samples.ray_offsets[:-1].long(), samples.ray_offsets[1:].long() - 1
+        rgb, density = samples.inputs.new_zeros(len(own), 3), samples.deltas.new_zeros(len(own))
+
+        def ask(which: Tensor) -> None:
+            chosen = which.nonzero()[:, 0]
+            given = samples.inputs[chosen], batch.rays.directions[rays], samples.ray_index[chosen]
+            rgb[chosen], density[chosen] = self.before(*given)
+
         none = torch.full((r,), len(own), device=device)
         first = none.scatter_reduce(0, index[own], number[own], "amin")
-        last = torch.zeros_like(none).scatter_reduce(0, index[own], number[own], "amax")
-        taken = (1 - torch.exp(-thick))[:, None] * rgb
-        ahead, past = number < first[index], number > last[index]
+        ahead = number < first[index]
+        if agree:  # what cells that learn showed before they did says where rays of old pictures end, and nothing else
+            ask(torch.ones_like(own))
+        else:
+            ask(ahead)
+            dark = samples.deltas.new_zeros(r).index_add(0, index, density * samples.deltas)
+            ask(~own & ~ahead & (dark < -math.log(LEAST_LIGHT))[index])
+        thick = (density * samples.deltas).double()  # optical depths
+        frozen = thick.masked_fill(own, 0)
+        total = frozen.cumsum(0)
+        until = total - frozen  # up to each sample, and of the rays before
+        since = until - until[first][index]
+        hides = (number > first[index]) & (since + frozen > MOST_BETWEEN)
+        cut = none.scatter_reduce(0, index[hides], number[hides], "amin")
+        learns, hidden = own & (number < cut[index]), own & (number > cut[index])
+        last = torch.zeros_like(none).scatter_reduce(0, index[learns], number[learns], "amax")
+        taken = (-torch.expm1(-frozen)).float()[:, None] * rgb
 
         def light(rows: Tensor, since: Tensor) -> Tensor:
             share = torch.exp(since[index[rows]] - until[rows]).float()[:, None]
             return rgb.new_zeros(r, 3).index_add(0, index[rows], share * taken[rows])
 
-        before, behind = light(ahead, until[starts]), light(past, total[last])
+        before, behind = light(ahead, until[starts]), light(number > last[index], total[last])
         passes = torch.exp(until[starts] - until[first]).float()[:, None]
-        ends = samples.ray_offsets[1:].long() - 1
         if batch.background is not None:
             background = batch.background[rays] if batch.background.dim() == 2 else batch.background
             behind = behind + torch.exp(total[last] - total[ends]).float()[:, None] * background
-        between = thick.new_zeros(r).index_add(0, index[~own & ~ahead & ~past], thick[~own & ~ahead & ~past])
-        good = (passes[:, 0] > LEAST_LIGHT) & (between < MOST_BETWEEN)
+        good = passes[:, 0] > LEAST_LIGHT
+        good[index[hidden & (since < -math.log(LEAST_LIGHT))]] = False
+        depths = torch.nn.functional.pad(samples.depths, (0, 1), value=math.inf)
         if agree:
             # Up to where half of the light has gone.
-            gone = total - until[starts][index] > math.log(2)
-            stop = none.scatter_reduce(0, index[gone], number[gone], "amin")
-            far = torch.where(stop < len(own), samples.depths[stop.clamp(max=len(own) - 1)], batch.far[rays])
+            whole = thick.cumsum(0)
+            gone = whole - (whole - thick)[starts][index] > math.log(2)
+            stop = depths[none.scatter_reduce(0, index[gone], number[gone], "amin")]
+            far = torch.minimum(stop, batch.far[rays])
             good &= ~self.contradicting.meet(batch.rays[rays], batch.near[rays], far)
-        rays, before, passes, behind = rays[good], before[good], passes[good], behind[good]
-        kept = batch.rays[rays]
-        return Pool(kept, batch.near[rays], batch.far[rays], batch.target[rays], before, passes, behind)
+        rows, rays = good.nonzero()[:, 0], rays[good]
+        found = before[rows], passes[rows], behind[rows], depths[cut[rows]]
+        return Pool(batch.rays[rays], batch.near[rays], batch.far[rays], batch.target[rays], *found)
 
     def step(self, pool: Pool, number: int, done: float) -> int:
         """Moves the networks of the cells that learn; returns the rays that they have learnt from.
@@ -375,13 +443,14 @@ class Session:
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(config, done, number)
         self.revisit(number)
-        chosen = torch.randint(len(pool), (config.rays * RAYS,), generator=self.generator).to(pool.near.device)
+        chosen = torch.randint(len(pool), (config.rays,), generator=self.generator).to(pool.near.device)
         rays, near, far = pool.rays[chosen], pool.near[chosen], pool.far[chosen]
         samples = self.renderer.sampler.sample(rays, near, far, jitter=True, generator=self.generator)
-        samples = samples.part(self.learns(samples.positions))
+        shown = samples.depths < pool.end[chosen].index_select(0, samples.ray_index)
+        samples = samples.part(shown & self.learns(samples.positions))
         self.optimizer.zero_grad()
-        shown = pool.target[chosen], pool.before[chosen], pool.light[chosen], pool.behind[chosen]
-        density, weights = (self.learn_fused if self.is_fused else self.learn)(rays, far, samples, *shown)
+        seen = pool.target[chosen], pool.before[chosen], pool.light[chosen], pool.behind[chosen]
+        density, weights = (self.learn_fused if self.is_fused else self.learn)(rays, far, samples, *seen)
         self.optimizer.step()
         if config.average:
             update_averages(self.optimizer, config.average, number)
@@ -395,48 +464,38 @@ class Session:
     ) -> tuple[Tensor, Tensor]:
         """Gradients of the colours' error; density [m] and weights [m] of the samples. Arguments as of `Pool`."""
         space, backend = self.renderer.sampler.space, self.config.backend
-        seen = render_samples(self.field, rays, far, samples, space, background=behind, backend=backend)
+        seen = render_samples(self.parts, rays, far, samples, space, background=behind, backend=backend)
         colour_loss(before + light * seen.colour, target).backward()
         return seen.density.detach(), seen.weights.detach()
-
-    @property
-    def is_fused(self) -> bool:
-        """Whether networks, colours, loss and gradients are one operation, as in `voronerf.step.ray_loss.Fused`."""
-        router = self.learners[0]
-        known = getattr(type(router.module), "activate", None) is activate_radiance and router.by_table
-        return known and len(self.parts) == len(self.learners) == 1
 
     def learn_fused(
         self, rays: Rays, far: Tensor, samples: Samples, target: Tensor, before: Tensor, light: Tensor, behind: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """As :meth:`learn`, for one router with a layer table."""
-        router, frame, found = self.learners[0], self.parts[0].frame, list[RenderLoss]()
+        """As :meth:`learn`, in one operation, see `voronerf.step.ray_loss.Fused`."""
+        networks, found = Networks(self.asked(samples, rays.directions), samples), list[RenderLoss]()
         wanted, factor = (target - before) / light, light.square().index_select(0, samples.ray_index)
 
         def loss(raw: Tensor) -> tuple[Tensor, Tensor]:
             result, gradient = render_loss_gradient(
                 raw,
-                samples.deltas / frame.scale,
+                networks.deltas,
                 samples.ray_offsets,
                 wanted,
                 background=behind,
-                density_scale=density_scale(router),
+                density_scale=networks.density_scale,
                 hidden=HIDDEN,
                 backend=self.config.backend,
             )
             found.append(result)
             return result.loss, gradient * factor
 
-        directions = rays.directions if frame.is_identity else frame.inverse.directions(rays.directions)
-        network = router.table_arguments(self.own_points(samples.positions), directions, samples.ray_index)
-        assert network is not None
-        learn_outputs(network, loss, backend=self.config.backend).backward()
-        return found[0].density / frame.scale, found[0].weights
+        networks.learn(loss, backward=True, backend=self.config.backend)
+        return networks.density(found[0]), found[0].weights
 
     def revisit(self, number: int) -> None:
         """Before some steps, evaluates the field in random voxels of cells that learn."""
         grid, own = self.source.grid, self.own_voxels
-        if grid is None or own is None or number % REVISIT_EVERY or not len(own):
+        if grid is None or number % REVISIT_EVERY or not len(own):
             return
         count = math.ceil(len(own) * REVISITED)
         chosen = own[torch.randint(len(own), (count,), generator=self.generator).to(own.device)]

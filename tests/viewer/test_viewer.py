@@ -26,13 +26,15 @@ import viser
 from tab import Tab
 from websockets.exceptions import ConnectionClosed
 
-from voronerf import open_run
+from voronerf import Run, open_run
 from voronerf.cli import main
 from voronerf.cli.opening import crop_box
 from voronerf.data.record import read_scene
 from voronerf.evaluation.panels import palette
 from voronerf.rendering import CameraPath, orbit_cameras, read_camera_path, write_camera_path
+from voronerf.router import Similarity
 from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.streaming import Pages
 from voronerf.training.trainer import Trainer
 from voronerf.viewer import Subject, Training, view_run, watch
 from voronerf.viewer.cameras import scene_bounds
@@ -67,6 +69,22 @@ def test_a_camera_at_rest_sees_what_render_gives(run, scene, tab) -> None:
         tab.set("Pixels", side)
         assert apart(tab.rest(), run.render(larger(scene.test.cameras, side), index).colour) < 1.5
     assert min(len(picture) for picture in tab.pictures) < 128  # coarse ones came before
+
+
+def test_a_run_that_is_read_as_it_is_met_is_shown_as_a_whole_one(run, scene, tmp_path, monkeypatch) -> None:
+    """`view --memory` of a joined run: a tab sees what all networks in memory show."""
+    monkeypatch.setattr("voronerf.viewer.client.SHARP", 128)
+    made = []
+    monkeypatch.setattr("voronerf.run.Pages", lambda *given: made.append(Pages(*given)) or made[0])
+    whole = Run.join([run, run], tmp_path / "town", frames=[Similarity(), Similarity.of((1.0, 0, 0))])
+    bounded = open_run(tmp_path / "town", scene=scene, memory="4G")
+    assert made[0].reads == 0  # nothing before it is met
+    with closing(view_run(bounded, port=0)) as viewer, closing(Tab(viewer, scene.test.cameras)) as tab:
+        for index in (0, 1):
+            tab.look(scene.test.cameras, index)
+            shown = whole.render(larger(scene.test.cameras, 128), index).colour
+            assert apart(tab.rest(), shown) < 1.5
+    assert made[0].reads > 0
 
 
 def test_on_a_phone_the_panel_is_folded_away(viewer, scene, tab):

@@ -11,7 +11,7 @@ many of whose rays are off for no such voxel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,8 +20,9 @@ from voronerf.ops.observe_occupancy.reference import cells_of
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.renderer import Renderer
+from voronerf.step import Batch
 from voronerf.training.batches import RayBatches
-from voronerf.training.errors import Cells, see_errors
+from voronerf.training.errors import Cells, SeenErrors, see_errors
 
 #: Rays of the new pictures that are rendered.
 RAYS = 1 << 15
@@ -31,7 +32,11 @@ LEAST = 3 / 64**2
 VOXELS, STEPS = 40, 96
 #: A voxel has changed if it has so many rays, this share of them is off, and a neighbour has changed, too.
 VOXEL_RAYS, VOXEL_SHARE = 10, 0.6
-#: A cell has changed if it has so many voxels that have, and they are this share of those that enough rays pass, ...
+#: ... or if so many new and so many old rays end there or in a voxel next to it, and the mean colours that they are off
+#: by differ so much, and (squared) so many times what chance makes of it: a shadow is less than one ray may be off by.
+TONE_RAYS, TONE, TONE_CHANCE = 16, 0.05, 20.0
+#: A cell has changed if it has so many voxels that have, and they are this share of those that enough rays pass, or so
+#: many of another tone, ...
 CELL_VOXELS, CELL_SPACE = 6, 0.02
 #: ... or so many rays that meet no such voxel, and this share of them is off, where 1 in 10 is expected.
 CELL_RAYS, CELL_SHARE = 32, 0.3
@@ -54,6 +59,11 @@ class Voxels:
         points = positions if self.contraction is None else self.contraction.points(positions)
         inside = ((points >= self.box[0]) & (points <= self.box[1])).all(-1)
         return torch.where(inside, cells_of(points, self.box, self.chosen.shape).long(), -1)
+
+    def has(self, positions: Tensor) -> Tensor:
+        """Which positions [n, 3] of the world lie in chosen voxels, bool [n]."""
+        numbers = self.numbers(positions)
+        return self.chosen.reshape(-1)[numbers.clamp(min=0)] & (numbers >= 0)
 
     def centres(self) -> Tensor:
         """The middles of the chosen voxels in the world, [q, 3]."""
@@ -79,7 +89,8 @@ def along(voxels: Voxels, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
 class Changes:
     """What new pictures show."""
 
-    cells: Tensor  # bool [k], those that have changed, or are worse in the new pictures than they were in training
+    worse: Tensor  # bool [k], the cells that are worse in the new pictures than they were in training
+    rebuilt: Tensor  # bool [k], those some of whose space has changed
     voxels: Voxels  # the space that has changed
     off: float  # the share of those of the new rays that meet a cell that are off
     met: float  # the share of the new rays that meet a cell
@@ -87,7 +98,14 @@ class Changes:
 
 
 @torch.no_grad()
-def find_changes(renderer: Renderer, cells: Cells, batches: RayBatches, usual: Tensor, space: Voxels) -> Changes:
+def find_changes(
+    renderer: Renderer,
+    cells: Cells,
+    batches: RayBatches,
+    usual: Tensor,
+    space: Voxels,
+    old: RayBatches | None = None,
+) -> Changes:
     """Compares the pictures of a changed scene with what a run shows.
 
     Args:
@@ -96,6 +114,7 @@ def find_changes(renderer: Renderer, cells: Cells, batches: RayBatches, usual: T
         batches: Of the new pictures.
         usual: [k + 1], see `usual_errors`.
         space: All voxels; which are chosen does not matter.
+        old: Of the pictures that the run has learnt from; None where they are not known.
     """
     renderer.train(False)
     generator = torch.Generator(batches.device).manual_seed(1)
@@ -111,22 +130,54 @@ def find_changes(renderer: Renderer, cells: Cells, batches: RayBatches, usual: T
     passed = numbers[first].bincount(minlength=size)
     wrong = numbers[first & off[:, None]].bincount(minlength=size)
     changed = ((passed >= VOXEL_RAYS) & (wrong >= VOXEL_SHARE * passed)).reshape(space.chosen.shape)
+    toned = torch.zeros_like(changed)
+    if old is not None:
+        before = old.draw(RAYS, generator, random_background=False)
+        toned = other_tone(batch, seen, before, see_errors(renderer, cells, before), space)
     changed &= near_by(changed) > 1
+    known = (passed >= VOXEL_RAYS).reshape(changed.shape)
+    counts = [
+        own[own >= 0].bincount(minlength=cells.num_cells)
+        for chosen in (changed, known, toned)
+        for own in (cells.assign(replace(space, chosen=chosen).centres()).long(),)
+    ]
+    rebuilt = ((counts[0] >= CELL_VOXELS) & (counts[0] >= CELL_SPACE * counts[1])) | (counts[2] >= CELL_VOXELS)
+    changed |= toned
     voxels = Voxels(space.box, changed, space.contraction)
     changed = changed.reshape(-1)
     explained = (changed[numbers.clamp(min=0)] & first).any(1)
     k = cells.num_cells
     rest, bad = (seen.cell[rows].bincount(minlength=k + 1)[:k] for rows in (~explained, ~explained & off))
     shares = bad / rest.clamp(min=1)
-    found = (rest >= CELL_RAYS) & (shares > CELL_SHARE)
-    known = Voxels(space.box, (passed >= VOXEL_RAYS).reshape(voxels.chosen.shape), space.contraction)
-    counts = [
-        own[own >= 0].bincount(minlength=k) for own in (cells.assign(v.centres()).long() for v in (voxels, known))
-    ]
-    found |= (counts[0] >= CELL_VOXELS) & (counts[0] >= CELL_SPACE * counts[1])
+    worse = (rest >= CELL_RAYS) & (shares > CELL_SHARE)
     met = seen.cell < k
     differ = int((off & met).sum()) / max(int(met.sum()), 1)
-    return Changes(found, voxels, differ, float(met.float().mean()), shares)
+    return Changes(worse, rebuilt, voxels, differ, float(met.float().mean()), shares)
+
+
+def other_tone(now: Batch, seen: SeenErrors, before: Batch, usual: SeenErrors, space: Voxels) -> Tensor:
+    """Voxels in which surfaces of the new pictures have another tone than in the old ones, bool [x, y, z].
+
+    Args:
+        now: Rays of the new pictures.
+        seen: How far they are off.
+        before: Rays of the old pictures.
+        usual: How far these are off, which is what the training leaves.
+        space: All voxels.
+    """
+    means, chances, enough = [], [], torch.ones_like(space.chosen)
+    for batch, found in ((now, seen), (before, usual)):
+        numbers = space.numbers(torch.addcmul(batch.rays.origins, found.depth[:, None], batch.rays.directions))
+        ends = (numbers >= 0) & (found.depth < batch.far)
+        values = torch.cat((torch.ones_like(found.error)[:, None], found.error[:, None], found.lighter), 1)[ends]
+        sums = values.new_zeros(space.chosen.numel(), 5).index_add(0, numbers[ends], values)
+        around = torch.nn.functional.avg_pool3d(sums.T.reshape(5, *space.chosen.shape), 3, 1, 1, divisor_override=1)
+        count = around[0].clamp(min=1)
+        means.append(around[2:] / count)
+        chances.append((around[1] / count - means[-1].square().sum(0)).clamp(min=0) / count)
+        enough &= around[0] >= TONE_RAYS
+    squared = (means[0] - means[1]).square().sum(0)
+    return enough & (squared > TONE**2) & (squared > TONE_CHANCE * (chances[0] + chances[1]))
 
 
 def near_by(chosen: Tensor) -> Tensor:

@@ -39,6 +39,7 @@ class SeenErrors(NamedTuple):
     """How far rays are off."""
 
     error: Tensor  # [r], the squared error of the colour, summed over the channels
+    lighter: Tensor  # [r, 3], the colour that is rendered less that of the pixel
     cell: Tensor  # int64 [r], the cell of the heaviest sample; k for rays that see the background
     depth: Tensor  # [r], the distance of the heaviest sample; that of the far end for rays that see the background
 
@@ -59,7 +60,7 @@ def see_errors(renderer: Renderer, cells: Cells, batch: Batch) -> SeenErrors:
             background = background[rows]
         rays, near, far = batch.rays[rows], batch.near[rows], batch.far[rows]
         last = renderer.render(rays, near, far, background=background)[-1]
-        error = (last.colour - batch.target[rows]).square().sum(-1)
+        lighter = last.colour - batch.target[rows]
         offsets, weights = last.samples.ray_offsets.long(), last.weights
         # The heaviest sample of each ray: the first that has the ray's largest weight.
         index = last.samples.ray_index.long()
@@ -73,7 +74,7 @@ def see_errors(renderer: Renderer, cells: Cells, batch: Batch) -> SeenErrors:
         owner = cells.assign(last.samples.positions[chosen]).long()
         cell[solid] = torch.where(owner < 0, cells.num_cells, owner)
         depth[solid] = last.samples.depths[chosen]
-        found.append(SeenErrors(error, cell, depth))
+        found.append(SeenErrors(lighter.square().sum(-1), lighter, cell, depth))
     return SeenErrors(*(torch.cat(column) for column in zip(*found, strict=True)))
 
 
