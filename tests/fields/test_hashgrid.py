@@ -80,11 +80,12 @@ def test_settings_come_from_the_scene():
 
 def test_the_grid_grows_with_the_images():
     box = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    found = [HashGridField.scene_options(1 / pixels, box, False) for pixels in (10, 40, 80, 100, 353)]
+    found = [HashGridField.scene_options(1 / pixels, box, False, 480) for pixels in (10, 40, 80, 100, 353)]
     assert [own["finest"] for own in found] == [32, 80, 160, 200, 706]
     assert [own["log2_entries"] for own in found] == [14, 14, 15, 15, 18]
-    contracted = HashGridField.scene_options(1 / 353, box, True)
-    assert contracted == {"box": box, "finest": 353, "log2_entries": 17}
+    for seconds, entries in ((60, 17), (180, 19)):
+        contracted = HashGridField.scene_options(1 / 353, box, True, seconds)
+        assert contracted == {"box": box, "finest": 353, "log2_entries": entries}
 
 
 def test_shared_parameters_count_once():
@@ -118,7 +119,7 @@ def test_a_table_that_does_not_fit_into_memory(monkeypatch):
 
 @pytest.mark.parametrize(
     ("side", "contraction", "samples", "entries"),
-    [(100, "none", 64, 15), (20, "none", 48, 14), (20, "sphere", 128, 17)],
+    [(100, "none", 64, 15), (20, "none", 48, 14), (20, "sphere", 128, 19)],
 )
 def test_larger_images_get_more_samples_and_larger_tables(side, contraction, samples, entries):
     scene = builtin_scene(side, train_views=2, test_views=1)

@@ -17,8 +17,9 @@ from voronerf.layers import MLP, Layer
 #: be at the kink of its ReLU, and the first steps could switch off a whole layer: one seed in seven lost its colours.
 HIDDEN_BIAS = 0.3
 
-#: The logarithm of the entries of a level in contracted space.
-CONTRACTED_ENTRIES = 17
+#: The logarithm of the entries of a level in contracted space, and that of a training of at least so many seconds: a
+#: larger table takes longer to read and to learn, and shows more in the end.
+CONTRACTED_ENTRIES, LONG_ENTRIES, LONG = 17, 19, 150.0
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
@@ -116,20 +117,22 @@ class HashGridField(RadianceField):
         return 0.02
 
     @staticmethod
-    def scene_options(pixel: float, box: Box, contracted: bool) -> dict[str, Any]:
+    def scene_options(pixel: float, box: Box, contracted: bool, seconds: float) -> dict[str, Any]:
         """The grid covers the space, and has finer cells and more entries for larger images.
 
         Half a pixel is the width of the finest cells. A surface meets as many cells as the square of the resolution;
         the entries grow more slowly, since larger tables take longer to read and to learn: 2^15 for an object of 88
         pixels, 2^18 for 353. In contracted space, most of what is seen is farther away than the middle, by which a
-        pixel is measured: the finest cells are as wide as that pixel, and there are 2^17 entries.
+        pixel is measured: the finest cells are as wide as that pixel, and there are 2^17 entries, or 2^19 in a training
+        of more than two minutes.
         """
         pixels = max(high - low for low, high in zip(*box)) / pixel
         finest, entries = round((1 if contracted else 2) * pixels), round(1.5 * math.log2(pixels) + 5.3)
+        large = LONG_ENTRIES if seconds >= LONG else CONTRACTED_ENTRIES
         return {
             "box": box,
             "finest": max(finest, 32),
-            "log2_entries": CONTRACTED_ENTRIES if contracted else min(max(entries, 14), 19),
+            "log2_entries": large if contracted else min(max(entries, 14), 19),
         }
 
     def reset_parameters(self) -> None:

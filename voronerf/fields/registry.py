@@ -14,10 +14,10 @@ have these attributes, all of which are optional:
     ray_growth               the most rays of a training step, as a multiple of ``--rays``, where space is empty:
                              more than 1, the default, for a field whose samples cost little beside the rest of a step
     lr_hold                  fraction of a training for which the learning rate stays before it falls; default 0
-    scene_options(pixel, box, contracted)
+    scene_options(pixel, box, contracted, seconds)
                              static method: options from the width of a pixel at the middle of the scene and the
-                             corners of the space that the field sees, both in scene units, and whether all of space
-                             was contracted into it; for those not given
+                             corners of the space that the field sees, both in scene units, whether all of space was
+                             contracted into it, and how long the training is; for those not given
     octaves(finest)          static method: position_octaves for images that show ``finest`` octaves; default all
 
 Its options are the named parameters of its constructor. A ``forward`` with a parameter ``ray_index`` is called with

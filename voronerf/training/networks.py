@@ -40,6 +40,8 @@ SIGHTINGS = 0.003
 OCCUPANCY_RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
 #: Samples of a ray through contracted space whose empty part is skipped.
 CONTRACTED_SAMPLES = 128
+#: About what a step takes on two cores, for a training that is given in steps.
+STEP_SECONDS = 0.01
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
 SAMPLE_BYTES = 64
 
@@ -143,7 +145,9 @@ def resolve_config(config: TrainConfig, scene: Scene) -> TrainConfig:
         octaves = kind.octaves(octaves_for(scene, config.contraction))
         config = replace(config, field_options=(*config.field_options, f"position_octaves={octaves}"))
     if kind.scene_options is not None:
-        found = kind.scene_options(pixel_at_the_middle(scene, config.contraction), space_of(config, scene), contracted)
+        seconds = STEP_SECONDS * (config.steps or 0) if config.budget is None else config.budget
+        pixel, space = pixel_at_the_middle(scene, config.contraction), space_of(config, scene)
+        found = kind.scene_options(pixel, space, contracted, seconds)
         more = [f"{name}={value}" for name, value in found.items() if name not in config.network_options]
         config = replace(config, field_options=(*config.field_options, *more))
     if config.parameters is None:
