@@ -61,7 +61,6 @@ def prepare(name, backend, device):
     rest = {}
 
     def ready(tensor):
-        # Warp's camera rays have no gradients.
         return tensor.to(device).detach().requires_grad_(tensor.is_floating_point())
 
     def make(n):
