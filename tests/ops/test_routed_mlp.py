@@ -146,6 +146,11 @@ def test_output_cells_and_gradients(device, backend, name, source):
     assert out.shape == (61, case.table.out_features)
 
 
+@pytest.mark.parametrize("n", [95, 97, 2500])
+def test_any_number_of_samples(device, backend, n):
+    Case.make(n=n).check(device, backend)
+
+
 def test_directions_of_each_sample(device, backend):
     Case.make(rays=None).check(device, backend)
 
