@@ -6,7 +6,6 @@ The decorators of ``torch.compiler`` import the whole compiler of torch, which t
 from __future__ import annotations
 
 import functools
-import sys
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
@@ -23,17 +22,15 @@ def constant_result(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def not_compiled(function: Callable[P, R], reason: str) -> Callable[P, R]:
-    """``torch.compiler.disable``, applied once there is a compiler: it runs the function as it is.
+    """``torch.compiler.disable``, applied at the first call: the compiler runs the function as it is.
 
     Args:
-        function: Any.
+        function: Any that is called in this way only where torch's compiler has been imported.
         reason: What the compiler says where a graph must not break.
     """
 
     @functools.wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:
-        if not torch.compiler.is_compiling() and "torch._dynamo" not in sys.modules:
-            return function(*args, **kwargs)
         disabled = getattr(function, "_not_compiled", None)
         if disabled is None:
             disabled = torch.compiler.disable(function, reason=reason)

@@ -123,7 +123,7 @@ def test_times_are_those_of_a_step() -> None:
     router(x)
     seen.clear()
     layout = Call(router.module, "forward", Layout((300,), None, frozenset()), ["input"], (x,), {})
-    grouping = Grouping({"cells": router.diagram.locate(x)}, 300, 6, x.device, "auto")
+    grouping = Grouping(router.diagram.locate(x), 300, 6, x.device, "auto")
     times = ways.measured([Grouped(), Loop()], layout, grouping)
     assert len(times) == 2 and all(0 < time < 10 for time in times) and seen.count("backward") >= 2 * (1 + 6)
     with torch.no_grad():

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -26,66 +25,50 @@ class Grouping:
     """Entries of n samples in k cells, sorted by cell.
 
     Args:
-        where: What tells ``routed_mlp`` the cells: ``cells``, int32 [n]; a diagram's tables; nothing for one cell.
+        cells: int32 [n], the cell of each entry; None where there is one cell.
         n: Entries.
         k: Cells.
         device: Of the samples.
         backend: Of the operations.
-        locate: Gives the cells, if ``where`` is a diagram's tables.
         rows: int64 [n], the sample of each entry, any of them any number of times; None for each in turn.
+
+    Attributes:
+        offsets: int32 [k + 1]; cell c owns sorted rows ``offsets[c]`` to ``offsets[c + 1]``.
     """
 
     def __init__(
         self,
-        where: dict[str, Any],
+        cells: Tensor | None,
         n: int,
         k: int,
         device: torch.device,
         backend: str,
-        locate: Callable[[], Tensor] | None = None,
         rows: Tensor | None = None,
     ) -> None:
-        self._where = where
-        self.where, self.n, self.k, self.device, self.backend, self.rows = where, n, k, device, backend, rows
+        self.cells, self.n, self.k, self.device, self.backend, self.rows = cells, n, k, device, backend, rows
         self.start = 0  # of the cells of a part
-        self._locate = locate
+        self._order: Tensor | None = None
+        if cells is None:
+            self.offsets = torch.tensor([0, n], dtype=torch.int32, device=device)
+        else:
+            self._order, self.offsets = ops.cell_sort(cells, k, backend=backend)
 
     def anew(self) -> Grouping:
-        """The same entries, not sorted yet."""
-        return Grouping(self._where, self.n, self.k, self.device, self.backend, self._locate, self.rows)
-
-    @property
-    def cells(self) -> Tensor | None:
-        """int32 [n], the cell of each entry; None where there is one cell."""
-        if self._locate is not None and "cells" not in self.where:
-            self.where = {"cells": self._locate()}
-        return self.where.get("cells")
-
-    @functools.cached_property
-    def _sorted(self) -> tuple[Tensor | None, Tensor]:
-        cells = self.cells
-        if cells is None:
-            return None, torch.tensor([0, self.n], dtype=torch.int32, device=self.device)
-        return ops.cell_sort(cells, self.k, backend=self.backend)
-
-    @property
-    def offsets(self) -> Tensor:
-        """int32 [k + 1]; cell c owns sorted rows ``offsets[c]`` to ``offsets[c + 1]``."""
-        return self._sorted[1]
+        """The same entries, sorted again."""
+        return Grouping(self.cells, self.n, self.k, self.device, self.backend, self.rows)
 
     @functools.cached_property
     def source(self) -> Tensor | None:
         """int32 [n], the sample of each sorted row; None where they are not sorted."""
-        order = self._sorted[0]
+        order = self._order
         return order if self.rows is None or order is None else self.rows.int().index_select(0, order)
 
     @functools.cached_property
     def _inverse(self) -> Tensor:
         """int32 [n], the sorted row of each entry."""
-        order = self._sorted[0]
-        assert order is not None
-        rows = torch.arange(self.n, dtype=torch.int32, device=order.device)
-        return torch.empty_like(order).scatter_(0, order.long(), rows)
+        assert self._order is not None
+        rows = torch.arange(self.n, dtype=torch.int32, device=self.device)
+        return torch.empty_like(self._order).scatter_(0, self._order.long(), rows)
 
     @functools.cached_property
     def sorted_cells(self) -> Tensor:
@@ -101,7 +84,7 @@ class Grouping:
 
     def of_entries(self, rows: Tensor, cells: Tensor) -> Grouping:
         """Samples int64 [m] in other cells, int32 [m], than their own."""
-        return Grouping({"cells": cells}, len(rows), self.k, self.device, self.backend, rows=rows)
+        return Grouping(cells, len(rows), self.k, self.device, self.backend, rows)
 
     def parts(self, rows: int) -> list[Grouping]:
         """Sorted rows in parts of whole cells, at most ``rows`` each; a cell of more is cut into parts of its own."""
@@ -118,8 +101,8 @@ class Grouping:
             count = -(-(end - begin) // rows)
             edges = [begin + (end - begin) * i // count for i in range(count + 1)]
             for first, last in itertools.pairwise(edges):
-                part = Grouping({}, last - first, stop - start, self.device, self.backend)
-                part._sorted, part.start = (None, self.offsets[start : stop + 1].clamp(first, last) - first), start
+                part = Grouping(None, last - first, stop - start, self.device, self.backend)
+                part.offsets, part.start = self.offsets[start : stop + 1].clamp(first, last) - first, start
                 parts.append(part)
         return parts
 
@@ -142,7 +125,7 @@ class Grouping:
         return x if self.source is None else self._permute(x, back=True)
 
     def _permute(self, x: Tensor, back: bool = False) -> Tensor:
-        order = self._sorted[0]
+        order = self._order
         if x.requires_grad and torch.is_grad_enabled():
             permuted: Tensor = _Permute.apply(x, *((self._inverse, order) if back else (order, self._inverse)))
             return permuted

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, cast
 
@@ -637,9 +638,10 @@ class VoronoiRouter(nn.Module):
                 number, text = self._known.number, repr(spec)
                 found = torch.ops.voronerf.routed(number, method, text, positions, tensors, parameters)
                 return built(structure, found)
+        if torch.compiler.is_compiling() or "torch._dynamo" in sys.modules:
+            return self._route_uncompiled(method, *args, coords=coords, **kwargs)
         return self._route_as_it_is(method, *args, coords=coords, **kwargs)
 
-    @functools.partial(not_compiled, reason=_NO_GRAPH)
     def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         called = getattr(self.module, method)
         if coords is not None and "coords" in (accepted_names([called]) or ()):  # the method's own argument
@@ -652,6 +654,8 @@ class VoronoiRouter(nn.Module):
         if method in self._choices.fused:
             self._known.note(method, args, kwargs, positions.dim() - 1, result)
         return result
+
+    _route_uncompiled = not_compiled(_route_as_it_is, _NO_GRAPH)
 
     def _call(self, module: nn.Module, method: str, positions: Tensor, args: Any, kwargs: dict[str, Any]) -> Any:
         """What a method gives with the parameters of a module, the router's own or a double of it."""
@@ -687,12 +691,10 @@ class VoronoiRouter(nn.Module):
             return known.grouping
         flat, k = positions.detach().reshape(-1, 3), self.num_cells
         if flat.shape[0]:
-            nearest = functools.partial(self.diagram.locate, flat, backend=self.backend)
-            locate = None if k == 1 else functools.partial(self.assign, flat) if drawn else nearest
-            grouping = Grouping(self._where(flat, flat), flat.shape[0], k, flat.device, self.backend, locate)
+            cells = None if k == 1 else self.assign(flat)
         else:  # the module runs on placeholders, since it may not take an empty batch
-            where = {"cells": torch.zeros(2, dtype=torch.int32, device=flat.device)}
-            grouping = Grouping(where, 2, k, flat.device, self.backend)
+            cells = torch.zeros(2, dtype=torch.int32, device=flat.device)
+        grouping = Grouping(cells, flat.shape[0] or 2, k, flat.device, self.backend)
         if self.methods:
             self._assigned = Assigned(grouping, positions.detach().clone(), key, {method})
         return grouping

@@ -340,8 +340,8 @@ class Trial:
         self.n = n = rows_for(call.module, tensors_of((call.args, call.kwargs)), _TRIED)
         picked = torch.arange(n, device=device) * call.layout.n // n
         cells = (torch.arange(n, device=device) * 7 % 5 // 2).int()
-        self.entries = Grouping({"cells": cells}, n, _CELLS, device, grouping.backend, rows=picked)
-        self.entries.source, self.entries.occupied  # noqa: B018  sorted here: under a mode torch imports its compiler
+        self.entries = Grouping(cells, n, _CELLS, device, grouping.backend, rows=picked)
+        self.entries.source, self.entries.occupied  # noqa: B018  found here: under a mode torch imports its compiler
         generator = torch.Generator().manual_seed(0)
         memo: dict[int, Any] = {id(p): _made_different(p, generator) for p in cell_parameters(call.module)}
         module = clone_module(call.module, memo).to(dtype)

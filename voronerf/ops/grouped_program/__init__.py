@@ -26,6 +26,7 @@ _OP = backends.declare(
     "grouped_program",
     native=Implementation(EVERYWHERE, FLOATS),
 )
+_HALF = (torch.float16, torch.bfloat16)  # computed in float32
 
 
 def grouped_program(
@@ -79,9 +80,12 @@ def grouped_program(
         _check(inputs, parameters, offsets, program, order)
         if alike is not None and len(_PASSED) < 4096:
             _PASSED.add(alike)
-    run = backends.resolve(_OP, backend=backend, device=inputs[0].device, dtype=inputs[0].dtype)
-    results: list[Tensor] = run(inputs, parameters, offsets, program=program, order=order)
-    return results
+    dtype = inputs[0].dtype
+    run = backends.resolve(_OP, backend=backend, device=inputs[0].device, dtype=dtype)
+    if dtype in _HALF:
+        inputs, parameters = ([tensor.float() for tensor in tensors] for tensors in (inputs, parameters))
+    results: list[Tensor] = run(inputs, parameters, offsets, order, program.text)
+    return [tensor.to(dtype) for tensor in results] if dtype in _HALF else results
 
 
 _PASSED: set[Any] = set()  # what arguments that have passed the checks are like: those of a program take 60 us

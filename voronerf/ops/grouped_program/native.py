@@ -1,8 +1,7 @@
 """Programs of the compiled module. n rows, k cells, w columns of a value.
 
-The gradient of a program is a program, and runs by the same op; so do further derivatives. Tensors are cast to float32
-on the way in and back on the way out. A program with higher derivatives of a function than the compiled module has runs
-in PyTorch.
+The gradient of a program is a program, and runs by the same op; so do further derivatives. A program with higher
+derivatives of a function than the compiled module has runs in PyTorch.
 """
 
 from __future__ import annotations
@@ -28,31 +27,19 @@ _GRANULE = 16
 _FEW = 4  # outputs of a layer that has a product of its own (few_outputs_tile.h)
 
 
-def grouped_program(
-    inputs: Sequence[Tensor],
-    parameters: Sequence[Tensor],
-    offsets: Tensor,
-    *,
-    program: Program,
-    order: Tensor | None = None,
-) -> list[Tensor]:
-    """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
-    dtype = inputs[0].dtype
-    if program.orders > _ORDERS:
-        return in_torch(inputs, parameters, offsets, program=program, order=order)
-    wide = [x.to(torch.float32) for x in inputs], [p.to(torch.float32) for p in parameters]
-    found: list[Tensor] = _run(*wide, offsets, order, program.text)
-    return [tensor.to(dtype) for tensor in found]
-
-
 @custom_op("grouped_program_native")
-def _run(
+def grouped_program(
     inputs: Sequence[Tensor], parameters: Sequence[Tensor], offsets: Tensor, order: Tensor | None, text: str
 ) -> Iterator[list[Tensor]]:
+    """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
     program, n, k = Program.parse(text), inputs[0].shape[0], offsets.shape[0] - 1
     results = [inputs[0].new_empty(n, columns.width) for columns in program.outputs]
     sums = [inputs[0].new_empty(k, *shape) for shape in program.sums]
     yield [*results, *sums]
+    if program.orders > _ORDERS:
+        for made, found in zip((*results, *sums), in_torch(inputs, parameters, offsets, order, text), strict=True):
+            made.copy_(found)
+        return
     plan, machine = _plan(text), native.machine(inputs[0])
     turned = [not x.is_contiguous() and x.t().is_contiguous() for x in inputs]
     code, constants = plan.on(inputs[0].device)
@@ -99,7 +86,7 @@ def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
         which = tuple(wanted[:count]), tuple(wanted[count:]), tuple(given[:split]), tuple(given[split:])
         more = [[g.contiguous() for g in part if g is not None] for part in (arriving[:split], arriving[split:])]
         own = gradient(program, *which)
-        results = grouped_program([*rows, *more[0]], [*parameters, *more[1]], offsets, program=own, order=order)
+        results = grouped_program([*rows, *more[0]], [*parameters, *more[1]], offsets, order, own.text)
         following = iter(results)
         found = [next(following) if want else None for want in wanted]
         for i, shared in enumerate(ctx.shared, start=count):
@@ -108,7 +95,7 @@ def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
     return found[:count], found[count:], None, None, None
 
 
-_run.register_autograd(_gradients, setup_context=_keep)
+grouped_program.register_autograd(_gradients, setup_context=_keep)
 
 
 # Plans ----------------------------------------------------------------------------------------------------------------

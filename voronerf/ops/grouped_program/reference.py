@@ -16,14 +16,14 @@ def grouped_program(
     inputs: Sequence[Tensor],
     parameters: Sequence[Tensor],
     offsets: Tensor,
-    *,
-    program: Program,
-    order: Tensor | None = None,
+    order: Tensor | None,
+    text: str,
 ) -> list[Tensor]:
-    """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
+    """A program on the rows of each cell; see ``voronerf.ops.grouped_program``. ``text`` is that of a program."""
     check_offsets("grouped_program", offsets, inputs[0].shape[0])
     if order is not None:
         inputs = [x.index_select(0, order) for x in inputs]
+    program = Program.parse(text)
     run = _Run(program, inputs, parameters, offsets)
     results = [run.columns(columns) for columns in program.outputs]
     rows = torch.arange(len(inputs[0]), device=offsets.device)
