@@ -34,10 +34,26 @@ print(sorted({"torch._dynamo", "sympy"} & sys.modules.keys()))
 """
 
 
+TRAINING = """
+import sys, tempfile, pathlib, torch
+from voronerf.data import builtin_scene
+from voronerf.training.config import TrainConfig
+from voronerf.training.trainer import Trainer
+torch.set_num_threads(1)
+scene = builtin_scene(16, train_views=4, test_views=2)
+with tempfile.TemporaryDirectory() as folder:
+    for steps in (4, 8):
+        small = {"cells": (4,), "width": 8, "depth": 1, "rays": 64}
+        Trainer(TrainConfig(out=pathlib.Path(folder), steps=steps, resume=steps > 4, **small), scene).run()
+print(sorted({"torch._dynamo", "sympy"} & sys.modules.keys()))
+"""
+
+
 @pytest.mark.native
-def test_a_first_call_imports_no_compiler() -> None:
+@pytest.mark.parametrize("code", [FIRST, TRAINING], ids=["call", "training"])
+def test_neither_a_first_call_nor_a_training_imports_the_compiler(code: str) -> None:
     """It takes as long as importing torch."""
-    run = subprocess.run([sys.executable, "-c", FIRST], capture_output=True, text=True, check=False)
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (run.returncode, run.stdout, run.stderr) == (0, "[]\n", "")
 
 

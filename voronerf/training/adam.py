@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -30,6 +31,11 @@ class Adam(torch.optim.Adam):
 
     #: Whether it passes over frozen cells (`VoronoiRouter.freeze`) by itself.
     leaves_frozen = True
+
+    # The first call of torch's own imports its compiler, to keep it off them, which takes over a second.
+    add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
+    state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
+    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
 
     def __init__(
         self,
