@@ -4,6 +4,7 @@ import numpy as np
 from helpers import refuses
 
 from voronerf.data import load_scene, rich_scene
+from voronerf.data.builtin.caster import Caster
 from voronerf.data.builtin.opaque import cast
 from voronerf.data.builtin.rich import SOLIDS
 from voronerf.data.builtin.solids import Box, Cylinder, Sphere, Torus, normalised
@@ -42,6 +43,6 @@ def test_shadows_are_cast_by_the_same_solids():
     # A point in the wall's shadow: the lamp stands at (0.45, -0.55, 0.70), so shadows fall towards (-x, +y).
     targets = np.array([[-0.2, 0.3, 0.0], [0.2, -0.3, 0.0]], np.float32)
     directions = normalised(targets - origin)
-    colour, depth = cast(origin, directions, (floor, wall))
+    colour, depth = cast(origin, directions, Caster([(floor, wall)]))
     np.testing.assert_allclose(depth, np.linalg.norm(targets - origin, axis=1), atol=1e-3)
     assert colour[0, 0] < 0.8 * colour[1, 0]

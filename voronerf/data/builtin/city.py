@@ -10,16 +10,16 @@ import functools
 import math
 import os
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from voronerf.data.builtin.caster import Caster
 from voronerf.data.builtin.city_solids import city
-from voronerf.data.builtin.opaque import SUPERSAMPLES, Hits, bounds, render_views, see
-from voronerf.data.builtin.solids import Array, Rows, Solid, first_hits, rotation, slab
+from voronerf.data.builtin.opaque import SUPERSAMPLES, bounds, render_views, see
+from voronerf.data.builtin.solids import Array, rotation
 from voronerf.data.errors import SceneError
 from voronerf.data.scene import Scene, Split
 from voronerf.data.store import Make, stored
@@ -79,7 +79,7 @@ def city_scene(
     made_of = sides[0] if sides[0] == sides[1] else list(sides)
     solids = [solid for group in groups for solid in group]
     box = bounds(solids)
-    look = functools.partial(see, solids=solids, hits=block_caster(groups))
+    look = functools.partial(see, caster=Caster(groups))
 
     def views(part: str, seed: int, count: int) -> Split:
         cameras = city_cameras(size, sides, count, seed)
@@ -101,7 +101,7 @@ def city_views(cameras: Cameras, blocks: tuple[int, int]) -> Split:
     """The city from other cameras, which are square and have one focal length; in memory."""
     groups = city(blocks, None)
     solids = [solid for group in groups for solid in group]
-    look = functools.partial(see, solids=solids, hits=block_caster(groups))
+    look = functools.partial(see, caster=Caster(groups))
     return render_views(cameras, "view", look, box=bounds(solids), supersamples=SUPERSAMPLES)
 
 
@@ -158,25 +158,3 @@ def _above(random: np.random.Generator) -> tuple[Array, Array]:
     azimuth, climb, distance = random.uniform(0, 2 * np.pi), random.uniform(0.5, 1.25), random.uniform(1.5, 2.3)
     away = np.array((np.cos(climb) * np.cos(azimuth), np.cos(climb) * np.sin(azimuth), np.sin(climb)))
     return np.float32(aim + distance * away), np.float32(aim)
-
-
-def block_caster(groups: Sequence[Sequence[Solid]]) -> Hits:
-    """What finds the first solid on a ray, block by block; solids are numbered through all groups."""
-    boxes = [bounds(group) for group in groups]
-    starts = np.cumsum([0, *(len(group) for group in groups)])
-
-    def hits(origins: Array, directions: Array) -> tuple[Array, Rows]:
-        origins, directions = np.broadcast_arrays(origins, directions)
-        depth, which = np.full(len(origins), np.inf, dtype=np.float32), np.zeros(len(origins), dtype=np.int64)
-        # Near blocks first, since they hide the others.
-        nearest = [float(np.linalg.norm(box.mean(axis=0) - origins[:1])) for box in boxes] if len(origins) else []
-        for group in np.argsort(nearest):
-            middle, half = boxes[group].mean(axis=0), (boxes[group][1] - boxes[group][0]) / 2
-            enter, leave, _ = slab(origins - middle, directions, tuple(half.tolist()))
-            rows = ((leave >= np.maximum(enter, 0)) & (enter < depth)).nonzero()[0]
-            found, number = first_hits(groups[group], origins[rows], directions[rows])
-            closer = found < depth[rows]
-            depth[rows[closer]], which[rows[closer]] = found[closer], starts[group] + number[closer]
-        return depth, which
-
-    return hits

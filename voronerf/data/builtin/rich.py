@@ -10,6 +10,7 @@ import colorsys
 import functools
 import math
 
+from voronerf.data.builtin.caster import Caster
 from voronerf.data.builtin.opaque import (
     SUPERSAMPLES,
     TEST_VIEWS,
@@ -45,7 +46,9 @@ def rich_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views: i
         torch.Size([4, 4])
     """
     cameras = builtin_cameras("rich_scene", size, train_views, test_views)
-    return render_scene("builtin-rich", cameras, functools.partial(see, solids=SOLIDS), bounds(SOLIDS), SUPERSAMPLES)
+    return render_scene(
+        "builtin-rich", cameras, functools.partial(see, caster=Caster([SOLIDS])), bounds(SOLIDS), SUPERSAMPLES
+    )
 
 
 def _hue(share: float, value: float = 0.9, saturation: float = 0.7) -> tuple[float, float, float]:

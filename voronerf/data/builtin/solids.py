@@ -20,6 +20,8 @@ SURFACE = 5e-4  # a traced ray closer than this to a torus has hit it
 
 Array = NDArray[np.float32]
 Rows = NDArray[np.int64]
+Axes = tuple[Array, Array, Array]
+"""x, y and z of vectors, of shapes that broadcast."""
 
 
 # points [n, 3] and normals [n, 3] in the solid's frame -> colour [n, 3] in 0..1
@@ -47,7 +49,14 @@ def turned(vectors: Array, matrix: Array | None) -> Array:
     if matrix is None:
         return vectors
     x, y, z = vectors.T
-    return np.stack([x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3)], axis=-1)
+    return np.stack(turned_axes((x, y, z), matrix), axis=-1)
+
+
+def turned_axes(vectors: Axes, matrix: Array) -> Axes:
+    """vectors @ matrix [3, 3, ...], of which the further axes broadcast with theirs."""
+    x, y, z = vectors
+    first, second, third = (x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3))
+    return first, second, third
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +81,18 @@ class Solid(ABC):
     def extent(self) -> tuple[float, float, float]:
         """Half sides of the bounding box in the solid's own frame."""
 
+    def reach(self) -> float:
+        """Radius of a ball around the centre that holds the solid."""
+        return math.hypot(*self.extent())
+
     @abstractmethod
-    def distance(self, origins: Array, directions: Array) -> Array:
-        """Distance to the first hit in the solid's own frame, [r]."""
+    def measures(self) -> tuple[float, ...]:
+        """What `distance` takes of a solid."""
+
+    @staticmethod
+    @abstractmethod
+    def distance(origins: Axes, directions: Axes, *measures: Array) -> Array:
+        """Distance to the first hit in a solid's own frame; all arguments broadcast, for rays with a solid each."""
 
     @abstractmethod
     def normal(self, points: Array) -> Array:
@@ -90,10 +108,9 @@ class Solid(ABC):
 
     def hit(self, origins: Array, directions: Array) -> Array:
         """Distance to the first hit of rays in the world, [r]; either argument may be [1, 3] for all rays."""
-        start = turned(origins - np.array(self.centre, dtype=np.float32), self.turn)
-        along = turned(directions, self.turn)
-        shape = np.broadcast_shapes(start.shape, along.shape)
-        return self.distance(np.broadcast_to(start, shape), np.broadcast_to(along, shape))
+        (ox, oy, oz) = turned(origins - np.array(self.centre, dtype=np.float32), self.turn).T
+        (dx, dy, dz) = turned(directions, self.turn).T
+        return self.distance((ox, oy, oz), (dx, dy, dz), *np.array(self.measures(), dtype=np.float32))
 
     def surface(self, points: Array) -> tuple[Array, Array]:
         """(normals [n, 3] in the world, colours [n, 3]) of points on the surface."""
@@ -112,10 +129,17 @@ class Sphere(Solid):
     def extent(self) -> tuple[float, float, float]:  # noqa: D102 (described by Solid)
         return self.radius, self.radius, self.radius
 
-    def distance(self, origins: Array, directions: Array) -> Array:  # noqa: D102
-        (ox, oy, oz), (dx, dy, dz) = origins.T, directions.T
+    def reach(self) -> float:  # noqa: D102
+        return self.radius
+
+    def measures(self) -> tuple[float, ...]:  # noqa: D102
+        return (self.radius**2,)
+
+    @staticmethod
+    def distance(origins: Axes, directions: Axes, *measures: Array) -> Array:  # noqa: D102
+        (ox, oy, oz), (dx, dy, dz), (square,) = origins, directions, measures
         b = ox * dx + oy * dy + oz * dz
-        root = b * b - (ox * ox + oy * oy + oz * oz) + np.float32(self.radius**2)
+        root = b * b - (ox * ox + oy * oy + oz * oz) + square
         t = -b - np.sqrt(np.maximum(root, 0))
         return np.where((root >= 0) & (t > 0), t, np.float32(np.inf))
 
@@ -132,8 +156,12 @@ class Box(Solid):
     def extent(self) -> tuple[float, float, float]:  # noqa: D102 (described by Solid)
         return self.half
 
-    def distance(self, origins: Array, directions: Array) -> Array:  # noqa: D102
-        enter, _, hit = slab(origins, directions, self.half)
+    def measures(self) -> tuple[float, ...]:  # noqa: D102
+        return self.half
+
+    @staticmethod
+    def distance(origins: Axes, directions: Axes, *measures: Array) -> Array:  # noqa: D102
+        enter, _, hit = slab(origins, directions, measures)
         return np.where(hit, enter, np.float32(np.inf))
 
     def normal(self, points: Array) -> Array:  # noqa: D102
@@ -153,15 +181,19 @@ class Cylinder(Solid):
     def extent(self) -> tuple[float, float, float]:  # noqa: D102 (described by Solid)
         return self.radius, self.radius, self.half_height
 
-    def distance(self, origins: Array, directions: Array) -> Array:  # noqa: D102
+    def measures(self) -> tuple[float, ...]:  # noqa: D102
+        return self.radius**2, self.half_height
+
+    @staticmethod
+    def distance(origins: Axes, directions: Axes, *measures: Array) -> Array:  # noqa: D102
         # the ray is inside between the later of the two entries (tube, slab) and the earlier of the two exits
-        (ox, oy, oz), (dx, dy, dz) = origins.T, directions.T
+        (ox, oy, oz), (dx, dy, dz), (square, half_height) = origins, directions, measures
         a = np.maximum(dx * dx + dy * dy, np.float32(1e-12))
-        b, c = ox * dx + oy * dy, ox * ox + oy * oy - np.float32(self.radius**2)
+        b, c = ox * dx + oy * dy, ox * ox + oy * oy - square
         root = b * b - a * c
         spread = np.sqrt(np.maximum(root, 0))
         dz = np.where(np.abs(dz) < 1e-9, np.float32(1e-9), dz)
-        low, high = (-self.half_height - oz) / dz, (self.half_height - oz) / dz
+        low, high = (-half_height - oz) / dz, (half_height - oz) / dz
         enter = np.maximum((-b - spread) / a, np.minimum(low, high))
         leave = np.minimum((-b + spread) / a, np.maximum(low, high))
         return np.where((root >= 0) & (enter <= leave) & (enter > 0), enter, np.float32(np.inf))
@@ -185,19 +217,25 @@ class Torus(Solid):
     def extent(self) -> tuple[float, float, float]:  # noqa: D102 (described by Solid)
         return self.ring + self.tube, self.ring + self.tube, self.tube
 
-    def distance(self, origins: Array, directions: Array) -> Array:  # noqa: D102
-        t, leave, inside = slab(origins, directions, self.extent())
-        result = np.full_like(t, np.inf)
-        rows = inside.nonzero()[0]
-        t, leave, origins, directions = t[rows], leave[rows], origins[rows], directions[rows]
+    def measures(self) -> tuple[float, ...]:  # noqa: D102
+        return self.ring, self.tube, self.ring + self.tube
+
+    @staticmethod
+    def distance(origins: Axes, directions: Axes, *measures: Array) -> Array:  # noqa: D102
+        ring, tube, outer = measures
+        enter, leave, inside = slab(origins, directions, (outer, outer, tube))
+        result = np.full_like(enter, np.inf)
+        rows = inside.ravel().nonzero()[0]
+        given = [np.broadcast_to(each, enter.shape)[inside] for each in (*origins, *directions, ring, tube)]
+        state = np.stack((enter[inside], leave[inside], *given))
         for _ in range(TRACE_STEPS):
-            x, y, z = (origins + t[:, None] * directions).T
-            gap = np.hypot(np.hypot(x, y) - np.float32(self.ring), z) - np.float32(self.tube)
+            t, leave, ox, oy, oz, dx, dy, dz, ring, tube = state
+            gap = np.hypot(np.hypot(ox + t * dx, oy + t * dy) - ring, oz + t * dz) - tube
             arrived = gap < SURFACE
-            result[rows[arrived]] = t[arrived]
-            t = t + gap
-            on = ~arrived & (t < leave)
-            rows, t, leave, origins, directions = rows[on], t[on], leave[on], origins[on], directions[on]
+            result.ravel()[rows[arrived]] = t[arrived]
+            state[0] = t + gap
+            on = ~arrived & (state[0] < leave)
+            rows, state = rows[on], state[:, on]
         return result
 
     def normal(self, points: Array) -> Array:  # noqa: D102
@@ -206,52 +244,13 @@ class Torus(Solid):
         return normalised(np.stack((x * inward, y * inward, z), axis=-1))
 
 
-def slab(origins: Array, directions: Array, half: tuple[float, float, float]) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Where rays are inside of a box around the origin: (enter [r], leave [r], hit [r]). One behind them is missed."""
-    enter, leave = np.full(len(origins), -np.inf, np.float32), np.full(len(origins), np.inf, np.float32)
-    for o, d, side in zip(origins.T, directions.T, half):
+def slab(origins: Axes, directions: Axes, half: Sequence[float | Array]) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Where rays are inside of a box around the origin: (enter, leave, hit). One behind them is missed."""
+    lows, highs = [], []
+    for o, d, side in zip(origins, directions, half):
         d = np.where(np.abs(d) < 1e-9, np.float32(1e-9), d)
         low, high = (-side - o) / d, (side - o) / d
-        enter, leave = np.maximum(enter, np.minimum(low, high)), np.minimum(leave, np.maximum(low, high))
+        lows.append(np.minimum(low, high))
+        highs.append(np.maximum(low, high))
+    enter, leave = np.maximum(np.maximum(*lows[:2]), lows[2]), np.minimum(np.minimum(*highs[:2]), highs[2])
     return enter, leave, (leave > enter) & (enter > 0)
-
-
-def candidates(solids: Sequence[Solid], origins: Array, directions: Array) -> list[Rows]:
-    """For each solid the rows of the rays that meet its bounding ball.
-
-    Most rays pass most solids by; they are dropped here before the solids' own costlier arithmetic.
-
-    Args:
-        solids: of the scene.
-        origins: [r, 3], or [1, 3] where all rays start from the same point.
-        directions: [r, 3] unit, or [1, 3] where all rays are parallel.
-    """
-    (ox, oy, oz), (dx, dy, dz) = origins.T, directions.T
-    own, square = ox * dx + oy * dy + oz * dz, ox * ox + oy * oy + oz * oz
-    rows = []
-    for solid in solids:
-        cx, cy, cz = (np.float32(value) for value in solid.centre)
-        reach = np.float32(sum(side * side for side in solid.extent()) + 1e-3)
-        along = dx * cx + dy * cy + dz * cz - own
-        apart = square - 2 * (ox * cx + oy * cy + oz * cz) + (cx * cx + cy * cy + cz * cz)
-        rows.append(((apart - along * along <= reach) & (along >= -np.sqrt(reach))).nonzero()[0])
-    return rows
-
-
-def first_hits(solids: Sequence[Solid], origins: Array, directions: Array) -> tuple[Array, Rows]:
-    """The first solid on each ray: (distance [r], infinite for a miss; its number [r], 0 for a miss).
-
-    Arguments as of `candidates`.
-    """
-    (count,) = np.broadcast_shapes(origins.shape[:1], directions.shape[:1])
-    depth, which = np.full(count, np.inf, dtype=np.float32), np.zeros(count, dtype=np.int64)
-    for index, (solid, rows) in enumerate(zip(solids, candidates(solids, origins, directions))):
-        found = solid.hit(_rows_of(origins, rows), _rows_of(directions, rows))
-        closer = found < depth[rows]
-        depth[rows[closer]], which[rows[closer]] = found[closer], index
-    return depth, which
-
-
-def _rows_of(vectors: Array, rows: Rows) -> Array:
-    """Rows of vectors [r, 3]; vectors [1, 3] stand for every row and are returned whole."""
-    return vectors if len(vectors) == 1 else vectors[rows]
