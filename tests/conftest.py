@@ -35,6 +35,7 @@ from voronerf import backends
 torch.cpu._is_amx_tile_supported = lambda: False
 
 PARTS = ("native", "cuda", "warp")
+NO_CUDA = backends.missing("reference", torch.device("cuda")) is not None
 
 pytest_plugins = ("pytester",)
 
@@ -69,6 +70,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     names = backends.BACKENDS if mark is None else backends.implemented(mark.args[0])
     if wants_device:
         pairs = [(backend, device) for device in devices for backend in names]
+        if NO_CUDA:  # one row stays to say so
+            pairs = pairs[: len(names) + 1]
         metafunc.parametrize(("backend", "device"), pairs, indirect=["device"], ids=["-".join(pair) for pair in pairs])
     else:
         metafunc.parametrize("backend", names)

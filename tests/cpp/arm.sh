@@ -4,7 +4,7 @@
 set -euo pipefail
 build=$(mktemp -d)
 trap 'rm -rf "$build"' EXIT
-CXX=${CXX:-aarch64-linux-gnu-g++} "$(dirname "$0")/build.sh" "$build" -O2 -DVN_STD_THREADS -pthread -static
+CXX=${CXX:-aarch64-linux-gnu-g++} "$(dirname "$0")/build.sh" "$build" -O1 -DVN_STD_THREADS -pthread -static
 for test in ops networks; do
   echo -n "$test, aarch64: "
   qemu-aarch64 "$build/$test" "${1:-12}"

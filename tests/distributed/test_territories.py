@@ -48,9 +48,14 @@ def line(count=2):
     return Territories(centres, boxes, torch.zeros(0), torch.zeros(0))
 
 
+@pytest.fixture(scope="module")
+def city():
+    return city_scene(2, blocks=(2, 3), train_views=6, test_views=2)
+
+
 @pytest.mark.parametrize("count", [1, 2, 5, 8])
-def test_the_views_of_a_city_are_shared_out(count):
-    scene = city_scene(8, blocks=(2, 3), train_views=6, test_views=2)
+def test_the_views_of_a_city_are_shared_out(city, count):
+    scene = city
     found = cut_space(scene, count, None)
     sizes = torch.bincount(found.train, minlength=count)
     assert len(found) == count and int(sizes.max()) - int(sizes.min()) <= 1

@@ -140,11 +140,11 @@ def test_territories_move_and_ranks_change(tmp_path):
 
 
 def test_eight_ranks_are_one_process_to_the_bit(tmp_path):
-    """Fifty steps with two splits; two territories change places."""
-    given = {"territories": 8, "steps": 50, "cells": (2, 2), "split_at_steps": (12, 33)}
+    """Two splits; two territories change places between them."""
+    given = {"territories": 8, "steps": 24, "cells": (2, 2), "split_at_steps": (8, 18)}
     one, eight = (settings(tmp_path / name, "hashgrid", **given) for name in ("one", "eight"))
     JointTrainer(one, scene()).run()
-    moves = {25: ([0, 5], [5, 1, 2, 3, 4, 0, 6, 7])}
+    moves = {13: ([0, 5], [5, 1, 2, 3, 4, 0, 6, 7])}
     assert on_ranks(train, tmp_path, {"eight": eight}, None, moves, folder=tmp_path, size=8)[0] == [0] * 8
     assert_same(joint_tensors(one.out), joint_tensors(eight.out))
     assert json.loads((tmp_path / "eight-5.json").read_text())["own"] == [0]

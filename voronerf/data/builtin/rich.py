@@ -41,7 +41,7 @@ def rich_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views: i
 
     Examples:
         >>> from voronerf.data import rich_scene
-        >>> scene = rich_scene(4)
+        >>> scene = rich_scene(4, train_views=3, test_views=1)
         >>> scene.train.images.shape[1:3]
         torch.Size([4, 4])
     """
