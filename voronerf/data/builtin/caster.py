@@ -53,7 +53,8 @@ class Caster:
 
         Args:
             origins: [r, 3], or [1, 3] where all rays start from the same point.
-            directions: [r, 3] unit, or [1, 3] where all rays are parallel.
+            directions: [r, 3] unit, or [1, 3] where all rays are parallel. If there are r of both, rays that lie
+                together should come one after another.
 
         Returns:
             (distance [r], infinite for a miss; number of the solid [r], 0 for a miss).
@@ -62,7 +63,7 @@ class Caster:
         depth, which = np.full(count, np.inf, dtype=np.float32), np.zeros(count, dtype=np.int64)
         if count == 0:
             return depth, which
-        order = _bundles(directions if len(directions) > 1 else origins, count)
+        order = _bundles(directions if len(directions) > 1 else origins, count, len(origins) > 1 < len(directions))
         start, along = (v.T[:, order] if len(v) > 1 else v.T[..., None] for v in (origins, directions))  # [3, b, 64]
         near, number = np.full(order.shape, np.inf, dtype=np.float32), np.zeros(order.shape, dtype=np.int32)
         bundle, solid = self._pairs(start, along, len(order))
@@ -125,13 +126,13 @@ def _around(balls: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.append(middle, (np.linalg.norm(balls[:3] - middle[:, None], axis=0) + balls[3]).max())
 
 
-def _bundles(vectors: Array, count: int) -> Rows:
+def _bundles(vectors: Array, count: int, ordered: bool) -> Rows:
     """Numbers of rays of which the vectors [r, 3] lie together, [b, BUNDLE]; the last ray fills up its bundle.
 
-    They are sorted into the squares of a grid across the direction in which the vectors differ least.
+    They are sorted into the squares of a grid across the direction in which the vectors differ least, or ``ordered``.
     """
     order = np.arange(count)
-    if len(vectors) > 1:
+    if len(vectors) > 1 and not ordered:
         side = max(1, min(int((count / BUNDLE) ** 0.5), 255))
         key = np.zeros(count, dtype=np.uint16)
         columns = np.ascontiguousarray(vectors.T)

@@ -31,7 +31,7 @@ SUPERSAMPLES = 3  # on each side of a pixel
 LIGHT = normalised(np.array(((0.45, -0.55, 0.70),), dtype=np.float32))
 AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.46, 0.64, 0.50
 BAND = 1 << 16  # rays at a time, so that their arrays stay in the cache
-# from an origin [1, 3] and unit directions [r, 3] to premultiplied colour and opacity, [r, 4]
+# from origins [r, 3], or one [1, 3], and unit directions [r, 3] to premultiplied colour and opacity, [r, 4]
 See = Callable[[Array, Array], Array]
 # from a shape [c, h, w, 4] and a function that makes image i to the images
 Keep = Callable[[tuple[int, int, int, int], Callable[[int], NDArray[np.uint8]]], Tensor]
@@ -89,11 +89,11 @@ def bounds(solids: Sequence[Solid] = SOLIDS) -> Array:
     return np.stack((boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)))
 
 
-def cast(origin: Array, directions: Array, caster: Caster | None = None) -> tuple[Array, Array]:
-    """First hits of rays from one point, and their light.
+def cast(origins: Array, directions: Array, caster: Caster | None = None) -> tuple[Array, Array]:
+    """First hits of rays, and their light.
 
     Args:
-        origin: [1, 3].
+        origins: [r, 3], or [1, 3] where all rays start from the same point.
         directions: [r, 3], unit.
         caster: of the solids that there are; default: of those of the scene.
 
@@ -101,11 +101,11 @@ def cast(origin: Array, directions: Array, caster: Caster | None = None) -> tupl
         (colour [r, 3] in 0..1, zero where nothing is hit; depth [r], infinite there).
     """
     caster = caster or CASTER
-    depth, which = caster(origin, directions)
+    depth, which = caster(origins, directions)
     rows = np.isfinite(depth).nonzero()[0]
     rows = rows[np.argsort(which[rows], kind="stable")]  # those of a solid lie together
     seen_along = directions[rows]
-    points = origin + depth[rows, None] * seen_along
+    points = (origins if len(origins) == 1 else origins[rows]) + depth[rows, None] * seen_along
     normals, albedo = np.zeros_like(points), np.zeros_like(points)
     gloss, sharpness = np.zeros(len(rows), dtype=np.float32), np.ones(len(rows), dtype=np.float32)
     numbers, starts = np.unique(which[rows], return_index=True)
@@ -147,58 +147,71 @@ def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
     return Cameras(poses, torch.tensor((focal, focal, size / 2, size / 2)).repeat(len(poses), 1), size, size)
 
 
-def see(origin: Array, directions: Array, caster: Caster | None = None) -> Array:
-    """First hits of rays from one point as premultiplied colour and coverage, [r, 4]; arguments as of `cast`."""
-    colour, depth = cast(origin, directions, caster)
+def see(origins: Array, directions: Array, caster: Caster | None = None) -> Array:
+    """First hits of rays as premultiplied colour and coverage, [r, 4]; arguments as of `cast`."""
+    colour, depth = cast(origins, directions, caster)
     return np.concatenate((colour, np.isfinite(depth)[:, None]), axis=-1, dtype=np.float32)
 
 
 def render_views(
     cameras: Cameras, name: str, see: See, *, box: Array, supersamples: int, keep: Keep | None = None
 ) -> Split:
-    """All images, a view a thread, each with an alpha channel.
+    """All images, on all cores, each with an alpha channel.
 
     Args:
         cameras: their poses, all with one focal length and the principal point in the middle.
         name: of the split, which its images are named after.
-        see: from an origin [1, 3] and unit directions [r, 3] to premultiplied colour and opacity [r, 4] in 0..1.
+        see: as `see`, premultiplied colour and opacity in 0..1.
         box: [2, 3] that holds everything; ``see`` gets the rays that meet it.
         supersamples: rays on each side of a pixel, which is their average.
         keep: gives the images [c, h, w, 4] of a function that makes one; default: all are made now.
     """
 
-    def make(index: int) -> NDArray[np.uint8]:
-        return _image(cameras, index, see, box, supersamples)
+    def make(indices: Sequence[int]) -> NDArray[np.uint8]:
+        return _images(cameras, indices, see, box, supersamples)
 
-    if keep is None:
+    count = len(cameras)
+    if keep is None:  # small views several at a time, since NumPy's calls take longer than a few rays
+        several = max(1, BAND // (cameras.height * cameras.width * supersamples**2))
+        several = min(several, -(-count // (os.cpu_count() or 1)))
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            images = torch.from_numpy(np.stack(list(pool.map(make, range(len(cameras))))))
+            made = pool.map(make, [range(i, min(i + several, count)) for i in range(0, count, several)])
+            images = torch.from_numpy(np.concatenate(list(made)))
     else:
-        images = keep((len(cameras), cameras.height, cameras.width, 4), make)
+        images = keep((count, cameras.height, cameras.width, 4), lambda index: make([index])[0])
     names = tuple(f"{name}_{index:03d}" for index in range(len(cameras)))
     return Split(cameras, images, names)
 
 
-def _image(cameras: Cameras, index: int, see: See, box: Array, fine: int) -> NDArray[np.uint8]:
-    """One image: fine^2 rays a pixel, a band of rows at a time; averages premultiplied colour and opacity."""
+def _images(cameras: Cameras, indices: Sequence[int], see: See, box: Array, fine: int) -> NDArray[np.uint8]:
+    """Some images: fine^2 rays a pixel, a band of rows at a time; averages premultiplied colour and opacity."""
+    size = cameras.width
+    middle, half = (box[0] + box[1]) / 2, ((box[1] - box[0]) / 2).tolist()
+    images = np.zeros((len(indices), size, size, 4), dtype=np.uint8)
+    band = max(1, BAND // (size * fine * fine))
+    for first in range(0, size, band):
+        parts = [_directions(cameras, index, fine, slice(first * fine, (first + band) * fine)) for index in indices]
+        directions = np.concatenate(parts)
+        origins: Array = cameras.poses[list(indices), :3, 3].numpy()
+        if len(indices) > 1:
+            origins = np.repeat(origins, len(parts[0]), axis=0)
+        enter, leave, _ = slab(tuple((origins - middle).T), tuple(directions.T), half)
+        inside = (leave > np.maximum(enter, 0)).nonzero()[0]  # the camera may be in the box
+        rgba = np.zeros((len(directions), 4), dtype=np.float32)
+        rgba[inside] = see(origins if len(origins) == 1 else origins[inside], directions[inside])
+        pixels = rgba.reshape(-1, fine, size, fine, 4).mean(axis=(1, 3))
+        pixels[..., :3] /= np.maximum(pixels[..., 3:], np.float32(1e-6))
+        shown = np.rint(pixels * 255).clip(0, 255).astype(np.uint8)
+        images[:, first : first + band] = shown.reshape(len(indices), -1, size, 4)
+    return images
+
+
+def _directions(cameras: Cameras, index: int, fine: int, rows: slice) -> Array:
+    """The rays of some rows of an image, row by row, [r, 3]."""
     size = cameras.width
     pose: Array = cameras.poses[index].numpy()
     focal = float(cameras.intrinsics[index, 0])
     steps = ((np.arange(size * fine, dtype=np.float32) + np.float32(0.5)) / fine - size / 2) / np.float32(focal)
-    middle, half = (box[0] + box[1]) / 2, ((box[1] - box[0]) / 2).tolist()
-    image = np.zeros((size, size, 4), dtype=np.uint8)
-    band = max(1, BAND // (size * fine * fine))
-    for first in range(0, size, band):
-        rows = steps[first * fine : (first + band) * fine]
-        u, v = np.meshgrid(steps, rows)
-        local = np.stack((u.ravel(), -v.ravel(), np.full(u.size, -1, dtype=np.float32)), axis=-1)
-        directions = normalised(turned(local, pose[:3, :3].T))
-        origin = pose[None, :3, 3]
-        enter, leave, _ = slab(tuple((origin - middle).T), tuple(directions.T), half)
-        inside = (leave > np.maximum(enter, 0)).nonzero()[0]  # the camera may be in the box
-        rgba = np.zeros((u.size, 4), dtype=np.float32)
-        rgba[inside] = see(origin, directions[inside])
-        pixels = rgba.reshape(len(rows) // fine, fine, size, fine, 4).mean(axis=(1, 3))
-        pixels[..., :3] /= np.maximum(pixels[..., 3:], np.float32(1e-6))
-        image[first : first + band] = np.rint(pixels * 255).clip(0, 255).astype(np.uint8)
-    return image
+    u, v = np.meshgrid(steps, steps[rows])
+    local = np.stack((u.ravel(), -v.ravel(), np.full(u.size, -1, dtype=np.float32)), axis=-1)
+    return normalised(turned(local, pose[:3, :3].T))
