@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import math
 import os
 import stat
+import sys
 import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +48,33 @@ def rename(old: Path, new: Path) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+@contextlib.contextmanager
+def locked(folder: Path, busy: Callable[[], None]) -> Iterator[None]:
+    """Locks a folder against other processes; without effect on Windows, and on file systems without locks.
+
+    Args:
+        folder: Which is there.
+        busy: Called where another process holds the lock, which is waited for unless this raises an error.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            busy()
+            fcntl.flock(number, fcntl.LOCK_EX)
+        except OSError:
+            pass  # no locks here
+        yield
+    finally:
+        os.close(number)
 
 
 def leads_outside(path: Path, folder: Path) -> bool:

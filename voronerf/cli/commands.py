@@ -205,7 +205,8 @@ def _train_and_draw(
     config: TrainConfig, out: Path, scene: Scene, watch: Watch | None, group: Group | None, quiet: bool
 ) -> dict[str, Any]:
     with contextlib.ExitStack() as stack:
-        with TrainingDisplay(console, scene.name, quiet=quiet) as display:
+        display = TrainingDisplay(console, scene.name, quiet=quiet)
+        with display.progress:
             for note in scene.notes:
                 display.on_event(f"{scene.name}: {note}")
             told: dict[str, Any] = {"on_step": display.on_step, "on_event": display.on_event}
@@ -466,7 +467,8 @@ def process(
         verbose: Show what COLMAP says.
     """
     check_counts(frames=frames, max_features=max_features)
-    with StageDisplay(console) as display:
+    display = StageDisplay(console)
+    with display.progress:
         make_scene(
             source,
             out,

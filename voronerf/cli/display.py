@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import TracebackType
 
 from rich.console import Console
 from rich.markup import escape
@@ -46,6 +45,8 @@ class _Rate(ProgressColumn):
 class TrainingDisplay:
     """Shows step, stage, rays/s, loss, PSNR and the time left; the trainer's callbacks are its two methods.
 
+    Its ``progress`` is the live line, which shows while it is entered.
+
     Args:
         console: Where to write; its own detection of a terminal decides between a live line and plain ones.
         label: Name of the run.
@@ -73,15 +74,6 @@ class TrainingDisplay:
         )
         self.loss = math.nan  # until the first is read
 
-    def __enter__(self) -> TrainingDisplay:
-        self.progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.progress.stop()
-
     def on_step(self, now: TrainingProgress) -> None:
         """Shows the state after a step; the loss is smoothed over about twenty steps."""
         self.loss = now.loss if math.isnan(self.loss) else 0.95 * self.loss + 0.05 * now.loss
@@ -105,6 +97,8 @@ class TrainingDisplay:
 class StageDisplay:
     """Shows the stages of a long command: a bar for each on a terminal, with the time left; plain lines elsewhere.
 
+    Its ``progress`` are the bars, which show while it is entered.
+
     Args:
         console: Where to write.
     """
@@ -122,15 +116,6 @@ class StageDisplay:
             refresh_per_second=4,
         )
         self.tasks: dict[str, TaskID] = {}
-
-    def __enter__(self) -> StageDisplay:
-        self.progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.progress.stop()
 
     def show(self, stage: str, done: int, total: int) -> None:
         """Shows how much of a stage is done; a total of 0 is not known."""

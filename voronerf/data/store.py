@@ -10,18 +10,16 @@ c images of h x w pixels.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import hashlib
 import logging
 import mmap
 import os
-import sys
 import time
 import warnings
 import weakref
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -32,7 +30,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from voronerf.data.errors import SceneError
-from voronerf.files import cache_folder, json_text, private_folder, read_json, write_text
+from voronerf.files import cache_folder, json_text, locked, private_folder, read_json, write_text
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +70,9 @@ def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int]
     wanted = {"version": VERSION, "shape": list(shape), "made_of": _digest(made_of)}
     try:
         private_folder(folder.parent)
-        with _locked(private_folder(folder)):
+        private_folder(folder)
+        waits = "%s: another process makes these images, this one waits for it"
+        with locked(folder, lambda: log.warning(waits, folder)):
             sums = _recorded(folder, wanted, shape[0])
             # who has mapped a file that holds other images keeps it
             if not sums:
@@ -173,26 +173,6 @@ def _write(file: int, data: memoryview, place: int) -> None:
     os.lseek(file, place, os.SEEK_SET)
     while data:
         data = data[os.write(file, data) :]
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Waits for another process that builds the store."""
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
-
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            log.warning("%s: another process makes these images, this one waits for it", folder)
-            fcntl.flock(number, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(number)
 
 
 def _digest(value: Any) -> str:

@@ -6,14 +6,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from voronerf.fields.radiance import reset_layers, run_network
+from voronerf.fields.radiance import RadianceField, reset_layers
 from voronerf.layers import MLP, Layer
 
 
-class DensityField(nn.Module):
+class DensityField(RadianceField):
     """ReLU layers and a density, without colour: a proposal network (Barron et al. 2022, "Mip-NeRF 360", section 3).
 
-    Density is a scaled softplus, as that of :class:`voronerf.fields.NeRF`.
+    Its colour is black, and it takes no view directions. Density is a scaled softplus, as that of
+    :class:`voronerf.fields.NeRF`.
 
     Args:
         width: Channels of the hidden layers, at least 1.
@@ -32,6 +33,8 @@ class DensityField(nn.Module):
         >>> density.shape
         torch.Size([10])
     """
+
+    view_directions = False
 
     def __init__(
         self,
@@ -68,18 +71,3 @@ class DensityField(nn.Module):
         """Raw [n, 1] to (black [n, 3], density [n] >= 0 per scene unit), float32 or wider."""
         raw = raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw
         return raw.new_zeros(raw.shape[0], 3), F.softplus(raw.squeeze(-1)) * self.density_scale
-
-    def forward(
-        self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Evaluates the field.
-
-        Args:
-            positions: [n, 3] in scene units, or Gaussians [n, 6] for the integrated encoding.
-            directions: [n, 3] or [r, 3], ignored; accepted because renderers pass them.
-            ray_index: int32 [n], ignored.
-
-        Returns:
-            (black [n, 3], density [n] per scene unit).
-        """
-        return self.activate(run_network(self.layers, self.linears(), positions))

@@ -126,9 +126,7 @@ def _routed(
 
 
 @_routed.register_fake
-def _(
-    number: int, method: str, spec: str, positions: Tensor, tensors: list[Tensor], parameters: list[Tensor]
-) -> list[Tensor]:
+def _(number: int, method: str, spec: str, positions: Tensor, *tensors: list[Tensor]) -> list[Tensor]:
     shapes = _ROUTERS[number]._known.calls[method, ast.literal_eval(spec)][1]
     return [positions.new_empty((*positions.shape[:-1], *features), dtype=dtype) for features, dtype in shapes]
 
@@ -154,17 +152,11 @@ def _routed_backward(
     return [torch.zeros_like(leaf) if g is None else g.clone() for g, leaf in zip(given, leaves, strict=True)]
 
 
-@_routed_backward.register_fake
-def _(
-    number: int,
-    method: str,
-    spec: str,
-    positions: Tensor,
-    tensors: list[Tensor],
-    parameters: list[Tensor],
-    gradients: list[Tensor],
-) -> list[Tensor]:
-    return [torch.empty_like(t) for t in (*tensors, *parameters)]
+_routed_backward.register_fake(
+    lambda number, method, spec, positions, tensors, parameters, gradients: [
+        torch.empty_like(t) for t in (*tensors, *parameters)
+    ]
+)
 
 
 @contextlib.contextmanager

@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import shlex
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 from voronerf.data import Scene, is_builtin
 from voronerf.evaluation.lpips import OFF
 from voronerf.evaluation.plots import plot_curves
-from voronerf.files import leads_outside, read_json, read_json_lines, remove_partial
+from voronerf.files import leads_outside, locked, read_json, read_json_lines, remove_partial
 from voronerf.training.checkpoint import checkpoint_paths
 from voronerf.training.config import ConfigError, TrainConfig
 
@@ -97,19 +96,11 @@ def held(folder: Path) -> Iterator[None]:
     """
     check_folders(folder)
     made = _made(folder)
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
 
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(f"--out must not be in use by another run, got {folder}") from None
-        except OSError:
-            pass  # no locks here
+    def refuse() -> None:
+        raise ConfigError(f"--out must not be in use by another run, got {folder}")
+
+    with locked(folder, refuse):
         remove_partial(folder)
         try:
             yield
@@ -117,8 +108,6 @@ def held(folder: Path) -> Iterator[None]:
             with contextlib.suppress(OSError):
                 if made:
                     folder.rmdir()  # fails if something was written, and is then not needed
-    finally:
-        os.close(number)
 
 
 def stored_config(run: Path) -> TrainConfig | None:
