@@ -83,10 +83,7 @@ def milliseconds(value: float) -> str:
 
 def markdown(rows: list[Row]) -> list[str]:
     """The table of some rows, native backend."""
-    found = [
-        "| | dtype | | ms | of the limit | best alternative | ms | x |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    found = ["| | dtype | | ms | of the limit | best alternative | ms | x |", "|---|---|---|---|---|---|---|---|"]
     for row in rows:
         other = best(row)
         percent = row["percent_of_peak"]

@@ -16,10 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def _keys_kernel(
-    cells: wp.array(dtype=wp.int32),
-    k: wp.int32,
-    keys: wp.array(dtype=wp.int32),
-    order: wp.array(dtype=wp.int32),
+    cells: wp.array(dtype=wp.int32), k: wp.int32, keys: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32)
 ) -> None:
     i = wp.tid()
     # Cells out of range (possible where values are not read) go before cell 0, whose key is 1, or behind the last.

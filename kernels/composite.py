@@ -94,10 +94,7 @@ def _bound(given: Samples, ray: wp.int32) -> wp.int32:
 
 
 @wp.kernel
-def _composite_kernel(
-    given: Samples,
-    found: Results,
-) -> None:
+def _composite_kernel(given: Samples, found: Results) -> None:
     ray = wp.tid()
     begin = _bound(given, ray)
     end = _bound(given, ray + 1)
@@ -124,11 +121,7 @@ def _composite_kernel(
 
 
 @wp.kernel
-def _composite_backward_kernel(
-    arriving: Results,
-    given: Samples,
-    found: Gradients,
-) -> None:
+def _composite_backward_kernel(arriving: Results, given: Samples, found: Gradients) -> None:
     ray = wp.tid()
     begin = _bound(given, ray)
     end = _bound(given, ray + 1)

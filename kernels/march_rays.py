@@ -153,12 +153,7 @@ class Samples:
 
 
 @wp.kernel
-def _march_kernel(
-    given: Given,
-    counting: wp.bool,
-    offsets: wp.array(dtype=wp.int32),
-    out: Samples,
-) -> None:
+def _march_kernel(given: Given, counting: wp.bool, offsets: wp.array(dtype=wp.int32), out: Samples) -> None:
     ray = wp.tid()
     origin = wp.vec3(given.origins[ray, 0], given.origins[ray, 1], given.origins[ray, 2])
     direction = wp.vec3(given.directions[ray, 0], given.directions[ray, 1], given.directions[ray, 2])

@@ -21,9 +21,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.kernel
 def _nearest_centre_kernel(
-    points: wp.array2d(dtype=Any),
-    centres: wp.array2d(dtype=Any),
-    cells: wp.array(dtype=wp.int32),
+    points: wp.array2d(dtype=Any), centres: wp.array2d(dtype=Any), cells: wp.array(dtype=wp.int32)
 ) -> None:
     i = wp.tid()
     x = wp.float64(points[i, 0])

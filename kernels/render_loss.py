@@ -65,10 +65,7 @@ class Found:
 
 
 @wp.kernel
-def _render_loss_kernel(
-    given: Inputs,
-    found: Found,
-) -> None:
+def _render_loss_kernel(given: Inputs, found: Found) -> None:
     ray = wp.tid()
     begin = wp.clamp(given.offsets[ray], 0, given.raw.shape[0])
     end = wp.clamp(given.offsets[ray + 1], 0, given.raw.shape[0])

@@ -180,12 +180,7 @@ class Builder:
         return Program(tuple(self.inputs), tuple(self.parameters), tuple(self.steps), tuple(outputs), tuple(self.sums))
 
     def emit(
-        self,
-        op: str,
-        width: int,
-        operands: Sequence[Columns] = (),
-        numbers: Sequence[float] = (),
-        name: str = "",
+        self, op: str, width: int, operands: Sequence[Columns] = (), numbers: Sequence[float] = (), name: str = ""
     ) -> Columns:
         """Adds a step and gives the columns of its value."""
         key = Step(op, 0, width, tuple(operands), tuple(numbers), name)

@@ -7,23 +7,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-FLOOR = {
-    torch.float64: 1e-14,
-    torch.float32: 2e-6,
-    torch.float16: 2.0**-11,
-    torch.bfloat16: 2.0**-8,
-}
+FLOOR = {torch.float64: 1e-14, torch.float32: 2e-6, torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
 """Rounding that a result may have on top of twice the error of plain PyTorch, relative to its largest magnitude.
 
 bfloat16 has half of a unit in the last place, 2^-9, for the result and the same for one intermediate.
 """
 
-AGREE = {
-    torch.float64: 1e-7,
-    torch.float32: 1e-3,
-    torch.float16: 5e-2,
-    torch.bfloat16: 1e-1,
-}
+AGREE = {torch.float64: 1e-7, torch.float32: 1e-3, torch.float16: 5e-2, torch.bfloat16: 1e-1}
 """How far two ways to run a network of some ten layers may differ, relative to the largest magnitude of the result."""
 
 

@@ -188,9 +188,7 @@ def network_work(n: int, direction: str, device: torch.device) -> Work:
         moved = 2 * moved + n * 4.0 * 2 * grid.out_features
     return Work(
         lambda backend: Contender(functools.partial(results, network=fused(backend))),
-        {
-            "native, encoded before": lambda: Contender(functools.partial(results, network=separate)),
-        },
+        {"native, encoded before": lambda: Contender(functools.partial(results, network=separate))},
         error,
         3e-2,  # a ReLU within rounding of its kink may go either way
         operations,

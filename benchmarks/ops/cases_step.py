@@ -251,9 +251,7 @@ def adam_work(entries: int, touched: float, device: torch.device) -> Work:
     exact = [x.clone() for x in ours("reference").run(0)]
     return Work(
         ours,
-        {
-            "torch.optim.Adam, fused": torchs,
-        },
+        {"torch.optim.Adam, fused": torchs},
         _worst(exact),
         1e-5,
         # the gradient is read; of the entries that have one, parameter and two moments are read and written

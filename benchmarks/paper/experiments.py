@@ -220,9 +220,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         published=_kilo_published,
     ),
     "initialisation": Experiment(
-        "figure",
-        "New cells start as copies of their parent, or from random parameters.",
-        _INITIALISED,
+        "figure", "New cells start as copies of their parent, or from random parameters.", _INITIALISED
     ),
     "ghosting": Experiment(
         "figure",

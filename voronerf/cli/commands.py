@@ -42,13 +42,7 @@ from voronerf.training.config_checks import check_device, check_joint, why_no_oc
 from voronerf.training.joint import JointTrainer
 from voronerf.training.networks import resolve_config
 from voronerf.training.progress import Progress
-from voronerf.training.run_directory import (
-    check_stored_paths,
-    choose_directory,
-    held,
-    is_outside,
-    write_curve,
-)
+from voronerf.training.run_directory import check_stored_paths, choose_directory, held, is_outside, write_curve
 from voronerf.training.trainer import Trainer
 
 console = Console(soft_wrap=True)
@@ -178,12 +172,7 @@ def _draw_joint(config: TrainConfig, scene: Scene) -> None:
 
 
 def run_training(
-    config: TrainConfig,
-    scene: Scene,
-    *,
-    watch: Watch | None = None,
-    group: Group | None = None,
-    quiet: bool = False,
+    config: TrainConfig, scene: Scene, *, watch: Watch | None = None, group: Group | None = None, quiet: bool = False
 ) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
 

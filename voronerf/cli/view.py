@@ -10,13 +10,7 @@ from voronerf.cli.opening import AS_IN_TRAINING, Opening
 from voronerf.data.record import read_scene
 
 
-def view(
-    run: Path,
-    /,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    opening: Opening = AS_IN_TRAINING,
-) -> int:
+def view(run: Path, /, host: str = "127.0.0.1", port: int = 8080, opening: Opening = AS_IN_TRAINING) -> int:
     """Look at a trained run in a browser, until Ctrl-C.
 
     Args:

@@ -21,15 +21,7 @@ from voronerf.data.record3d import find_record3d, load_record3d
 from voronerf.data.scene import KINDS, Scene, Split
 from voronerf.data.transforms import load_transforms
 
-__all__ = [
-    "Scene",
-    "SceneError",
-    "Split",
-    "builtin_scene",
-    "city_scene",
-    "load_scene",
-    "rich_scene",
-]
+__all__ = ["Scene", "SceneError", "Split", "builtin_scene", "city_scene", "load_scene", "rich_scene"]
 
 BUILTIN_SIZE = 100
 BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene}

@@ -16,15 +16,7 @@ from voronerf.data.errors import SceneError
 from voronerf.data.images import read_images
 from voronerf.data.photographs import Reading, distinct_names
 from voronerf.data.scene import Scene, Split
-from voronerf.data.transforms import (
-    Frame,
-    Listed,
-    capture_scene,
-    focal_length,
-    has_lens,
-    number,
-    read_transforms,
-)
+from voronerf.data.transforms import Frame, Listed, capture_scene, focal_length, has_lens, number, read_transforms
 from voronerf.rendering.cameras import Cameras
 
 log = logging.getLogger(__name__)

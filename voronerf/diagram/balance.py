@@ -181,13 +181,7 @@ def balance(
 
 
 def first_centres(
-    samples: Tensor,
-    masses: Tensor,
-    k: int,
-    *,
-    init: str,
-    generator: torch.Generator | None,
-    uniform_scale: float = 1.0,
+    samples: Tensor, masses: Tensor, k: int, *, init: str, generator: torch.Generator | None, uniform_scale: float = 1.0
 ) -> Tensor:
     """float32 [k, 3] first centres from CPU samples float32 [m, 3] and masses [m]; see `init` of `balance`."""
     distinct, member = torch.unique(samples, dim=0, return_inverse=True)

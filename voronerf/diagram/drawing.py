@@ -15,12 +15,7 @@ _LARGE_PIECE = 1 << 22
 
 @torch.no_grad()
 def draw_cell(
-    points: Tensor,
-    centres: Tensor,
-    child_offsets: Tensor,
-    child: Tensor,
-    uniforms: Tensor,
-    temperature: float,
+    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, uniforms: Tensor, temperature: float
 ) -> Tensor:
     """A leaf for every point, drawn at random by its distances to the centres, level by level.
 

@@ -197,12 +197,7 @@ class VoronoiDiagram(nn.Module):
         return {name: value for name, value in self.__dict__.items() if name not in ("_grid", "_points_located")}
 
     def sample_cell(
-        self,
-        points: Tensor,
-        *,
-        temperature: float,
-        generator: torch.Generator | None = None,
-        backend: str = "auto",
+        self, points: Tensor, *, temperature: float, generator: torch.Generator | None = None, backend: str = "auto"
     ) -> Tensor:
         """Draws the leaf of each point at random; near centres are likelier (the paper's stochastic assignment).
 

@@ -10,13 +10,4 @@ register_field("mipnerf")(MipNeRF)
 register_field("kilonerf")(KiloNeRF)
 register_field("hashgrid")(HashGridField)
 
-__all__ = [
-    "FIELDS",
-    "DensityField",
-    "FieldType",
-    "HashGridField",
-    "KiloNeRF",
-    "MipNeRF",
-    "NeRF",
-    "register_field",
-]
+__all__ = ["FIELDS", "DensityField", "FieldType", "HashGridField", "KiloNeRF", "MipNeRF", "NeRF", "register_field"]

@@ -56,8 +56,7 @@ method = MethodSpecification(
         steps_per_eval_batch=500,
         steps_per_save=2000,
         pipeline=VanillaPipelineConfig(
-            datamanager=VoronerfDataManagerConfig(dataparser=NerfstudioDataParserConfig()),
-            model=VoronerfModelConfig(),
+            datamanager=VoronerfDataManagerConfig(dataparser=NerfstudioDataParserConfig()), model=VoronerfModelConfig()
         ),
         optimizers={
             "fields": {"optimizer": AdamConfig(), "scheduler": DecaySchedulerConfig()},

@@ -21,16 +21,7 @@ from torch import Tensor
 
 from voronerf.ops.pixel_rays.lens import FISHEYE, PERSPECTIVE, camera_rays, distort, undistort
 
-__all__ = [
-    "Cameras",
-    "Rays",
-    "distort",
-    "focus_point",
-    "look_at",
-    "orbit_cameras",
-    "turntable_cameras",
-    "undistort",
-]
+__all__ = ["Cameras", "Rays", "distort", "focus_point", "look_at", "orbit_cameras", "turntable_cameras", "undistort"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -129,13 +129,7 @@ def blurred_weights(weights: Tensor) -> Tensor:
 
 
 def union_depths(
-    depths: Tensor,
-    edges: Tensor,
-    weights: Tensor,
-    count: int,
-    *,
-    uniforms: Tensor | None = None,
-    backend: str = "auto",
+    depths: Tensor, edges: Tensor, weights: Tensor, count: int, *, uniforms: Tensor | None = None, backend: str = "auto"
 ) -> tuple[Tensor, Tensor]:
     """The samples of a first pass together with new ones where it found something (NeRF, section 5.2).
 

@@ -147,11 +147,7 @@ class PerCell(torch.Tensor):
     def __new__(cls, stacked: Tensor, origin: tuple[Tensor, int] | None = None) -> PerCell:
         """Wraps [k, ...]."""
         wrapper: PerCell = torch.Tensor._make_wrapper_subclass(
-            cls,
-            stacked.shape[1:],
-            dtype=stacked.dtype,
-            device=stacked.device,
-            requires_grad=stacked.requires_grad,
+            cls, stacked.shape[1:], dtype=stacked.dtype, device=stacked.device, requires_grad=stacked.requires_grad
         )
         wrapper.stacked, wrapper.origin = stacked, origin or (stacked, 0)
         return wrapper

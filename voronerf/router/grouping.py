@@ -37,13 +37,7 @@ class Grouping:
     """
 
     def __init__(
-        self,
-        cells: Tensor | None,
-        n: int,
-        k: int,
-        device: torch.device,
-        backend: str,
-        rows: Tensor | None = None,
+        self, cells: Tensor | None, n: int, k: int, device: torch.device, backend: str, rows: Tensor | None = None
     ) -> None:
         self.cells, self.n, self.k, self.device, self.backend, self.rows = cells, n, k, device, backend, rows
         self.start = 0  # of the cells of a part

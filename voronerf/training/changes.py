@@ -99,12 +99,7 @@ class Changes:
 
 @torch.no_grad()
 def find_changes(
-    renderer: Renderer,
-    cells: Cells,
-    batches: RayBatches,
-    usual: Tensor,
-    space: Voxels,
-    old: RayBatches | None = None,
+    renderer: Renderer, cells: Cells, batches: RayBatches, usual: Tensor, space: Voxels, old: RayBatches | None = None
 ) -> Changes:
     """Compares the pictures of a changed scene with what a run shows.
 

@@ -85,14 +85,7 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
         need(getattr(config, name) in words, name, f"be {either(words)}")
     need(config.backend in ("auto", *BACKENDS), "backend", f"be auto, {', '.join(BACKENDS)}")
     need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
-    for name in (
-        "rays",
-        "fine_samples",
-        "reservoir",
-        "reservoir_batches",
-        "evaluations",
-        "keep_checkpoints",
-    ):
+    for name in ("rays", "fine_samples", "reservoir", "reservoir_batches", "evaluations", "keep_checkpoints"):
         need(getattr(config, name) >= 1, name, "be at least 1")
     need(config.downscale is None or config.downscale >= 1, "downscale", "be at least 1")
     cells = config.occupancy_resolution

@@ -34,12 +34,7 @@ from voronerf.training import state
 from voronerf.training.appearance import Appearance
 from voronerf.training.average import averages_in_place, drop_averages, update_averages
 from voronerf.training.batches import RayBatches
-from voronerf.training.checkpoint import (
-    Checkpoint,
-    CheckpointError,
-    CheckpointWriter,
-    last_checkpoint,
-)
+from voronerf.training.checkpoint import Checkpoint, CheckpointError, CheckpointWriter, last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.cuda_graph import GraphedStep, set_learning_rate
 from voronerf.training.divergence import (

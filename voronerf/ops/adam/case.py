@@ -21,8 +21,4 @@ def _make(draw: Draw, n: int) -> Arguments:
     return {"rules": rules, **lists, "guard": guard, "loss": loss}
 
 
-CASE = Case(
-    _make,
-    refused={"loss must come with a guard, got none": {"guard": None}},
-    in_place=True,
-)
+CASE = Case(_make, refused={"loss must come with a guard, got none": {"guard": None}}, in_place=True)

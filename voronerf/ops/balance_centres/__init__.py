@@ -9,10 +9,7 @@ from voronerf import backends
 from voronerf.backends import Implementation
 from voronerf.checks import Checked, check_integer, check_number
 
-_OP = backends.declare(
-    "balance_centres",
-    native=Implementation(("cpu",), (torch.float32,)),
-)
+_OP = backends.declare("balance_centres", native=Implementation(("cpu",), (torch.float32,)))
 
 
 def balance_centres(

@@ -11,9 +11,4 @@ def _make(draw: Draw, n: int) -> Arguments:
     return {**call, "neighbours": draw.number("neighbours", 8, 1, 9)}
 
 
-CASE = Case(
-    _make,
-    refused={
-        "alpha must be a number, got NoneType": {"alpha": None},
-    },
-)
+CASE = Case(_make, refused={"alpha must be a number, got NoneType": {"alpha": None}})

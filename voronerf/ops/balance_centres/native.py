@@ -21,13 +21,7 @@ def balance_centres(
     yield moved, weights
     compiled = native.compiled
     given = compiled.BalanceInputs(
-        samples=samples,
-        masses=masses,
-        m=m,
-        k=k,
-        steps=steps,
-        alpha=alpha,
-        neighbours=min(neighbours, k - 1),
+        samples=samples, masses=masses, m=m, k=k, steps=steps, alpha=alpha, neighbours=min(neighbours, k - 1)
     )
     cells = samples.new_empty(m, dtype=torch.int32)
     workspace = masses.new_empty(compiled.balance_centres_workspace(k))

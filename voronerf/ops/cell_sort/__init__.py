@@ -8,11 +8,7 @@ from voronerf import backends
 from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import INDEX, Checked, check_integer
 
-_OP = backends.declare(
-    "cell_sort",
-    native=Implementation(EVERYWHERE, INDEX),
-    warp=Implementation(EVERYWHERE, INDEX),
-)
+_OP = backends.declare("cell_sort", native=Implementation(EVERYWHERE, INDEX), warp=Implementation(EVERYWHERE, INDEX))
 
 
 def cell_sort(cells: Tensor, k: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:

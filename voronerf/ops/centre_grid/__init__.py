@@ -13,10 +13,7 @@ from voronerf.backends import COORDINATES, Implementation
 from voronerf.checks import FLOATING, Checked
 from voronerf.ops.centre_grid.reference import BRICK_BITS, CELL_BITS, GridTables, centre_table, root_bits
 
-_OP = backends.declare(
-    "centre_grid",
-    native=Implementation(("cpu",), COORDINATES),
-)
+_OP = backends.declare("centre_grid", native=Implementation(("cpu",), COORDINATES))
 
 
 @dataclass(frozen=True, eq=False)

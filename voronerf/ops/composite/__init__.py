@@ -9,11 +9,7 @@ from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import FLOATING, INDEX, LIKE_FIRST, Checked, check_count
 from voronerf.ops.composite.reference import Composite
 
-_OP = backends.declare(
-    "composite",
-    native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS),
-)
+_OP = backends.declare("composite", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS))
 
 
 def composite(

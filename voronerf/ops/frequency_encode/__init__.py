@@ -9,9 +9,7 @@ from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import FLOATING, Checked, check_flag, check_integer
 
 _OP = backends.declare(
-    "frequency_encode",
-    native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS, "encode"),
+    "frequency_encode", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS, "encode")
 )
 
 

@@ -10,10 +10,7 @@ from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import FLOATING, INDEX, Checked, check_choice, check_same_dtype
 from voronerf.layers import ACTIVATIONS
 
-_OP = backends.declare(
-    "grouped_linear",
-    native=Implementation(EVERYWHERE, FLOATS),
-)
+_OP = backends.declare("grouped_linear", native=Implementation(EVERYWHERE, FLOATS))
 
 
 def grouped_linear(

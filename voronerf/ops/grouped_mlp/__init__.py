@@ -12,10 +12,7 @@ from voronerf.checks import INDEX, check_count, check_dtype, check_no_inference,
 from voronerf.layers import MLP
 from voronerf.ops.grouped_mlp.checks import check_network
 
-_OP = backends.declare(
-    "grouped_mlp",
-    native=Implementation(EVERYWHERE, FLOATS),
-)
+_OP = backends.declare("grouped_mlp", native=Implementation(EVERYWHERE, FLOATS))
 
 
 def grouped_mlp(

@@ -256,12 +256,7 @@ def _present(biases: Sequence[Tensor]) -> list[Tensor | None]:
 
 
 def _on_cuda(
-    key: Key,
-    inputs: native.compiled.MlpInputs,
-    machine: native.compiled.Cuda,
-    *,
-    backward: bool,
-    parameters: bool,
+    key: Key, inputs: native.compiled.MlpInputs, machine: native.compiled.Cuda, *, backward: bool, parameters: bool
 ) -> tuple[native.compiled.MlpCudaCall, Tensor]:
     """What a call takes besides its tensors: its plan and a workspace."""
     assert inputs.positions is not None

@@ -22,10 +22,7 @@ from voronerf.checks import (
 )
 from voronerf.program import Program
 
-_OP = backends.declare(
-    "grouped_program",
-    native=Implementation(EVERYWHERE, FLOATS),
-)
+_OP = backends.declare("grouped_program", native=Implementation(EVERYWHERE, FLOATS))
 _HALF = (torch.float16, torch.bfloat16)  # computed in float32
 
 

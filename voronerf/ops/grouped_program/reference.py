@@ -13,11 +13,7 @@ from voronerf.program import BINARY, FUNCTIONS, VALUE, Columns, Program, Step
 
 
 def grouped_program(
-    inputs: Sequence[Tensor],
-    parameters: Sequence[Tensor],
-    offsets: Tensor,
-    order: Tensor | None,
-    text: str,
+    inputs: Sequence[Tensor], parameters: Sequence[Tensor], offsets: Tensor, order: Tensor | None, text: str
 ) -> list[Tensor]:
     """A program on the rows of each cell; see ``voronerf.ops.grouped_program``. ``text`` is that of a program."""
     check_offsets("grouped_program", offsets, inputs[0].shape[0])

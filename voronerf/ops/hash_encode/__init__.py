@@ -11,9 +11,7 @@ from voronerf.checks import FLOATING, INDEX, Checked
 from voronerf.grids import HashGrid
 
 _OP = backends.declare(
-    "hash_encode",
-    native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS),
+    "hash_encode", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
 )
 
 

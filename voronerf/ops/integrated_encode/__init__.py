@@ -9,9 +9,7 @@ from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import FLOATING, LIKE_FIRST, Checked, check_integer
 
 _OP = backends.declare(
-    "integrated_encode",
-    native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS, "encode"),
+    "integrated_encode", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS, "encode")
 )
 
 

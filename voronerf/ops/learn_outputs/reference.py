@@ -16,10 +16,7 @@ Loss = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 def learn_outputs(
-    network: Mapping[str, Any],
-    loss: Loss,
-    backward: bool,
-    evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp,
+    network: Mapping[str, Any], loss: Loss, backward: bool, evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp
 ) -> Tensor:
     """The loss, with gradients; see ``voronerf.ops.learn_outputs``."""
     network = dict(network)

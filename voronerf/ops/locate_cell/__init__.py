@@ -11,20 +11,12 @@ from voronerf.checks import FLOATING, INDEX, Checked, check_integer
 from voronerf.ops.nearest_centre import of_one_dtype
 
 _OP = backends.declare(
-    "locate_cell",
-    native=Implementation(EVERYWHERE, COORDINATES),
-    warp=Implementation(EVERYWHERE, COORDINATES),
+    "locate_cell", native=Implementation(EVERYWHERE, COORDINATES), warp=Implementation(EVERYWHERE, COORDINATES)
 )
 
 
 def locate_cell(
-    points: Tensor,
-    centres: Tensor,
-    child_offsets: Tensor,
-    child: Tensor,
-    *,
-    depth: int,
-    backend: str = "auto",
+    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, *, depth: int, backend: str = "auto"
 ) -> Tensor:
     """Leaf of every point in a tree of diagrams: on each level, the nearest centre of the diagram that holds the point.
 

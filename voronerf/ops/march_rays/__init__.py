@@ -11,9 +11,7 @@ from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_choice, check_coun
 from voronerf.ops.march_rays.reference import March, Rays
 
 _OP = backends.declare(
-    "march_rays",
-    native=Implementation(EVERYWHERE, (torch.float32,)),
-    warp=Implementation(EVERYWHERE, (torch.float32,)),
+    "march_rays", native=Implementation(EVERYWHERE, (torch.float32,)), warp=Implementation(EVERYWHERE, (torch.float32,))
 )
 _SPACINGS = ("linear", "disparity")
 

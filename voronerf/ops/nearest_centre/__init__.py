@@ -12,19 +12,11 @@ from voronerf.ops.centre_grid import CentreGrid
 from voronerf.ops.nearest_centre_grid import nearest_centre_grid
 
 _OP = backends.declare(
-    "nearest_centre",
-    native=Implementation(EVERYWHERE, COORDINATES),
-    warp=Implementation(EVERYWHERE, COORDINATES),
+    "nearest_centre", native=Implementation(EVERYWHERE, COORDINATES), warp=Implementation(EVERYWHERE, COORDINATES)
 )
 
 
-def nearest_centre(
-    points: Tensor,
-    centres: Tensor,
-    *,
-    grid: CentreGrid | None = None,
-    backend: str = "auto",
-) -> Tensor:
+def nearest_centre(points: Tensor, centres: Tensor, *, grid: CentreGrid | None = None, backend: str = "auto") -> Tensor:
     """Index of the nearest centre of every point: ``argmin_c |x - v_c|``.
 
     Exact: the direct form of the distance is used, and ties go to the lowest index. A point that is not finite goes to

@@ -9,10 +9,7 @@ from voronerf import backends
 from voronerf.backends import COORDINATES, Implementation
 from voronerf.ops.centre_grid import CentreGrid
 
-_OP = backends.declare(
-    "nearest_centre_grid",
-    native=Implementation(("cpu",), COORDINATES),
-)
+_OP = backends.declare("nearest_centre_grid", native=Implementation(("cpu",), COORDINATES))
 
 
 def nearest_centre_grid(points: Tensor, centres: Tensor, grid: CentreGrid, backend: str) -> Tensor:

@@ -10,10 +10,7 @@ from voronerf.backends import EVERYWHERE, Implementation
 from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_number, check_range, detached
 from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
 
-_OP = backends.declare(
-    "pixel_rays",
-    native=Implementation(EVERYWHERE, (torch.float32,)),
-)
+_OP = backends.declare("pixel_rays", native=Implementation(EVERYWHERE, (torch.float32,)))
 
 
 def pixel_rays(

@@ -20,14 +20,7 @@ def own_samples(
     found_positions, (found_depths, found_deltas) = positions.new_empty(n, 3), depths.new_empty(2, n)
     found_index, of_own, offsets = cells.new_empty(n), cells.new_empty(n), cells.new_empty(n + 1)
     known = native.compiled.KnownSamples(
-        positions=positions,
-        ray_index=ray_index,
-        depths=depths,
-        deltas=deltas,
-        cells=cells,
-        own=own,
-        n=n,
-        bent=bent,
+        positions=positions, ray_index=ray_index, depths=depths, deltas=deltas, cells=cells, own=own, n=n, bent=bent
     )
     found = native.compiled.OwnSamples(
         positions=found_positions,

@@ -11,9 +11,7 @@ from voronerf.checks import FLOATING, INDEX, Checked, check_count, check_number,
 from voronerf.ops.render_loss.reference import Rendered, RenderLoss
 
 _OP = backends.declare(
-    "render_loss",
-    native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS),
+    "render_loss", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
 )
 _GRADIENT = backends.declare(
     "render_loss_gradient",

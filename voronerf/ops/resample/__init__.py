@@ -8,11 +8,7 @@ from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import FLOATING, LIKE_FIRST, Checked, check_count, check_integer
 
-_OP = backends.declare(
-    "resample",
-    native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS),
-)
+_OP = backends.declare("resample", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS))
 
 
 def resample(

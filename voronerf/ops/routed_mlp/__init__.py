@@ -28,10 +28,7 @@ from voronerf.ops.nearest_centre import of_one_dtype
 from voronerf.ops.routed_mlp.reference import Operations, Where
 from voronerf.ops.routed_mlp.reference import routed_mlp as compose
 
-_OP = backends.declare(
-    "routed_mlp",
-    native=Implementation(EVERYWHERE, FLOATS),
-)
+_OP = backends.declare("routed_mlp", native=Implementation(EVERYWHERE, FLOATS))
 _DEFAULTS: dict[str, Any] = {
     **dict.fromkeys(("layers", "directions", "direction_index", "features", "frozen")),
     **Where._field_defaults,

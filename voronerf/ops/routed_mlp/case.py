@@ -21,12 +21,7 @@ def _make(draw: Draw, n: int) -> Arguments:
 
 CASE = Case(
     _make,
-    {
-        "": {},
-        "nested": {"by": "tree"},
-        "one cell": {"by": "one cell", **GAUSSIANS},
-        "of cells": {"by": "cells"},
-    },
+    {"": {}, "nested": {"by": "tree"}, "one cell": {"by": "one cell", **GAUSSIANS}, "of cells": {"by": "cells"}},
     refused={"centres must have shape [k, 3] with k = 2, got [1, 3]": {"centres": torch.zeros(1, 3)}},
     differentiable=True,
 )

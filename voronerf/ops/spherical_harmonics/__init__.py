@@ -9,9 +9,7 @@ from voronerf.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.checks import FLOATING, Checked, check_integer
 
 _OP = backends.declare(
-    "spherical_harmonics",
-    native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS),
+    "spherical_harmonics", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
 )
 
 
