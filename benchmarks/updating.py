@@ -111,9 +111,8 @@ def measure(
         after = recoloured(before, old)
     began = time.process_time()
     shutil.rmtree(folder / f"{name}-made", ignore_errors=True)
-    made = old.update(
-        after, folder / f"{name}-made", seconds=share * seconds, clock=time.process_time, say=said.append, seed=seed
-    )
+    given: dict[str, Any] = {"clock": time.process_time, "say": said.append, "seed": seed, "more": kind == "fox"}
+    made = old.update(after, folder / f"{name}-made", seconds=share * seconds, **given)
     spent = time.process_time() - began
     total = (1 + share) * seconds if kind == "fox" else seconds
     every = whole if kind == "fox" else replace(after, box=before.box)

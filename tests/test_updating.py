@@ -167,6 +167,24 @@ def test_a_shadow_is_found_though_no_ray_is_off(runs, city):
     assert ((places > low - 0.2) & (places < high + 0.2)).all()
 
 
+def test_more_pictures_of_the_same_scene_let_all_cells_learn(tmp_path, runs, city):
+    """Nothing is divided, and old pictures count as new ones do, also where the run shows them badly."""
+    images = city.train.images.clone()
+    images[..., :3] = 255 - images[..., :3]
+    other = replace(city, train=replace(city.train, images=images))
+    run, before = voronerf.open_run(runs["hashgrid"], scene=city), digest(runs["hashgrid"])
+    refuses("shows another scene", run.update, other, tmp_path / "made", seconds=1.0, error=ConfigError)
+    made = run.update(other, tmp_path / "made", seconds=4.0, clock=ticking(), more=True)
+    assert made.router.num_cells == run.router.num_cells and digest(runs["hashgrid"]) == before
+    for name, parameter in made.router[0][0].module.named_parameters():
+        now, was = (values.flatten(1) for values in (parameter, dict(run.router.module.named_parameters())[name]))
+        assert (now != was).any(1).all() or "table" in name, name
+    # Pictures and their negatives agree on a mean: grey.
+    seen, grey = (render_camera(opened.renderer, city, city.train.cameras, 0) for opened in (run, made))
+    was, now = ((image.colour - 0.5).abs()[seen.opacity > 0.9].mean() for image in (seen, grey))
+    assert now < 0.5 * was
+
+
 def test_training_keeps_the_errors_of_cells(runs, city):
     run = voronerf.open_run(runs["hashgrid"], scene=city)
     usual = last_checkpoint(runs["hashgrid"]).group("errors")["usual"]
@@ -228,15 +246,19 @@ def test_a_ray_is_the_light_before_of_and_behind_the_cells_that_learn(tmp_path, 
     cells[:3] = True
     parts, learners = updating.split_off(source.parts, cells)
     voxels, generator = updating.space_voxels(city.box), torch.Generator().manual_seed(0)
-    session = updating.Session(
-        replace(source, parts=parts), source.parts, cells, learners, torch.arange(0), voxels, generator
-    )
+    own = updating.voxels_of(source.grid, parts, cells)
+    session = updating.Session(replace(source, parts=parts), source.parts, cells, learners, own, voxels, generator)
     pool = session.pool(updating.RayBatches(city, torch.device("cpu")), 2000)
     assert len(pool) > 100
     sampler = session.renderer.sampler
     samples = sampler.sample(pool.rays, pool.near, pool.far)
     shown = samples.depths < pool.end[samples.ray_index.long()]
     own = samples.part(shown & session.learns(samples.positions))
+    # A step, which takes samples near these cells alone, has the same.
+    near = session.learning.sampler.sample(pool.rays, pool.near, pool.far)
+    assert len(near.depths) < len(samples.depths)
+    near = near.part(near.depths < pool.end[near.ray_index.long()])
+    assert torch.equal(near.part(session.learns(near.positions)).positions, own.positions)
     with torch.no_grad():
         seen = updating.render_samples(session.parts, pool.rays, pool.far, own, sampler.space, background=pool.behind)
         whole = updating.render_samples(source.parts, pool.rays, pool.far, samples, sampler.space)

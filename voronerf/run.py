@@ -200,6 +200,7 @@ class Run:
         seconds: float | None = None,
         data: str | None = None,
         old: bool = True,
+        more: bool = False,
         seed: int = 0,
         clock: Callable[[], float] = time.perf_counter,
         say: Callable[[str], None] = lambda line: None,
@@ -215,6 +216,8 @@ class Run:
             seconds: To train for; None for a tenth of the time that the run was trained for, and 10 at least.
             data: Where the new pictures were loaded from, for the settings of the new run.
             old: Also learn from the pictures of this run's scene, where they agree with the new ones.
+            more: The scene is the same, and these are more pictures of it: all cells learn, from old and new pixels
+                alike.
             seed: Of the rays that are drawn.
             clock: Counts seconds.
             say: Told a line for what is found.
@@ -238,7 +241,8 @@ class Run:
             raise ConfigError(f"--budget must be positive, got {seconds}")
         new = placed(scene, self.scene)
         before = self.scene if old and len(self.scene.train.images) else None
-        found = updating.update(source, new, before, usual, seconds=seconds, seed=seed, clock=clock, say=say)
+        given: dict[str, Any] = {"more": more, "seed": seed, "clock": clock, "say": say}
+        found = updating.update(source, new, before, usual, seconds=seconds, **given)
         config = replace(found.source.config, data=data or self.config.data)
         editing.write(replace(found.source, config=config, scene=new), Path(out))
         return open_run(out, scene=new, backend=self.renderer.backend)

@@ -23,19 +23,28 @@ from voronerf.rendering.cameras import Rays
 from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid
 from voronerf.rendering.sampling import colour_loss
-from voronerf.rendering.volume import Samples, render_samples
+from voronerf.rendering.volume import Samples, gradient_shares, render_samples
 from voronerf.router import Part, Parts, VoronoiRouter
 from voronerf.router.parts import Asked
-from voronerf.step.cells import DECAY, REVISIT_EVERY, REVISITED
+from voronerf.step.cells import DECAY, MOST_REVISITED, REVISIT_EVERY, REVISITED
 from voronerf.step.ray_loss import Networks, why_not_fused
 from voronerf.training.adam import Adam
 from voronerf.training.average import averages_in_place, update_averages
 from voronerf.training.batches import RayBatches
-from voronerf.training.changes import LEAST_MET, MOST_OFF, Changes, Voxels, find_changes, near_by, space_voxels
+from voronerf.training.changes import (
+    LEAST_MET,
+    MOST_OFF,
+    Changes,
+    Voxels,
+    find_changes,
+    near_by,
+    space_voxels,
+)
 from voronerf.training.config import ConfigError
 from voronerf.training.errors import usual_errors
+from voronerf.training.networks import SHRINK_EVERY, TABLE_DECAY
 from voronerf.training.parts import grouped_parameters
-from voronerf.training.rates import learning_rate
+from voronerf.training.rates import learning_rate, next_rays
 from voronerf.training.renderers import make_contraction, make_renderer
 
 #: Rays that are drawn at a time to find those that meet cells that learn, how many of these there are to be, and the
@@ -58,14 +67,14 @@ class Update:
     Attributes:
         source: The run that it makes.
         cells: bool [k], those of its cells that learnt.
-        changes: What the new pictures showed.
+        changes: What the new pictures showed; None for more pictures of the same scene.
         steps: Steps of training.
         seconds: Of training, finding the changes included.
     """
 
     source: Source
     cells: Tensor
-    changes: Changes
+    changes: Changes | None
     steps: int
     seconds: float
 
@@ -77,6 +86,7 @@ def update(
     usual: Tensor | None,
     *,
     seconds: float,
+    more: bool = False,
     seed: int = 0,
     clock: Callable[[], float] = time.perf_counter,
     say: Callable[[str], None] = lambda line: None,
@@ -89,6 +99,7 @@ def update(
         old: The pictures that the run was trained on; None to learn from the new ones alone.
         usual: [k + 1], the errors of the run, see `usual_errors`; None to find them from the old pictures.
         seconds: To train for, finding the changes included.
+        more: Whether the new pictures are more of the same scene: all cells learn from all pixels then.
         seed: Of the rays that are drawn.
         clock: Counts seconds.
         say: Told a line for what is found.
@@ -97,56 +108,45 @@ def update(
         ConfigError: For pictures that show nothing new, nothing of the scene, another one, or one in another frame.
     """
     device = source.parts.diagram.centres.device
-    Adam([torch.zeros(1, requires_grad=True)], lr=1.0)  # torch imports its compiler with the first; not on the clock
     began = clock()
     contraction = next((part.contraction for part in source.parts if part.contraction is not None), None)
     if contraction is None and source.scene.box is None:
         contraction = cast(Contraction, make_contraction(source.scene))
     box = cast(Tensor, source.scene.box) if contraction is None else contraction.cube
-    renderer = make_renderer(source.config, source.scene, {"field": source.parts}, occupancy=source.grid)
-    if usual is None:
-        if old is None:
-            raise ConfigError("the run has no errors to compare with, as its training keeps them; give --old DIR")
-        usual = usual_errors(renderer, source.parts, RayBatches(old, device, backend=source.config.backend))
-    # Rays are drawn from all pixels here; those that miss the box show the background.
+    # Rays are drawn from all pixels; those that miss the box show the background.
     pictures = list[RayBatches]()
     for scene in (new, old):
         if scene is not None:
             pictures.append(RayBatches(replace(scene, box=None), device, backend=source.config.backend))
             pictures[-1].box = scene.box
-    changes = find_changes(renderer, source.parts, pictures[0], usual, space_voxels(box, contraction), *pictures[1:])
-    if changes.met < LEAST_MET:
-        raise ConfigError(f"--data must show the scene of the run, {changes.met:.2%} of its rays meet it")
-    if changes.off > MOST_OFF:
-        raise ConfigError(
-            f"--data shows another scene, or this one in another frame: {changes.off:.0%} of what it shows differs"
-        )
     generator = torch.Generator().manual_seed(seed)
-    count, k = int((changes.worse | changes.rebuilt).sum()), source.parts.num_cells
-    say(f"{changes.off:.1%} of the new rays that meet the scene are off: {count} of {k} cells learn")
-    if not count:
-        raise ConfigError(
-            f"--data shows nothing new: {changes.off:.1%} of the rays that meet the scene are off, as in training"
-        )
-    divided, cells = divide(source, changes, generator)
+    changes, voxels, k = None, space_voxels(box, contraction), source.parts.num_cells
+    divided, cells = source.parts, torch.ones(k, dtype=torch.bool, device=device)
+    if not more:
+        changes = compare(source, usual, voxels, *pictures)
+        voxels, count = changes.voxels, int((changes.worse | changes.rebuilt).sum())
+        say(f"{changes.off:.1%} of the new rays that meet the scene are off: {count} of {k} cells learn")
+        if not count:
+            raise ConfigError(
+                f"--data shows nothing new: {changes.off:.1%} of the rays that meet the scene are off, as in training"
+            )
+        divided, cells = divide(source, changes, generator)
     if divided.num_cells > k:
         say(f"these are divided, so that what has not changed in them stays: {int(cells.sum())} smaller ones learn")
     parts, learners = split_off(divided, cells)
-    grid, own, through = source.grid, torch.empty(0, dtype=torch.int64), None
+    grid, own = source.grid, torch.empty(0, dtype=torch.int64)
     if grid is not None:
         own = voxels_of(grid, parts, cells)
-        through, grid = bounds(grid, own, changes.voxels), opened(grid, own)
-    session = Session(
-        replace(source, parts=parts, grid=grid), source.parts, cells, learners, own, changes.voxels, generator
-    )
-    backend = source.config.backend
-    given = [scene for scene in (new, old) if scene is not None]
-    pictures = [RayBatches(scene, device, through=through, backend=backend) for scene in given]
+        grid = opened(grid, own[:0] if more else own)
+    session = Session(replace(source, parts=parts, grid=grid), source.parts, cells, learners, own, voxels, generator)
     count = DRAWN if grid is not None else DRAWN // 4  # of rays that skip nothing
     pools: list[list[Pool]] = []
 
     def draw() -> Pool:
         """More rays to learn from, with those before; the oldest go."""
+        if more:
+            total = sum(map(len, pictures))
+            return Pool.joined([session.every(each, max(1, DRAWN * len(each) // total)) for each in pictures])
         found = [session.pool(batches, count >> number, agree=number > 0) for number, batches in enumerate(pictures)]
         pools.append(found)
         while sum(len(pool) for pair in pools[1:] for pool in pair) >= POOL:
@@ -154,23 +154,21 @@ def update(
         return Pool.joined([pool for pair in pools for pool in pair])
 
     pool = draw()
-    while clock() - began < FINDING * seconds and len(pool) < POOL:
+    while not more and clock() - began < FINDING * seconds and len(pool) < POOL:
         pool = draw()
     rays = [sum(len(pair[number]) for pair in pools) for number in range(len(pictures))]
-    say(f"learning from {rays[0]} rays of the new pictures and {sum(rays[1:])} of the old ones")
-    if not rays[0]:
-        raise ConfigError("--data must show the cells that have changed, got pictures that see them through others")
+    if not more:
+        say(f"learning from {rays[0]} rays of the new pictures and {sum(rays[1:])} of the old ones")
+        if not rays[0]:
+            raise ConfigError("--data must show the cells that have changed, got pictures that see them through others")
     steps, drawn, started = 0, 0, clock() - began
     left = max(seconds - started, LEARNING * seconds)
     while (done := (clock() - began - started) / left) < 1:
-        if drawn > AGAIN * len(pool):
+        if drawn > (1 if more else AGAIN) * len(pool):
             pool, drawn = draw(), 0
         drawn += session.step(pool, steps, done)
         steps += 1
-    if grid is not None and source.grid is not None:
-        # Voxels across a border have seen samples of cells that learn.
-        others = torch.ones_like(grid.occupied).view(-1).index_fill(0, own, False).view_as(grid.occupied)
-        grid.density[others], grid.occupied[others] = source.grid.density[others], source.grid.occupied[others]
+    session.keep_grid()
     learnt = [parameter for router in learners for parameter in router.parameters()]
     with averages_in_place(session.optimizer):
         averages = [parameter.data for parameter in learnt]
@@ -179,6 +177,30 @@ def update(
     for router in learners:
         router.eval()
     return Update(session.source, cells, changes, steps, clock() - began)
+
+
+def compare(
+    source: Source, usual: Tensor | None, space: Voxels, new: RayBatches, old: RayBatches | None = None
+) -> Changes:
+    """What new pictures show; arguments as of :func:`update` and :func:`find_changes`.
+
+    Raises:
+        ConfigError: For pictures that show nothing of the scene, or another one.
+    """
+    renderer = make_renderer(source.config, source.scene, {"field": source.parts}, occupancy=source.grid)
+    if usual is None:
+        if old is None:
+            raise ConfigError("the run has no errors to compare with, as its training keeps them; give --old DIR")
+        usual = usual_errors(renderer, source.parts, old)
+    changes = find_changes(renderer, source.parts, new, usual, space, old)
+    if changes.met < LEAST_MET:
+        raise ConfigError(f"--data must show the scene of the run, {changes.met:.2%} of its rays meet it")
+    if changes.off > MOST_OFF:
+        raise ConfigError(
+            f"--data shows another scene, or this one in another frame: {changes.off:.0%} of what it shows differs; "
+            "--more takes it for more pictures of the same"
+        )
+    return changes
 
 
 def divide(source: Source, changes: Changes, generator: torch.Generator) -> tuple[Parts, Tensor]:
@@ -246,19 +268,20 @@ def opened(grid: OccupancyGrid, rows: Tensor) -> OccupancyGrid:
     return again
 
 
+def around(grid: OccupancyGrid, rows: Tensor) -> OccupancyGrid:
+    """A grid in which only some voxels, int64 [q], and those that touch them are occupied, where they were before."""
+    again = type(grid).from_state(grid.state_dict(), contraction=grid.contraction, device=grid.box.device)
+    chosen = torch.zeros_like(grid.occupied)
+    chosen.view(-1)[rows] = True
+    again.occupied &= near_by(chosen) > 0
+    return again
+
+
 def voxels_of(grid: OccupancyGrid, parts: Parts, cells: Tensor) -> Tensor:
     """The voxels of a grid whose middles lie in cells, bool [k]: int64 [q]."""
     every = torch.arange(grid.occupied.numel(), device=grid.box.device)
     owner = torch.cat([parts.assign(grid.points(rows)) for rows in every.split(1 << 17)]).long()
     return every[cells[owner.clamp(min=0)] & (owner >= 0)]
-
-
-def bounds(grid: OccupancyGrid, rows: Tensor, changed: Voxels) -> Tensor | None:
-    """A box [2, 3] around what is in some voxels of the grid, int64 [q], and what has changed; None for nothing."""
-    middles = torch.cat((grid.points(rows[grid.occupied.view(-1)[rows]]), changed.centres()))
-    fewest = [min(pair) for pair in zip(grid.occupied.shape, changed.chosen.shape, strict=True)]
-    side = (grid.box[1] - grid.box[0]) / torch.tensor(fewest, device=middles.device)
-    return torch.stack((middles.amin(0) - side, middles.amax(0) + side)) if len(middles) else None
 
 
 @dataclass(frozen=True)
@@ -331,11 +354,16 @@ class Session:
             part = source.parts[0]
             self.leaves = torch.zeros_like(part.owner, dtype=torch.bool)
             self.leaves[part.leaves] = cells
-        self.renderer = make_renderer(self.config, source.scene, {"field": source.parts}, occupancy=source.grid)
+        field = {"field": source.parts}
+        self.renderer = make_renderer(self.config, source.scene, field, occupancy=source.grid)
+        # Steps take samples near cells that learn alone; the grid of the source says where others are.
+        self.grid = None if source.grid is None else around(source.grid, own)
+        self.learning = make_renderer(self.config, source.scene, field, occupancy=self.grid)
+        self.rays = self.config.rays
         for router in learners:
             router.requires_grad_().train()
         dense, tables = grouped_parameters(learners)
-        groups = [{"params": dense, "sparse": False}, {"params": tables, "sparse": True}]
+        groups = [{"params": dense, "sparse": False}, {"params": tables, "sparse": True, "shrink": TABLE_DECAY}]
         assert self.config.lr is not None
         given: dict[str, Any] = {"betas": (0.9, 0.99), "eps": 1e-15, "backend": self.config.backend}
         self.optimizer = Adam([group for group in groups if group["params"]], lr=self.config.lr, **given)
@@ -344,6 +372,8 @@ class Session:
 
     def learns(self, positions: Tensor) -> Tensor:
         """Which positions [n, 3] lie in cells that learn."""
+        if bool(self.cells.all()):
+            return torch.ones(len(positions), dtype=torch.bool, device=positions.device)
         if len(self.parts) == 1:  # whose region is the scene
             part = self.parts[0]
             leaf = part.diagram.locate(part.contracted(part.own_points(positions)), backend=self.parts.backend)
@@ -362,6 +392,14 @@ class Session:
         )
         return [Asked(self.learners[0], None, points, directions, samples.ray_index, part.frame.scale)]
 
+    def every(self, batches: RayBatches, count: int) -> Pool:
+        """So many rays where all cells learn."""
+        batch = batches.draw(count, self.generator, random_background=self.config.background == "random")
+        none, light = torch.zeros_like(batch.target), torch.ones_like(batch.near)
+        behind = none if batch.background is None else batch.background.expand_as(none)
+        end = torch.full_like(light, math.inf)
+        return Pool(batch.rays, batch.near, batch.far, batch.target, none, light[:, None], behind, end)
+
     @torch.no_grad()
     def pool(self, batches: RayBatches, count: int, *, agree: bool = False) -> Pool:
         """Those of so many rays that meet cells that learn, and through no other surface.
@@ -372,13 +410,14 @@ class Session:
             agree: Leave out rays through space that has changed.
         """
         batch = batches.draw(count, self.generator, random_background=self.config.background == "random")
-        samples = self.renderer.sampler.sample(batch.rays, batch.near, batch.far)
-        own = self.learns(samples.positions)
-        index, device = samples.ray_index.long(), own.device
+        samples = self.learning.sampler.sample(batch.rays, batch.near, batch.far)
+        own, device = self.learns(samples.positions), samples.positions.device
         meets = torch.zeros(len(batch.rays), dtype=torch.bool, device=device)
-        meets[index[own]] = True
+        meets[samples.ray_index.long()[own]] = True
         rays = meets.nonzero()[:, 0]
-        own, samples = own[meets[index]], samples.of_rays(rays)
+        self.keep_grid()
+        samples = self.renderer.sampler.sample(batch.rays[rays], batch.near[rays], batch.far[rays])
+        own = self.learns(samples.positions)
         index, r, number = samples.ray_index.long(), len(rays), torch.arange(len(own), device=device)
         starts, ends = samples.ray_offsets[:-1].long(), samples.ray_offsets[1:].long() - 1
         rgb, density = samples.inputs.new_zeros(len(own), 3), samples.deltas.new_zeros(len(own))
@@ -431,6 +470,13 @@ class Session:
         found = before[rows], passes[rows], behind[rows], depths[cut[rows]]
         return Pool(batch.rays[rays], batch.near[rays], batch.far[rays], batch.target[rays], *found)
 
+    def keep_grid(self) -> None:
+        """Tells the grid of the source what steps have found in the voxels of cells that learn."""
+        if self.grid is not None and self.source.grid is not None:
+            own, kept = self.own_voxels, self.source.grid
+            kept.density.view(-1)[own] = self.grid.density.view(-1)[own]
+            kept.occupied.view(-1)[own] = self.grid.occupied.view(-1)[own]
+
     def step(self, pool: Pool, number: int, done: float) -> int:
         """Moves the networks of the cells that learn; returns the rays that they have learnt from.
 
@@ -443,20 +489,23 @@ class Session:
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(config, done, number)
         self.revisit(number)
-        chosen = torch.randint(len(pool), (config.rays,), generator=self.generator).to(pool.near.device)
+        chosen = torch.randint(len(pool), (self.rays,), generator=self.generator).to(pool.near.device)
         rays, near, far = pool.rays[chosen], pool.near[chosen], pool.far[chosen]
-        samples = self.renderer.sampler.sample(rays, near, far, jitter=True, generator=self.generator)
+        samples = self.learning.sampler.sample(rays, near, far, jitter=True, generator=self.generator)
         shown = samples.depths < pool.end[chosen].index_select(0, samples.ray_index)
         samples = samples.part(shown & self.learns(samples.positions))
         self.optimizer.zero_grad()
         seen = pool.target[chosen], pool.before[chosen], pool.light[chosen], pool.behind[chosen]
         density, weights = (self.learn_fused if self.is_fused else self.learn)(rays, far, samples, *seen)
         self.optimizer.step()
+        if number % SHRINK_EVERY == 0:
+            self.optimizer.shrink(SHRINK_EVERY)
         if config.average:
             update_averages(self.optimizer, config.average, number)
-        if self.source.grid is not None:
+        if self.grid is not None:
             found = samples.positions, density, samples.deltas, weights
-            self.source.grid.observe(*found, decay=DECAY, backend=config.backend)
+            self.grid.observe(*found, decay=DECAY, backend=config.backend)
+            self.rays = next_rays(config, self.rays, len(samples.deltas))
         return len(chosen)
 
     def learn(
@@ -474,6 +523,8 @@ class Session:
         """As :meth:`learn`, in one operation, see `voronerf.step.ray_loss.Fused`."""
         networks, found = Networks(self.asked(samples, rays.directions), samples), list[RenderLoss]()
         wanted, factor = (target - before) / light, light.square().index_select(0, samples.ray_index)
+        shares = gradient_shares(self.learning.sampler.space.full_gradient, samples.depths)
+        factor = factor if shares is None else factor * shares[:, None]
 
         def loss(raw: Tensor) -> tuple[Tensor, Tensor]:
             result, gradient = render_loss_gradient(
@@ -494,9 +545,9 @@ class Session:
 
     def revisit(self, number: int) -> None:
         """Before some steps, evaluates the field in random voxels of cells that learn."""
-        grid, own = self.source.grid, self.own_voxels
+        grid, own = self.grid, self.own_voxels
         if grid is None or number % REVISIT_EVERY or not len(own):
             return
-        count = math.ceil(len(own) * REVISITED)
+        count = min(math.ceil(len(own) * REVISITED), MOST_REVISITED)
         chosen = own[torch.randint(len(own), (count,), generator=self.generator).to(own.device)]
         grid.update(self.parts, chosen, decay=1.0, generator=self.generator, backend=self.config.backend)

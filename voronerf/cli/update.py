@@ -25,6 +25,7 @@ def update(
     budget: float | None = None,
     old: str | None = None,
     use_old: bool = True,
+    more: bool = False,
     downscale: int | None = None,
     allow_outside: bool = False,
     seed: int = 0,
@@ -39,6 +40,7 @@ def update(
         old: Scene folder of the pictures before; default as in training, if that lies in the run directory, the working
             directory or VORONERF_DATA, since a run may be another person's.
         use_old: Also learn from the pictures before, where they agree with the new ones.
+        more: These are more pictures of the same scene: all cells learn, from old and new pictures alike.
         downscale: Factor on the new images; default as in training.
         allow_outside: Also read images that lie outside of the scene folders.
         seed: Of the rays that are drawn.
@@ -57,4 +59,4 @@ def update(
     config = replace(config, data=data, downscale=downscale or config.downscale)
     scene = load_scene(data, allow_outside=allow_outside, **config.reading)
     opened = open_run(run, data=old, scene=None if use_old else read_scene(record), allow_outside=allow_outside)
-    return tell(opened.update(scene, out, seconds=budget, data=data, old=use_old, seed=seed, say=say))
+    return tell(opened.update(scene, out, seconds=budget, data=data, old=use_old, more=more, seed=seed, say=say))

@@ -122,8 +122,9 @@ class Similarity:
 
     def points(self, points: Tensor) -> Tensor:
         """Points [..., 3] of the part in the scene."""
-        moved = points @ (self.scale * self.rotation.T).to(points) + self.translation.to(points)
-        return points if self.is_identity else moved
+        if self.is_identity:
+            return points
+        return points @ (self.scale * self.rotation.T).to(points) + self.translation.to(points)
 
     def directions(self, directions: Tensor) -> Tensor:
         """Unit vectors [..., 3] of the part in the scene."""

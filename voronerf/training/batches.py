@@ -38,7 +38,6 @@ class RayBatches:
         cones: Whether the rays have radii.
         sightings: Whether a share of the rays, `SEEN`, are through sightings of points.
         views: int64, the training views to draw from; None for all.
-        through: [2, 3], a box in that of the scene that rays must meet; None for all of it.
         appearance: Of the pictures; batches have their colours without it.
         refinement: Of the cameras, which change.
         backend: Of the ops.
@@ -52,7 +51,6 @@ class RayBatches:
         cones: bool = False,
         sightings: bool = False,
         views: Tensor | None = None,
-        through: Tensor | None = None,
         appearance: Appearance | None = None,
         refinement: Refinement | None = None,
         backend: str = "auto",
@@ -66,7 +64,7 @@ class RayBatches:
         self.pages = Pages(self.images) if scene.train.on_disk else None
         self.background = scene.background_colour(self.place)
         self.box = None if scene.box is None else scene.box.to(self.place)
-        self.useful = self._useful_pixels(self.box if through is None else through.to(self.place))
+        self.useful = self._useful_pixels(self.box)
         self.sightings = None
         if sightings and scene.train.sightings is not None:
             self.sightings = Sightings(*(tensor.to(self.place) for tensor in scene.train.sightings))
