@@ -1,5 +1,6 @@
 # Set-up happens by itself: a virtual environment in .venv from requirements-ci.txt, and the extension built in place, both
-# redone only when their inputs change. PYTHON is the interpreter to start from.
+# redone only when their inputs change. PYTHON is the interpreter to start from. Of the thousands of files that pip would
+# compile most are never imported.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -88,11 +89,11 @@ clean:
 
 $(VENV)/.installed: requirements-ci.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-ci.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements-ci.txt
 	@touch $@
 
 $(VENV)/.docs: requirements-docs.txt $(VENV)/.installed
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements-docs.txt
 	@touch $@
 
 $(VENV)/.built: $(VENV)/.installed $(SOURCES)

@@ -127,7 +127,7 @@ def test_territories_move_and_ranks_change(tmp_path):
     half = settings(tmp_path / "half", "nerf")
     assert on_ranks(train, tmp_path, {"half": half}, 11, folder=tmp_path)[0] == [0, 0]
     assert load_checkpoint(checkpoint_path(half.out)).values["step"] == 16
-    for ranks in (2, 3, 1):
+    for ranks in (3, 1):  # with as many as before: test_a_rank_that_is_killed
         config = replace(half, out=tmp_path / f"to-{ranks}", resume=True)
         shutil.copytree(half.out, config.out)
         if ranks == 1:
