@@ -1,7 +1,7 @@
 # Set-up happens by itself: a virtual environment in .venv from requirements-ci.txt, and the extension built in place, both
-# redone only when their inputs change. PYTHON is the interpreter to start from. Of the thousands of files that pip would
-# compile most are never imported.
+# redone only when their inputs change. PYTHON is the interpreter to start from.
 PYTHON ?= python3
+PIP_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 
@@ -89,11 +89,11 @@ clean:
 
 $(VENV)/.installed: requirements-ci.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements-ci.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_ARGS) -r requirements-ci.txt
 	@touch $@
 
 $(VENV)/.docs: requirements-docs.txt $(VENV)/.installed
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements-docs.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_ARGS) -r requirements-docs.txt
 	@touch $@
 
 $(VENV)/.built: $(VENV)/.installed $(SOURCES)
