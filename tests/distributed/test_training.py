@@ -1,6 +1,7 @@
 """Joint training: the same bits on any number of ranks, what these hold and send, moved and resumed runs."""
 
 import functools
+import gc
 import json
 import shutil
 from dataclasses import replace
@@ -13,6 +14,7 @@ from ranks import joint_tensors, on_ranks
 from voronerf.data import builtin_scene
 from voronerf.data.scene import Sightings
 from voronerf.distributed.group import joined
+from voronerf.step.ray_runs import _Pass
 from voronerf.training.checkpoint import CheckpointError, checkpoint_path, load_checkpoint
 from voronerf.training.config import TrainConfig
 from voronerf.training.joint import JointTrainer, balanced
@@ -148,6 +150,19 @@ def test_eight_ranks_are_one_process_to_the_bit(tmp_path):
     assert on_ranks(train, tmp_path, {"eight": eight}, None, moves, folder=tmp_path, size=8)[0] == [0] * 8
     assert_same(joint_tensors(one.out), joint_tensors(eight.out))
     assert json.loads((tmp_path / "eight-5.json").read_text())["own"] == [0]
+
+
+@pytest.mark.parametrize("name", ["dense", "hashgrid"])
+def test_a_step_leaves_no_tensors_for_the_collector(tmp_path, name):
+    """Else the next one is given new pages by the system, which takes an eighth of its time."""
+    trainer = JointTrainer(settings(tmp_path / "run", name), scene())
+    gc.collect()
+    gc.disable()
+    try:
+        trainer.train_step()
+        assert not [each for each in gc.get_objects() if type(each) is _Pass]
+    finally:
+        gc.enable()
 
 
 def test_the_heaviest_rank_gives_territories_away():

@@ -211,7 +211,7 @@ class JointLoss:
                 if keys:
                     table = torch.cat([came[key] for key in keys])
                     seen = table[:, 8] if self.sightings else None
-                    guests[number] = _Pass(self.territories[number], _batch(table, seen), **given)
+                    guests[number] = _Pass(self.territories[number], _batch(table, seen), guest=True, **given)
             _nest(list(guests.values()), lambda: compose_all(sizes, left))
 
         def compose_all(sizes: Mapping[int, Mapping[Key, int]], left: Mapping[int, _Left]) -> None:
@@ -244,6 +244,13 @@ class JointLoss:
             pairs = (number * count + links[number, place]).sort().values.tolist()
             keys = [divmod(pair, count) for pair in pairs]
             self.routes.append([Route(self.owner[n], self.owner[other], (n, other)) for n, other in keys])
+        #: Where rays of each own territory go, numbers and marks, without those that bring no light and with them.
+        self.ways: dict[int, list[tuple[Tensor, Tensor]]] = {}
+        for own in self.territories:
+            ways = [self.map.goes_to(own, wide) for wide in (False, True)]
+            marks = [torch.zeros(count, dtype=torch.bool).index_fill_(0, links, True) for links in ways]
+            device = self.group.device
+            self.ways[own] = [(way.to(device), mark.to(device)) for way, mark in zip(ways, marks, strict=True)]
 
     def _leave(self, number: int, home: _Pass, batch: Batch) -> _Left:
         """The rays of a territory that go on."""
@@ -252,25 +259,25 @@ class JointLoss:
         away = other != number
         ray, other = ray[away], other[away]
         counts[:count] += torch.bincount(other, minlength=count).cpu()
-        counts[2 * count] += rays
-        counts[2 * count + 1] += rays * self.wide
-        links, known = (self.map.goes_to(number, wide).to(ray.device) for wide in (self.wide, True))
-        sent, linked = torch.zeros(2, count, dtype=torch.bool, device=ray.device)
-        sent[links] = linked[known] = True
-        learnt = torch.ones(rays, dtype=torch.bool, device=ray.device)
-        learnt[ray[~linked[other]]] = False  # what lies where rays never go is not known
-        goes = learnt[ray] & sent[other]
-        rows = ray[goes]
-        sizes = torch.bincount(other[goes], minlength=count)[links].tolist()
-        parts = self._table(batch)[rows].split(sizes)
-        return _Left(links, rows, learnt, {(number, n): part for n, part in zip(links.tolist(), parts, strict=True)})
+        counts[2 * count : 2 * count + 2] += torch.tensor((rays, rays * self.wide))
+        (links, sent), (_, linked) = self.ways[number][self.wide], self.ways[number][True]
+        learnt, unknown = None, ray[~linked[other]]
+        goes = sent[other]
+        if len(unknown):  # what lies where rays never go is not known
+            learnt = torch.ones(rays, dtype=torch.bool, device=ray.device)
+            learnt[unknown] = False
+            goes &= learnt[ray]
+        ray, other = ray[goes], other[goes]
+        sizes = torch.bincount(other, minlength=count)[links].tolist()
+        parts = self._table(batch, ray).split(sizes)
+        return _Left(links, ray, learnt, {(number, n): part for n, part in zip(links.tolist(), parts, strict=True)})
 
-    def _table(self, batch: Batch) -> Tensor:
-        """Rays as rows of numbers."""
-        rays = batch.rays
-        columns = [rays.origins, rays.directions, batch.near[:, None], batch.far[:, None]]
+    def _table(self, batch: Batch, ray: Tensor) -> Tensor:
+        """Some rays as rows of numbers."""
+        rays = batch.rays[ray]
+        columns = [rays.origins, rays.directions, batch.near[ray, None], batch.far[ray, None]]
         if self.sightings:
-            columns.append(_points(batch)[:, None])
+            columns.append(_points(batch)[ray, None])
         return torch.cat(columns, 1)
 
     def _compose(
@@ -285,15 +292,15 @@ class JointLoss:
         every, numbers = torch.cat(parts), torch.cat((home.ids, left.rows))
         ray = numbers[starts + every[:, -1].long()]
         every[:, -1] = ray.to(every.dtype)
-        known = left.learnt[ray]
-        sums = every if bool(known.all()) else every[known]
+        known = None if left.learnt is None else left.learnt[ray]
+        sums = every if known is None else every[known]
         target, background = batch.target, batch.background
         if every.shape[1] == 6:
             given: dict[str, Any] = {"background": background, "first": 0, "rays": len(target)}
             answers, loss = compose_runs(sums, target, **given, backend=home.renderer.backend)
         else:
             answers, loss = _put_together(sums, batch, self.sightings)
-        if len(sums) < len(every):
+        if known is not None:
             told = answers.new_zeros(every.shape)
             told[known] = answers
             answers = told
@@ -313,13 +320,13 @@ class _Left(NamedTuple):
     Attributes:
         links: int64, the territories, ascending.
         rows: int64 [n], the rays, territory after territory.
-        learnt: bool [r], the rays that go to all that they meet.
+        learnt: bool [r], the rays that go to all that they meet; None for all rays.
         parts: For each territory what is said of its rays.
     """
 
     links: Tensor
     rows: Tensor
-    learnt: Tensor
+    learnt: Tensor | None
     parts: dict[Key, Tensor]
 
 
@@ -331,25 +338,37 @@ class _Pass:
         sums: [q, c + 3] of its runs; the last column is a number in ``ids``.
         answers: [q, c + 3], to be set before the gradients.
         loss: [], to be set where the rays are put together here.
-        end: [r], the depth at which a ray has ended, or infinity.
+        guest: Whether the rays are those of others.
+        end: [r], the depth at which a ray has ended, or infinity; not known of those of others.
         found: What was found, for these rays.
     """
 
-    def __init__(self, territory: Territory, batch: Batch, *, sightings: float = 0.0, backward: bool = False) -> None:
-        self.territory, self.renderer, self.backward = territory, territory.renderer, backward
-        near, far, device = batch.near, batch.far, batch.near.device
-        hit = torch.ones_like(near, dtype=torch.bool)
+    def __init__(
+        self,
+        territory: Territory,
+        batch: Batch,
+        *,
+        guest: bool = False,
+        sightings: float = 0.0,
+        backward: bool = False,
+    ) -> None:
+        self.territory, self.renderer, self.guest, self.backward = territory, territory.renderer, guest, backward
+        self.rays, self.near, self.far = batch.rays, batch.near, batch.far
+        self.points = _points(batch) if sightings else None
+        self.ids = torch.arange(len(self.near), device=self.near.device)
+        self.end = self.near if guest else torch.full_like(self.near, math.inf)
         if self.renderer.contraction is None:
-            box = territory.place.box.to(device)
-            first, last, _ = intersect_box(batch.rays.origins, batch.rays.directions, box, 0.0, math.inf)
-            near, far = torch.maximum(near, first), torch.minimum(far, last)
-            hit = far > near
-        self.count, self.ids = len(hit), hit.nonzero()[:, 0]
-        self.rays, self.near, self.far = batch.rays[self.ids], near[self.ids], far[self.ids]
-        self.points = _points(batch)[self.ids] if sightings else None
+            box = territory.place.box.to(self.near.device)
+            first, last, _ = intersect_box(self.rays.origins, self.rays.directions, box, 0.0, math.inf)
+            self.near, self.far = torch.maximum(self.near, first), torch.minimum(self.far, last)
+            hit = self.far > self.near
+            if not bool(hit.all()):
+                self.ids = hit.nonzero()[:, 0]
+                self.rays, self.near, self.far = self.rays[self.ids], self.near[self.ids], self.far[self.ids]
+                self.points = None if self.points is None else self.points[self.ids]
         self.width = 6 + int(sightings > 0)
-        self.sums = near.new_empty(0, self.width)
-        self.answers, self.loss, self.end = self.sums, near.new_zeros(()), torch.full_like(near, math.inf)
+        self.sums = self.near.new_empty(0, self.width)
+        self.answers, self.loss = self.sums, self.near.new_zeros(())
         self.total: Tensor | None = None
         self.found: Found | None = None
 
@@ -419,8 +438,10 @@ class _Pass:
         self._finds(own, weights, density.detach())
 
     def _told(self, sums: Tensor, own: OwnSamples) -> None:
-        """Keeps the sums, and finds the rays that end here."""
+        """Keeps the sums, and finds the rays that end here, if they are own ones."""
         self.sums = sums
+        if self.guest:
+            return
         ray = sums[:, -1].long()
         optical = torch.zeros_like(self.near).index_add_(0, ray, sums[:, -3])
         last = torch.zeros_like(self.near)
@@ -450,14 +471,10 @@ class _Pass:
 
 def _nest(passes: Sequence[_Pass], last: Callable[[], None]) -> None:
     """Makes the sums of all passes, calls ``last``, and lets all of them learn."""
-
-    def go(index: int) -> None:
-        if index == len(passes):
-            last()
-        else:
-            passes[index].evaluate(lambda: go(index + 1))
-
-    go(0)
+    if not passes:
+        return last()
+    first, *others = passes  # no function that names itself: that would keep all tensors of a step until a collection
+    return first.evaluate(lambda: _nest(others, last))
 
 
 def _together(home: _Pass | None, guest: _Pass | None) -> Found:

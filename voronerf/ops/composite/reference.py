@@ -41,6 +41,9 @@ def check_ray_offsets(op: str, ray_offsets: Tensor, m: int) -> None:
     traced = torch.compiler.is_compiling() or type(ray_offsets) is not Tensor  # which has no values
     if traced or ray_offsets.device.type != "cpu":
         return
+    values = ray_offsets.numpy()  # whose operations take a tenth of the time of torch's for some hundred rays
+    if len(values) == 0 or (values[0] >= 0 and values[-1] <= m and (values[1:] >= values[:-1]).all()):
+        return
     wrong = (ray_offsets < 0) | (ray_offsets > m)
     wrong[1:] |= ray_offsets[1:] < ray_offsets[:-1]
     if bool(wrong.any()):

@@ -193,12 +193,24 @@ def _check_outputs(op: str, raw: Tensor, samples: OwnSamples, density_scale: flo
         raise TypeError(f"{op}: samples must be OwnSamples, got {type(samples).__name__}")
     given = Checked(op)
     given.tensor("raw", raw, _FLOATS, "m", 4)
-    given.tensor("deltas", samples.deltas, LIKE_FIRST, "m")
-    given.tensor("depths", samples.depths, LIKE_FIRST, "m")
-    given.tensor("ray_index", samples.ray_index, INDEX, "m")
-    given.tensor("run_offsets", samples.run_offsets, INDEX, "q+1")
+    floats, whole = (samples.deltas, samples.depths), (samples.ray_index, samples.run_offsets)
+    rows = len(raw), len(raw), len(raw), None
+    if all(map(_is_plain, (*floats, *whole), (raw.dtype,) * 2 + INDEX * 2, rows)) and not raw.is_cuda:
+        given.sizes["q"] = len(samples.run_offsets) - 1
+    else:  # which says what is wrong
+        given.tensor("deltas", samples.deltas, LIKE_FIRST, "m")
+        given.tensor("depths", samples.depths, LIKE_FIRST, "m")
+        given.tensor("ray_index", samples.ray_index, INDEX, "m")
+        given.tensor("run_offsets", samples.run_offsets, INDEX, "q+1")
     check_ray_offsets(op, samples.run_offsets, len(raw))
     check_number(op, "density_scale", density_scale)
     if not density_scale > 0:
         raise ValueError(f"{op}: density_scale must be positive, got {density_scale}")
     return given
+
+
+def _is_plain(tensor: Tensor, dtype: torch.dtype, rows: int | None) -> bool:
+    """Whether it is a CPU tensor of this type and so many rows, or of one at least."""
+    if type(tensor) is not Tensor or tensor.dtype is not dtype or not tensor.is_cpu or tensor.dim() != 1:
+        return False
+    return tensor.layout is torch.strided and (len(tensor) >= 1 if rows is None else len(tensor) == rows)
