@@ -19,7 +19,6 @@ FIELDS = {"nerf": "NeRF", "mipnerf": "mip-NeRF"}
 SAMPLINGS = ("stratified", "hierarchical")
 WIDE, NARROW = "one network, width 256", "one network, width 64"
 BALANCED, RANDOM, UNIFORM = "balanced centres", "random centres", "uniform centres"
-LOOSE = "uniform centres, twice the box"
 INHERIT, FRESH = "inherited", "random parameters"
 NEAREST, STOCHASTIC = "nearest cell", "stochastic assignment"
 KILO_FIRST_STEPS = 16
@@ -232,13 +231,11 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "split-kinds": Experiment(
         "figure",
-        "Centres balanced by importance, drawn from the samples, or on a grid: over the samples, or one that "
-        "is twice as large along each axis, as if their place were not known.",
+        "Centres balanced by importance, drawn from the samples, or on a grid over them.",
         _changed(
             (BALANCED, {}),
             (RANDOM, {"centres": "random"}),
             (UNIFORM, {"centres": "uniform"}),
-            (LOOSE, {"centres": "uniform", "uniform_scale": 2.0}),
         ),
     ),
     "early-late": Experiment("figure", "The time of the split, as a share of the run.", _early_late_variants),

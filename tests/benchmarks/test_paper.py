@@ -197,7 +197,7 @@ def test_sizes_and_scenes(tmp_path, monkeypatch):
 def test_both_sides_have_the_same_settings(settings):
     """Variants differ in what is compared: no side has rays, samples, a rate or a schedule of its own."""
     compared = {"cells", "width", "parameters", "centres", "init"}
-    compared |= {"assignment", "split_at", "split_at_steps", "uniform_scale"}
+    compared |= {"assignment", "split_at", "split_at_steps"}
     for name, experiment in EXPERIMENTS.items():
         groups = {}
         for variant in experiment.variants(settings, "builtin"):

@@ -87,8 +87,6 @@ def test_settings_of_older_versions():
         ({"background": None}, "--background must be random or white, got None"),
         ({"backend": "fast"}, "--backend must be auto, .*got 'fast'"),
         ({"eval_views": 0}, "--eval-views must be at least 1, got 0"),
-        ({"uniform_scale": 2.0}, "--uniform-scale must be 1 without --centres uniform, got 2.0"),
-        ({"uniform_scale": 0.0, "centres": "uniform"}, "--uniform-scale must be positive and finite, got 0.0"),
         ({"temperature": -1.0}, "--temperature must be positive and finite, got -1.0"),
         ({"temperature": float("inf")}, "--temperature must be positive and finite, got inf"),
         ({"seed": 10**22}, r"--seed must lie in 0\.\.2\^63 - 1"),

@@ -96,7 +96,6 @@ def balance(
     alpha: float = 0.05,
     neighbours: int = 8,
     init: str | None = None,
-    uniform_scale: float = 1.0,
     generator: torch.Generator | None = None,
     backend: str = "auto",
 ) -> Balance:
@@ -122,7 +121,6 @@ def balance(
             "published"). "weighted": distinct samples drawn one by one with probability proportional to importance
             (default of
             "centroidal"). "uniform": `uniform_centres` over the bounding box of the samples.
-        uniform_scale: factor > 0 on the size of that box about its middle.
         generator: CPU generator of the draws; None for torch's global one.
         backend: of the ops, see `voronerf.backends`.
 
@@ -148,8 +146,6 @@ def balance(
     _check_choice("init", init, ("random", "weighted", "uniform"))
     if k < 1:
         raise ValueError(f"balance: k must be at least 1, got {k}")
-    if not 0 < uniform_scale < float("inf"):
-        raise ValueError(f"balance: uniform_scale must be positive and finite, got {uniform_scale}")
     if steps < 0 or neighbours < 1:
         raise ValueError(f"balance: steps must be >= 0 and neighbours >= 1, got {steps} and {neighbours}")
     total = float(importance.double().sum())
@@ -162,7 +158,7 @@ def balance(
     def weigh(centres: Tensor) -> Tensor:
         return cell_weights(ops.nearest_centre(samples, centres, backend=backend), masses, k)
 
-    centres = first_centres(samples, masses, k, init=init, generator=generator, uniform_scale=uniform_scale)
+    centres = first_centres(samples, masses, k, init=init, generator=generator)
     before = after = weigh(centres)
     if method == "centroidal":
         centres = lloyd(samples, masses, centres, backend=backend)
@@ -180,16 +176,13 @@ def balance(
     )
 
 
-def first_centres(
-    samples: Tensor, masses: Tensor, k: int, *, init: str, generator: torch.Generator | None, uniform_scale: float = 1.0
-) -> Tensor:
+def first_centres(samples: Tensor, masses: Tensor, k: int, *, init: str, generator: torch.Generator | None) -> Tensor:
     """float32 [k, 3] first centres from CPU samples float32 [m, 3] and masses [m]; see `init` of `balance`."""
     distinct, member = torch.unique(samples, dim=0, return_inverse=True)
     if k > distinct.shape[0]:
         raise ValueError(f"balance: k must be at most the number of distinct samples, {distinct.shape[0]}, got {k}")
     if init == "uniform":
-        box = torch.stack([samples.amin(0), samples.amax(0)])
-        return uniform_centres(box if uniform_scale == 1 else box.mean(0).lerp(box, uniform_scale), k)
+        return uniform_centres(torch.stack([samples.amin(0), samples.amax(0)]), k)
     # Sorting exponential variates divided by the weights draws without replacement in proportion to the weights
     # (Efraimidis and Spirakis 2006). Of several samples in one place only the first counts, because two centres in one
     # place would make an empty cell.

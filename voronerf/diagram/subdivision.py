@@ -48,7 +48,6 @@ def split_diagram(
     cells: str | Sequence[int] = "all",
     min_samples: int = 0,
     centres: str = "balanced",
-    uniform_scale: float = 1.0,
     generator: torch.Generator | None = None,
     backend: str = "auto",
     **options: Any,
@@ -70,7 +69,6 @@ def split_diagram(
             `uniform_centres` over the bounding box of the samples in the cell, not moved (some may lie outside the cell
             and have no samples); "centroidal": the centroids of their cells, weighted by importance. "random" and
             "uniform" are ablations of the paper.
-        uniform_scale: factor > 0 on the size of the box of "uniform", or of init="uniform", about its middle.
         generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
         backend: of the cell queries, see `voronerf.backends`.
         **options: arguments of `balance` for "balanced" and "centroidal": method, steps, alpha, neighbours, init.
@@ -131,7 +129,6 @@ def split_diagram(
             importance[inside],
             k,
             generator=generator,
-            uniform_scale=uniform_scale,
             backend=backend,
             **options,
         )

@@ -40,8 +40,7 @@ class SplitRule:
     """How cells are split, and what of a run is kept for it.
 
     Attributes:
-        centres: Of the new cells, see `split_diagram`, like the next two.
-        uniform_scale: Of a regular grid of centres.
+        centres: Of the new cells, see `split_diagram`.
         min_samples: A cell with fewer kept samples is not split further.
         inherit: Whether new cells start as copies of their parent, else from random parameters.
         reservoir: Samples that are kept.
@@ -54,7 +53,6 @@ class SplitRule:
     """
 
     centres: str = "centroidal"
-    uniform_scale: float = 1.0
     min_samples: int = 64
     inherit: bool = True
     reservoir: int = 10_000
@@ -206,7 +204,6 @@ class Cells:
             self.children,
             cells=planned.cells,
             centres=rule.centres,
-            uniform_scale=rule.uniform_scale,
             min_samples=0 if self.diagram.num_cells == 1 else rule.min_samples,
             generator=self.generator,
             backend=self.renderer.backend,

@@ -112,8 +112,6 @@ class TrainConfig:
     centres: Literal["balanced", "random", "uniform", "centroidal"] = "centroidal"
     """Centres of the new cells: balanced by importance (as published), drawn from the samples, a regular grid, or
     centroids of their cells, which makes cells compact."""
-    uniform_scale: float = 1.0
-    """Size of the grid of --centres uniform along each axis, relative to the box of the kept samples."""
     init: Literal["inherit", "random"] = "inherit"
     """New cells start as copies of their parent, or from random parameters."""
     assignment: Literal["nearest", "stochastic"] = "nearest"
@@ -274,7 +272,6 @@ class TrainConfig:
         """How the splits are made."""
         return SplitRule(
             centres=self.centres,
-            uniform_scale=self.uniform_scale,
             min_samples=self.min_cell_samples,
             inherit=self.init == "inherit",
             reservoir=self.reservoir,
@@ -331,6 +328,7 @@ REMOVED: dict[str, Any] = {
     "warmup": 0.02,
     "temperature_final": 1.0,
     "split_at_seconds": None,
+    "uniform_scale": 1.0,
 }
 #: Settings of older versions that are options of the field now.
 MOVED = ("skips", "position_octaves", "direction_octaves", "view_directions")

@@ -107,9 +107,6 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(0 < config.lr_final <= 1, "lr_final", "lie in (0, 1]")
     need(0 <= config.average < 1, "average", "lie in [0, 1)")
     need(0 < config.temperature < float("inf"), "temperature", "be positive and finite")
-    need(0 < config.uniform_scale < float("inf"), "uniform_scale", "be positive and finite")
-    uniform = config.centres == "uniform"
-    need(uniform or config.uniform_scale == 1, "uniform_scale", "be 1 without --centres uniform")
     need(0 <= config.seed < 2**63, "seed", "lie in 0..2^63 - 1")
     largest = max(config.cells, default=0)
     need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")
