@@ -128,5 +128,4 @@ def march_rays(
         disparity=spacing == "disparity",
         most=samples if most is None else most,
     )
-    march: March = run(rays, capacity)
-    return march
+    return March(*run(rays, capacity))

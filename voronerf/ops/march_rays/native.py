@@ -1,12 +1,13 @@
 """``march_rays`` of the compiled module. r rays, s strata of a ray, m samples of all rays (packed).
 
-Two custom ops, since the number of samples is known between them: the first leaves a bit for every stratum that is kept
-and the offsets of the rays, the second the samples.
+Two passes, since the number of samples is known between them: the first leaves a bit for every stratum that is kept and
+the offsets of the rays, the second the samples.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,35 +15,37 @@ from torch import Tensor
 from voronerf import native
 from voronerf.checks import MAX_COUNT
 from voronerf.custom_op import custom_op
-from voronerf.ops.march_rays.reference import March, Rays
+from voronerf.ops.march_rays.reference import Rays
+
+Marched = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
-def march_rays(rays: Rays, capacity: int | None) -> March:
+def _results(near: Tensor, offsets: Tensor, rows: int) -> Marched:
+    """Memory for the samples of a `March`, after the offsets of the rays."""
+    ray_index, stop = (near.new_empty(count, dtype=torch.int32) for count in (rows, near.shape[0]))
+    return offsets, ray_index, near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3), stop
+
+
+def _shapes(*given: Any) -> Marched:
+    """Without a capacity the number of samples depends on where the rays go."""
+    *rays, capacity = given
+    near = Rays._make(rays).near
+    rows: Any = torch.library.get_ctx().new_dynamic_size() if capacity is None else capacity
+    return _results(near, near.new_empty(near.shape[0] + 1, dtype=torch.int32), rows)
+
+
+@custom_op("march_rays_native", fake=_shapes)
+def march_rays(rays: Rays, capacity: int | None) -> Iterator[Marched]:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
-    mask, offsets = _count(rays, MAX_COUNT if capacity is None else capacity)
-    rows = int(offsets[-1]) if capacity is None else capacity
-    return March(offsets, *_fill(rays, mask, offsets, rows))
-
-
-@custom_op("march_rays_native_count")
-def _count(rays: Rays, capacity: int) -> Iterator[tuple[Tensor, Tensor]]:
-    r = rays.near.shape[0]
+    inputs, machine, (r,) = _inputs(rays), native.machine(rays.near), rays.near.shape
     mask = rays.near.new_empty(r, -(-rays.samples // 32), dtype=torch.int32)
     offsets = rays.near.new_empty(r + 1, dtype=torch.int32)
-    yield mask, offsets
-    native.compiled.march_rays_count(_inputs(rays), mask, offsets, capacity, native.machine(rays.near))
-
-
-@custom_op("march_rays_native_fill")
-def _fill(
-    rays: Rays, mask: Tensor, offsets: Tensor, rows: int
-) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
-    near = rays.near
-    ray_index, stop = (near.new_empty(count, dtype=torch.int32) for count in (rows, near.shape[0]))
-    depths, deltas, positions = near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3)
-    results = ray_index, depths, deltas, positions, stop
+    most = MAX_COUNT if capacity is None else capacity
+    native.compiled.march_rays_count(inputs, mask, offsets, most, machine)
+    rows = int(offsets[-1]) if capacity is None else capacity
+    results = _results(rays.near, offsets, rows)
     yield results
-    native.compiled.march_rays_fill(_inputs(rays), mask, offsets, rows, *results, native.machine(near))
+    native.compiled.march_rays_fill(inputs, mask, offsets, rows, *results[1:], machine)
 
 
 def _inputs(rays: Rays) -> native.compiled.MarchInputs:
