@@ -90,7 +90,8 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     config = resolve_config(TrainConfig(), scene)
     space = make_renderer(config, scene, make_routers(config, "cpu")).sampler.space
     assert (config.sightings, space.full_gradient) == (0.003, 1.0)
-    assert (config.occupancy, config.occupancy_resolution, config.samples) == (True, 128, 128)
+    assert (config.occupancy, config.occupancy_resolution, config.samples) == (True, 128, 256)
+    assert resolve_config(TrainConfig(budget=60), scene).samples == 128
     batch = RayBatches(scene, torch.device("cpu"), sightings=True).draw(400, torch.Generator().manual_seed(0))
     assert len(batch.rays) == 400 and len(batch.seen) == 100
     rays = batch.rays[300:]

@@ -46,8 +46,7 @@ def test_a_step_takes_more_rays_where_space_is_empty(tmp_path, scene):
 
 
 def test_steps_on_large_images_keep_more_samples():
-    for samples, share in ((32, 0.25), (64, 0.25), (128, 0.5)):
-        config = TrainConfig(rays=100, samples=samples, contraction="none")
-        assert next_rays(config, 100, int(100 * samples * share / 2)) == 200
-        contracted = TrainConfig(rays=100, samples=samples, contraction="sphere")
-        assert next_rays(contracted, 100, int(100 * samples * 0.25 / 2)) == 200
+    for samples, boxed, contracted in ((32, 0.25, 0.25), (64, 0.25, 0.25), (128, 0.5, 0.25), (256, 1.0, 0.5)):
+        for contraction, share in (("none", boxed), ("sphere", contracted)):
+            config = TrainConfig(rays=100, samples=samples, contraction=contraction)
+            assert next_rays(config, 100, int(100 * samples * share / 2)) == 200

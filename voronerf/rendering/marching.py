@@ -17,7 +17,7 @@ from voronerf.rendering.samplers import Occupancy
 from voronerf.rendering.volume import Samples, normalised
 
 OPAQUE = 4e-3  # a ray ends when it lets less than this through, one level of an 8-bit image
-WAVE = 6  # samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain
+WAVE = 12  # samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain
 
 
 class Seen(NamedTuple):

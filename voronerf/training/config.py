@@ -133,13 +133,14 @@ class TrainConfig:
     ray_growth: float | None = None
     """Where empty space is skipped, few samples of a ray are left. A step then takes more rays, up to this multiple of
     --rays, so that it has a quarter of the samples of the first steps, or in a box half with 128 samples a ray, and so
-    on; 1 is off. Default 8 for hashgrid, else 1."""
+    on, elsewhere with 256; 1 is off. Default 8 for hashgrid, else 1."""
     sampling: str = "stratified"
     """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something
     (nerf: a coarse and a fine network); or proposal, where a small density network places the samples."""
     samples: int | None = None
-    """Samples per ray of the first pass, one in each stratum; default 32 for two passes, for one 64, and where empty
-    space is skipped 128, or for an object more for larger images: 64 at 100 pixels across it, 128 at 400."""
+    """Samples per ray of the first pass, one in each stratum; default 32 for two passes, for one 64. Where empty space
+    is skipped 128, or 256 in a training of at least 150 seconds; for an object more for larger images: 64 at 100 pixels
+    across it, 128 at 400."""
     fine_samples: int = 32
     """Samples per ray of the second pass; the fine network of nerf evaluates those of the first pass too."""
     sightings: float | None = None

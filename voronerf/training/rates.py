@@ -12,9 +12,9 @@ WARMUP_STEPS = 100
 #: The fraction of the run that it rises for, at most.
 WARMUP = 0.02
 #: The share of a step's samples that are to be left once empty space is known, if more rays can bring them, and the
-#: samples of a ray beyond which it grows with them: large images of an object need larger tables, which larger steps
-#: keep cheap.
-FILL, FILL_SAMPLES = 0.25, 64
+#: samples of a ray, in a box and in contracted space, beyond which it grows with them: these go with larger tables,
+#: which larger steps keep cheap.
+FILL, FILL_SAMPLES, CONTRACTED_FILL_SAMPLES = 0.25, 64, 128
 
 
 def learning_rate(config: TrainConfig, done: float, step: int) -> float:
@@ -31,6 +31,7 @@ def learning_rate(config: TrainConfig, done: float, step: int) -> float:
 def next_rays(config: TrainConfig, rays: int, samples: int) -> int:
     """Rays of the next step, after one whose ``rays`` had so many samples in occupied space; see ``ray_growth``."""
     assert config.samples is not None and config.ray_growth is not None
-    share = FILL * max(config.samples / FILL_SAMPLES, 1.0) if config.contraction == "none" else FILL
+    most = FILL_SAMPLES if config.contraction == "none" else CONTRACTED_FILL_SAMPLES
+    share = FILL * max(config.samples / most, 1.0)
     wanted = rays * share * config.rays * config.samples / max(samples, 1)
     return int(min(max(wanted, config.rays), config.rays * config.ray_growth))
