@@ -14,11 +14,11 @@ import voronerf
 from voronerf import updating
 from voronerf.cli.main import main
 from voronerf.data import SceneError, city_scene
-from voronerf.data.record import placed
+from voronerf.data.record import placed, read_scene
 from voronerf.editing import moved_cameras
 from voronerf.rendering import Cameras
 from voronerf.rendering.renderer import render_camera
-from voronerf.router import Similarity
+from voronerf.router import Similarity, VoronoiRouter
 from voronerf.training.checkpoint import last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.trainer import Trainer
@@ -176,13 +176,30 @@ def test_more_pictures_of_the_same_scene_let_all_cells_learn(tmp_path, runs, cit
     refuses("shows another scene", run.update, other, tmp_path / "made", seconds=1.0, error=ConfigError)
     made = run.update(other, tmp_path / "made", seconds=4.0, clock=ticking(), more=True)
     assert made.router.num_cells == run.router.num_cells and digest(runs["hashgrid"]) == before
-    for name, parameter in made.router[0][0].module.named_parameters():
+    for name, parameter in made.router.module.named_parameters():
         now, was = (values.flatten(1) for values in (parameter, dict(run.router.module.named_parameters())[name]))
         assert (now != was).any(1).all() or "table" in name, name
     # Pictures and their negatives agree on a mean: grey.
     seen, grey = (render_camera(opened.renderer, city, city.train.cameras, 0) for opened in (run, made))
     was, now = ((image.colour - 0.5).abs()[seen.opacity > 0.9].mean() for image in (seen, grey))
     assert now < 0.5 * was
+
+
+def test_more_pictures_are_learnt_as_in_a_training(tmp_path, city):
+    """In contracted space as well: through the occupancy grid, on cameras of all pictures; a second time, too."""
+    options = {"evaluations": 1, "final_views": 1, "panels": 0, "rays": 64, "contraction": "sphere"}
+    config = TrainConfig(out=tmp_path / "run", data="builtin-city:2x2", steps=40, cells=(), **options)
+    trainer = Trainer(config, city)
+    trainer.run()
+    run = voronerf.open_run(tmp_path / "run", scene=city)
+    for name in ("more", "again"):
+        run = run.update(city, tmp_path / name, seconds=1.0, clock=ticking(), more=True)
+        assert isinstance(run.router, VoronoiRouter) and run.renderer.occupancy is not None
+        step, trained = (last_checkpoint(run.path).values[key] for key in ("step", "seconds"))
+        assert step > 40 and 1 <= trained < 1.1
+        assert run.config.out == run.path and len(read_scene(run.path / "scene.json").train.names) == 2 * len(
+            city.train
+        )
 
 
 def test_training_keeps_the_errors_of_cells(runs, city):

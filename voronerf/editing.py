@@ -9,7 +9,8 @@ import itertools
 import math
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -194,24 +195,7 @@ def _join_views(views: Sequence[tuple[str, Split, Similarity]]) -> Split:
     none = torch.empty(0, 1, 1, 3, dtype=torch.uint8)
     if len(cameras) == 1:
         return Split(cameras[0], none, tuple(names))
-
-    def every(name: str, missing: Callable[[int], Tensor]) -> Tensor | None:
-        there = [getattr(c, name) for c in cameras]
-        if all(t is None for t in there):
-            return None
-        return torch.cat([missing(len(c)) if t is None else t for c, t in zip(cameras, there, strict=True)])
-
-    sizes = torch.cat(
-        [torch.tensor([[c.width, c.height]]).expand(len(c), 2) if c.sizes is None else c.sizes for c in cameras]
-    )
-    joined = Cameras.of_images(
-        torch.cat([c.poses for c in cameras]),
-        torch.cat([c.intrinsics for c in cameras]),
-        sizes,
-        every("distortion", lambda n: torch.zeros(n, 8)),
-        every("models", lambda n: torch.zeros(n, dtype=torch.int32)),
-    )
-    return Split(joined, none, tuple(names))
+    return Split(Cameras.joined(cameras), none, tuple(names))
 
 
 def moved_cameras(cameras: Cameras, frame: Similarity) -> Cameras:
@@ -493,6 +477,27 @@ def _coarse_levels(source: Source) -> dict[int, Coarse]:
     return found
 
 
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """A folder to write a run into, which becomes ``out`` when all of it is there; else nothing is left.
+
+    Raises:
+        ConfigError: When there is something in ``out``.
+        OSError: When it cannot be written; names ``out``.
+    """
+    check_out(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.parent / f".{out.name[:100]}.{os.getpid()}.partial"
+    try:
+        partial.mkdir()
+        yield partial
+        os.replace(partial, out)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(out)) from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
 def write(source: Source, out: Path) -> None:
     """Writes a run of parts, whole or not at all; with several parts also their coarse levels.
 
@@ -500,11 +505,7 @@ def write(source: Source, out: Path) -> None:
         ConfigError: When there is something in the folder.
         OSError: When it cannot be written; nothing is left then.
     """
-    check_out(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.parent / f".{out.name[:100]}.{os.getpid()}.partial"
-    try:
-        partial.mkdir()
+    with new_folder(out) as partial:
         config = replace(source.config, out=out)
         stored = Stored(
             config=config.to_values(),
@@ -532,8 +533,3 @@ def write(source: Source, out: Path) -> None:
         save_checkpoint(checkpoint_path(partial), Checkpoint(tensors, values))
         write_text(partial / "config.json", config.to_json())
         write_scene(partial / "scene.json", source.scene)
-        os.replace(partial, out)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror or str(error), str(out)) from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)

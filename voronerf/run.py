@@ -15,6 +15,7 @@ from torch import Tensor
 from voronerf import editing, updating
 from voronerf.data import Scene, load_scene
 from voronerf.data.record import placed, read_scene, with_refined, within
+from voronerf.data.scene import Split
 from voronerf.diagram import VoronoiDiagram
 from voronerf.editing import check_out
 from voronerf.evaluation.lpips import Lpips, find_lpips
@@ -230,18 +231,22 @@ class Run:
         check_out(Path(out))
         if self.config.appearance:
             raise ConfigError("--appearance must be off for a run that is updated: gains of new pictures are not known")
-        source = editing.join([self.source], [Similarity()])
-        checkpoint = last_checkpoint(self.path, keep=lambda name: name.startswith("errors."))
-        usual = checkpoint.group("errors").get("usual")
-        if self.renderer.sampler.passes > 1 or (usual is not None and len(usual) != source.parts.num_cells + 1):
-            usual = None  # of other samples, or cells
+        checkpoint = last_checkpoint(self.path, keep=lambda name: more or name.startswith("errors."))
         if seconds is None:
             seconds = max(10.0, float(checkpoint.values["seconds"]) / 10)
         if not 0 < seconds < math.inf:
             raise ConfigError(f"--budget must be positive, got {seconds}")
         new = placed(scene, self.scene)
         before = self.scene if old and len(self.scene.train.images) else None
-        given: dict[str, Any] = {"more": more, "seed": seed, "clock": clock, "say": say}
+        given: dict[str, Any] = {"seed": seed, "clock": clock, "say": say}
+        if more:
+            every = new if before is None else replace(new, train=Split.joined(before.train, new.train))
+            updating.train_on(checkpoint, every, Path(out), seconds=seconds, data=data, **given)
+            return open_run(out, scene=new, backend=self.renderer.backend)
+        source = editing.join([self.source], [Similarity()])
+        usual = checkpoint.group("errors").get("usual")
+        if self.renderer.sampler.passes > 1 or (usual is not None and len(usual) != source.parts.num_cells + 1):
+            usual = None  # of other samples, or cells
         found = updating.update(source, new, before, usual, seconds=seconds, **given)
         config = replace(found.source.config, data=data or self.config.data)
         editing.write(replace(found.source, config=config, scene=new), Path(out))

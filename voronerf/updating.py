@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from voronerf.data import Scene
 from voronerf.diagram import balance
-from voronerf.editing import Source
+from voronerf.editing import Source, new_folder
 from voronerf.ops.render_loss import RenderLoss, render_loss_gradient
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.contraction import Contraction
@@ -40,12 +41,15 @@ from voronerf.training.changes import (
     near_by,
     space_voxels,
 )
+from voronerf.training.checkpoint import Checkpoint
 from voronerf.training.config import ConfigError
 from voronerf.training.errors import usual_errors
 from voronerf.training.networks import SHRINK_EVERY, TABLE_DECAY
 from voronerf.training.parts import grouped_parameters
 from voronerf.training.rates import learning_rate, next_rays
 from voronerf.training.renderers import make_contraction, make_renderer
+from voronerf.training.state import stored_values
+from voronerf.training.trainer import Trainer
 
 #: Rays that are drawn at a time to find those that meet cells that learn, how many of these there are to be, and the
 #: share of an update that is spent on it before the first step at most, and the share that is left for steps at least.
@@ -67,14 +71,14 @@ class Update:
     Attributes:
         source: The run that it makes.
         cells: bool [k], those of its cells that learnt.
-        changes: What the new pictures showed; None for more pictures of the same scene.
+        changes: What the new pictures showed.
         steps: Steps of training.
         seconds: Of training, finding the changes included.
     """
 
     source: Source
     cells: Tensor
-    changes: Changes | None
+    changes: Changes
     steps: int
     seconds: float
 
@@ -86,7 +90,6 @@ def update(
     usual: Tensor | None,
     *,
     seconds: float,
-    more: bool = False,
     seed: int = 0,
     clock: Callable[[], float] = time.perf_counter,
     say: Callable[[str], None] = lambda line: None,
@@ -99,7 +102,6 @@ def update(
         old: The pictures that the run was trained on; None to learn from the new ones alone.
         usual: [k + 1], the errors of the run, see `usual_errors`; None to find them from the old pictures.
         seconds: To train for, finding the changes included.
-        more: Whether the new pictures are more of the same scene: all cells learn from all pixels then.
         seed: Of the rays that are drawn.
         clock: Counts seconds.
         say: Told a line for what is found.
@@ -120,33 +122,27 @@ def update(
             pictures.append(RayBatches(replace(scene, box=None), device, backend=source.config.backend))
             pictures[-1].box = scene.box
     generator = torch.Generator().manual_seed(seed)
-    changes, voxels, k = None, space_voxels(box, contraction), source.parts.num_cells
-    divided, cells = source.parts, torch.ones(k, dtype=torch.bool, device=device)
-    if not more:
-        changes = compare(source, usual, voxels, *pictures)
-        voxels, count = changes.voxels, int((changes.worse | changes.rebuilt).sum())
-        say(f"{changes.off:.1%} of the new rays that meet the scene are off: {count} of {k} cells learn")
-        if not count:
-            raise ConfigError(
-                f"--data shows nothing new: {changes.off:.1%} of the rays that meet the scene are off, as in training"
-            )
-        divided, cells = divide(source, changes, generator)
+    changes, k = compare(source, usual, space_voxels(box, contraction), *pictures), source.parts.num_cells
+    voxels, count = changes.voxels, int((changes.worse | changes.rebuilt).sum())
+    say(f"{changes.off:.1%} of the new rays that meet the scene are off: {count} of {k} cells learn")
+    if not count:
+        raise ConfigError(
+            f"--data shows nothing new: {changes.off:.1%} of the rays that meet the scene are off, as in training"
+        )
+    divided, cells = divide(source, changes, generator)
     if divided.num_cells > k:
         say(f"these are divided, so that what has not changed in them stays: {int(cells.sum())} smaller ones learn")
     parts, learners = split_off(divided, cells)
     grid, own = source.grid, torch.empty(0, dtype=torch.int64)
     if grid is not None:
         own = voxels_of(grid, parts, cells)
-        grid = opened(grid, own[:0] if more else own)
+        grid = opened(grid, own)
     session = Session(replace(source, parts=parts, grid=grid), source.parts, cells, learners, own, voxels, generator)
     count = DRAWN if grid is not None else DRAWN // 4  # of rays that skip nothing
     pools: list[list[Pool]] = []
 
     def draw() -> Pool:
         """More rays to learn from, with those before; the oldest go."""
-        if more:
-            total = sum(map(len, pictures))
-            return Pool.joined([session.every(each, max(1, DRAWN * len(each) // total)) for each in pictures])
         found = [session.pool(batches, count >> number, agree=number > 0) for number, batches in enumerate(pictures)]
         pools.append(found)
         while sum(len(pool) for pair in pools[1:] for pool in pair) >= POOL:
@@ -154,17 +150,16 @@ def update(
         return Pool.joined([pool for pair in pools for pool in pair])
 
     pool = draw()
-    while not more and clock() - began < FINDING * seconds and len(pool) < POOL:
+    while clock() - began < FINDING * seconds and len(pool) < POOL:
         pool = draw()
     rays = [sum(len(pair[number]) for pair in pools) for number in range(len(pictures))]
-    if not more:
-        say(f"learning from {rays[0]} rays of the new pictures and {sum(rays[1:])} of the old ones")
-        if not rays[0]:
-            raise ConfigError("--data must show the cells that have changed, got pictures that see them through others")
+    say(f"learning from {rays[0]} rays of the new pictures and {sum(rays[1:])} of the old ones")
+    if not rays[0]:
+        raise ConfigError("--data must show the cells that have changed, got pictures that see them through others")
     steps, drawn, started = 0, 0, clock() - began
     left = max(seconds - started, LEARNING * seconds)
     while (done := (clock() - began - started) / left) < 1:
-        if drawn > (1 if more else AGAIN) * len(pool):
+        if drawn > AGAIN * len(pool):
             pool, drawn = draw(), 0
         drawn += session.step(pool, steps, done)
         steps += 1
@@ -177,6 +172,56 @@ def update(
     for router in learners:
         router.eval()
     return Update(session.source, cells, changes, steps, clock() - began)
+
+
+def train_on(
+    checkpoint: Checkpoint,
+    scene: Scene,
+    out: Path,
+    *,
+    seconds: float,
+    data: str | None = None,
+    seed: int = 0,
+    clock: Callable[[], float] = time.perf_counter,
+    say: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Goes on with a training on other pictures of its scene, in a new run directory, whole or not at all.
+
+    The learning rate begins anew: where it went on from its fall, fox had 0.4 dB less of the pictures that came later.
+
+    Args:
+        checkpoint: The last one of the run.
+        scene: The pictures, in the space of the run (`placed`).
+        out: A new directory.
+        seconds: To train for.
+        data: Where the pictures were loaded from; None for where those of the run were.
+        seed: Of the rays that are drawn.
+        clock: Counts seconds.
+        say: Told a line for an event.
+
+    Raises:
+        ConfigError: For a run of several territories.
+        OSError: When it cannot be written; nothing is left then.
+    """
+    config, stored = stored_values(checkpoint)
+    if (config.territories or 1) > 1:
+        raise ConfigError(f"--more needs a run of one territory, got {config.territories}")
+    config = replace(
+        config,
+        data=data or config.data,
+        budget=seconds,
+        steps=None,
+        evaluations=1,
+        evaluation_share=0.0,
+        refine_cameras=False,  # those of the scene are as the run has moved them
+        resume=False,
+    )
+    with new_folder(out) as partial:
+        trainer = Trainer(replace(config, out=partial), scene, on_event=say, clock=clock, checkpoint=checkpoint)
+        trainer.config = replace(trainer.config, out=out)
+        trainer.seconds = 0.0  # of this training
+        trainer.draws.manual_seed(seed)
+        trainer.train()
 
 
 def compare(
@@ -372,8 +417,6 @@ class Session:
 
     def learns(self, positions: Tensor) -> Tensor:
         """Which positions [n, 3] lie in cells that learn."""
-        if bool(self.cells.all()):
-            return torch.ones(len(positions), dtype=torch.bool, device=positions.device)
         if len(self.parts) == 1:  # whose region is the scene
             part = self.parts[0]
             leaf = part.diagram.locate(part.contracted(part.own_points(positions)), backend=self.parts.backend)
@@ -391,14 +434,6 @@ class Session:
             part.frame.inverse.directions(directions),
         )
         return [Asked(self.learners[0], None, points, directions, samples.ray_index, part.frame.scale)]
-
-    def every(self, batches: RayBatches, count: int) -> Pool:
-        """So many rays where all cells learn."""
-        batch = batches.draw(count, self.generator, random_background=self.config.background == "random")
-        none, light = torch.zeros_like(batch.target), torch.ones_like(batch.near)
-        behind = none if batch.background is None else batch.background.expand_as(none)
-        end = torch.full_like(light, math.inf)
-        return Pool(batch.rays, batch.near, batch.far, batch.target, none, light[:, None], behind, end)
 
     @torch.no_grad()
     def pool(self, batches: RayBatches, count: int, *, agree: bool = False) -> Pool:

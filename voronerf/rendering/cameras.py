@@ -135,6 +135,29 @@ class Cameras:
         differ = bool((sizes != sizes[:1]).any())
         return cls(poses, intrinsics, width, height, distortion, models, sizes if differ else None)
 
+    @classmethod
+    def joined(cls, several: Sequence[Cameras]) -> Cameras:
+        """The cameras of all, one after another."""
+
+        def every(name: str, missing: Callable[[int], Tensor]) -> Tensor | None:
+            there = [getattr(cameras, name) for cameras in several]
+            if all(tensor is None for tensor in there):
+                return None
+            pairs = zip(several, there, strict=True)
+            return torch.cat([missing(len(cameras)) if tensor is None else tensor for cameras, tensor in pairs])
+
+        sizes = [
+            torch.tensor([[each.width, each.height]]).expand(len(each), 2) if each.sizes is None else each.sizes
+            for each in several
+        ]
+        return cls.of_images(
+            torch.cat([cameras.poses for cameras in several]),
+            torch.cat([cameras.intrinsics for cameras in several]),
+            torch.cat(sizes),
+            every("distortion", lambda n: torch.zeros(n, 8)),
+            every("models", lambda n: torch.zeros(n, dtype=torch.int32)),
+        )
+
     def __len__(self) -> int:
         return self.poses.shape[0]
 

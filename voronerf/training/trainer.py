@@ -257,11 +257,7 @@ class Trainer:
                 the first checkpoint; the last checkpoint is left as it was.
             OSError: When a checkpoint cannot be written.
         """
-        self.advance()
-        while not self._check_moments():
-            self.advance()
-        self._find_errors()
-        self.save()
+        self.train()
         if self.fraction >= 1:
             self.stopped = False  # a stop that came in the last step has nothing to end
             left = len(self.plan) - self.level
@@ -271,6 +267,19 @@ class Trainer:
                 router.blend = self.config.blend
             self._evaluate(self.config.final_views, self.lpips, last=True)
         return self._summarise()
+
+    def train(self) -> None:
+        """Trains to the end and saves, as :meth:`run` does before the last evaluation.
+
+        Raises:
+            TrainingError: As :meth:`run`.
+            OSError: As :meth:`run`.
+        """
+        self.advance()
+        while not self._check_moments():
+            self.advance()
+        self._find_errors()
+        self.save()
 
     def advance(self, until: float = math.inf) -> None:
         """Trains until ``until`` training seconds or the end of the budget, whichever comes first.
