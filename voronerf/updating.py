@@ -203,7 +203,7 @@ def train_on(
         ConfigError: For a run of several territories.
         OSError: When it cannot be written; nothing is left then.
     """
-    config, stored = stored_values(checkpoint)
+    config, _ = stored_values(checkpoint)
     if (config.territories or 1) > 1:
         raise ConfigError(f"--more needs a run of one territory, got {config.territories}")
     config = replace(
