@@ -264,7 +264,8 @@ def test_a_ray_that_has_ended_goes_no_further():
 def test_rays_to_where_few_go_are_not_learnt_from():
     """The others are; and once more rays go there, these are learnt from, too."""
     loss = joint(3)
-    loss.map.links[0], loss.routes = -1, [[], []]
+    loss.map.links[0] = -1
+    loss._chart()
     batch = rays_through(10)
     away = replace(batch, far=torch.where(torch.arange(10) < 5, 1.2, 9.0))
     found = loss.run({0: away})

@@ -118,12 +118,12 @@ def test_a_table_that_does_not_fit_into_memory(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("side", "contraction", "samples", "entries"),
-    [(100, "none", 64, 15), (20, "none", 48, 14), (20, "sphere", 128, 19)],
+    ("side", "contraction", "budget", "samples", "entries"),
+    [(100, "none", 480, 64, 15), (20, "none", 480, 48, 14), (20, "sphere", 149, 128, 17), (20, "sphere", 150, 256, 19)],
 )
-def test_larger_images_get_more_samples_and_larger_tables(side, contraction, samples, entries):
+def test_large_images_and_long_trainings_get_more_of_both(side, contraction, budget, samples, entries):
     scene = builtin_scene(side, train_views=2, test_views=1)
-    config = resolve_config(TrainConfig(contraction=contraction), scene)
+    config = resolve_config(TrainConfig(contraction=contraction, budget=budget), scene)
     given = dict(text.split("=", 1) for text in config.field_options)
     assert config.samples == samples and given.get("log2_entries") == (entries and str(entries))
     assert resolve_config(TrainConfig(samples=7, contraction=contraction), scene).samples == 7
