@@ -15,6 +15,7 @@ from voronerf import updating
 from voronerf.cli.main import main
 from voronerf.data import SceneError, city_scene
 from voronerf.data.record import placed, read_scene
+from voronerf.data.scene import Sightings
 from voronerf.editing import moved_cameras
 from voronerf.rendering import Cameras
 from voronerf.rendering.renderer import render_camera
@@ -286,15 +287,18 @@ def test_a_ray_is_the_light_before_of_and_behind_the_cells_that_learn(tmp_path, 
     assert float((whole.colour - colour).amax()) < 0.06
 
 
-def test_cameras_move_from_one_frame_to_another(city):
+def test_cameras_and_sightings_move_from_one_frame_to_another(city):
     angle = 0.3
     move = torch.eye(4, dtype=torch.float64)
     move[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     move[:3, :3] *= 2.0
     move[:3, 3] = torch.tensor([1.0, 2, 3])
     ours = replace(city, transform=move)
-    theirs = replace(city, transform=torch.eye(4, dtype=torch.float64))
-    found = placed(theirs, ours).train.cameras
+    seen = replace(city.train, sightings=Sightings(torch.tensor([7]), torch.tensor([3.0])))
+    theirs = replace(city, train=seen, transform=torch.eye(4, dtype=torch.float64))
+    train = placed(theirs, ours).train
+    found = train.cameras
+    torch.testing.assert_close(train.sightings.distances, torch.tensor([6.0]))  # the move doubles all lengths
     points = city.train.cameras.origins.double() @ move[:3, :3].T + move[:3, 3]
     torch.testing.assert_close(found.origins, points.float())
     lengths = found.poses[:, :3, :3].norm(dim=1)

@@ -98,12 +98,20 @@ def placed(scene: Scene, known: Scene) -> Scene:
     if known.transform is not None and scene.transform is not None:
         move = known.transform @ torch.linalg.inv(scene.transform)
         if not torch.allclose(move, torch.eye(4, dtype=move.dtype), atol=1e-6):
-            train, test = (replace(part, cameras=part.cameras.moved(move)) for part in (train, test))
+            scale = float(torch.linalg.det(move[:3, :3]).abs()) ** (1 / 3)
+            train, test = (_moved(part, move, scale) for part in (train, test))
     elif known.transform is not None or scene.transform is not None:
         which = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
         raise SceneError(f"{scene.name}: must be in the frame of {known.name}, got one that is {which} (--normalise)")
     names = ("near", "far", "box", "spacing", "kind", "contraction", "transform")
     return replace(scene, train=train, test=test, **{name: getattr(known, name) for name in names})
+
+
+def _moved(part: Split, move: Tensor, scale: float) -> Split:
+    """The views after a similarity [4, 4] of that scale."""
+    seen = part.sightings
+    seen = None if seen is None else seen._replace(distances=scale * seen.distances)
+    return replace(part, cameras=part.cameras.moved(move), sightings=seen)
 
 
 def read_scene(path: Path) -> Scene:

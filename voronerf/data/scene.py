@@ -83,7 +83,7 @@ class Split:
 
     @staticmethod
     def joined(first: Split, others: Split) -> Split:
-        """The images of both, in memory. Sightings are those of the first: others may measure in units of their own.
+        """The images of both, in memory, and their sightings.
 
         Raises:
             SceneError: one has transparent pixels and the other has not, or they are on disk.
@@ -105,16 +105,18 @@ class Split:
         masks = None
         if first.masks is not None or others.masks is not None:
             masks = stacked([torch.ones_like(e.images[..., 0]).bool() if e.masks is None else e.masks for e in both])
-        seen = first.sightings
-        if seen is not None:
-            height, width = first.images.shape[1:3]
-            view, row = seen.pixels // (height * width), seen.pixels // width % height
-            pixels = (view * cameras.height + row) * cameras.width + seen.pixels % width
-            seen = Sightings(pixels, seen.distances)
+        seen = list[Sightings]()
+        for start, each in zip((0, len(first)), both, strict=True):
+            if each.sightings is not None:
+                pixels, (height, width) = each.sightings.pixels, each.images.shape[1:3]
+                view, row = start + pixels // (height * width), pixels // width % height
+                pixels = (view * cameras.height + row) * cameras.width + pixels % width
+                seen.append(Sightings(pixels, each.sightings.distances))
+        sightings = Sightings(*(torch.cat(tensors) for tensors in zip(*seen, strict=True))) if seen else None
         names = (*first.names, *others.names)
         if len(set(names)) < len(names):
             names = (*first.names, *(f"1-{name}" for name in others.names))
-        return Split(cameras, stacked([each.images for each in both]), names, masks, sightings=seen)
+        return Split(cameras, stacked([each.images for each in both]), names, masks, sightings=sightings)
 
     def truth(self, index: int, background: Tensor | None) -> Tensor:
         """One image in 0..1 over `background` ([3]; None is black, as in rendering), float32 [h, w, 3]."""
