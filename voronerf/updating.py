@@ -19,7 +19,7 @@ from torch import Tensor
 from voronerf.data import Scene
 from voronerf.diagram import balance
 from voronerf.editing import Source, new_folder
-from voronerf.ops.render_loss import RenderLoss, render_loss_gradient
+from voronerf.ops.render_loss import render_loss_gradient
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.contraction import Contraction
 from voronerf.rendering.occupancy import HIDDEN, OccupancyGrid
@@ -556,27 +556,22 @@ class Session:
         self, rays: Rays, far: Tensor, samples: Samples, target: Tensor, before: Tensor, light: Tensor, behind: Tensor
     ) -> tuple[Tensor, Tensor]:
         """As :meth:`learn`, in one operation, see `voronerf.step.ray_loss.Fused`."""
-        networks, found = Networks(self.asked(samples, rays.directions), samples), list[RenderLoss]()
+        networks, backend = Networks(self.asked(samples, rays.directions), samples), self.config.backend
         wanted, factor = (target - before) / light, light.square().index_select(0, samples.ray_index)
         shares = gradient_shares(self.learning.sampler.space.full_gradient, samples.depths)
         factor = factor if shares is None else factor * shares[:, None]
-
-        def loss(raw: Tensor) -> tuple[Tensor, Tensor]:
-            result, gradient = render_loss_gradient(
-                raw,
-                networks.deltas,
-                samples.ray_offsets,
-                wanted,
-                background=behind,
-                density_scale=networks.density_scale,
-                hidden=HIDDEN,
-                backend=self.config.backend,
-            )
-            found.append(result)
-            return result.loss, gradient * factor
-
-        networks.learn(loss, backward=True, backend=self.config.backend)
-        return networks.density(found[0]), found[0].weights
+        found, gradient = render_loss_gradient(
+            networks.evaluate(backend),
+            networks.deltas,
+            samples.ray_offsets,
+            wanted,
+            background=behind,
+            density_scale=networks.density_scale,
+            hidden=HIDDEN,
+            backend=backend,
+        )
+        networks.learn(found.loss, gradient * factor, backward=True)
+        return networks.density(found), found.weights
 
     def revisit(self, number: int) -> None:
         """Before some steps, evaluates the field in random voxels of cells that learn."""

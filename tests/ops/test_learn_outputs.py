@@ -1,4 +1,4 @@
-"""Networks, a loss of their outputs and the gradients, in one operation."""
+"""Networks that learn from the gradient of a loss to their outputs."""
 
 from __future__ import annotations
 
@@ -51,6 +51,13 @@ def squares(out):
     return (factor * out.square()).sum(), 2 * factor * out
 
 
+def learn(given, *, backward=False, backend="auto"):
+    """The loss, with gradients."""
+    outputs = learn_outputs(given, backend=backend)
+    assert not outputs.raw.requires_grad
+    return outputs.learn(*squares(outputs.raw), backward=backward)
+
+
 def composed(given):
     """The same loss, differentiated by torch."""
     out, _ = routed_mlp(**given, backend="reference")
@@ -61,7 +68,7 @@ def composed(given):
 @pytest.mark.parametrize("backward", [False, True])
 def test_equals_its_parts(device, backend, n, k, backward):
     given, expected = network(device, n, k), network(device, n, k)
-    loss = learn_outputs(given, squares, backward=backward, backend=backend)
+    loss = learn(given, backward=backward, backend=backend)
     wanted = composed(expected)
     assert loss.requires_grad != backward
     if not backward:
@@ -78,8 +85,8 @@ def test_gradients_at_once_are_those_of_backward_bit_for_bit(device, backend):
     """They are added to those that are there, as autograd does it."""
     given, expected = network(device), network(device)
     for _ in range(2):
-        learn_outputs(given, squares, backward=True, backend=backend)
-        learn_outputs(expected, squares, backend=backend).backward()
+        learn(given, backward=True, backend=backend)
+        learn(expected, backend=backend).backward()
     for found, other in zip(parameters_of(given), parameters_of(expected), strict=True):
         assert torch.equal(found.grad, other.grad)
 
@@ -91,7 +98,7 @@ def test_only_what_needs_gradients_gets_them(device, backend):
         for number in frozen:
             parameters[number].requires_grad_(False)
         if len(frozen) < 4:
-            learn_outputs(given, squares, backward=True, backend=backend)
+            learn(given, backward=True, backend=backend)
         assert [p.grad is None for p in parameters] == [number in frozen or len(frozen) == 4 for number in range(4)]
 
 
@@ -102,7 +109,7 @@ def test_gradients_reach_what_parameters_are_made_of(device, backend):
         given = network(device)
         shared = given["weights"][0].detach()[0].clone().requires_grad_()
         given["weights"][0] = shared.expand(3, -1, -1)
-        loss = learn_outputs(given, squares, backward=backward, backend=backend)
+        loss = learn(given, backward=backward, backend=backend)
         if not backward:
             loss.backward()
         results.append([shared.grad, *(p.grad for p in parameters_of(given)[1:])])
@@ -114,20 +121,20 @@ def test_hooks_of_parameters_are_called(device, backend):
     first, second = given["weights"]
     first.register_hook(lambda gradient: called.append(gradient.shape))
     second.register_post_accumulate_grad_hook(lambda parameter: called.append(parameter.shape))
-    learn_outputs(given, squares, backward=True, backend=backend)
+    learn(given, backward=True, backend=backend)
     assert sorted(called) == sorted((first.shape, second.shape))
 
 
 def test_a_loss_without_gradients_to_anything(device, backend):
     with torch.no_grad():
-        loss = learn_outputs(network(device), squares, backend=backend)
+        loss = learn(network(device), backend=backend)
     assert not loss.requires_grad and float(loss) > 0
 
 
 def test_under_autocast(device, backend):
     given = network(device)
     with torch.autocast(torch.device(device).type, torch.bfloat16):
-        loss = learn_outputs(given, squares, backend=backend)
+        loss = learn(given, backend=backend)
     loss.backward()
     torch.testing.assert_close(loss.detach(), composed(network(device)).detach(), rtol=0.05, atol=0.0)
     assert all(parameter.grad.dtype == torch.float32 for parameter in parameters_of(given))
@@ -135,7 +142,7 @@ def test_under_autocast(device, backend):
 
 def test_is_once_differentiable(device, backend):
     given = network(device)
-    loss = learn_outputs(given, squares, backend=backend)
+    loss = learn(given, backend=backend)
     with pytest.raises(RuntimeError):
         gradients = torch.autograd.grad(loss, parameters_of(given), create_graph=True)
         torch.autograd.grad(sum(gradient.square().sum() for gradient in gradients), given["weights"][0])
@@ -144,18 +151,19 @@ def test_is_once_differentiable(device, backend):
 def test_refuses_what_makes_no_sense(device, backend):
     given = network(device)
     with refused(ValueError, "learn_outputs: network must hold positions, weights, biases and layers, got ..."):
-        learn_outputs({"positions": given["positions"]}, squares)
-    with refused(TypeError, "learn_outputs: loss must be a function, got int"):
-        learn_outputs(given, 1)
-    with refused(TypeError, "learn_outputs: backward must be True or False, got int"):
-        learn_outputs(given, squares, backward=1)
+        learn_outputs({"positions": given["positions"]})
     with refused(TypeError, "learn_outputs: unknown arguments other"):
-        learn_outputs({**given, "other": 1}, squares)
-    wrong = (lambda out: (out, out), "[40, 3] and [40, 3]"), (lambda out: (out.sum(), out[0]), "[] and [3]")
-    for result, came in wrong:
-        message = f"learn_outputs: loss must return a loss [] and a gradient [40, 3], got {came}"
-        with refused(ValueError, message):
-            learn_outputs(given, result, backend=backend)
+        learn_outputs({**given, "other": 1})
     with refused(ValueError, "learn_outputs: weights[1] must have shape ..."):
-        learn_outputs({**given, "weights": [given["weights"][0], given["weights"][1][:, :2]]}, squares)
+        learn_outputs({**given, "weights": [given["weights"][0], given["weights"][1][:, :2]]})
+    outputs = learn_outputs(given, backend=backend)
+    loss, gradient = squares(outputs.raw)
+    with refused(ValueError, "learn_outputs: loss must have shape [], got [40, 3]"):
+        outputs.learn(gradient, gradient)
+    with refused(ValueError, "learn_outputs: gradient must have shape [40, 3], got [3]"):
+        outputs.learn(loss, gradient[0])
+    with refused(TypeError, "learn_outputs: loss must be a tensor, got float"):
+        outputs.learn(0.0, gradient)
+    with refused(TypeError, "learn_outputs: backward must be True or False, got int"):
+        outputs.learn(loss, gradient, backward=1)
     assert all(parameter.grad is None for parameter in parameters_of(given))

@@ -149,14 +149,14 @@ def test_learn_outputs_leaves_frozen_cells_out(backend):
     router, points = make("table"), torch.rand(100, 3)
     router.freeze(FROZEN)
     network = router.table_arguments(points, torch.ones(100, 3), None)
-    loss = learn_outputs(network, lambda out: (out.square().sum(), 2 * out), backend=backend)
-    loss.backward()
+    outputs = learn_outputs(network, backend=backend)
+    outputs.learn(outputs.raw.square().sum(), 2 * outputs.raw, backward=True)
     for p in router.parameters():
         assert not p.grad[FROZEN].any() and p.grad[LEARNING].any()
     with pytest.raises(ValueError, match=r"frozen must have shape \[k\] with k = 4, got \[3\]"):
-        learn_outputs({**network, "frozen": torch.zeros(3, dtype=torch.bool)}, lambda out: (out.sum(), out))
+        learn_outputs({**network, "frozen": torch.zeros(3, dtype=torch.bool)})
     with pytest.raises(TypeError, match="frozen must have dtype bool, got float32"):
-        learn_outputs({**network, "frozen": torch.zeros(4)}, lambda out: (out.sum(), out))
+        learn_outputs({**network, "frozen": torch.zeros(4)})
 
 
 def test_a_step_leaves_out_rays_that_teach_nothing():

@@ -23,7 +23,7 @@ from voronerf.ops.grouped_mlp import grouped_mlp
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.hash_encode import hash_encode
 from voronerf.ops.integrated_encode import integrated_encode
-from voronerf.ops.learn_outputs import learn_outputs
+from voronerf.ops.learn_outputs import Outputs, learn_outputs
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
@@ -45,6 +45,7 @@ __all__ = [
     "HashGrid",
     "Layer",
     "March",
+    "Outputs",
     "OwnSamples",
     "PixelRays",
     "RenderLoss",

@@ -7,7 +7,6 @@ several territories.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +16,7 @@ import torch
 from torch import Tensor
 
 from voronerf.fields.radiance import activate_radiance
-from voronerf.ops.learn_outputs import learn_outputs
-from voronerf.ops.learn_outputs.reference import Loss
+from voronerf.ops.learn_outputs import Outputs, learn_outputs
 from voronerf.ops.render_loss import RenderLoss, render_loss_gradient
 from voronerf.ops.sighting_gradient import sighting_gradient
 from voronerf.ops.sighting_gradient.reference import seen_there, sighting_loss
@@ -175,6 +173,8 @@ class Networks:
 
     def __init__(self, asked: Sequence[Asked], samples: Samples) -> None:
         self.asked, self.samples, self.deltas = asked, samples, samples.deltas
+        self.alone = len(asked) == 1 and asked[0].rows is None  # one network speaks for all samples
+        self.outputs: list[Outputs] = []
         factors = [density_scale(each.router) / each.scale for each in self.asked]
         self.density_scale, self.factor = factors[0] if factors else 1.0, None
         if any(factor != factors[0] for factor in factors):
@@ -187,33 +187,26 @@ class Networks:
         """[m], per scene unit."""
         return found.density if self.factor is None else found.density * self.factor
 
-    def learn(self, loss: Loss, *, backward: bool, backend: str) -> Tensor:
-        """`learn_outputs` of all networks; a sample that none of them speaks for is empty. Arguments as of that."""
-        given: dict[str, Any] = {"backward": backward, "backend": backend}
+    def evaluate(self, backend: str) -> Tensor:
+        """[m, 4], what all networks put out; a sample that none of them speaks for is empty."""
         tables = [each.router.table_arguments(each.points, each.directions, each.ray_index) for each in self.asked]
-        if len(tables) == 1 and self.asked[0].rows is None:
-            return learn_outputs({**cast(Any, tables[0]), "rows": self.samples.rows}, loss, **given)
-        raw, learnt = self.deltas.new_full((len(self.deltas), 4), EMPTY), list[Tensor]()
+        if self.alone:
+            tables = [{**cast(Any, tables[0]), "rows": self.samples.rows}]
+        self.outputs = [learn_outputs(cast(Any, table), backend=backend) for table in tables]
+        if self.alone:
+            return self.outputs[0].raw
+        raw = self.deltas.new_full((len(self.deltas), 4), EMPTY)
+        for each, outputs in zip(self.asked, self.outputs, strict=True):
+            raw[each.rows] = outputs.raw
+        return raw
 
-        @torch.enable_grad()
-        def learn(index: int) -> Tensor:
-            """Puts out what this network and those after it say; the gradient of the loss of all of them."""
-            if index == len(tables):
-                total, gradient = loss(raw)
-                learnt.append(total)
-                return gradient
-            rows, found = self.asked[index].rows, list[Tensor]()
-
-            def own(out: Tensor) -> tuple[Tensor, Tensor]:
-                raw[rows] = out
-                found.append(learn(index + 1))
-                return out.new_zeros(()), found[0][rows]
-
-            learnt.append(learn_outputs(cast(Any, tables[index]), own, **given))
-            return found[0]
-
-        learn(0)
-        return functools.reduce(torch.add, learnt)
+    def learn(self, loss: Tensor, gradient: Tensor, *, backward: bool) -> Tensor:
+        """The loss with gradients; arguments as of `Outputs.learn`."""
+        if self.alone:
+            return self.outputs[0].learn(loss, gradient, backward=backward)
+        for each, outputs in zip(self.asked, self.outputs, strict=True):
+            loss = loss + outputs.learn(loss.new_zeros(()), gradient[each.rows], backward=backward)
+        return loss
 
 
 class Fused:
@@ -250,36 +243,30 @@ class Fused:
             inputs, directions = inputs.detach().requires_grad_(), directions.detach().requires_grad_()
         networks = Networks.of(field, samples._replace(inputs=inputs), directions)
         shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
-        found: list[RenderLoss] = []
-
-        def loss(raw: Tensor) -> tuple[Tensor, Tensor]:
-            result, gradient = render_loss_gradient(
-                raw,
-                networks.deltas,
-                samples.ray_offsets,
-                target,
-                background=background,
-                density_scale=networks.density_scale,
-                hidden=HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
-                backend=renderer.backend,
-            )
-            found.append(result)
-            total = result.loss
-            if seen is not None and batch.seen is not None:
-                # As the mean over rays, a part of them has its share of this taken afterwards.
-                factor = self.sightings / len(batch.seen) * len(batch.rays) / max(len(target), 1)
-                total = total + self._learn_sightings(gradient, result, samples, seen, factor)
-            if shares is not None:
-                gradient = gradient * shares[:, None]
-            if len(target) < all_rays:  # the others count, but learn nothing
-                total, gradient = (values * (len(target) / all_rays) for values in (total, gradient))
-            return total, gradient
-
-        total = networks.learn(loss, backward=backward, backend=renderer.backend)
+        found, gradient = render_loss_gradient(
+            networks.evaluate(renderer.backend),
+            networks.deltas,
+            samples.ray_offsets,
+            target,
+            background=background,
+            density_scale=networks.density_scale,
+            hidden=HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
+            backend=renderer.backend,
+        )
+        loss = found.loss
+        if seen is not None and batch.seen is not None:
+            # As the mean over rays, a part of them has its share of this taken afterwards.
+            factor = self.sightings / len(batch.seen) * len(batch.rays) / max(len(target), 1)
+            loss = loss + self._learn_sightings(gradient, found, samples, seen, factor)
+        if shares is not None:
+            gradient = gradient * shares[:, None]
+        if len(target) < all_rays:  # the others count, but learn nothing
+            loss, gradient = (values * (len(target) / all_rays) for values in (loss, gradient))
+        loss = networks.learn(loss, gradient, backward=backward)
         if asked:
             assert inputs.grad is not None and directions.grad is not None
             self._learn_rays(batch.rays, samples, inputs.grad, directions.grad)
-        return Found(total, found[0].error, found[0].weights, networks.density(found[0]), samples, found[0].colour)
+        return Found(loss, found.error, found.weights, networks.density(found), samples, found.colour)
 
     def _learn_rays(self, rays: Rays, samples: Samples, of_inputs: Tensor, of_directions: Tensor) -> None:
         """Gives rays the gradients to their origins and directions: samples move with them.

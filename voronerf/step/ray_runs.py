@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
@@ -198,35 +198,34 @@ class JointLoss:
         expect(self.group, "sums", width, back)
         expect(self.group, "answers", width, routes)
         homes = {n: _Pass(self.territories[n], batch, **given) for n, batch in batches.items()}
+        for home in homes.values():
+            home.evaluate()
+        left = {n: self._leave(n, home, batches[n]) for n, home in homes.items()}
+        parts = {key: part for each in left.values() for key, part in each.parts.items()}
+        came = send(self.group, "rays", width + 2, parts, routes)
+        sizes: dict[int, dict[Key, int]] = {n: {} for n in self.territories}
+        for key, table in came.items():
+            sizes[key[1]][key] = len(table)
         guests: dict[int, _Pass] = {}
-
-        def travel() -> None:
-            left = {n: self._leave(n, home, batches[n]) for n, home in homes.items()}
-            parts = {key: part for each in left.values() for key, part in each.parts.items()}
-            came = send(self.group, "rays", width + 2, parts, routes)
-            sizes: dict[int, dict[Key, int]] = {n: {} for n in self.territories}
-            for key, table in came.items():
-                sizes[key[1]][key] = len(table)
-            for number, keys in sizes.items():
-                if keys:
-                    table = torch.cat([came[key] for key in keys])
-                    seen = table[:, 8] if self.sightings else None
-                    guests[number] = _Pass(self.territories[number], _batch(table, seen), guest=True, **given)
-            _nest(list(guests.values()), lambda: compose_all(sizes, left))
-
-        def compose_all(sizes: Mapping[int, Mapping[Key, int]], left: Mapping[int, _Left]) -> None:
-            sums: dict[Key, Tensor] = {}
-            for number, guest in guests.items():
-                sums |= guest.parted(sizes[number])
-            came = send(self.group, "sums", width, sums, back)
-            answers: dict[Key, Tensor] = {}
-            for number, home in homes.items():
-                answers |= self._compose(number, home, batches[number], left[number], came)
-            told = send(self.group, "answers", width, answers, routes)
-            for number, guest in guests.items():
-                guest.answers = torch.cat([told[key] for key in sizes[number]])
-
-        _nest(list(homes.values()), travel)
+        for number, keys in sizes.items():
+            if keys:
+                table = torch.cat([came[key] for key in keys])
+                seen = table[:, 8] if self.sightings else None
+                guests[number] = _Pass(self.territories[number], _batch(table, seen), guest=True, **given)
+                guests[number].evaluate()
+        sums: dict[Key, Tensor] = {}
+        for number, guest in guests.items():
+            sums |= guest.parted(sizes[number])
+        came = send(self.group, "sums", width, sums, back)
+        answers: dict[Key, Tensor] = {}
+        for number, home in homes.items():
+            answers |= self._compose(number, home, batches[number], left[number], came)
+        told = send(self.group, "answers", width, answers, routes)
+        for number, guest in guests.items():
+            guest.answers = torch.cat([told[key] for key in sizes[number]])
+            guest.learn()
+        for home in homes.values():
+            home.learn()
         for number, counts in self.counts.items():
             counts[-2] += homes[number].samples if number in homes else 0
             counts[-1] += guests[number].samples if number in guests else 0
@@ -371,12 +370,12 @@ class _Pass:
         self.answers, self.loss = self.sums, self.near.new_zeros(())
         self.total: Tensor | None = None
         self.found: Found | None = None
+        self._going: Iterator[None] = iter(())
 
     @torch.enable_grad()
-    def evaluate(self, then: Callable[[], None]) -> None:
-        """Makes the sums, calls ``then``, which is to set the answers, and learns from these."""
+    def evaluate(self) -> None:
+        """Makes the sums."""
         if not len(self.ids):
-            then()
             return
         renderer, place = self.renderer, self.territory.place
         given: dict[str, Any] = {"jitter": True, "generator": self.territory.generator}
@@ -385,37 +384,39 @@ class _Pass:
         along = known.ray_index, known.depths, known.deltas, cells, place.own.to(cells.device)
         bent = renderer.contraction is not None
         if why_not_fused(renderer) is None and self.points is None:
-            self._fused(own_samples(known.positions, *along, bent=bent, backend=renderer.backend), then)
+            self._going = self._fused(own_samples(known.positions, *along, bent=bent, backend=renderer.backend))
         else:
-            self._composed(keep_own(known.positions, *along, bent=bent), then)
+            self._going = self._composed(keep_own(known.positions, *along, bent=bent))
+        next(self._going, None)
 
-    def _fused(self, own: OwnSamples, then: Callable[[], None]) -> None:
-        """From what the networks put out."""
+    @torch.enable_grad()
+    def learn(self) -> None:
+        """Learns from the answers."""
+        next(self._going, None)
+
+    def _fused(self, own: OwnSamples) -> Iterator[None]:
+        """From what the networks put out; pauses for the answers to the sums."""
         renderer, backend = self.renderer, self.renderer.backend
+        if not len(own.depths):
+            return
         field = cast(VoronoiRouter, renderer.field)
         shares, scale = gradient_shares(renderer.sampler.space.full_gradient, own.depths), density_scale(field)
-
-        def loss(raw: Tensor) -> tuple[Tensor, Tensor]:
-            sums, density = run_sums(raw, own, density_scale=scale, backend=backend)
-            self._told(sums, own)
-            then()
-            rule: dict[str, Any] = {"density_scale": scale, "hidden": HIDDEN, "backend": backend}
-            gradient, weights = run_gradients(raw, own, self.answers, **rule)
-            self._finds(own, weights, density)
-            return self.loss, gradient if shares is None else gradient * shares[:, None]
-
-        if not len(own.depths):
-            then()
-            return
         network = field.table_arguments(own.positions, self.rays.directions, own.ray_index)
         assert network is not None
-        self.total = learn_outputs(network, loss, backward=self.backward, backend=backend)
+        outputs = learn_outputs(network, backend=backend)
+        sums, density = run_sums(outputs.raw, own, density_scale=scale, backend=backend)
+        self._told(sums, own)
+        yield
+        rule: dict[str, Any] = {"density_scale": scale, "hidden": HIDDEN, "backend": backend}
+        gradient, weights = run_gradients(outputs.raw, own, self.answers, **rule)
+        self._finds(own, weights, density)
+        gradient = gradient if shares is None else gradient * shares[:, None]
+        self.total = outputs.learn(self.loss, gradient, backward=self.backward)
 
-    def _composed(self, own: OwnSamples, then: Callable[[], None]) -> None:
-        """From colours and densities, which torch differentiates."""
+    def _composed(self, own: OwnSamples) -> Iterator[None]:
+        """From colours and densities, which torch differentiates; pauses for the answers to the sums."""
         renderer = self.renderer
         if not len(own.depths):
-            then()
             return
         colour, density = ask(renderer.field, self.rays, _samples(own), renderer.sampler.space)
         if self.points is not None:  # the light from where points were seen is a fourth colour
@@ -425,7 +426,7 @@ class _Pass:
         runs, c = sum_runs(own, colour, density, blend), colour.shape[1]
         columns = runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]
         self._told(torch.cat(columns, 1).detach().to(self.near.dtype), own)
-        then()
+        yield
         answers = self.answers
         run, front = torch.repeat_interleave(own.run_offsets.diff()), torch.exp(-answers[:, c + 1])
         weights = runs.weights * front[run]
@@ -467,14 +468,6 @@ class _Pass:
         sums = self.sums.clone()
         sums[:, -1] = (number - torch.repeat_interleave(ends[:-1], each)).to(sums.dtype)
         return dict(zip(sizes, sums.split(each.tolist()), strict=True))
-
-
-def _nest(passes: Sequence[_Pass], last: Callable[[], None]) -> None:
-    """Makes the sums of all passes, calls ``last``, and lets all of them learn."""
-    if not passes:
-        return last()
-    first, *others = passes  # no function that names itself: that would keep all tensors of a step until a collection
-    return first.evaluate(lambda: _nest(others, last))
 
 
 def _together(home: _Pass | None, guest: _Pass | None) -> Found:
