@@ -8,7 +8,9 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import given
 import op_attacks
@@ -19,7 +21,7 @@ import store_attacks
 import torch
 import training_attacks
 import viewer_attacks
-from attempts import FAILED, REFUSED, RIGHT, Part, Tally, run_part
+from attempts import FAILED, REFUSED, RIGHT, Part, Tally, prepare, run_part
 
 #: Each part with its attempts in the long form and in the short one.
 PARTS = {
@@ -55,14 +57,20 @@ def main() -> int:
     torch.set_num_threads(1)
     until = time.monotonic() + 60 * options.minutes
     tallies: dict[str, Tally] = {}
-    for name in options.parts or PARTS:
-        part, long, short = PARTS[name]
-        count = options.count or (short if options.short else long)
-        if not count:  # what takes too long for the short form
-            continue
-        tallies[name] = run_part(part, range(options.seed, options.seed + count), jobs=options.jobs, until=until)
-        for seed, failure in tallies[name].failures:
-            print(f"{name}: {failure}\n    {sys.executable} tests/attack {name} --seed {seed} --count 1", flush=True)
+    with tempfile.TemporaryDirectory(prefix="attack-") as scratch:
+        for name in options.parts or PARTS:
+            part, long, short = PARTS[name]
+            count = options.count or (short if options.short else long)
+            if not count:  # what takes too long for the short form
+                continue
+            folder = Path(scratch) / getattr(part.prepare, "__name__", "nothing")  # which several parts start from
+            if not folder.exists():
+                prepare(part, folder)
+            seeds = range(options.seed, options.seed + count)
+            tallies[name] = run_part(part, seeds, folder, jobs=options.jobs, until=until)
+            for seed, failure in tallies[name].failures:
+                again = f"{sys.executable} tests/attack {name} --seed {seed} --count 1"
+                print(f"{name}: {failure}\n    {again}", flush=True)
 
     print(f"{'part':14} {'tried':>8} {'refused clearly':>16} {'accepted and right':>19} {'failed':>8} {'seconds':>8}")
     for name, tally in tallies.items():

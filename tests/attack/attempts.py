@@ -65,17 +65,20 @@ class Tally:
         return self.counts.total()
 
 
-def run_part(part: Part, seeds: Iterable[int], *, jobs: int, until: float = float("inf")) -> Tally:
-    """Makes the attempts of some seeds, ``jobs`` at a time; none begins after the time ``until``."""
+def prepare(part: Part, given: Path) -> None:
+    """Makes what the attempts of a part start from, in a folder that is not there yet."""
+    given.mkdir()
+    if part.prepare is not None:
+        status, _ = _finish(_fork(lambda: part.prepare(given)))
+        if status != 0:
+            raise RuntimeError(f"{part.name} could not be prepared")
+
+
+def run_part(part: Part, seeds: Iterable[int], given: Path, *, jobs: int, until: float = float("inf")) -> Tally:
+    """Makes the attempts of some seeds from what is given, ``jobs`` at a time; none begins after the time ``until``."""
     tally, started = Tally(), time.monotonic()
     waiting = list(seeds)[::-1]
     with tempfile.TemporaryDirectory(prefix="attack-") as scratch:
-        given = Path(scratch) / "given"
-        given.mkdir()
-        if part.prepare is not None:
-            status, _ = _finish(_fork(lambda: part.prepare(given)))
-            if status != 0:
-                raise RuntimeError(f"{part.name} could not be prepared")
         running = selectors.DefaultSelector()
         while running.get_map() or (waiting and time.monotonic() < until):
             while waiting and len(running.get_map()) < jobs and time.monotonic() < until:

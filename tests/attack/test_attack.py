@@ -26,8 +26,8 @@ def harmed(rng, folder, given):
 
 
 @linux
-def test_a_crash_is_a_failure_like_another():
-    tally = run_part(Part("part", harmed, 2, batch=4), range(6), jobs=2)
+def test_a_crash_is_a_failure_like_another(tmp_path):
+    tally = run_part(Part("part", harmed, 2, batch=4), range(6), tmp_path, jobs=2)
     assert tally.counts == {RIGHT: 2, REFUSED: 1, FAILED: 3}
     assert sorted(tally.failures) == [(1, "ended by SIGKILL"), (2, "took 2 s"), (3, "Failed: wrong")]
 
