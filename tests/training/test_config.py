@@ -1,7 +1,6 @@
 """Settings: every rule has its message, and JSON gives back what went in."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 import pytest
@@ -31,25 +30,6 @@ def test_json_round_trip(tmp_path):
 def test_json_of_something_else(text):
     with pytest.raises(ConfigError, match=r"run/config.json: not a configuration of this version"):
         TrainConfig.from_json(text, "run/config.json")
-
-
-def test_settings_of_older_versions():
-    """What is gone is passed over where it said what is always done now; options of the field have moved."""
-    old = {
-        "field": "nerf",
-        "width": 8,
-        "proposal_rounds": 1,
-        "distortion": 0.0,
-        "split_at_seconds": None,
-        "warmup": 0.02,
-    }
-    old |= {"skips": [1, 2], "position_octaves": 10, "direction_octaves": 4, "view_directions": True}
-    config = TrainConfig.from_json(json.dumps(old))
-    assert config.field_options == ("skips=(1, 2)", "position_octaves=10")
-    assert config.network_options["skips"] == (1, 2) and TrainConfig.from_json(config.to_json()) == config
-    message = "run: not a configuration of this version: distortion is gone and must be 0.0, got 0.01"
-    with pytest.raises(ConfigError, match=message):
-        TrainConfig.from_json(json.dumps({**old, "distortion": 0.01}), "run")
 
 
 @pytest.mark.parametrize(

@@ -302,7 +302,6 @@ class TrainConfig:
                 values = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
                 paths = {name: values.get(name) for name in PATHS}
                 values |= {name: Path(text) for name, text in paths.items() if isinstance(text, str)}
-                values = without_removed(values)
             check_types("settings", TrainConfig, values, optional=True)
             if not values:
                 raise ValueError("no settings")
@@ -317,22 +316,6 @@ CHOICES: dict[str, tuple[str, ...]] = {
 }
 #: Settings that are text in JSON.
 PATHS = ("out", "lpips")
-#: Settings of older versions that are gone, with what is always done in their place.
-REMOVED: dict[str, Any] = {
-    "balance": "published",
-    "split_proposal": False,
-    "proposal_rounds": 1,
-    "proposal_anneal": 0.0,
-    "distortion": 0.0,
-    "gradient_scaling": True,
-    "lr_split": 1.0,
-    "warmup": 0.02,
-    "temperature_final": 1.0,
-    "split_at_seconds": None,
-    "uniform_scale": 1.0,
-}
-#: Settings of older versions that are options of the field now.
-MOVED = ("skips", "position_octaves", "direction_octaves", "view_directions")
 #: Settings that may differ between a run and its continuation.
 RESUMABLE = frozenset(
     {
@@ -353,27 +336,6 @@ RESUMABLE = frozenset(
     }
     | {"checkpoint_every", "keep_checkpoints", "panels", "tensorboard", "blend", "lpips"}
 )
-
-
-def without_removed(values: dict[str, Any]) -> dict[str, Any]:
-    """Settings of an older version without those that are gone, where these say what is always done now.
-
-    Raises:
-        ValueError: A setting that is gone said something else.
-    """
-    for name in sorted(REMOVED.keys() & values.keys()):
-        if values[name] != REMOVED[name]:
-            was = f"{values[name]!r:.60}, which only version 0.1 and earlier can do"
-            raise ValueError(f"{name} is gone and must be {REMOVED[name]!r}, got {was}")
-    options = list(values.get("field_options") or ())
-    given = {name: values[name] for name in MOVED if values.get(name) is not None}
-    if isinstance(values.get("field"), str) and values["field"] in FIELDS:
-        known = FIELDS[values["field"]].options
-        own = {name: value for name, value in given.items() if name in known}
-        # The octaves of positions follow from the scene: a stored number is always one that was chosen.
-        options += [f"{n}={v!r}" for n, v in own.items() if n == "position_octaves" or v != known[n]]
-    kept = {name: value for name, value in values.items() if name not in REMOVED and name not in MOVED}
-    return {**kept, "field_options": tuple(options)} if options else kept
 
 
 def differences(a: TrainConfig, b: TrainConfig) -> list[str]:
