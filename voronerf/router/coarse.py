@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 #: Voxels that are made at a time.
 CHUNK = 1 << 14
+#: The most voxels along the longest side of a part. A level is drawn where a voxel is no wider than a pixel: by this
+#: where the part takes up to so many pixels of a picture, from which it is near.
+MOST_ACROSS = 128
 #: The opacity that is kept as 255, since a density cannot be infinite.
 OPAQUE = 0.999
 #: Where a voxel is asked: the middles of its eighths.
@@ -72,7 +75,7 @@ def make_coarse(part: Part, side: float, occupied: Callable[[Tensor], Tensor] | 
 
     Args:
         part: In evaluation mode.
-        side: Of a voxel in the scene, about.
+        side: Of a voxel in the scene, about; longer where there were more than `MOST_ACROSS`.
         occupied: Which positions [n, 3] of the scene may show something, bool [n]; None for all.
         backend: Of the look-up.
     """
@@ -81,7 +84,9 @@ def make_coarse(part: Part, side: float, occupied: Callable[[Tensor], Tensor] | 
         return None
     box = torch.stack((torch.stack([b[0] for b in boxes]).amax(0), torch.stack([b[1] for b in boxes]).amin(0)))
     box = box.to(part.owner.device)
-    shape = ((box[1] - box[0]) * part.frame.scale / side).ceil().clamp(1, 1024).long()
+    extent = (box[1] - box[0]) * part.frame.scale
+    side = max(side, float(extent.max()) / MOST_ACROSS)
+    shape = (extent / side).ceil().clamp(1, MOST_ACROSS).long()
     sides = (box[1] - box[0]) / shape
     corners, length = _CORNERS.to(box), float(sides.mean())
     voxels, values = [], []
