@@ -20,6 +20,7 @@ from voronerf.editing import moved_cameras
 from voronerf.rendering import Cameras
 from voronerf.rendering.renderer import render_camera
 from voronerf.router import Similarity, VoronoiRouter
+from voronerf.training import changes
 from voronerf.training.checkpoint import last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.trainer import Trainer
@@ -168,6 +169,31 @@ def test_a_shadow_is_found_though_no_ray_is_off(runs, city):
     assert ((places > low - 0.2) & (places < high + 0.2)).all()
 
 
+def test_surfaces_are_found_of_which_a_part_is_off(runs, city, monkeypatch):
+    """Two of five rays that end in a place are off: too few for a voxel, but more than of the old pictures."""
+    run = voronerf.open_run(runs["hashgrid"], scene=city)
+    low, high = torch.tensor([-0.4, -0.4, -0.1]), torch.tensor([0.4, 0.4, 0.1])
+    generator = torch.Generator().manual_seed(0)
+    images = [city.train.images.clone() for _ in range(2)]
+    for view in range(VIEWS):
+        image = render_camera(run.renderer, city, city.train.cameras, view)
+        here = ((image.heaviest > low) & (image.heaviest < high)).all(-1) & (image.opacity > 0.9)
+        here &= torch.rand(here.shape, generator=generator) < 0.4
+        for pictures, changed in zip(images, (here, here & False), strict=True):
+            colour = torch.where(changed[..., None], torch.tensor([1.0, 0, 1]), image.colour).clamp(0, 1)
+            pictures[view, ..., :3], pictures[view, ..., 3:] = (colour * 255).round().to(pictures.dtype), 255
+    speckled, shown = (replace(city, train=replace(city.train, images=pictures)) for pictures in images)
+    source, usual = run.source, torch.full((run.router.num_cells + 1,), 0.1)
+    new, old = (updating.RayBatches(scene, torch.device("cpu")) for scene in (speckled, shown))
+    monkeypatch.setattr(changes, "TONE", 2.0)
+    given = run.renderer, source.parts, new, usual, updating.space_voxels(city.box)
+    assert not updating.find_changes(*given).rebuilt.any()
+    found = updating.find_changes(*given, old)
+    assert found.rebuilt.any()
+    places = found.voxels.centres()
+    assert ((places > low - 0.2) & (places < high + 0.2)).all()
+
+
 def test_more_pictures_of_the_same_scene_let_all_cells_learn(tmp_path, runs, city):
     """Nothing is divided, and old pictures count as new ones do, also where the run shows them badly."""
     images = city.train.images.clone()
@@ -285,6 +311,22 @@ def test_a_ray_is_the_light_before_of_and_behind_the_cells_that_learn(tmp_path, 
     through = (1 - whole.opacity)[:, None]
     assert float(((colour - whole.colour) - through.clamp(max=1)).amax()) < 0.06
     assert float((whole.colour - colour).amax()) < 0.06
+
+
+def test_rays_are_drawn_by_their_errors():
+    """Half of them by chance, the others by the root of the squared error; a step keeps it, a search too."""
+    count, near = 1000, torch.arange(1000.0)
+    line = near[:, None].expand(-1, 3)
+    error = torch.zeros(count)
+    error[:2] = torch.tensor([0.01, 0.09])
+    pool = updating.Pool(updating.Rays(line, line), near, near, line, line, near[:, None], line, near, error)
+    chosen = pool.draw(8000, torch.Generator().manual_seed(0))
+    often = chosen.bincount(minlength=count)
+    assert abs(int(often[0]) - 1008) < 120 and abs(int(often[1]) - 3008) < 120  # one to three, and eight by chance
+    assert int((often > 0).sum()) > 900
+    more = updating.Pool.joined([pool, pool], 1500)
+    assert len(more) == 1500 and torch.equal(more.near, torch.cat((near[500:], near)))
+    assert torch.equal(more.error, torch.cat((error[500:], error))) and torch.equal(more.rays.origins[:, 0], more.near)
 
 
 def test_cameras_and_sightings_move_from_one_frame_to_another(city):

@@ -6,6 +6,7 @@ r rays, k cells.
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -53,9 +54,14 @@ from voronerf.training.trainer import Trainer
 
 #: Rays that are drawn at a time to find those that meet cells that learn, how many of these there are to be, and the
 #: share of an update that is spent on it before the first step at most, and the share that is left for steps at least.
-DRAWN, POOL, FINDING, LEARNING = 1 << 15, 1 << 17, 0.3, 0.25
-#: How often a ray is learnt from before others are found.
-AGAIN = 4
+DRAWN, POOL, FINDING, LEARNING = 1 << 15, 1 << 17, 0.4, 0.25
+#: How often a ray is learnt from before others are found, and in how many searches old pictures take part once where
+#: there are as many new ones: few of their rays are left in the end. Where there are fewer, more often.
+AGAIN, OLD_EVERY = 2, 8
+#: The share of a step's rays that are drawn by their errors, more often the larger the root of the squared error.
+BY_ERROR = 0.5
+#: The weight decay of tables, of that of a training: what is left of the old scene has fewer steps to go in.
+FORGET = 5.0
 #: Rays learn if this share of the light reaches the cells that learn; they end where, behind the first of these, others
 #: of more than that optical depth begin, unless this share of the light reaches cells that learn behind them.
 LEAST_LIGHT, MOST_BETWEEN = 0.05, 0.05
@@ -139,28 +145,29 @@ def update(
         grid = opened(grid, own)
     session = Session(replace(source, parts=parts, grid=grid), source.parts, cells, learners, own, voxels, generator)
     count = DRAWN if grid is not None else DRAWN // 4  # of rays that skip nothing
-    pools: list[list[Pool]] = []
+    rays, searches = [0, 0], itertools.count()
+    seldom = max(1, round(OLD_EVERY * min(1.0, len(pictures[0]) / len(pictures[-1]))))
 
-    def draw() -> Pool:
-        """More rays to learn from, with those before; the oldest go."""
-        found = [session.pool(batches, count >> number, agree=number > 0) for number, batches in enumerate(pictures)]
-        pools.append(found)
-        while sum(len(pool) for pair in pools[1:] for pool in pair) >= POOL:
-            pools.pop(0)
-        return Pool.joined([pool for pair in pools for pool in pair])
+    def more(known: Sequence[Pool]) -> Pool:
+        """Rays to learn from: those that are known and others, the last `POOL` of them."""
+        search = next(searches)
+        for number, batches in enumerate(pictures):
+            if not number or search % seldom == 0:
+                known = [*known, session.pool(batches, count >> number, agree=number > 0)]
+                rays[number] += len(known[-1])
+        return Pool.joined(known, POOL)
 
-    pool = draw()
+    pool = more([])
     while clock() - began < FINDING * seconds and len(pool) < POOL:
-        pool = draw()
-    rays = [sum(len(pair[number]) for pair in pools) for number in range(len(pictures))]
-    say(f"learning from {rays[0]} rays of the new pictures and {sum(rays[1:])} of the old ones")
+        pool = more([pool])
+    say(f"learning from {rays[0]} rays of the new pictures and {rays[1]} of the old ones")
     if not rays[0]:
         raise ConfigError("--data must show the cells that have changed, got pictures that see them through others")
     steps, drawn, started = 0, 0, clock() - began
     left = max(seconds - started, LEARNING * seconds)
     while (done := (clock() - began - started) / left) < 1:
         if drawn > AGAIN * len(pool):
-            pool, drawn = draw(), 0
+            pool, drawn = more([pool]), 0
         drawn += session.step(pool, steps, done)
         steps += 1
     session.keep_grid()
@@ -344,6 +351,7 @@ class Pool:
         light: [p, 1], the share of the light that passes there.
         behind: [p, 3], the colour behind the last sample in the cells, background included.
         end: [p], the depth from which cells that learn are hidden by others, or infinity.
+        error: [p], the squared errors when the rays were last learnt from; 1 before.
     """
 
     rays: Rays
@@ -354,16 +362,28 @@ class Pool:
     light: Tensor
     behind: Tensor
     end: Tensor
+    error: Tensor
 
     def __len__(self) -> int:
         return len(self.rays)
 
     @staticmethod
-    def joined(pools: Sequence[Pool]) -> Pool:
-        """The rays of several pools."""
-        rays = Rays(*(torch.cat([getattr(pool.rays, name) for pool in pools]) for name in ("origins", "directions")))
-        names = ("near", "far", "target", "before", "light", "behind", "end")
-        return Pool(rays, *(torch.cat([getattr(pool, name) for pool in pools]) for name in names))
+    def joined(pools: Sequence[Pool], most: int) -> Pool:
+        """The rays of several pools, the last of them if there are more than ``most``."""
+
+        def last(values: Sequence[Tensor]) -> Tensor:
+            return torch.cat([*values])[-most:]
+
+        rays = Rays(*(last([getattr(pool.rays, name) for pool in pools]) for name in ("origins", "directions")))
+        names = ("near", "far", "target", "before", "light", "behind", "end", "error")
+        return Pool(rays, *(last([getattr(pool, name) for pool in pools]) for name in names))
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """The numbers int64 [count] of rays for a step: some by chance, the others by their errors."""
+        chosen = torch.randint(len(self), (count,), generator=generator)
+        sums, several = self.error.sqrt().cumsum(0).cpu(), int(BY_ERROR * count)
+        chosen[:several] = torch.searchsorted(sums, sums[-1] * torch.rand(several, generator=generator))
+        return chosen.clamp(max=len(self) - 1).to(self.near.device)
 
 
 class Session:
@@ -408,7 +428,10 @@ class Session:
         for router in learners:
             router.requires_grad_().train()
         dense, tables = grouped_parameters(learners)
-        groups = [{"params": dense, "sparse": False}, {"params": tables, "sparse": True, "shrink": TABLE_DECAY}]
+        groups = [
+            {"params": dense, "sparse": False},
+            {"params": tables, "sparse": True, "shrink": TABLE_DECAY * FORGET},
+        ]
         assert self.config.lr is not None
         given: dict[str, Any] = {"betas": (0.9, 0.99), "eps": 1e-15, "backend": self.config.backend}
         self.optimizer = Adam([group for group in groups if group["params"]], lr=self.config.lr, **given)
@@ -502,7 +525,7 @@ class Session:
             far = torch.minimum(stop, batch.far[rays])
             good &= ~self.contradicting.meet(batch.rays[rays], batch.near[rays], far)
         rows, rays = good.nonzero()[:, 0], rays[good]
-        found = before[rows], passes[rows], behind[rows], depths[cut[rows]]
+        found = before[rows], passes[rows], behind[rows], depths[cut[rows]], passes.new_ones(len(rows))
         return Pool(batch.rays[rays], batch.near[rays], batch.far[rays], batch.target[rays], *found)
 
     def keep_grid(self) -> None:
@@ -524,14 +547,16 @@ class Session:
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate(config, done, number)
         self.revisit(number)
-        chosen = torch.randint(len(pool), (self.rays,), generator=self.generator).to(pool.near.device)
+        chosen = pool.draw(self.rays, self.generator)
         rays, near, far = pool.rays[chosen], pool.near[chosen], pool.far[chosen]
         samples = self.learning.sampler.sample(rays, near, far, jitter=True, generator=self.generator)
         shown = samples.depths < pool.end[chosen].index_select(0, samples.ray_index)
         samples = samples.part(shown & self.learns(samples.positions))
         self.optimizer.zero_grad()
         seen = pool.target[chosen], pool.before[chosen], pool.light[chosen], pool.behind[chosen]
-        density, weights = (self.learn_fused if self.is_fused else self.learn)(rays, far, samples, *seen)
+        density, weights, pool.error[chosen] = (self.learn_fused if self.is_fused else self.learn)(
+            rays, far, samples, *seen
+        )
         self.optimizer.step()
         if number % SHRINK_EVERY == 0:
             self.optimizer.shrink(SHRINK_EVERY)
@@ -545,16 +570,20 @@ class Session:
 
     def learn(
         self, rays: Rays, far: Tensor, samples: Samples, target: Tensor, before: Tensor, light: Tensor, behind: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Gradients of the colours' error; density [m] and weights [m] of the samples. Arguments as of `Pool`."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Gradients of the colours' errors; density [m] and weights [m] of the samples, and the squared errors [r].
+
+        Arguments as of `Pool`.
+        """
         space, backend = self.renderer.sampler.space, self.config.backend
         seen = render_samples(self.parts, rays, far, samples, space, background=behind, backend=backend)
-        colour_loss(before + light * seen.colour, target).backward()
-        return seen.density.detach(), seen.weights.detach()
+        colour = before + light * seen.colour
+        colour_loss(colour, target).backward()
+        return seen.density.detach(), seen.weights.detach(), (colour.detach() - target).square().sum(-1)
 
     def learn_fused(
         self, rays: Rays, far: Tensor, samples: Samples, target: Tensor, before: Tensor, light: Tensor, behind: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """As :meth:`learn`, in one operation, see `voronerf.step.ray_loss.Fused`."""
         networks, backend = Networks(self.asked(samples, rays.directions), samples), self.config.backend
         wanted, factor = (target - before) / light, light.square().index_select(0, samples.ray_index)
@@ -571,7 +600,7 @@ class Session:
             backend=backend,
         )
         networks.learn(found.loss, gradient * factor, backward=True)
-        return networks.density(found), found.weights
+        return networks.density(found), found.weights, found.error * light[:, 0].square()
 
     def revisit(self, number: int) -> None:
         """Before some steps, evaluates the field in random voxels of cells that learn."""

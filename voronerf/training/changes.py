@@ -35,6 +35,10 @@ VOXEL_RAYS, VOXEL_SHARE = 10, 0.6
 #: ... or if so many new and so many old rays end there or in a voxel next to it, and the mean colours that they are off
 #: by differ so much, and (squared) so many times what chance makes of it: a shadow is less than one ray may be off by.
 TONE_RAYS, TONE, TONE_CHANCE = 16, 0.05, 20.0
+#: ... or if of so many rays that end there and pass no voxel of the first kind this share more are off than of the old
+#: ones, and (squared) so many times what chance makes of it, and twice as much in a voxel next to it: what is smaller
+#: than a voxel is off in few of its rays.
+OFF_RAYS, OFF_SHARE, OFF_CHANCE = 12, 0.15, 6.0
 #: A cell has changed if it has so many voxels that have, and they are this share of those that enough rays pass, or so
 #: many of another tone, ...
 CELL_VOXELS, CELL_SPACE = 6, 0.02
@@ -125,11 +129,15 @@ def find_changes(
     passed = numbers[first].bincount(minlength=size)
     wrong = numbers[first & off[:, None]].bincount(minlength=size)
     changed = ((passed >= VOXEL_RAYS) & (wrong >= VOXEL_SHARE * passed)).reshape(space.chosen.shape)
+    changed &= near_by(changed) > 1
     toned = torch.zeros_like(changed)
     if old is not None:
         before = old.draw(RAYS, generator, random_background=False)
-        toned = other_tone(batch, seen, before, see_errors(renderer, cells, before), space)
-    changed &= near_by(changed) > 1
+        usual_seen = see_errors(renderer, cells, before)
+        were = usual_seen.error > usual[usual_seen.cell].clamp(min=LEAST)
+        shown = ~(changed.reshape(-1)[numbers.clamp(min=0)] & first).any(1)
+        toned = other_tone(batch, seen, before, usual_seen, space)
+        toned |= more_off(batch, seen, off, shown, before, usual_seen, were, space)
     known = (passed >= VOXEL_RAYS).reshape(changed.shape)
     counts = [
         own[own >= 0].bincount(minlength=cells.num_cells)
@@ -162,17 +170,66 @@ def other_tone(now: Batch, seen: SeenErrors, before: Batch, usual: SeenErrors, s
     """
     means, chances, enough = [], [], torch.ones_like(space.chosen)
     for batch, found in ((now, seen), (before, usual)):
-        numbers = space.numbers(torch.addcmul(batch.rays.origins, found.depth[:, None], batch.rays.directions))
-        ends = (numbers >= 0) & (found.depth < batch.far)
-        values = torch.cat((torch.ones_like(found.error)[:, None], found.error[:, None], found.lighter), 1)[ends]
-        sums = values.new_zeros(space.chosen.numel(), 5).index_add(0, numbers[ends], values)
-        around = torch.nn.functional.avg_pool3d(sums.T.reshape(5, *space.chosen.shape), 3, 1, 1, divisor_override=1)
+        around = where_they_end(batch, found, torch.cat((found.error[:, None], found.lighter), 1), space)
         count = around[0].clamp(min=1)
         means.append(around[2:] / count)
         chances.append((around[1] / count - means[-1].square().sum(0)).clamp(min=0) / count)
         enough &= around[0] >= TONE_RAYS
     squared = (means[0] - means[1]).square().sum(0)
     return enough & (squared > TONE**2) & (squared > TONE_CHANCE * (chances[0] + chances[1]))
+
+
+def more_off(
+    now: Batch,
+    seen: SeenErrors,
+    off: Tensor,
+    shown: Tensor,
+    before: Batch,
+    usual: SeenErrors,
+    were: Tensor,
+    space: Voxels,
+) -> Tensor:
+    """Voxels in which more of the new rays that end there are off than of the old ones, bool [x, y, z].
+
+    Args:
+        now: Rays of the new pictures.
+        seen: Where they end.
+        off: Which are off, bool [r].
+        shown: Which of them count, bool [r].
+        before: Rays of the old pictures.
+        usual: Where they end.
+        were: Which of these are off, bool [r].
+        space: All voxels.
+    """
+    new = where_they_end(now, seen, off.float()[:, None], space, shown)
+    old = where_they_end(before, usual, were.float()[:, None], space)
+    counts = new[0].clamp(min=1), old[0].clamp(min=1)
+    both = (new[1] + old[1]) / (counts[0] + counts[1])
+    chance = (both * (1 - both)).clamp(min=0.01) * (1 / counts[0] + 1 / counts[1])
+    more = (new[1] / counts[0] - old[1] / counts[1]).clamp(min=0)
+    enough = (new[0] >= OFF_RAYS) & (old[0] >= OFF_RAYS)
+    off_more = enough & (more > OFF_SHARE) & (more.square() > OFF_CHANCE * chance)
+    return off_more & (near_by(off_more & (more.square() > 2 * OFF_CHANCE * chance)) > 0)
+
+
+def where_they_end(
+    batch: Batch, seen: SeenErrors, values: Tensor, space: Voxels, chosen: Tensor | None = None
+) -> Tensor:
+    """How many rays end in and around each voxel, and the sums of their values [r, c]: [1 + c, x, y, z].
+
+    Args:
+        batch: The rays.
+        seen: Their depths.
+        values: Of each ray.
+        space: All voxels.
+        chosen: Which rays count, bool [r]; None for all.
+    """
+    numbers = space.numbers(torch.addcmul(batch.rays.origins, seen.depth[:, None], batch.rays.directions))
+    ends = (numbers >= 0) & (seen.depth < batch.far)
+    ends = ends if chosen is None else ends & chosen
+    every = torch.cat((torch.ones_like(values[:, :1]), values), 1)[ends]
+    sums = every.new_zeros(space.chosen.numel(), every.shape[1]).index_add(0, numbers[ends], every)
+    return torch.nn.functional.avg_pool3d(sums.T.reshape(-1, *space.chosen.shape), 3, 1, 1, divisor_override=1)
 
 
 def near_by(chosen: Tensor) -> Tensor:
