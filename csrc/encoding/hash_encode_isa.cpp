@@ -70,12 +70,15 @@ VN_INLINE void corners_of(const HashEncoding& in, const GridLevel& level, const 
 
 void hash_encode_rows(const HashEncoding& in, float* out, int64_t stride, int64_t begin, int64_t end) {
   for_table(in, [&](auto features, auto type) {
+    using T = typename decltype(type)::Value;
     HashCorners corners;
     for_blocks(in, begin, end, [&](int64_t first, int64_t rows, const HashPlaces& places) {
       for (int32_t level = 0; level < in.count; ++level) {
         corners_of<false>(in, in.levels[level], places, rows, corners);
-        hash_interpolate<features.value, typename decltype(type)::Value>(
-            in, in.levels[level], corners, first, rows, out + first * stride + level * features.value, stride);
+        const int64_t size = in.levels[level].entries * features.value * static_cast<int64_t>(sizeof(T));
+        if (size >= kFetchedLevel) hash_fetch<features.value, T>(in, in.levels[level], corners, first, rows);
+        hash_interpolate<features.value, T>(in, in.levels[level], corners, first, rows,
+                                            out + first * stride + level * features.value, stride);
       }
     });
   });

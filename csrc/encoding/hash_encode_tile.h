@@ -229,6 +229,23 @@ VN_INLINE T* table_of(const HashEncoding& in, T* level, int64_t point) {
   return in.in.cells == nullptr ? level : level + in.in.cells[point] * in.in.entries * kFeatures;
 }
 
+// Bytes of a level that a second-level cache does not hold beside the others: asking for entries ahead pays.
+constexpr int64_t kFetchedLevel = 1 << 20;
+
+// Entries of a level on their way to the cache, of all points before the first is computed: a processor that waits for
+// those of one point looks no more than a few points ahead. Corners that differ in x alone mostly share a line.
+template <int kFeatures, typename T>
+VN_INLINE void hash_fetch(const HashEncoding& in, const GridLevel& level, const HashCorners& corners, int64_t first,
+                          int64_t rows) {
+  const T* table = static_cast<const T*>(in.in.table) + level.offset * kFeatures;
+  for (int64_t i = 0; i < rows; ++i) {
+    const T* own = table_of<kFeatures>(in, table, first + i);
+    for (int corner = 0; corner < 8; corner += 2) {
+      __builtin_prefetch(own + int64_t{corners.entry[corner][i]} * kFeatures);
+    }
+  }
+}
+
 // Features of one level, for points `first` to `first + rows`, rows of the result `stride` apart.
 template <int kFeatures, typename T>
 VN_INLINE void hash_interpolate(const HashEncoding& in, const GridLevel& level, const HashCorners& corners,

@@ -24,6 +24,7 @@ GRIDS = {
     "four features": HashGrid(levels=4, features=4, log2_entries=10, finest=64, interpolation="smoothstep", box=BOX),
     "eight features": HashGrid(levels=3, features=8, log2_entries=10, base=8, finest=64),
     "many levels": HashGrid(levels=24, features=2, log2_entries=10, base=16, finest=2**19),
+    "asked for ahead": HashGrid(levels=2, features=2, log2_entries=17, base=60, finest=200),
     "torch-ngp": HashGrid(levels=6, features=2, log2_entries=12, base=5, finest=77, convention="torch-ngp"),
     "nerfstudio": HashGrid(levels=6, features=2, log2_entries=12, base=5, finest=77, convention="nerfstudio"),
 }
