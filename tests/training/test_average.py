@@ -29,9 +29,9 @@ def test_averages_are_exponential_over_a_growing_window(tmp_path, scene, decay):
     def follow(progress):
         nonlocal expected
         done, now = progress.step - 1, weights(trainer)
-        if done % 4 == 0:
+        if done % 8 == 0:
             window = min(1 / (1 - decay), max(1, done / 30))
-            new = 1 - (1 - 1 / window) ** 4
+            new = 1 - (1 - 1 / window) ** 8
             expected = now if expected is None else [a + (b - a) * new for a, b in zip(expected, now)]
         if progress.step % 10 == 0:
             torch.testing.assert_close(averages(trainer), expected, rtol=1e-4, atol=1e-6)

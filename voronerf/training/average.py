@@ -18,14 +18,14 @@ from voronerf.training.checkpoint import Checkpoint, CheckpointError
 
 #: Steps from one update of the averages to the next: weights of steps in between are much the same, and a large table
 #: takes time to read.
-AVERAGE_EVERY = 4
+AVERAGE_EVERY = 8
 #: The window of an average is at most this part of the steps done, since weights move far in the first steps.
 WINDOW = 1 / 30
 _KEY = "average"
 
 
 def update_averages(optimizer: torch.optim.Optimizer, decay: float, step: int) -> None:
-    """Adds the weights after a step, the first being 0, to their exponential averages, at every fourth step.
+    """Adds the weights after a step, the first being 0, to their exponential averages, at every eighth step.
 
     The decay per step is 1 - 1 / w with the window w = ``WINDOW`` * step, until it reaches ``decay``.
     """
