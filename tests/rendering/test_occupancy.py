@@ -1,5 +1,7 @@
 """The grid, and rendering through it: what is left out must not be seen."""
 
+import math
+
 import pytest
 import torch
 from helpers import refuses, render_image, renderer_of, seeded
@@ -19,6 +21,7 @@ from voronerf.rendering import (
     render_until_opaque,
 )
 from voronerf.step import Batch, Step
+from voronerf.training.renderers import through_grid
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 WHITE = torch.ones(3)
@@ -215,6 +218,32 @@ def test_a_translucent_field_is_walked_to_its_end():
     torch.testing.assert_close(quick.colour, plain.colour, atol=1e-5, rtol=0)
     torch.testing.assert_close(quick.opacity, plain.opacity, atol=1e-5, rtol=0)
     assert 0.2 < float(plain.opacity.max()) < 0.9
+
+
+def test_a_ray_that_ends_has_the_colour_before_its_end():
+    """Through fog of one colour it is that colour, although the last of the light never reached the background."""
+    asked = [0]
+
+    def fog(positions, directions, ray_index):
+        asked[0] += len(positions)
+        return torch.full_like(positions, 0.25), torch.full_like(positions[:, 0], 8.0)
+
+    rays = Rays(torch.tensor([[0.0, 0, -1], [0, 0, 0.9]]), torch.tensor([[0.0, 0, 1]]).expand(2, 3))
+    sampler = Occupancy(OccupancyGrid(BOX, 4, threshold=0.1), 200)
+    ends = torch.zeros(2), torch.tensor([2.0, 0.1])
+    seen = render_until_opaque(fog, rays, *ends, sampler, background=WHITE)
+    left = math.exp(-0.8)  # of the second ray, which does not end
+    torch.testing.assert_close(seen.colour[:, 0], torch.tensor([0.25, 0.25 * (1 - left) + left]))
+    torch.testing.assert_close(seen.opacity, torch.tensor([1.0, 1 - left]))
+    # 1 - exp(-8 t) is 0.98 at t = 0.49; the mean distance of what is seen of the fog until there
+    assert asked[0] < 200 + 64 and 0.1 < float(seen.depth[0]) < 0.125
+
+
+def test_pictures_have_twice_the_strata_of_a_training_up_to_a_bound():
+    grid = OccupancyGrid(BOX, 4, threshold=0.1)
+    found = {samples: through_grid(Stratified(samples), grid).picture_samples for samples in (64, 128, 256, 512)}
+    assert found == {64: 128, 128: 256, 256: 384, 512: 512}
+    assert through_grid(Stratified(64), grid, picture_samples=300).picture_samples == 300
 
 
 @pytest.mark.parametrize("backend", ["auto", "reference"])

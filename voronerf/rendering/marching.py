@@ -16,7 +16,7 @@ from voronerf.rendering.field import Field
 from voronerf.rendering.samplers import Occupancy
 from voronerf.rendering.volume import Samples, normalised
 
-OPAQUE = 4e-3  # a ray ends when it lets less than this through, one level of an 8-bit image
+OPAQUE = 0.02  # a ray ends when it lets less than this through: what is behind counts as of the colour before it
 WAVE = 12  # samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain
 
 
@@ -60,7 +60,7 @@ def render_until_opaque(
     """`render_rays` for pictures, without gradients: rays are walked in waves, and end when they are opaque.
 
     A wave is a few samples of every ray that is not opaque yet. So the field evaluates little more than the samples in
-    front of the first surface of each ray.
+    front of the first surface of each ray. A ray that has ended counts as opaque, with the colour that it has by then.
 
     Args:
         field: called once for each wave.
@@ -109,11 +109,15 @@ def render_until_opaque(
         through[live] = light
         more = ((stop < sampler.picture_samples) & (light > OPAQUE)).nonzero()[:, 0]
         live, start = live[more], stop[more]
+    depth = normalised(depth, opacity, far)
+    ended = through <= OPAQUE
+    colour /= torch.where(ended, opacity, 1)[:, None]
+    opacity = torch.where(ended, 1, opacity)
     if background is not None:
         colour += (1 - opacity)[:, None] * background.to(colour)
     places = rays.origins + at[:, None] * rays.directions
     places = places if contraction is None else contraction.points(places)
-    return Seen(colour, opacity, normalised(depth, opacity, far), places)
+    return Seen(colour, opacity, depth, places)
 
 
 def _heaviest(samples: Samples, weights: Tensor, rays: int) -> tuple[Tensor, Tensor]:

@@ -28,7 +28,7 @@ from voronerf.ops.ray_runs.reference import OwnSamples, along_rays, answer, comp
 from voronerf.ops.ray_runs.reference import own_samples as keep_own
 from voronerf.ops.sighting_gradient.reference import seen_there, sighting_loss
 from voronerf.rendering.cameras import Rays
-from voronerf.rendering.marching import OPAQUE, Seen
+from voronerf.rendering.marching import Seen
 from voronerf.rendering.occupancy import HIDDEN
 from voronerf.rendering.rays import intersect_box
 from voronerf.rendering.renderer import Renderer
@@ -447,7 +447,7 @@ class _Pass:
         optical = torch.zeros_like(self.near).index_add_(0, ray, sums[:, -3])
         last = torch.zeros_like(self.near)
         last.scatter_reduce_(0, ray, own.depths[own.run_offsets[1:].long() - 1], "amax")
-        self.end[self.ids] = torch.where(optical > -math.log(OPAQUE), last, math.inf)
+        self.end[self.ids] = torch.where(optical > -math.log(FAINT), last, math.inf)
 
     def _finds(self, own: OwnSamples, weights: Tensor, density: Tensor) -> None:
         error = weights.new_zeros(len(self.ids))
