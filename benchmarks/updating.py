@@ -119,7 +119,7 @@ def measure(
     again = train(every, data, total, seed, downscale, folder / f"{name}-again")
     rows = {name: scores(run, after, before) for name, run in (("old", old), ("updated", made), ("again", again))}
     cells = {"before": old.router.num_cells, "after": made.router.num_cells}
-    size = old.scene.train.cameras.smallest
+    size = list(old.scene.train.cameras.smallest)
     return {
         "data": Path(data).name,
         "size": size,
@@ -148,7 +148,7 @@ def main() -> None:
         args = given.kind, given.data, given.seconds, given.share, seed, given.downscale, given.runs
         row = measure(*args)
         print(json.dumps(row, indent=1))
-        same = ("data", "seed")
+        same = ("data", "size", "seed")
         rest = [old for old in known.get(given.kind, []) if [old.get(k) for k in same] != [row[k] for k in same]]
         known[given.kind] = [*rest, row]
         kinds[given.kind] = metadata(command=__doc__)  # each of a machine of its own
