@@ -3,7 +3,9 @@
     python -m benchmarks.updating city --runs DIR
     python -m benchmarks.updating city --runs DIR --data builtin-city:3x3 --seconds 60 --seeds 1
     python -m benchmarks.updating lego --runs DIR --data LEGO --seconds 45 --downscale 4
-    python -m benchmarks.updating fox --runs DIR --data FOX --seconds 25 --downscale 1 --seeds 0 1
+    python -m benchmarks.updating lego --runs DIR --data LEGO --seconds 150 --downscale 2 --seeds 0 1
+    python -m benchmarks.updating fox --runs DIR --data FOX --seconds 25 --downscale 4 --seeds 0 1
+    python -m benchmarks.updating fox --runs DIR --data FOX --seconds 70 --downscale 1 --seeds 0 1
 
 city: `builtin-city:4x4` with a block rebuilt. lego: the loader's bucket recoloured, in pictures edited by where a
 trained run sees their pixels. fox: every other view first, the others later. Trainings that are in DIR already are not
