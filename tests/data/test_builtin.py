@@ -6,6 +6,7 @@ import torch
 from helpers import refuses
 
 from voronerf.data import builtin_scene, load_scene
+from voronerf.data.builtin.caster import Caster
 from voronerf.data.builtin.opaque import bounds, cast
 from voronerf.data.builtin.opaque_solids import SOLIDS
 from voronerf.data.builtin.solids import Box, Cylinder, Sphere, Torus, rotation
@@ -54,7 +55,7 @@ def test_hits_against_marching(solid):
     origins = (2 * origins / np.linalg.norm(origins, axis=-1, keepdims=True)).astype(np.float32)
     directions = generator.normal(size=(150, 3)) * 0.35 - origins
     directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
-    found = solid.hit(origins, directions)
+    found, _ = Caster([[solid]])(origins, directions)
     steps = np.arange(0.5, 3.5, 1e-3)
     hits = 0
     for origin, direction, distance in zip(origins, directions, found):

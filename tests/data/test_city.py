@@ -43,7 +43,7 @@ def test_rays_see_the_first_of_all_solids(kind):
         origins = np.random.default_rng(1).uniform((-1, -1, 1), (1, 1, 2), size=(1501, 3)).astype(np.float32)
         directions = -LIGHT
     solids = [solid for group in groups for solid in group]
-    alone = np.stack([solid.hit(origins, directions) for solid in solids])
+    alone = np.stack([Caster([[solid]])(origins, directions)[0] for solid in solids])
     depth, which = Caster(groups)(origins, directions)
     assert np.array_equal(depth, alone.min(axis=0)) and np.array_equal(which, alone.argmin(axis=0))
     assert np.isfinite(depth).mean() > 0.2 and len(np.unique(which)) > 20

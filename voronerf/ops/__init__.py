@@ -17,6 +17,7 @@ from voronerf.ops.centre_grid import CentreGrid, centre_grid
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_pixels import draw_pixels
 from voronerf.ops.draw_pixels.reference import Runs
+from voronerf.ops.first_solid import Solids, first_solid
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
 from voronerf.ops.grouped_mlp import grouped_mlp
@@ -51,6 +52,7 @@ __all__ = [
     "RenderLoss",
     "Rule",
     "Runs",
+    "Solids",
     "adam",
     "balance_centres",
     "cell_sort",
@@ -58,6 +60,7 @@ __all__ = [
     "compose_runs",
     "composite",
     "draw_pixels",
+    "first_solid",
     "frequency_encode",
     "grouped_linear",
     "grouped_mlp",

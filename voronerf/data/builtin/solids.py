@@ -1,8 +1,7 @@
 """Solids that rays are cast against: spheres, boxes, cylinders and tori, each in its own frame.
 
-r rays, n points. Distances are along unit directions, infinite where a ray misses. Rays start outside of every
-solid; one that starts inside of the box around a torus does not see it. NumPy, so that views can be cast in parallel
-threads.
+n points. Which of them a ray meets first, and where, is said by :func:`voronerf.ops.first_solid`. NumPy, so that views
+can be shaded in parallel threads.
 """
 
 from __future__ import annotations
@@ -14,9 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-TRACE_STEPS = 40
-SURFACE = 5e-4  # a traced ray closer than this to a torus has hit it
 
 Array = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -49,14 +45,7 @@ def turned(vectors: Array, matrix: Array | None) -> Array:
     if matrix is None:
         return vectors
     x, y, z = vectors.T
-    return np.stack(turned_axes((x, y, z), matrix), axis=-1)
-
-
-def turned_axes(vectors: Axes, matrix: Array) -> Axes:
-    """vectors @ matrix [3, 3, ...], of which the further axes broadcast with theirs."""
-    x, y, z = vectors
-    first, second, third = (x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3))
-    return first, second, third
+    return np.stack([x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,18 +70,9 @@ class Solid(ABC):
     def extent(self) -> tuple[float, float, float]:
         """Half sides of the bounding box in the solid's own frame."""
 
-    def reach(self) -> float:
-        """Radius of a ball around the centre that holds the solid."""
-        return math.hypot(*self.extent())
-
     @abstractmethod
     def measures(self) -> tuple[float, ...]:
-        """What `distance` takes of a solid."""
-
-    @staticmethod
-    @abstractmethod
-    def distance(origins: Axes, directions: Axes, *measures: Array) -> Array:
-        """Distance to the first hit in a solid's own frame; all arguments broadcast, for rays with a solid each."""
+        """Those of its kind, see :class:`voronerf.ops.Solids`."""
 
     @abstractmethod
     def normal(self, points: Array) -> Array:
@@ -105,12 +85,6 @@ class Solid(ABC):
             half = np.abs(self.turn) @ half
         centre = np.array(self.centre, dtype=np.float32)
         return np.stack((centre - half, centre + half))
-
-    def hit(self, origins: Array, directions: Array) -> Array:
-        """Distance to the first hit of rays in the world, [r]; either argument may be [1, 3] for all rays."""
-        (ox, oy, oz) = turned(origins - np.array(self.centre, dtype=np.float32), self.turn).T
-        (dx, dy, dz) = turned(directions, self.turn).T
-        return self.distance((ox, oy, oz), (dx, dy, dz), *np.array(self.measures(), dtype=np.float32))
 
     def surface(self, points: Array) -> tuple[Array, Array]:
         """(normals [n, 3] in the world, colours [n, 3]) of points on the surface."""
@@ -129,19 +103,8 @@ class Sphere(Solid):
     def extent(self) -> tuple[float, float, float]:  # noqa: D102 (described by Solid)
         return self.radius, self.radius, self.radius
 
-    def reach(self) -> float:  # noqa: D102
-        return self.radius
-
     def measures(self) -> tuple[float, ...]:  # noqa: D102
         return (self.radius**2,)
-
-    @staticmethod
-    def distance(origins: Axes, directions: Axes, *measures: Array) -> Array:  # noqa: D102
-        (ox, oy, oz), (dx, dy, dz), (square,) = origins, directions, measures
-        b = ox * dx + oy * dy + oz * dz
-        root = b * b - (ox * ox + oy * oy + oz * oz) + square
-        t = -b - np.sqrt(np.maximum(root, 0))
-        return np.where((root >= 0) & (t > 0), t, np.float32(np.inf))
 
     def normal(self, points: Array) -> Array:  # noqa: D102
         return normalised(points)
@@ -158,11 +121,6 @@ class Box(Solid):
 
     def measures(self) -> tuple[float, ...]:  # noqa: D102
         return self.half
-
-    @staticmethod
-    def distance(origins: Axes, directions: Axes, *measures: Array) -> Array:  # noqa: D102
-        enter, _, hit = slab(origins, directions, measures)
-        return np.where(hit, enter, np.float32(np.inf))
 
     def normal(self, points: Array) -> Array:  # noqa: D102
         face = np.argmax(np.abs(points) / np.array(self.half, dtype=np.float32), axis=-1)[:, None]
@@ -184,20 +142,6 @@ class Cylinder(Solid):
     def measures(self) -> tuple[float, ...]:  # noqa: D102
         return self.radius**2, self.half_height
 
-    @staticmethod
-    def distance(origins: Axes, directions: Axes, *measures: Array) -> Array:  # noqa: D102
-        # the ray is inside between the later of the two entries (tube, slab) and the earlier of the two exits
-        (ox, oy, oz), (dx, dy, dz), (square, half_height) = origins, directions, measures
-        a = np.maximum(dx * dx + dy * dy, np.float32(1e-12))
-        b, c = ox * dx + oy * dy, ox * ox + oy * oy - square
-        root = b * b - a * c
-        spread = np.sqrt(np.maximum(root, 0))
-        dz = np.where(np.abs(dz) < 1e-9, np.float32(1e-9), dz)
-        low, high = (-half_height - oz) / dz, (half_height - oz) / dz
-        enter = np.maximum((-b - spread) / a, np.minimum(low, high))
-        leave = np.minimum((-b + spread) / a, np.maximum(low, high))
-        return np.where((root >= 0) & (enter <= leave) & (enter > 0), enter, np.float32(np.inf))
-
     def normal(self, points: Array) -> Array:  # noqa: D102
         x, y, z = points.T
         around = np.hypot(x, y)
@@ -209,7 +153,7 @@ class Cylinder(Solid):
 
 @dataclass(frozen=True, eq=False)
 class Torus(Solid):
-    """A ring around the z axis of its frame, found by sphere tracing its exact distance (Hart 1996)."""
+    """A ring around the z axis of its frame."""
 
     ring: float = 1.0
     tube: float = 0.25
@@ -219,24 +163,6 @@ class Torus(Solid):
 
     def measures(self) -> tuple[float, ...]:  # noqa: D102
         return self.ring, self.tube, self.ring + self.tube
-
-    @staticmethod
-    def distance(origins: Axes, directions: Axes, *measures: Array) -> Array:  # noqa: D102
-        ring, tube, outer = measures
-        enter, leave, inside = slab(origins, directions, (outer, outer, tube))
-        result = np.full_like(enter, np.inf)
-        rows = inside.ravel().nonzero()[0]
-        given = [np.broadcast_to(each, enter.shape)[inside] for each in (*origins, *directions, ring, tube)]
-        state = np.stack((enter[inside], leave[inside], *given))
-        for _ in range(TRACE_STEPS):
-            t, leave, ox, oy, oz, dx, dy, dz, ring, tube = state
-            gap = np.hypot(np.hypot(ox + t * dx, oy + t * dy) - ring, oz + t * dz) - tube
-            arrived = gap < SURFACE
-            result.ravel()[rows[arrived]] = t[arrived]
-            state[0] = t + gap
-            on = ~arrived & (state[0] < leave)
-            rows, state = rows[on], state[:, on]
-        return result
 
     def normal(self, points: Array) -> Array:  # noqa: D102
         x, y, z = points.T
