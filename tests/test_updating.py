@@ -313,6 +313,28 @@ def test_a_ray_is_the_light_before_of_and_behind_the_cells_that_learn(tmp_path, 
     assert float((whole.colour - colour).amax()) < 0.06
 
 
+def test_what_was_empty_is_opened_where_it_has_changed(runs, city):
+    """Of the empty voxels those in and around changed space are learnt from, and all of a cell that learns whole."""
+    run = voronerf.open_run(runs["hashgrid"], scene=city)
+    source = voronerf.editing.join([run.source], [Similarity()])
+    voxels = updating.space_voxels(city.box)
+    chosen = torch.zeros_like(voxels.chosen)
+    chosen[4:8, 4:8, 4:8] = True
+    voxels, grid, k = replace(voxels, chosen=chosen), source.grid, run.router.num_cells
+    every = torch.arange(grid.occupied.numel())
+    points, empty = grid.points(every), ~grid.occupied.view(-1)
+    size = (city.box[1] - city.box[0]) / torch.tensor(chosen.shape)
+    low, high = (city.box[0] + size * edge for edge in (4, 8))
+    away = torch.maximum(low - points, points - high).div(size).amax(1)  # in voxels
+    none = torch.zeros(k, dtype=torch.bool)
+    for whole in (none, none.index_fill(0, torch.tensor([5]), True)):
+        changes = updating.Changes(whole, ~whole, voxels, 0.1, 1.0, torch.zeros(k))
+        found = updating.may_fill(source, every, changes)
+        own = whole[run.router.assign(points).long()]
+        assert found[~empty].all() and found[away < 0.99].all() and found[own].all() and own.any() == whole.any()
+        assert not found[empty & ~own & (away > 1.01)].any() and (empty & (away < 0.99)).any()
+
+
 def test_rays_are_drawn_by_their_errors():
     """Half of them by chance, the others by the root of the squared error; a step keeps it, a search too."""
     count, near = 1000, torch.arange(1000.0)

@@ -10,7 +10,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -142,6 +142,7 @@ def update(
     grid, own = source.grid, torch.empty(0, dtype=torch.int64)
     if grid is not None:
         own = voxels_of(grid, parts, cells)
+        own = own[may_fill(source, own, changes)]
         grid = opened(grid, own)
     session = Session(replace(source, parts=parts, grid=grid), source.parts, cells, learners, own, voxels, generator)
     count = DRAWN if grid is not None else DRAWN // 4  # of rays that skip nothing
@@ -320,6 +321,20 @@ def opened(grid: OccupancyGrid, rows: Tensor) -> OccupancyGrid:
     return again
 
 
+def may_fill(source: Source, rows: Tensor, changes: Changes) -> Tensor:
+    """Which voxels of the grid of a run, int64 [q], may be occupied after an update, bool [q].
+
+    Those that are, those in and around space that has changed, and all of cells that learn whole. Samples in all space
+    of cells that learn were most of those of the first steps, and left fog.
+    """
+    grid, voxels = source.grid, changes.voxels
+    assert grid is not None
+    points = grid.points(rows)
+    near = replace(voxels, chosen=near_by(voxels.chosen) > 0).has(points)
+    owner = source.parts.assign(points).long()
+    return grid.occupied.view(-1)[rows] | near | (changes.worse[owner.clamp(min=0)] & (owner >= 0))
+
+
 def around(grid: OccupancyGrid, rows: Tensor) -> OccupancyGrid:
     """A grid in which only some voxels, int64 [q], and those that touch them are occupied, where they were before."""
     again = type(grid).from_state(grid.state_dict(), contraction=grid.contraction, device=grid.box.device)
@@ -351,7 +366,7 @@ class Pool:
         light: [p, 1], the share of the light that passes there.
         behind: [p, 3], the colour behind the last sample in the cells, background included.
         end: [p], the depth from which cells that learn are hidden by others, or infinity.
-        error: [p], the squared errors when the rays were last learnt from; 1 before.
+        error: [p], the squared errors when the rays were last learnt from, 0 where they met no sample; 1 before.
     """
 
     rays: Rays
@@ -375,8 +390,14 @@ class Pool:
             return torch.cat([*values])[-most:]
 
         rays = Rays(*(last([getattr(pool.rays, name) for pool in pools]) for name in ("origins", "directions")))
-        names = ("near", "far", "target", "before", "light", "behind", "end", "error")
+        names = [field.name for field in fields(Pool)][1:]
         return Pool(rays, *(last([getattr(pool, name) for pool in pools]) for name in names))
+
+    def part(self, rows: Tensor) -> Pool:
+        """Some of the rays, int64 [r]."""
+        rays = Rays(self.rays.origins.index_select(0, rows), self.rays.directions.index_select(0, rows))
+        names = [field.name for field in fields(Pool)][1:]
+        return Pool(rays, *(getattr(self, name).index_select(0, rows) for name in names))
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """The numbers int64 [count] of rays for a step: some by chance, the others by their errors."""
@@ -398,7 +419,7 @@ class Session:
         before: The parts before they were divided and began to learn.
         cells: bool [k], those that learn.
         learners: Their routers.
-        own: int64 [q], the voxels of the grid in these cells.
+        own: int64 [q], the voxels of the grid in these cells that may be occupied.
         changed: The space that has changed.
         generator: Of random numbers.
     """
@@ -548,15 +569,15 @@ class Session:
             group["lr"] = learning_rate(config, done, number)
         self.revisit(number)
         chosen = pool.draw(self.rays, self.generator)
-        rays, near, far = pool.rays[chosen], pool.near[chosen], pool.far[chosen]
-        samples = self.learning.sampler.sample(rays, near, far, jitter=True, generator=self.generator)
-        shown = samples.depths < pool.end[chosen].index_select(0, samples.ray_index)
+        drawn = pool.part(chosen)
+        rays, far = drawn.rays, drawn.far
+        samples = self.learning.sampler.sample(rays, drawn.near, far, jitter=True, generator=self.generator)
+        shown = samples.depths < drawn.end.index_select(0, samples.ray_index)
         samples = samples.part(shown & self.learns(samples.positions))
         self.optimizer.zero_grad()
-        seen = pool.target[chosen], pool.before[chosen], pool.light[chosen], pool.behind[chosen]
-        density, weights, pool.error[chosen] = (self.learn_fused if self.is_fused else self.learn)(
-            rays, far, samples, *seen
-        )
+        seen = drawn.target, drawn.before, drawn.light, drawn.behind
+        density, weights, error = (self.learn_fused if self.is_fused else self.learn)(rays, far, samples, *seen)
+        pool.error[chosen] = error.masked_fill(samples.ray_offsets.diff() == 0, 0)
         self.optimizer.step()
         if number % SHRINK_EVERY == 0:
             self.optimizer.shrink(SHRINK_EVERY)

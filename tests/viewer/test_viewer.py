@@ -33,6 +33,7 @@ from voronerf.data.record import read_scene
 from voronerf.evaluation.panels import palette
 from voronerf.rendering import CameraPath, orbit_cameras, read_camera_path, write_camera_path
 from voronerf.router import Similarity
+from voronerf.training import streaming
 from voronerf.training.config import ConfigError, TrainConfig
 from voronerf.training.streaming import Pages
 from voronerf.training.trainer import Trainer
@@ -71,20 +72,38 @@ def test_a_camera_at_rest_sees_what_render_gives(run, scene, tab) -> None:
     assert min(len(picture) for picture in tab.pictures) < 128  # coarse ones came before
 
 
-def test_a_run_that_is_read_as_it_is_met_is_shown_as_a_whole_one(run, scene, tmp_path, monkeypatch) -> None:
-    """`view --memory` of a joined run: a tab sees what all networks in memory show."""
+def test_a_run_larger_than_its_bound_is_shown_as_a_whole_one(run, scene, tmp_path, monkeypatch) -> None:
+    """`view --memory` of three files, of which two fit: a tab sees what all of them show, whatever it looks at."""
     monkeypatch.setattr("voronerf.viewer.client.SHARP", 128)
-    made = []
-    monkeypatch.setattr("voronerf.run.Pages", lambda *given: made.append(Pages(*given)) or made[0])
-    whole = Run.join([run, run], tmp_path / "town", frames=[Similarity(), Similarity.of((1.0, 0, 0))])
+    made, used = [], []
+
+    class Told(Pages):
+        def use(self, name):
+            super().use(name)
+            used.append((name, len(self.held)))
+
+    monkeypatch.setattr("voronerf.run.Pages", lambda *given: made.append(Told(*given)) or made[0])
+    thirds = [run.cut(cells, tmp_path / str(cells[0])) for cells in ([0, 1], [2, 3], [4, 5])]
+    whole = Run.join(thirds, tmp_path / "town", frames=[Similarity.of((0.2 * i, 0, 0)) for i in range(3)])
     bounded = open_run(tmp_path / "town", scene=scene, memory="4G")
-    assert made[0].reads == 0  # nothing before it is met
+    (pages,) = made
+    assert len(pages.files) == 3 and not pages.reads  # nothing before it is met
+    limit, largest = int(4 * 2**30 * (1 - streaming.SPARE)), max(file.size for file in pages.files.values())
+    monkeypatch.setattr(
+        streaming, "anonymous_bytes", lambda: limit - 2 * largest + sum(file.size for file in pages.held.values())
+    )
+    cameras = larger(scene.test.cameras, 128)
     with closing(view_run(bounded, port=0)) as viewer, closing(Tab(viewer, scene.test.cameras)) as tab:
         for index in (0, 1):
             tab.look(scene.test.cameras, index)
-            shown = whole.render(larger(scene.test.cameras, 128), index).colour
-            assert apart(tab.rest(), shown) < 1.5
-    assert made[0].reads > 0
+            shown = whole.render(cameras, index)
+            assert apart(tab.rest(), shown.colour) < 1.5
+        for pane in ("cells", "error", "opacity"):
+            tab.set("Show", pane)
+            picture = tab.rest()
+        assert apart(picture, shown.opacity[..., None].expand(128, 128, 3)) < 1.5
+    assert {name for name, _ in used} == set(pages.files) and max(held for _, held in used) == 2
+    assert pages.reads > 3  # what was dropped came again
 
 
 def test_on_a_phone_the_panel_is_folded_away(viewer, scene, tab):

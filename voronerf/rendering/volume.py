@@ -77,10 +77,11 @@ class Samples(NamedTuple):
 
     def part(self, rows: Tensor) -> Samples:
         """Some of the samples, bool [m]; all rays stay."""
-        counts = torch.zeros_like(self.ray_offsets).index_add(0, self.ray_index[rows].long() + 1, rows[rows].int())
-        packed = (values[rows] for values in (self.inputs, self.ray_index, self.depths, self.deltas))
+        kept = torch.nn.functional.pad(rows.cumsum(0, dtype=torch.int32), (1, 0))
+        chosen = rows.nonzero()[:, 0]
+        packed = (values.index_select(0, chosen) for values in (self.inputs, self.ray_index, self.depths, self.deltas))
         inputs, index, depths, deltas = packed
-        return Samples(inputs, index, counts.cumsum(0, dtype=torch.int32), depths, deltas)
+        return Samples(inputs, index, kept.index_select(0, self.ray_offsets), depths, deltas)
 
     def by_ray(self, values: Tensor) -> Tensor:
         """Values [m, ...] as [r, s, ...], where all rays have as many samples; else as they are."""
