@@ -229,6 +229,17 @@ def test_more_pictures_are_learnt_as_in_a_training(tmp_path, city):
         )
 
 
+def test_more_pictures_open_what_was_found_empty(tmp_path, runs, city, monkeypatch):
+    """What the first pictures did not see is empty in their grid; the first step on others samples all of it."""
+    run, seen = voronerf.open_run(runs["hashgrid"], scene=city), []
+    empty = ~run.renderer.occupancy.occupied
+    step = Trainer.train_step
+    monkeypatch.setattr(Trainer, "train_step", lambda self: seen.append(self.occupancy.occupied.clone()) or step(self))
+    made = run.update(city, tmp_path / "more", seconds=1.0, clock=ticking(), more=True)
+    assert empty.any() and seen[0].all()
+    assert not seen[-1].all() and not made.renderer.occupancy.occupied.all()  # it is found empty again
+
+
 def test_training_keeps_the_errors_of_cells(runs, city):
     run = voronerf.open_run(runs["hashgrid"], scene=city)
     usual = last_checkpoint(runs["hashgrid"]).group("errors")["usual"]
