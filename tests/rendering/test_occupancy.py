@@ -146,6 +146,35 @@ def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
     refuses("observe: decay must lie in 0..1, got -1", grid.observe, torch.zeros(1, 3), *[torch.zeros(1)] * 3, decay=-1)
 
 
+def test_holes_in_a_surface_are_filled_where_the_field_is_dense():
+    """A cell in the middle of a ball comes back; what stands alone, what is thin and what is air stay empty."""
+    radius = torch.stack(torch.meshgrid(*[torch.linspace(-15 / 16, 15 / 16, 16)] * 3, indexing="ij")).norm(dim=0)
+
+    def emptied(density, contraction=None):
+        grid = OccupancyGrid(BOX, 16, threshold=1.0, contraction=contraction)
+        grid.occupied = radius < 0.5
+        grid.occupied[8, 8, 8] = grid.occupied[10, 8, 8] = False
+        grid.density = 60.0 * grid.occupied
+        before = grid.occupied.clone()
+
+        def field(positions, directions, ray_index):
+            ball, alone = positions.norm(dim=-1) < 0.5, positions[:, 0] > 0.7
+            return positions, torch.where(ball, density, torch.where(alone, 60.0, 0.0))
+
+        grid.fill_holes(field, generator=seeded(0))
+        assert torch.equal(grid.occupied, grid.density >= grid.threshold)
+        assert bool(grid.occupied[before].all())
+        return grid, grid.occupied & ~before
+
+    grid, filled = emptied(60.0)
+    assert bool(filled[8, 8, 8]) and bool(filled[10, 8, 8]) and float(grid.density[8, 8, 8]) == 2.0
+    assert bool((radius[filled] < 0.5 + 3**0.5 / 16).all())
+    assert not bool(emptied(1.5)[1].any())  # thinner than two thresholds
+    # In contracted space densities count by its own units, which are longer ones of the world off the centre.
+    contracted = emptied(1.5, Contraction(torch.zeros(3), 0.2))[1]
+    assert bool(contracted[10, 8, 8]) and not bool(contracted[8, 8, 8])
+
+
 def test_images_are_the_same_with_a_fraction_of_the_samples():
     dense, sparse = Ball(), Ball()
     options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 96, "background": WHITE}

@@ -381,3 +381,21 @@ def test_evaluations_are_part_of_the_budget(tmp_path, scene, final_views, views)
     trainer = Trainer(uncounted, scene, clock=lambda: float(next(seconds)))
     assert 40 <= trainer.run()["seconds"] <= 44
     assert [line["views"] for line in trainer.metrics] == [5, 5, 5, final_views or len(scene.test.names)]
+
+
+def test_holes_of_the_grid_are_filled_once_at_the_end_by_the_averaged_field(tmp_path, scene, monkeypatch):
+    filled = []
+    monkeypatch.setattr(OccupancyGrid, "fill_holes", lambda grid, field, **_: filled.append(weight_of(trainer)))
+    config = small(tmp_path / "a", occupancy=True, occupancy_resolution=8, contraction="sphere")
+    trainer = stopping(config, scene, 12)
+    trainer.run()
+    assert trainer.step == 12 and not filled
+    trainer = Trainer(replace(config, resume=True), scene)
+    trainer.run()
+    with trainer.averaged():
+        averaged = weight_of(trainer)
+    assert len(filled) == 1 and torch.equal(filled[0], averaged)
+    assert not torch.equal(averaged, weight_of(trainer))
+    # What is in a box gains nothing by it.
+    Trainer(small(tmp_path / "b", occupancy=True, occupancy_resolution=8, contraction="none"), scene).run()
+    assert len(filled) == 1

@@ -27,6 +27,9 @@ from voronerf.router import VoronoiRouter
 
 CHUNK = 1 << 17  # points that a field evaluates at a time
 HIDDEN = 1e-3  # a sample is hidden if less than this share of the light reaches it
+# An empty cell is a hole if so many of the 27 around and in it are occupied, and so many random points in it are all
+# denser than so many thresholds.
+HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 9, 2, 2.0
 
 
 class OccupancyGrid:
@@ -187,6 +190,33 @@ class OccupancyGrid:
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
         self._enter(positions, density, deltas, weights, decay=decay, hidden=HIDDEN, backend=backend)
+
+    @torch.no_grad()
+    def fill_holes(self, field: Field, *, generator: torch.Generator | None = None) -> None:
+        """Occupies empty cells among occupied ones in which a field is dense: holes in surfaces that few rays meet.
+
+        For a field that learns no more: before, each of these cells would cost samples in every step. Where no ray asks
+        a field any more, it can be dense by chance. Cells that stand alone, or are thin in places, stay empty for that.
+
+        Args:
+            field: called without gradients.
+            generator: of the points, on any device.
+        """
+        beside = torch.nn.functional.avg_pool3d(self.occupied[None].float(), 3, 1, 1, divisor_override=1)[0]
+        holes = ((beside >= HOLE_NEIGHBOURS) & ~self.occupied).view(-1).nonzero()[:, 0]
+        least, device = HOLE_DENSITY * self.threshold, self.box.device
+        drawn_on = device if generator is None else generator.device
+        for _ in range(HOLE_POINTS):
+            dense = [holes[:0]]
+            for part in holes.split(CHUNK):
+                points = self.points(part, torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device))
+                density = density_of(field, points)
+                if self.contraction is not None:
+                    density = density * self.contraction.stretch(points)
+                dense.append(part[density >= least])
+            holes = torch.cat(dense)
+        self.density.view(-1)[holes] = least
+        self.occupied.view(-1)[holes] = True
 
     def _enter(self, positions: Tensor, density: Tensor, deltas: Tensor, weights: Tensor, **rule: Any) -> None:
         """Samples, in the units of the world, on their way into the grid; ``rule`` as for `observe_occupancy`."""

@@ -318,6 +318,11 @@ class Trainer:
                 self.save(wait=False)
         if loss is not None:
             self._read(loss)
+            if self.fraction >= 1:
+                started = self.clock()
+                with self.averaged():
+                    self.cells.fill_holes(self.config.seed)
+                self._count(started)
         self.writer.wait()
 
     def _read(self, loss: Tensor) -> None:
