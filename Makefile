@@ -51,9 +51,10 @@ docs: $(VENV)/.built $(VENV)/.docs
 cuda-check: $(VENV)/.installed
 	@$(BIN)/python .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
 
-# The C++ of the CPU kernels on 64-bit Arm, in qemu: needs g++-aarch64-linux-gnu and qemu-user.
+# The C++ of the CPU kernels on 64-bit Arm, in qemu, with CASES random networks and calls: needs g++-aarch64-linux-gnu and qemu-user.
+CASES ?= 12
 arm-check:
-	@tests/cpp/arm.sh
+	@tests/cpp/arm.sh $(CASES)
 
 # The operations with the instruction sets that this processor would not choose; of graphs these know nothing.
 ISAS ?= portable avx2
