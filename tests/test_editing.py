@@ -16,6 +16,7 @@ from helpers import refuses
 from voronerf import Run, editing, open_run
 from voronerf.cli.main import main
 from voronerf.data import builtin_scene
+from voronerf.data.record import read_scene
 from voronerf.router import Parts, Similarity, Solid
 from voronerf.step import Batch, Step
 from voronerf.step.ray_loss import Composed, Fused
@@ -383,6 +384,10 @@ def test_the_commands(runs, tmp_path, capsys) -> None:
     file = tmp_path / "where.json"
     file.write_text(json.dumps({"2": {"translation": [2.5, 0, 0], "degrees": [0, 0, 90], "scale": 0.5}}))
     assert main(["join", one, two, "--out", str(tmp_path / "same"), "--transforms", str(file)]) == 0
+    moves = ["--move", "2", "2.5 0 0 0 0 0 1", "--move", "3", "5 0 0 0 0 0 1"]
+    assert main(["join", one, two, one, "--out", str(tmp_path / "three"), *moves]) == 0
+    frames = [part.frame for part in open_run(tmp_path / "three", scene=read_scene(runs[0] / "scene.json")).router]
+    assert [frame.translation.tolist() for frame in frames] == [[0, 0, 0], [2.5, 0, 0], [5, 0, 0]]
     index = {
         name: sorted(path.name for path in (tmp_path / name / "checkpoints").iterdir()) for name in ("joined", "same")
     }
@@ -395,6 +400,7 @@ def test_the_commands(runs, tmp_path, capsys) -> None:
     for command, said in {
         f"join {one} {two} --out {joined}": "--out must not hold a run already",
         f"join {one} --out X": "join needs two runs or more, got 1",
+        f"join {one} {two} --out X --blend -1": "--blend must be a distance of 0 or more, got -1.0",
         f"join {one} {tmp_path / 'none'} --out X": "none: must hold a run",
         f"cut {one} --out X": "cut needs one of --box, --sphere and --cells, got none",
         f"cut {one} --out X --box 1 1 1 0 0 0": "--box: Solid: a box must have its second corner above the first",
@@ -408,7 +414,7 @@ def test_the_commands(runs, tmp_path, capsys) -> None:
         ("2", "1 0 0 0 0 0 0"): "--move 2: Similarity: scale must be positive and finite, got 0",
         ("2", "1 0 0"): "seven numbers, got 3",
         ("3", "1 0 0 0 0 0 1"): "--move 3: must be the number of a run, 1 to 2",
-        ("2",): "--move must be N",
+        ("2", "1 0 0 0 0 0 1", "--move", "2", "2 0 0 0 0 0 1"): "--move 2: must be given once",
         ("2", "1 0 0 0 0 0 -1"): "got -1",
     }.items():
         assert main(["join", one, two, "--out", str(tmp_path / "x"), "--move", *move]) == 1

@@ -11,6 +11,7 @@ from scene_files import write_images
 
 from voronerf.data import SceneError, load_scene, process
 from voronerf.data.colmap import read_model
+from voronerf.data.lenses import colmap_lens
 from voronerf.data.soundness import camera_faults, lost_cameras
 from voronerf.evaluation.video import write_video
 from voronerf.rendering.cameras import orbit_cameras
@@ -145,6 +146,11 @@ def test_cameras_far_from_all_others_count_as_missing():
     assert lost_cameras(origins).nonzero().flatten().tolist() == [7]
     assert camera_faults(origins) == []  # one is not all
     assert "depths from 0.02 to 3.52e+04" in camera_faults(circle(), torch.tensor([[0.02, 5.0], [1.0, 3.52e4]]))[0]
+    lenses = [colmap_lens("OPENCV", (736, 700, 400, 266, 0.1, 0, p1, 0.01)) for p1 in (0.02, -0.09)]
+    assert [camera_faults(circle(), lenses=[(lens, 800)]) for lens in lenses] == [
+        [],
+        ["a lens is tilted, p1 -0.09 and p2 0.01"],
+    ]
 
 
 def test_a_scene_says_what_is_wrong_with_its_cameras(tmp_path):

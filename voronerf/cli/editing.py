@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from voronerf.cli.commands import say
 from voronerf.data.record import read_scene
 from voronerf.editing import align as find_frame
@@ -45,7 +47,7 @@ def join(
     runs: tuple[Path, ...],
     /,
     out: Path,
-    move: tuple[str, ...] = (),
+    move: tyro.conf.UseAppendAction[tuple[tuple[str, str], ...]] = (),
     transforms: Path | None = None,
     align: bool = False,
     blend: float | None = None,
@@ -55,8 +57,8 @@ def join(
     Args:
         runs: Two run directories or more; the first gives data, background and settings.
         out: The new run directory.
-        move: N "tx ty tz rx ry rz s", any number of times: the run with this number, the first being 1, is scaled by
-            s, turned by angles in degrees about x, y, z and moved.
+        move: N "tx ty tz rx ry rz s", once for each run that moves: the run with this number, the first being 1, is
+            scaled by s, turned by angles in degrees about x, y, z and moved.
         transforms: JSON file with such transforms: {"2": {"translation": [..], "degrees": [..], "scale": 1}}, or a
             matrix of 4 x 4 in the place of an object.
         align: Find the transforms of all runs but the first, from the cameras of images with names that both have.
@@ -65,6 +67,8 @@ def join(
     check_out(out)
     if len(runs) < 2:
         raise ConfigError(f"join needs two runs or more, got {len(runs)}")
+    if blend is not None and not 0 <= blend < float("inf"):
+        raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
     frames = given_frames(len(runs), move, transforms)
     if align and frames:
         raise ConfigError("give --align, or --move and --transforms, not both")
@@ -81,15 +85,13 @@ def join(
     return tell(Run.join(sources, out, frames=every, blend=blend))
 
 
-def given_frames(runs: int, move: Sequence[str], transforms: Path | None) -> dict[int, Similarity]:
+def given_frames(runs: int, move: Sequence[tuple[str, str]], transforms: Path | None) -> dict[int, Similarity]:
     """The transforms of the command line and of a JSON file, by the number of their run from 0."""
     found: dict[int, Similarity] = {}
-    if len(move) % 2:
-        raise ConfigError(f'--move must be N "{MOVE}", got {" ".join(move)!r:.80}')
     stored: Any = {} if transforms is None else read_json(transforms)
     if not isinstance(stored, dict):
         raise ConfigError(f"{transforms}: must be an object with a transform for each run, got {stored!r:.60}")
-    named = [(f"--move {n}", n, text) for n, text in zip(move[::2], move[1::2], strict=True)]
+    named = [(f"--move {n}", n, text) for n, text in move]
     for where, number, value in [*named, *((f"{transforms}: {n}", n, value) for n, value in stored.items())]:
         if not number.isdecimal() or not 1 <= int(number) <= runs:
             raise ConfigError(f"{where}: must be the number of a run, 1 to {runs}")

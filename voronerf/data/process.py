@@ -135,7 +135,7 @@ def process(
     try:
         import pycolmap
     except ImportError:
-        raise ImportError("voronerf process needs pycolmap: pip install pycolmap") from None
+        raise ImportError("voronerf process needs pycolmap: pip install 'voronerf[colmap]'") from None
     if not source.exists():
         raise SceneError(f"{source}: there is no such video or folder")
     settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features)

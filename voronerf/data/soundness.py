@@ -21,8 +21,9 @@ COLLAPSED = 0.05
 DEEPEST = 1e4
 #: Focal lengths over the width of an image: fields of view of 4 to 127 degrees.
 FOCAL_LENGTHS = (0.25, 15.0)
-#: How much the focal lengths of the two axes may differ, and how large the first coefficient of a lens may be.
-ASPECT, BENT = 0.05, 1.0
+#: How much the focal lengths of the two axes may differ, and how large the first coefficient of a lens and those of its
+#: tilt (p1, p2) may be.
+ASPECT, BENT, TILTED = 0.05, 1.0, 0.05
 
 
 def lost_cameras(origins: Tensor) -> Tensor:
@@ -71,6 +72,8 @@ def camera_faults(
             faults.append(f"the focal lengths of the two axes differ, {fx:.4g} and {fy:.4g}")
         elif abs(lens.coefficients[0]) > BENT:
             faults.append(f"the first coefficient of a lens is {lens.coefficients[0]:.3g}")
+        elif max(abs(tilt) for tilt in lens.coefficients[2:4]) > TILTED:
+            faults.append(f"a lens is tilted, p1 {lens.coefficients[2]:.3g} and p2 {lens.coefficients[3]:.3g}")
     return list(dict.fromkeys(faults))
 
 

@@ -229,11 +229,11 @@ class VoronoiRouter(nn.Module):
         return joined
 
     @torch.no_grad()
-    def part(self, cells: Tensor) -> VoronoiRouter:
+    def part(self, cells: Sequence[int] | Tensor) -> VoronoiRouter:
         """A router with some of the cells, and a copy of what all cells share; it gives the same results in them.
 
         Args:
-            cells: int64 [c], ascending numbers, at least one; they become 0 to c - 1.
+            cells: [c], ascending numbers, at least one; they become 0 to c - 1.
 
         Raises:
             ValueError: No cells, cells out of range, or cells that do not ascend.
@@ -242,10 +242,11 @@ class VoronoiRouter(nn.Module):
             >>> import torch
             >>> from voronerf import VoronoiRouter
             >>> router = VoronoiRouter(torch.nn.Linear(3, 1), torch.rand(8, 3), coords="first3")
-            >>> router.part(torch.tensor([2, 5])).module.weight.shape
+            >>> router.part([2, 5]).module.weight.shape
             torch.Size([2, 1, 3])
         """
-        return self.with_cells(self.diagram.part(cells), cells)
+        taken = torch.as_tensor(cells, dtype=torch.int64, device=self.diagram.centres.device)
+        return self.with_cells(self.diagram.part(taken), taken)
 
     def with_cells(self, diagram: VoronoiDiagram, parents: Tensor) -> VoronoiRouter:
         """A copy with the cells of another diagram, each of which has the parameters of one of this router's.
