@@ -44,7 +44,8 @@ def info(run: Path | None = None, /) -> int:
     """
     if run is not None:
         opened = open_run(run)
-        for line in Step(opened.renderer, sightings=opened.config.sightings or 0.0).explain().splitlines():
+        step = Step(opened.renderer, sightings=opened.config.sightings or 0.0)
+        for line in step.explain(opened.config.territories or 1).splitlines():
             say(line)
         return 0
     for name, value in backends.describe().items():

@@ -311,7 +311,7 @@ class Fused:
             found.weights[begin:],
             samples.ray_offsets[first:],
             seen[first:],
-            backend=self.renderer.backend if density.is_cpu else "auto",  # a GPU has the reference alone
+            backend=self.renderer.backend,
         )
         # The density is a softplus of the output, whose derivative is 1 - exp(-density / scale) times the scale.
         gradient[begin:, 3] -= factor * scale * slope * torch.expm1(-density / scale)

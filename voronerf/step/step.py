@@ -53,13 +53,19 @@ class Step:
         """
         return self.way(batch, generator, backward=backward)
 
-    def explain(self) -> str:
-        """How a step is computed, and what keeps it from a faster way: some lines."""
+    def explain(self, territories: int = 1) -> str:
+        """How a step is computed, and what keeps it from a faster way: some lines.
+
+        Args:
+            territories: Those of the training; with several, the renderer is that of one of them.
+        """
         renderer, sampler = self.renderer, self.renderer.sampler
         counts = f"{sampler.samples} and {sampler.fine_samples}" if sampler.passes > 1 else f"{sampler.samples}"  # type: ignore[attr-defined]
         lines = [f"samples: {type(sampler).__name__}, {counts} a ray"]
         if isinstance(sampler, Occupancy):
             lines[0] += f", of which {sampler.grid.share:.0%} of the grid are left"
+        if territories > 1:
+            return "\n".join([*lines, *self._explain_territories(territories)])
         lines.append(f"loss: {self.way.explain()}")
         obstacle = why_not_fused(renderer, self.sightings)
         if obstacle is None:
@@ -76,3 +82,14 @@ class Step:
             elif isinstance(field, VoronoiRouter) and not field.by_table:
                 lines.append(f"{name}: {field.explain()}")
         return "\n".join(lines)
+
+    def _explain_territories(self, count: int) -> list[str]:
+        """The way of `voronerf.step.ray_runs`."""
+        obstacle = "points of the sparse model" if self.sightings else why_not_fused(self.renderer)
+        parts = "one operation each" if obstacle is None else f"separate operations: {obstacle}"
+        return [
+            f"loss: partial sums of {count} territories, each with networks and tables of its own",
+            "networks: called for the rays of a territory and for those that reach it from others; forward and "
+            f"backward are {parts}",
+            "not faster: the loss of a ray waits for the sums of all territories that it crosses",
+        ]

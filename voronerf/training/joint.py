@@ -178,8 +178,7 @@ class JointTrainer:
 
     def explain(self) -> str:
         """How a step is computed: some lines."""
-        first = next(iter(self.trainers.values())).learner.explain()
-        return f"{first}\n{len(self.owner)} territories: partial sums of rays that cross borders travel between them"
+        return next(iter(self.trainers.values())).learner.explain(len(self.owner))
 
     def learning_rate(self) -> float:
         """Of the next step, see :func:`voronerf.training.rates.learning_rate`; half of it after a divergence."""

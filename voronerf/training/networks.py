@@ -210,8 +210,9 @@ def check_backend(config: TrainConfig, device: torch.device) -> None:
     """
     marching = ("march_rays", "observe_occupancy", "learn_outputs", "render_loss_gradient") if config.occupancy else ()
     drawing = () if SAMPLERS[config.sampling].passes == 1 else ("resample",)
-    ops = ("nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite")
-    for op in (*ops, *marching, *drawing):
+    ops = ("pixel_rays", "nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", "adam")
+    seeing = ("sighting_gradient",) if config.sightings and config.occupancy else ()
+    for op in (*ops, *marching, *drawing, *seeing):
         backends.resolve(op, backend=config.backend, device=device, dtype=torch.float32)
     backends.resolve("cell_sort", backend=config.backend, device=device, dtype=torch.int32)
 
