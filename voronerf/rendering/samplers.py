@@ -184,7 +184,7 @@ class Occupancy(Stratified):
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> Samples:
-        """As that of `Stratified`."""
+        """Samples of the occupied strata of each ray; arguments and result as in `Stratified.sample`."""
         # A ray's jitter follows from the sum of the seed and of its number.
         seed = draw_seed(near.device, generator) if jitter else None
         return self.march(rays, near, far, seed=seed)[0]
@@ -253,7 +253,7 @@ class Hierarchical(Stratified):
 
     @staticmethod
     def networks(cones: bool) -> tuple[str, ...]:
-        """As that of `Stratified`."""
+        """Names of the networks; a field of cones serves both passes."""
         return ("field",) if cones else ("field", "coarse")
 
     def draw(
@@ -266,7 +266,7 @@ class Hierarchical(Stratified):
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Samples, tuple[Rendered, ...]]:
-        """As that of `Stratified`."""
+        """Samples again where the coarse pass has seen something; as in `Stratified.draw`."""
         first = self.sample(rays, near, far, jitter=jitter, generator=generator)
         before = look(self.first, first)
         return self.space.samples(rays, *self.again(before, jitter, generator)), (before,)
@@ -295,7 +295,7 @@ class Hierarchical(Stratified):
         return torch.lerp(edges[:, :-1], edges[:, 1:], inside), edges
 
     def loss_before(self, before: Rendered, last: Rendered, target: Tensor) -> Tensor:
-        """As that of `Stratified`."""
+        """Loss of the colours of the coarse pass, []."""
         return (COARSE_SHARE if self.space.cones else 1.0) * colour_loss(before.colour, target)
 
 
@@ -312,15 +312,15 @@ class Proposal(Hierarchical):
 
     @staticmethod
     def networks(cones: bool) -> tuple[str, ...]:
-        """As that of `Stratified`."""
+        """Names of the networks: the field, and the one that proposes."""
         return ("field", "proposal")
 
     def again(self, before: Rendered, jitter: bool, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """As that of `Hierarchical`."""
+        """Depths and edges of the second pass: the new intervals alone."""
         return self.intervals(before, jitter, generator)
 
     def loss_before(self, before: Rendered, last: Rendered, target: Tensor) -> Tensor:
-        """As that of `Stratified`."""
+        """The `interlevel_loss` of the proposed weights and those of the field, []."""
         assert last.samples.edges is not None and before.samples.edges is not None
         seen, proposed = (each.samples.by_ray(each.weights) for each in (last, before))
         return interlevel_loss(last.samples.edges, seen, before.samples.edges, proposed)

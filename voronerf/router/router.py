@@ -328,7 +328,7 @@ class VoronoiRouter(nn.Module):
         self._set_frozen(self.frozen | self._mask("freeze", cells))
 
     def unfreeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
-        """Lets frozen cells learn again, with the optimiser's moments that they had; arguments as of :meth:`freeze`."""
+        """Lets frozen cells learn again, with the optimiser's moments that they had; takes what `freeze` takes."""
         self._set_frozen(self.frozen & ~self._mask("unfreeze", cells))
 
     def _mask(self, method: str, cells: Sequence[int] | Tensor | None) -> Tensor:
@@ -437,8 +437,8 @@ class VoronoiRouter(nn.Module):
 
         Args:
             state_dict: What ``state_dict()`` of a router around the same module gave.
-            strict: As of ``nn.Module``.
-            assign: As of ``nn.Module``; parameters are new objects then.
+            strict: See ``nn.Module``.
+            assign: See ``nn.Module``; parameters are new objects then.
             optimizer: The optimiser that holds this router's parameters. Where the number of cells changes, its state
                 begins anew, if its own ``load_state_dict`` does not follow. Without it an optimiser that has state of
                 the cells before raises at its next step.

@@ -201,7 +201,7 @@ class Networks:
         return raw
 
     def learn(self, loss: Tensor, gradient: Tensor, *, backward: bool) -> Tensor:
-        """The loss with gradients; arguments as of `Outputs.learn`."""
+        """The loss with gradients; see `Outputs.learn`."""
         if self.alone:
             return self.outputs[0].learn(loss, gradient, backward=backward)
         for each, outputs in zip(self.asked, self.outputs, strict=True):
@@ -221,7 +221,7 @@ class Fused:
         self.renderer, self.sightings = renderer, sightings
 
     def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
-        """As of :class:`RayLoss`."""
+        """See :class:`RayLoss`."""
         renderer, directions, target, background = self.renderer, batch.rays.directions, batch.target, batch.background
         field = cast(VoronoiRouter | Parts, renderer.field)
         samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, jitter=True, generator=generator)
@@ -318,7 +318,7 @@ class Fused:
         return factor * loss
 
     def explain(self) -> str:
-        """As of :class:`RayLoss`."""
+        """See :class:`RayLoss`."""
         return "networks, colours, loss and gradients in one operation"
 
 
@@ -345,7 +345,7 @@ class Composed:
         self.renderer, self.sightings = renderer, sightings
 
     def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
-        """As of :class:`RayLoss`."""
+        """See :class:`RayLoss`."""
         given: dict[str, Any] = {"background": batch.background, "jitter": True, "generator": generator}
         *before, last = self.renderer.render(batch.rays, batch.near, batch.far, **given)
         loss, samples = colour_loss(last.colour, batch.target), last.samples
@@ -366,7 +366,7 @@ class Composed:
         return Found(loss, error, last.weights.detach(), last.density.detach(), samples, last.colour.detach())
 
     def explain(self) -> str:
-        """As of :class:`RayLoss`."""
+        """See :class:`RayLoss`."""
         return "networks, colours and loss are separate operations"
 
 

@@ -235,7 +235,7 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
 
     Args:
         run: The run directory.
-        keep: As of :func:`load_checkpoint`.
+        keep: See :func:`load_checkpoint`.
 
     Raises:
         CheckpointError: When there is none.

@@ -377,7 +377,7 @@ class JointTrainer:
             self._go_back(f"gradients of {PATIENCE} steps in a row not finite")
 
     def _check_moments(self) -> bool:
-        """As that of a trainer, of all territories."""
+        """Goes back to the last good state if a moment of Adam of any territory is not finite."""
         finite = all(all_finite(trainer.optimizer) for trainer in self.trainers.values())
         if self.group.largest(torch.tensor(float(not finite), device=self.group.device)) > 0:
             self._go_back("parameters or moments of Adam not finite")
@@ -435,7 +435,7 @@ class JointTrainer:
         self._record(found)
 
     def _record(self, scores: list[ViewScore]) -> None:
-        """As that of a trainer."""
+        """Appends scores and the state of the run to ``metrics.jsonl``."""
         now = {
             "step": self.step,
             "seconds": round(self.seconds, 3),

@@ -283,7 +283,7 @@ def open_routers(
         config: The settings.
         device: Of the networks.
         checkpoint: Of the run that goes on, or is opened.
-        pages: As of :func:`voronerf.training.parts.open_parts`.
+        pages: See :func:`voronerf.training.parts.open_parts`.
 
     Raises:
         CheckpointError: When a part is damaged.

@@ -148,7 +148,7 @@ def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
 
 
 def see(origins: Array, directions: Array, caster: Caster | None = None) -> Array:
-    """First hits of rays as premultiplied colour and coverage, [r, 4]; arguments as of `cast`."""
+    """First hits of rays as premultiplied colour and coverage, [r, 4]; arguments are those of `cast`."""
     colour, depth = cast(origins, directions, caster)
     return np.concatenate((colour, np.isfinite(depth)[:, None]), axis=-1, dtype=np.float32)
 

@@ -17,7 +17,7 @@ class Tape(Protocol):
     """What outputs were computed from, for their backward pass."""
 
     def learn(self, loss: Tensor, gradient: Tensor, backward: bool) -> Tensor:
-        """The loss with gradients; arguments as of `voronerf.ops.learn_outputs.Outputs.learn`."""
+        """The loss with gradients; see `voronerf.ops.learn_outputs.Outputs.learn`."""
         ...
 
 
