@@ -2,6 +2,10 @@
 //
 // Strata go by in words of 32. Where they lie is arithmetic without branches, which the compiler turns into vectors;
 // looking up their cells is a byte load each. Rays that only want a few samples leave after the word that has them.
+//
+// Of pictures, whose strata are many and whose samples are middles, most strata are empty. There a vector holds rays
+// instead, and each goes on to the next stratum that may not be empty: `leap`. It looks at the same middles with the
+// same arithmetic, so that the samples are the same bits.
 #include "rays/march_rays_isa.h"
 
 #include "common/simd.h"
@@ -10,6 +14,8 @@
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
+
+constexpr int64_t kUnit = 16;  // rays that leap together, and samples that are filled in together
 
 // Cells of 32 strata from `first`, -1 outside the box.
 template <MarchWhere W, bool Jittered, bool Disparity>
@@ -71,6 +77,211 @@ VN_INLINE void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int
   }
 }
 
+// Whether the middles of strata lie between their edges whatever is rounded, and whether a depth tells its stratum:
+// strata are wide against the digits of their depths.
+VN_INLINE bool wide(const MarchRay& ray, bool disparity) {
+  const float largest = __builtin_fmaxf(__builtin_fabsf(ray.near), __builtin_fabsf(ray.far));
+  return (!disparity || ray.near > 0.0f) && ray.far - ray.near >= 1e-5f * ray.count * largest;
+}
+
+// Cells that a ray's point passes in the grid, at most, while the ray goes on by 1: for all of the way to `kMarchRoom`
+// cells, each of which is `width` of the grid's space.
+template <MarchWhere W>
+VN_INLINE float pace_of(const MarchInputs& in, float width, const float* origin, const float* direction, float length,
+                        float at, const float* point) {
+  const float room = kMarchRoom * width;
+  if (W == MarchWhere::kSphere) {
+    // At a distance of r >= 1 radii the contraction shortens what lies along the radius to 1 / r^2, and what lies
+    // across to (2 - 1 / r) / r. Both fall with r, and so does the angle between a ray that goes outwards and the
+    // radius. Of another the nearest place counts that it can reach.
+    const float *centre = in.space.sphere, inverse = 1.0f / centre[3];
+    float square = 0.0f, outwards = 0.0f;
+    for (int axis = 0; axis < 3; ++axis) {
+      const float offset = (origin[axis] + at * direction[axis] - centre[axis]) * inverse;
+      square += offset * offset;
+      outwards += offset * direction[axis];
+    }
+    const float r = __builtin_sqrtf(square), here = 1.0f / (r < 1.0f ? 1.0f : r), across = (2.0f - here) * here;
+    const float nearest = r - room * inverse / across, share = 1.0f / (nearest < 1.0f ? 1.0f : nearest);
+    const float along = here * here, part = outwards * here, parts = part * part;
+    const float leaving = across * across * (length * length - parts) + along * along * parts;
+    const float falling = 1.001f * __builtin_sqrtf(leaving < 0.0f ? 0.0f : leaving);
+    const float any = (2.0f - share) * share * length;
+    return ((outwards > 0.0f) & (r > 1.0f) ? falling : any) / width;
+  }
+  if (W == MarchWhere::kPerspective) {
+    // Lines stay lines, on which a point at depth z moves as fast as 1 / z^2: to three quarters of the depth here.
+    // Nothing is known of where depths are bounded.
+    const float *axes = in.space.perspective + 3, *slopes = in.space.perspective + 12;
+    float forwards[3] = {};
+    for (int axis = 0; axis < 3; ++axis) {
+      for (int i = 0; i < 3; ++i) forwards[i] += axes[3 * i + axis] * direction[axis];
+    }
+    const float depth = 2.0f * slopes[0] / (1.0f - point[2]), inverse = 1.0f / depth;
+    const float x = __builtin_fabsf(forwards[0] / slopes[1] - point[0] * forwards[2]) * inverse;
+    const float y = __builtin_fabsf(forwards[1] / slopes[2] - point[1] * forwards[2]) * inverse;
+    const float z = 2.0f * slopes[0] * __builtin_fabsf(forwards[2]) * inverse * inverse;
+    const float sideways = x < y ? y : x, most = sideways < z ? z : sideways, nearing = (4.0f / 3.0f) * most;
+    // Towards the camera: no farther than a quarter of the depth.
+    const float back = -forwards[2] * (4.0f * kMarchRoom) * inverse * width;
+    const float known = forwards[2] < 0.0f ? nearing : most;
+    const float found = 1.001f * (known < back ? back : known) / width;
+    return 0.75f * depth > 0.5f * slopes[0] ? found : __builtin_huge_valf();
+  }
+  return length / width;
+}
+
+constexpr int32_t kToWalk = -1;  // in the place of a ray's count
+
+// Rays that walk together, a lane each: which ray it is, and at which stratum.
+struct Walk {
+  int32_t ray[kUnit], stratum[kUnit], found[kUnit];
+  float near[kUnit], far[kUnit], from[3][kUnit], along[3][kUnit], length[kUnit], slack[kUnit], share[kUnit];
+};
+
+template <bool Disparity>
+VN_INLINE void enter(const MarchInputs& in, float width, int64_t i, int64_t j, Walk& walk) {
+  const MarchRay ray = march_ray(in, i);
+  float away = 0.0f, square = 0.0f;
+  for (int axis = 0; axis < 3; ++axis) {
+    walk.from[axis][j] = in.origins[3 * i + axis], walk.along[axis][j] = in.directions[3 * i + axis];
+    away += __builtin_fabsf(walk.from[axis][j]);
+    square += walk.along[axis][j] * walk.along[axis][j];
+  }
+  walk.ray[j] = static_cast<int32_t>(i), walk.found[j] = 0;
+  walk.stratum[j] = in.start == nullptr || in.start[i] < 0 ? 0 : in.start[i];
+  walk.near[j] = ray.near, walk.far[j] = ray.far, walk.length[j] = __builtin_sqrtf(square);
+  // What may be rounded of a place, in cells; and strata in a unit of 1 - near / depth, or of depth - near.
+  walk.slack[j] = 1e-3f + 1e-6f * (away + __builtin_fabsf(ray.far) * walk.length[j]) / width;
+  walk.share[j] = (Disparity ? ray.far : 1.0f) / (ray.far - ray.near) * ray.count;
+}
+
+// Middles of strata of the rays of [begin, end) whose count is kToWalk, from empty cell to empty cell: a ray goes on by
+// as much as no occupied cell can be near. A lane whose ray has ended takes the next one.
+template <MarchWhere W, bool Disparity>
+VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* scale, uint32_t* mask, int32_t* counts,
+                    int64_t begin, int64_t end) {
+  const int64_t words = march_words(in.s);
+  const int32_t strata = static_cast<int32_t>(in.s);
+  const float width = 1.0f / __builtin_fmaxf(scale[0], __builtin_fmaxf(scale[1], scale[2]));
+  // What lies this far behind a stratum's middle is rounded to it or to what is behind.
+  const float count = static_cast<float>(in.s), before = 0.5f - (0.01f + 2e-6f * count);
+  const MarchRay any = march_ray(in, begin);  // all have as many strata
+  Walk walk;
+  int64_t next_ray = begin;
+  // Lanes whose ray has ended, and lanes that have one.
+  uint32_t ended = (1u << kUnit) - 1, there = ended;
+  for (int64_t j = 0; j < kUnit; ++j) walk.ray[j] = -1;
+  while (true) {
+    for (; ended != 0; ended &= ended - 1) {
+      const int64_t j = __builtin_ctz(ended);
+      if (walk.ray[j] >= 0) counts[walk.ray[j]] = walk.found[j];
+      while (next_ray < end && counts[next_ray] != kToWalk) ++next_ray;
+      if (next_ray < end) {
+        enter<Disparity>(in, width, next_ray++, j, walk);
+        continue;
+      }
+      enter<Disparity>(in, width, begin, j, walk);  // anything: it is not looked at
+      walk.ray[j] = -1, walk.stratum[j] = strata;
+      there &= ~(1u << j);
+    }
+    if (there == 0) break;
+    int32_t cells[kUnit], rooms[kUnit], next[kUnit];
+    float places[3][kUnit], free[kUnit], depth[kUnit], pace[kUnit];
+    for (int64_t j = 0; j < kUnit; ++j) {
+      const float o[3] = {walk.from[0][j], walk.from[1][j], walk.from[2][j]};
+      const float d[3] = {walk.along[0][j], walk.along[1][j], walk.along[2][j]};
+      const MarchRay ray{walk.near[j], walk.far[j], any.count, any.share};
+      const float at = march_depth(ray, march_fraction(ray, static_cast<float>(walk.stratum[j]) + 0.5f), Disparity);
+      float point[3];
+      march_point(in, W, o, d, at, point);
+      cells[j] = march_cell(in, scale, point);
+      for (int axis = 0; axis < 3; ++axis) places[axis][j] = (point[axis] - in.box[axis]) * scale[axis];
+      depth[j] = at;
+      pace[j] = pace_of<W>(in, width, o, d, walk.length[j], at, point);
+    }
+    for (int64_t j = 0; j < kUnit; ++j) free[j] = 1.0f;
+    for (int axis = 0; axis < 3; ++axis) {
+      const float side = axis == 0 ? static_cast<float>(in.x) : static_cast<float>(axis == 1 ? in.y : in.z);
+      for (int64_t j = 0; j < kUnit; ++j) {
+        const float above = places[axis][j] > 0.0f ? places[axis][j] : 0.0f, inside = above < side ? above : side;
+        const float part = inside - static_cast<float>(static_cast<int32_t>(inside));
+        const float nearer = part < 0.5f ? part : 1.0f - part;
+        free[j] = free[j] < nearer ? free[j] : nearer;
+      }
+    }
+    for (int64_t j = 0; j < kUnit; ++j) rooms[j] = cells[j] < 0 ? -kMarchRoom : room[cells[j]];
+    for (int64_t j = 0; j < kUnit; ++j) {
+      const float cellwise = static_cast<float>(rooms[j] - 1) + (free[j] - walk.slack[j]);
+      const float to = depth[j] + (cellwise < 0.0f ? 0.0f : cellwise) / pace[j];
+      const float share = Disparity ? 1.0f - walk.near[j] / to : to - walk.near[j];
+      const float whole = share * walk.share[j] + before, ahead = whole < count ? whole : count;
+      const int32_t far = static_cast<int32_t>(whole >= 0.0f ? ahead : 0.0f), one = walk.stratum[j] + 1;
+      next[j] = far < one ? one : far;
+    }
+    uint32_t hits = 0;
+    for (int j = 0; j < kUnit; ++j) hits |= (rooms[j] == 0 ? 1u : 0u) << j;
+    hits &= there;
+    for (; hits != 0; hits &= hits - 1) {
+      const int64_t j = __builtin_ctz(hits);
+      mask[walk.ray[j] * words + walk.stratum[j] / kMarchWord] |= uint32_t{1} << (walk.stratum[j] % kMarchWord);
+      if (++walk.found[j] == in.most) next[j] = strata;
+    }
+    for (int64_t j = 0; j < kUnit; ++j) {
+      walk.stratum[j] = next[j];
+      ended |= static_cast<uint32_t>(next[j] >= strata) << j;
+    }
+    ended &= there;
+  }
+}
+
+template <MarchWhere W, bool Disparity>
+VN_INLINE void count_by_leaps(const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts,
+                              int64_t begin, int64_t end) {
+  const int64_t words = march_words(in.s);
+  float scale[3];
+  march_scale(in, scale);
+  for (int64_t i = begin; i < end; ++i) {
+    const bool ended = in.start != nullptr && in.start[i] >= in.s;
+    if (ended || !wide(march_ray(in, i), Disparity)) {
+      count<W, false, Disparity>(in, mask, counts, i, i + 1);
+      continue;
+    }
+    for (int64_t w = i * words; w < (i + 1) * words; ++w) mask[w] = 0;
+    counts[i] = kToWalk;
+  }
+  leap<W, Disparity>(in, room, scale, mask, counts, begin, end);
+}
+
+// Samples in `strata`, at most kUnit of one ray, to rows from `row`.
+template <MarchWhere W, bool Disparity>
+VN_INLINE void fill_unit(const MarchInputs& in, const MarchRay& ray, uint32_t key, int64_t i, const int32_t* strata,
+                         int64_t many, int64_t row, int32_t* ray_index, float* depths, float* deltas,
+                         float* positions) {
+  const float *origin = in.origins + 3 * i, *direction = in.directions + 3 * i;
+  float inside[kUnit], at[kUnit], length[kUnit], x[kUnit], y[kUnit], z[kUnit];
+  if (in.seed != nullptr) {
+    for (int64_t j = 0; j < kUnit; ++j) inside[j] = hashed(key, static_cast<uint32_t>(strata[j]));
+  } else {
+    for (int64_t j = 0; j < kUnit; ++j) inside[j] = 0.5f;
+    for (int64_t j = 0; in.uniforms != nullptr && j < many; ++j) inside[j] = in.uniforms[i * in.s + strata[j]];
+  }
+  for (int64_t j = 0; j < kUnit; ++j) {
+    const float first = march_edge(ray, strata[j], Disparity), last = march_edge(ray, strata[j] + 1, Disparity);
+    at[j] = march_sample(ray, strata[j], inside[j], first, last, Disparity);
+    length[j] = last - first;
+    float point[3];
+    march_point(in, W, origin, direction, at[j], point);
+    x[j] = point[0], y[j] = point[1], z[j] = point[2];
+  }
+  for (int64_t j = 0; j < many; ++j, ++row) {
+    ray_index[row] = static_cast<int32_t>(i);
+    depths[row] = at[j];
+    deltas[row] = length[j];
+    positions[3 * row] = x[j], positions[3 * row + 1] = y[j], positions[3 * row + 2] = z[j];
+  }
+}
+
 template <MarchWhere W, bool Disparity>
 VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
                     float* depths, float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
@@ -78,9 +289,10 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
   for (int64_t i = begin; i < end; ++i) {
     const MarchRay ray = march_ray(in, i);
     const uint32_t* own = mask + i * words;
-    int64_t row = offsets[i], got = 0, next = in.s;
-    const int64_t room = offsets[i + 1] - row;
     const uint32_t key = march_key(in, i);
+    const int64_t room = offsets[i + 1] - offsets[i];
+    int64_t got = 0, next = in.s, row = offsets[i], waiting = 0;
+    int32_t strata[kUnit] = {};
     bool cut = false;
     for (int64_t w = 0; w < words && !cut; ++w) {
       for (uint32_t word = own[w]; word != 0; word &= word - 1) {
@@ -90,22 +302,29 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
           cut = true;
           break;
         }
-        const float first = march_edge(ray, stratum, Disparity), last = march_edge(ray, stratum + 1, Disparity);
-        const float inside = march_inside(in, key, i, stratum);
-        ray_index[row] = static_cast<int32_t>(i);
-        depths[row] = march_sample(ray, stratum, inside, first, last, Disparity);
-        deltas[row] = last - first;
-        march_point(in, W, in.origins + 3 * i, in.directions + 3 * i, depths[row], positions + 3 * row);
-        ++row;
+        if (waiting == kUnit) {
+          fill_unit<W, Disparity>(in, ray, key, i, strata, kUnit, row, ray_index, depths, deltas, positions);
+          row += kUnit;
+          waiting = 0;
+        }
+        strata[waiting++] = static_cast<int32_t>(stratum);
         if (++got == in.most) next = stratum + 1;
       }
+    }
+    if (waiting > 0) {
+      fill_unit<W, Disparity>(in, ray, key, i, strata, waiting, row, ray_index, depths, deltas, positions);
     }
     stop[i] = static_cast<int32_t>(next);
   }
 }
 
 template <MarchWhere W>
-VN_INLINE void count_in(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
+VN_INLINE void count_in(const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts, int64_t begin,
+                        int64_t end) {
+  if (room != nullptr) {
+    return in.disparity ? count_by_leaps<W, true>(in, room, mask, counts, begin, end)
+                        : count_by_leaps<W, false>(in, room, mask, counts, begin, end);
+  }
   const bool middles = in.uniforms == nullptr && in.seed == nullptr;
   if (in.disparity) {
     middles ? count<W, false, true>(in, mask, counts, begin, end) : count<W, true, true>(in, mask, counts, begin, end);
@@ -127,13 +346,14 @@ VN_INLINE void fill_in(const MarchInputs& in, const uint32_t* mask, const int32_
 
 }  // namespace
 
-void march_count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
+void march_count(const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts, int64_t begin,
+                 int64_t end) {
   if (in.space.sphere != nullptr) {
-    count_in<MarchWhere::kSphere>(in, mask, counts, begin, end);
+    count_in<MarchWhere::kSphere>(in, room, mask, counts, begin, end);
   } else if (in.space.perspective != nullptr) {
-    count_in<MarchWhere::kPerspective>(in, mask, counts, begin, end);
+    count_in<MarchWhere::kPerspective>(in, room, mask, counts, begin, end);
   } else {
-    count_in<MarchWhere::kWorld>(in, mask, counts, begin, end);
+    count_in<MarchWhere::kWorld>(in, room, mask, counts, begin, end);
   }
 }
 

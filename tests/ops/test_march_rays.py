@@ -113,6 +113,19 @@ def test_equals_the_reference_to_the_last_bit(device, backend, rest, r, samples)
             same(march(given, samples, device, backend, **rest, **more), expected)
 
 
+@pytest.mark.parametrize("rest", [{}, {"contraction": SPHERE.numbers}, {"contraction": AHEAD.numbers}])
+@pytest.mark.parametrize("spacing", ["linear", "disparity"])
+def test_many_rays_of_a_picture_equal_the_reference(device, backend, rest, spacing):
+    need("march_rays", backend, device, torch.float32)
+    rest = rest | {"spacing": spacing}
+    for shape, share in (((24, 20, 28), 0.0), ((24, 20, 28), 0.002), ((24, 20, 28), 0.05), ((8, 33, 5), 0.5)):
+        given = case(900, shape, share)
+        given["far"][:40], given["far"][40:80] = given["near"][:40] * (1 + 1e-5), 100.0  # short strata, and long ones
+        for more in ({}, {"most": 3}, {"start": torch.randint(0, 70, (900,), dtype=torch.int32), "most": 5}):
+            expected = march(given, 64, torch.device("cpu"), "reference", **rest, **more)
+            same(march(given, 64, device, backend, **rest, **more), expected)
+
+
 def test_a_seed_stands_for_uniforms_of_its_own(device, backend):
     r, samples = 200, 40
     box = torch.tensor([[-99.0] * 3, [99.0] * 3])

@@ -17,7 +17,9 @@ from voronerf.rendering.samplers import Occupancy
 from voronerf.rendering.volume import Samples, normalised
 
 OPAQUE = 0.02  # a ray ends when it lets less than this through: what is behind counts as of the colour before it
-WAVE = 12  # samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain
+#: Samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain. Pictures of
+#: contracted space, photographs, have so many rays that a wave's own costs count less.
+WAVE, CONTRACTED_WAVE = 12, 8
 
 
 class Seen(NamedTuple):
@@ -85,13 +87,14 @@ def render_until_opaque(
         (tensor([[1., 1., 1.]]), tensor([2.2500]))
     """
     r, contraction = len(rays), sampler.space.contraction
+    wave = WAVE if contraction is None else CONTRACTED_WAVE
     colour, opacity, depth = torch.zeros_like(rays.origins), torch.zeros_like(near), torch.zeros_like(near)
     through, top = torch.ones_like(near), torch.zeros_like(near)
     at = far.clone()
     live, start = torch.arange(r, device=near.device), None
     while live.numel() > 0:
         now = rays if live.numel() == r else rays[live]
-        samples, stop = sampler.march(now, near[live], far[live], start=start, most=WAVE, picture=True)
+        samples, stop = sampler.march(now, near[live], far[live], start=start, most=wave, picture=True)
         found = field(samples.inputs, now.directions, samples.ray_index)
         rgb, sigma = (values.to(near.dtype) for values in found)
         along = samples.depths, samples.deltas
@@ -101,7 +104,7 @@ def render_until_opaque(
         opacity[live] += light * part.opacity
         depth[live] += light * part.depth
         if heaviest:
-            weight, place = _heaviest(samples, part.weights, len(live))
+            weight, place = _heaviest(samples, part.weights, len(live), wave)
             weight = weight * light
             better = weight > top[live]
             top[live[better]], at[live[better]] = weight[better], place[better]
@@ -120,10 +123,10 @@ def render_until_opaque(
     return Seen(colour, opacity, depth, places)
 
 
-def _heaviest(samples: Samples, weights: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-    """Weight and depth [r] of the heaviest sample of each ray, of at most `WAVE`; -1 where there is none."""
+def _heaviest(samples: Samples, weights: Tensor, rays: int, most: int) -> tuple[Tensor, Tensor]:
+    """Weight and depth [r] of the heaviest sample of each ray, of which there are at most `most`; -1 without any."""
     row = torch.arange(len(weights), device=weights.device) - samples.ray_offsets[samples.ray_index]
-    table = weights.new_full((2, rays * WAVE), -1.0)
-    table[:, samples.ray_index.long() * WAVE + row] = torch.stack((weights, samples.depths))
-    weight, column = table[0].reshape(-1, WAVE).max(dim=1)
-    return weight, table[1].reshape(-1, WAVE).gather(1, column[:, None])[:, 0]
+    table = weights.new_full((2, rays * most), -1.0)
+    table[:, samples.ray_index.long() * most + row] = torch.stack((weights, samples.depths))
+    weight, column = table[0].reshape(-1, most).max(dim=1)
+    return weight, table[1].reshape(-1, most).gather(1, column[:, None])[:, 0]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from voronerf.ops.pixel_rays import pixel_rays
 from voronerf.rendering.cameras import Cameras, Rays
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
@@ -197,6 +198,20 @@ class Renderer:
             rows = numbers[top : top + side, left : left + side].reshape(-1)
             yield from (piece for piece in rows[hit[rows]].split(chunk) if len(piece))
 
+    def _rays(self, cameras: Cameras, index: int) -> Rays:
+        """Through all pixels of one camera: by the op that makes those of a training, as it undoes lenses faster."""
+        chosen = cameras[[index]]
+        known = chosen.models is None or chosen.distortion is not None
+        if self.cones or self.backend == "warp" or cameras.poses.dtype != torch.float32 or not known:
+            return cameras.image_rays(index, cones=self.cones)
+        width, height = cameras.size(index)
+        blank = torch.zeros(1, height, width, 3, dtype=torch.uint8, device=cameras.poses.device)
+        pixels = torch.arange(width * height, device=blank.device)
+        lens = {"distortion": chosen.distortion, "models": chosen.models}
+        given = chosen.poses, chosen.intrinsics, blank, pixels
+        found = pixel_rays(*given, near=0.0, far=1.0, **lens, backend=self.backend)
+        return Rays(found.origins, found.directions)
+
     @torch.no_grad()
     def image(
         self,
@@ -227,7 +242,7 @@ class Renderer:
             chunk = 16_384 if self.look is not None else 4096 if self.occupancy is None else 131_072
         if chunk < 1:
             raise ValueError(f"Renderer.image: chunk must be >= 1, got {chunk}")
-        rays = cameras.image_rays(index, cones=self.cones)
+        rays = self._rays(cameras, index)
         first, last, hit = intersect_box(rays.origins, rays.directions, box, near, far)
         colour = torch.zeros_like(rays.origins)
         colour = colour if background is None else background.to(colour).repeat(len(rays), 1)
