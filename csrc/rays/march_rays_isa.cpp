@@ -8,12 +8,15 @@
 // same arithmetic, so that the samples are the same bits.
 #include "rays/march_rays_isa.h"
 
+#include "common/memory_tile.h"
 #include "common/simd.h"
 #include "rays/march_rays_math.h"
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
+
+typedef int32_t Ints __attribute__((vector_size(4 * kLanes)));
 
 constexpr int64_t kUnit = 16;  // rays that leap together, and samples that are filled in together
 
@@ -164,6 +167,7 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
   const int64_t words = march_words(in.s);
   const int32_t strata = static_cast<int32_t>(in.s);
   const float width = 1.0f / __builtin_fmaxf(scale[0], __builtin_fmaxf(scale[1], scale[2]));
+  const float sides[3] = {static_cast<float>(in.x), static_cast<float>(in.y), static_cast<float>(in.z)};
   // What lies this far behind a stratum's middle is rounded to it or to what is behind.
   const float count = static_cast<float>(in.s), before = 0.5f - (0.01f + 2e-6f * count);
   const MarchRay any = march_ray(in, begin);  // all have as many strata
@@ -200,19 +204,19 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
       depth[j] = at;
       pace[j] = pace_of<W>(in, width, o, d, walk.length[j], at, point);
     }
-    for (int64_t j = 0; j < kUnit; ++j) free[j] = 1.0f;
-    for (int axis = 0; axis < 3; ++axis) {
-      const float side = axis == 0 ? static_cast<float>(in.x) : static_cast<float>(axis == 1 ? in.y : in.z);
-      for (int64_t j = 0; j < kUnit; ++j) {
-        const float above = places[axis][j] > 0.0f ? places[axis][j] : 0.0f, inside = above < side ? above : side;
-        const float part = inside - static_cast<float>(static_cast<int32_t>(inside));
-        const float nearer = part < 0.5f ? part : 1.0f - part;
-        free[j] = free[j] < nearer ? free[j] : nearer;
+    for (int64_t j = 0; j < kUnit; j += kLanes) {
+      const F32 one = splat(1.0f);
+      F32 border = one;
+      for (int axis = 0; axis < 3; ++axis) {
+        const F32 inside = min(max(load(places[axis] + j), splat(0.0f)), splat(sides[axis]));
+        const F32 part = inside - __builtin_convertvector(__builtin_convertvector(inside, Ints), F32);
+        border = min(border, min(part, one - part));
       }
+      store(free + j, border - load(walk.slack + j));
     }
     for (int64_t j = 0; j < kUnit; ++j) rooms[j] = cells[j] < 0 ? -kMarchRoom : room[cells[j]];
     for (int64_t j = 0; j < kUnit; ++j) {
-      const float cellwise = static_cast<float>(rooms[j] - 1) + (free[j] - walk.slack[j]);
+      const float cellwise = static_cast<float>(rooms[j] - 1) + free[j];
       const float to = depth[j] + (cellwise < 0.0f ? 0.0f : cellwise) / pace[j];
       const float share = Disparity ? 1.0f - walk.near[j] / to : to - walk.near[j];
       const float whole = share * walk.share[j] + before, ahead = whole < count ? whole : count;
