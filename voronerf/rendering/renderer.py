@@ -207,9 +207,17 @@ class Renderer:
         width, height = cameras.size(index)
         blank = torch.zeros(1, height, width, 3, dtype=torch.uint8, device=cameras.poses.device)
         pixels = torch.arange(width * height, device=blank.device)
-        lens = {"distortion": chosen.distortion, "models": chosen.models}
-        given = chosen.poses, chosen.intrinsics, blank, pixels
-        found = pixel_rays(*given, near=0.0, far=1.0, **lens, backend=self.backend)
+        found = pixel_rays(
+            chosen.poses,
+            chosen.intrinsics,
+            blank,
+            pixels,
+            near=0.0,
+            far=1.0,
+            distortion=chosen.distortion,
+            models=chosen.models,
+            backend=self.backend,
+        )
         return Rays(found.origins, found.directions)
 
     @torch.no_grad()
