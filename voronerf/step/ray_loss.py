@@ -44,7 +44,7 @@ class Batch:
         target: [r, 3], the colour of each ray's pixel over the background.
         background: [3], or [r, 3] where it was drawn; None for black.
         seen: [s], the distances of the points that the last s rays end at, or None.
-        view: int64 [r], the picture of each ray, or None where nobody asks.
+        view: int64 [r], number of the training picture of each ray, or None if not needed.
 
     Examples:
         >>> import torch

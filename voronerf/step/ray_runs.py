@@ -109,8 +109,8 @@ class Map:
         """Which territories rays [r] may meet between near and far.
 
         Returns:
-            Rays and territories, int64 [p] each, by territories and then rays. What is asked grows with p, and with the
-            logarithm of T.
+            Numbers of rays and of territories, int64 [p] each, sorted by territory, then by ray. The cost grows with p
+            and with log T.
         """
         inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
         tops, *levels = (boxes.to(near.device) for boxes in self._levels)
