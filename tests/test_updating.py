@@ -19,7 +19,7 @@ from voronerf.data.scene import Sightings
 from voronerf.editing import moved_cameras
 from voronerf.rendering import Cameras
 from voronerf.rendering.renderer import render_camera
-from voronerf.router import Similarity, VoronoiRouter
+from voronerf.router import Similarity, Solid, VoronoiRouter
 from voronerf.training import changes
 from voronerf.training.checkpoint import last_checkpoint
 from voronerf.training.config import ConfigError, TrainConfig
@@ -275,6 +275,8 @@ def test_bad_pictures_are_a_line(tmp_path, runs, city, rebuilt):
         refuses("--budget must be positive", run.update, rebuilt, out, seconds=seconds, error=ConfigError)
     refuses("--out must not hold a run already", run.update, rebuilt, runs["nerf"], seconds=1.0, error=ConfigError)
     assert not out.exists() and not list(tmp_path.iterdir())
+    cut = run.cut(Solid.box((-1, -1, -1), (1, 1, 1)), tmp_path / "cut")  # which has no errors of a training
+    refuses("leave out --no-use-old", cut.update, rebuilt, out, seconds=1.0, old=False, error=ConfigError)
 
 
 def test_an_interrupted_update_leaves_nothing(tmp_path, runs, city, rebuilt, monkeypatch):

@@ -246,7 +246,10 @@ def compare(
     renderer = make_renderer(source.config, source.scene, {"field": source.parts}, occupancy=source.grid)
     if usual is None:
         if old is None:
-            raise ConfigError("the run has no errors to compare with, as its training keeps them; give --old DIR")
+            raise ConfigError(
+                "the run keeps no errors to compare with, as those that were joined, cut, placed or updated: its old "
+                "pictures are needed, so leave out --no-use-old"
+            )
         usual = usual_errors(renderer, source.parts, old)
     changes = find_changes(renderer, source.parts, new, usual, space, old)
     if changes.met < LEAST_MET:
