@@ -10,6 +10,7 @@ from tiny_runs import assert_resumes, small
 from voronerf import VoronoiRouter
 from voronerf.fields import FIELDS, register_field
 from voronerf.training.adam import Adam
+from voronerf.training.networks import make_optimizer
 from voronerf.training.trainer import Trainer
 
 
@@ -115,6 +116,12 @@ def test_a_field_names_its_tables(tmp_path, scene, embedded):
     shrunk = table[~met].detach() / before[~met]  # the others have the decay of the first step alone
     assert float(shrunk.max()) < 1 and torch.allclose(shrunk, shrunk[0, 0])
     assert bool((table[met] != before[met] * shrunk[0, 0]).any(1).all())
+
+
+def test_tables_of_many_views_shrink_less(tmp_path, scene, embedded):
+    trainer = Trainer(small(tmp_path, field=embedded, depth=None), scene)
+    made = (make_optimizer(trainer.routers, trainer.config, views=views) for views in (1, 300, 3000))
+    assert [optimizer.param_groups[1]["shrink"] for optimizer in made] == pytest.approx([0.1, 0.1, 0.01])
 
 
 def test_tables_resume_bit_for_bit(tmp_path, scene, embedded):

@@ -31,8 +31,9 @@ from voronerf.training.streaming import Pages
 
 #: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
-#: Weight decay of tables: of what nothing asks for again, such as noise that early steps have left in empty space.
-TABLE_DECAY = 0.1
+#: Weight decay of tables: of what nothing asks for again, such as noise that early steps have left in empty space. With
+#: more views than these it is less by as much: a place is asked for again only after many more steps.
+TABLE_DECAY, DECAY_VIEWS = 0.1, 300
 #: Steps from one decay to the next, since a large table takes time to read.
 SHRINK_EVERY = 16
 #: Factor of the loss on the sightings of points.
@@ -343,7 +344,7 @@ def parameter_groups(
     return dense, tables
 
 
-def make_optimizer(routers: Mapping[str, VoronoiRouter | Parts], config: TrainConfig) -> Adam:
+def make_optimizer(routers: Mapping[str, VoronoiRouter | Parts], config: TrainConfig, *, views: int) -> Adam:
     """Adam with a decay of 0.99 for the squared gradients, where the default is 0.999.
 
     After a split each cell sees fewer samples and other gradients than its parent. With the default, the moments of the
@@ -351,12 +352,17 @@ def make_optimizer(routers: Mapping[str, VoronoiRouter | Parts], config: TrainCo
     100 x 100.
 
     Tables have weight decay; otherwise their entries that have no gradient stay as they are.
+
+    Args:
+        routers: The networks, by name.
+        config: The settings.
+        views: Of the training; the more of them, the less a table decays.
     """
     assert config.lr is not None
     dense, tables = parameter_groups(routers, config)
     groups = [{"params": dense, "sparse": False}]
     if tables:
-        groups.append({"params": tables, "sparse": True, "shrink": TABLE_DECAY})
+        groups.append({"params": tables, "sparse": True, "shrink": TABLE_DECAY / max(1.0, views / DECAY_VIEWS)})
     options: dict[str, Any] = {"lr": config.lr}
     if config.cuda_graph:  # a graph reads the learning rate and the step count from tensors
         options = {"lr": torch.tensor(config.lr, device=dense[0].device), "capturable": True}

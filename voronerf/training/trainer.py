@@ -130,7 +130,7 @@ class Trainer:
             router.generator = self.draws
         #: Whether native ops compute the networks: then steps are the same bit for bit on any number of threads.
         self.any_threads = computes_natively(self.routers, config)
-        self.optimizer = make_optimizer(self.routers, config)
+        self.optimizer = make_optimizer(self.routers, config, views=len(scene.train))
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=config.precision == "fp16")
         grid = make_grid(config, scene, self.device) if config.occupancy else None
         self.renderer = make_renderer(config, scene, self.routers, occupancy=grid)
@@ -642,7 +642,7 @@ class Trainer:
         """
         _, stored = state.stored_values(checkpoint)
         restore_routers(self.routers, checkpoint)
-        self.optimizer = make_optimizer(self.routers, self.config)
+        self.optimizer = make_optimizer(self.routers, self.config, views=len(self.scene.train))
         try:
             state.load_moments(self.optimizer, checkpoint, stored.step)
             self.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
