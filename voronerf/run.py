@@ -141,6 +141,7 @@ class Run:
             raise ConfigError(
                 f"join needs two runs or more, and a frame for each: got {len(runs)} runs, {count} frames"
             )
+        _check_blend(blend)
         return cls._made(
             runs[0], out, editing.join([run.source for run in runs], frames or [Similarity()] * len(runs)), blend
         )
@@ -395,8 +396,7 @@ def open_run(
     """
     path = Path(path)
     check_device(device)
-    if blend is not None and not 0 <= blend < math.inf:
-        raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
+    _check_blend(blend)
     check_folders(path)
     if not 0 <= detail < math.inf:
         raise ConfigError(f"--detail must be a number of pixels, 0 or more, got {detail}")
@@ -448,3 +448,8 @@ def open_run(
         del checkpoint, state
         pages.forget(checkpoint_path(path))
     return Run(path, config, scene, routers, renderer)
+
+
+def _check_blend(blend: float | None) -> None:
+    if blend is not None and not 0 <= blend < math.inf:
+        raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")

@@ -238,7 +238,7 @@ def train_on(
 def compare(
     source: Source, usual: Tensor | None, space: Voxels, new: RayBatches, old: RayBatches | None = None
 ) -> Changes:
-    """What new pictures show; arguments as of :func:`update` and :func:`find_changes`.
+    """What new pictures show; takes what :func:`update` and :func:`find_changes` take.
 
     Raises:
         ConfigError: For pictures that show nothing of the scene, or another one.

@@ -67,8 +67,6 @@ def join(
     check_out(out)
     if len(runs) < 2:
         raise ConfigError(f"join needs two runs or more, got {len(runs)}")
-    if blend is not None and not 0 <= blend < float("inf"):
-        raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")
     frames = given_frames(len(runs), move, transforms)
     if align and frames:
         raise ConfigError("give --align, or --move and --transforms, not both")
