@@ -115,7 +115,9 @@ def poisoned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[torch.Tensor]]:
 
 @pytest.fixture(autouse=True)
 def _same_seed() -> None:
-    torch.manual_seed(0)
+    torch.default_generator.manual_seed(0)  # torch.manual_seed also formats the stack, once for every kind of device
+    if not NO_CUDA:
+        torch.cuda.manual_seed_all(0)
 
 
 @pytest.fixture(autouse=True)

@@ -175,6 +175,17 @@ def test_circles_are_found() -> None:
     assert circles(graph) == ["a.b", "a.c", "a.d"]
 
 
+def test_few_functions_take_many_arguments() -> None:
+    many = []
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                every = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                if len([argument for argument in every if argument.arg not in ("self", "cls")]) > 8:
+                    many.append(f"{path.relative_to(ROOT)}: {node.name}")
+    assert len(many) <= 20, many
+
+
 def test_core_knows_no_framework() -> None:
     assert CORE
     for path in CORE:

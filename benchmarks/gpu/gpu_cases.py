@@ -19,14 +19,6 @@ STEPS: dict[str, tuple[int, str, bool, int]] = {
 the number of cells."""
 
 
-MORE: dict[str, list[dict[str, Any]]] = {
-    "nearest_centre": [{"k": 700}, {"points": "lattice"}],
-    "hash_encode": [{"features": features} for features in (1, 4, 8)],
-    "pixel_rays": [{"models": None}],
-}
-"""Calls beside the kinds of an op's case."""
-
-
 def has_wgmma(device: str) -> bool:
     """Whether a device multiplies by groups of warps: an H100 or an H200, or the emulated one."""
     import torch
@@ -195,7 +187,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             (f"{op} {', '.join(map(str, pins.values()))}".strip(), functools.partial(of_case, op, pins))
             for op in backends.ops("native", "cuda")
             if cases_of_ops[op].comparable
-            for pins in (*cases_of_ops[op].kinds.values(), *MORE.get(op, ()))
+            for pins in (*cases_of_ops[op].kinds.values(), *cases_of_ops[op].on_devices)
         ),
         *(
             (f"cell_sort {n} {k} by {way}", functools.partial(sort, n, k, way))

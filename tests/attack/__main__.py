@@ -27,16 +27,16 @@ from attempts import FAILED, REFUSED, RIGHT, Part, Tally, prepare, run_part
 PARTS = {
     part.name: (part, long, short)
     for part, long, short in (
-        (Part("valid-calls", op_attacks.valid_call, 60, 200), 140_000, 300),
-        (Part("invalid-calls", op_attacks.invalid_call, 60, 200), 60_000, 300),
+        (Part("valid-calls", op_attacks.valid_call, 60, 200), 140_000, 150),
+        (Part("invalid-calls", op_attacks.invalid_call, 60, 200), 60_000, 150),
         (Part("kills", training_attacks.killed_training, 300, 1, given.prepare_scenes), 20, 1),
         (Part("ranks", rank_attacks.harmed_ranks, 1200), 3, 0),
         (Part("bits", run_attacks.flipped_bit, 60, 20, given.prepare_runs), 500, 15),
-        (Part("scenes", scene_attacks.stranger_scene, 60, 1, given.prepare_photographs), 150, 6),
-        (Part("runs", run_attacks.stranger_run, 60, 1, given.prepare_runs), 150, 6),
-        (Part("stores", store_attacks.harmed_store, 60, 1, given.prepare_scenes), 150, 6),
-        (Part("clients", viewer_attacks.hostile_client, 60, 1, given.prepare_runs), 150, 3),
-        (Part("stress", training_attacks.stressed_command, 60, 1, given.prepare_scenes), 150, 6),
+        (Part("scenes", scene_attacks.stranger_scene, 60, 1, given.prepare_photographs), 150, 4),
+        (Part("runs", run_attacks.stranger_run, 60, 1, given.prepare_runs), 150, 4),
+        (Part("stores", store_attacks.harmed_store, 60, 1, given.prepare_scenes), 150, 4),
+        (Part("clients", viewer_attacks.hostile_client, 60, 1, given.prepare_runs), 150, 2),
+        (Part("stress", training_attacks.stressed_command, 60, 1, given.prepare_scenes), 150, 4),
     )
 }
 

@@ -29,11 +29,6 @@ NETWORKS = (
     *(("float32", 227, "auto"), ("bfloat16", 40, "tiles"), ("bfloat16", 227, "auto"), ("bfloat16", 1, "auto")),
     *(("bfloat16", 227, "wgmma"), ("float16", 30, "auto"), ("float16", 40, "wgmma")),
 )
-SIZES = dict.fromkeys(("nearest_centre", "locate_cell", "cell_sort", "observe_occupancy", "draw_pixels"), 260)
-"""Of calls with a thread for each row: more than a block. Others take more, of which ThreadSanitizer knows some
-thousand, and needs milliseconds for each."""
-PINS: dict[str, list[dict[str, Any]]] = {"nearest_centre": [{"k": 530}, {"dtype": torch.float64}]}
-"""Calls beside the kinds of an op's case."""
 
 
 class Recorder:
@@ -95,29 +90,29 @@ def call_case(op: str, pins: dict[str, Any], n: int) -> None:
         torch.autograd.grad(sum(x.square().sum() for x in smooth), leaves, allow_unused=True)
 
 
-def recorded() -> list[tuple[int, list[Any]]]:
-    """Bytes of shared memory, and the calls of a device that has them."""
+def recorded() -> list[tuple[int, str, list[Any]]]:
+    """Bytes of shared memory of a device, what may be senseless (`Case.hostile`), and calls of an op."""
     found = []
 
-    def record(run: Any, *arguments: Any, shared: int = 227) -> None:
+    def record(op: str, run: Any, *arguments: Any, shared: int = 227) -> None:
         with emulated(shared_bytes=shared * 1024) as loaded:
             recorder = Recorder(_native.compiled, loaded)
             with mock.patch.object(_native, "compiled", recorder):
                 run(*arguments)
-        found.append((shared * 1024, recorder.calls))
+        found.append((shared * 1024, cases()[op].hostile, recorder.calls))
 
     for op in backends.ops("native", "cuda"):
-        for pins in (*cases()[op].kinds.values(), *PINS.get(op, ())):
-            record(call_case, op, pins, SIZES.get(op, 40))
+        for pins in (*cases()[op].kinds.values(), *cases()[op].on_devices):
+            record(op, call_case, op, pins, cases()[op].device_rows)
     for (precision, shared, way), kind in itertools.product(NETWORKS, ("", "hashed")):
         if kind and (precision, way) not in (("float32", "auto"), ("bfloat16", "auto")):
             continue
         with using_way(way):
             pins = {**cases()["grouped_mlp"].kinds[kind], "dtype": getattr(torch, precision)}
-            record(call_case, "grouped_mlp", pins, 64, shared=shared)
+            record("grouped_mlp", call_case, "grouped_mlp", pins, 64, shared=shared)
     # By counting and by radix. Keys of 4 bytes would need 65,535 cells, each a thread: too many for a sanitizer.
     for n, k, way in ((3000, 5, "automatic"), (9000, 2, "counting"), (600, 3, "radix"), (300, 1100, "automatic")):
         cells = torch.randint(-1, k + 1, (n,), dtype=torch.int32)
         memory = torch.full_like(cells, -7), cells.new_full((k + 1,), -7)
-        record(sort_cells, cells, *memory, "cell_sort", way)
+        record("cell_sort", sort_cells, cells, *memory, "cell_sort", way)
     return found

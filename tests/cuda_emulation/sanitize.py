@@ -16,10 +16,6 @@ from emulation_build import load
 RANDOM = np.random.default_rng(0)
 DTYPES = {name: name for name in ("float32", "float64", "int32", "int64", "uint8", "bool")}
 LEAST, MOST = -(2**31), 2**31 - 1
-HOSTILE = {"cell_sort": False, "hash_encode": False, "hash_encode_backward": False, "grouped_mlp": False}
-HOSTILE |= {"grouped_mlp_backward": False, "locate_cell": True, "composite": True, "composite_backward": True}
-HOSTILE |= {"render_loss": True, "resample": True, "grouped_program": False}
-"""Functions that take whatever is in their arrays, and whether that holds of floating-point numbers, too."""
 SOUND = ("order", "direction_index", "code", "turned")
 """Fields that are checked, or made by the library itself."""
 
@@ -64,8 +60,8 @@ def sound_arrays(value):
     return {part[1] for name, part in named if name in SOUND and part is not None} | sound_arrays(list(value[3]))
 
 
-def harm(name, arguments, before, after):
-    """The arrays with senseless entries where a function only reads them."""
+def harm(numbers, arguments, before, after):
+    """The arrays with senseless indices, and numbers where these may be so, where a function only reads them."""
     kept = sound_arrays(arguments)
     for number, (array, changed) in enumerate(zip(before, after)):
         if number in kept or array.tobytes() != changed.tobytes():
@@ -73,7 +69,7 @@ def harm(name, arguments, before, after):
         if array.dtype == np.int32:
             values = [LEAST, -5, -1, 0, 1, 4, 5, array.size, array.size + 1, 65_536, MOST]
             before[number] = RANDOM.choice(values, array.shape).astype(np.int32)
-        elif HOSTILE[name] and array.dtype.kind == "f" and array.size > 1:
+        elif numbers and array.dtype.kind == "f" and array.size > 1:
             before[number] = array.copy()
             before[number].ravel()[::5], before[number].ravel()[1::7] = np.nan, RANDOM.choice([np.inf, -1, 1e38])
 
@@ -91,14 +87,14 @@ def main(path, calls, kind="usual"):
     module.name_dtypes(DTYPES)
     with open(calls, "rb") as file:
         every = pickle.load(file)
-    for shared, made in every * (3 if kind == "hostile" else 1):
+    for shared, hostile, made in every * (3 if kind == "hostile" else 1):
+        if kind == "hostile" and not hostile:
+            continue
         module.device(90, 120, shared)
         for name, arguments, before, after in made:
             before = list(before)
             if kind == "hostile":
-                if name not in HOSTILE:
-                    continue
-                harm(name, arguments, before, after)
+                harm(hostile == "numbers", arguments, before, after)
             memory = [Memory(array) for array in before]
             getattr(module, name)(*(argument(module, value, memory) for value in arguments))
             if kind != "hostile":

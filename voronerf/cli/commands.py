@@ -89,7 +89,10 @@ def train(
         import_viewer().check_address(host, port)
     scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
     if view and (config.territories or 1) > 1:
-        raise ConfigError("--view must be off with several territories; `voronerf view` shows their last checkpoint")
+        raise ConfigError(
+            f"--view must be off with several territories, got {config.territories}; `voronerf view` shows their last "
+            "checkpoint"
+        )
     if explain:
         unused = replace(config, out=config.out or Path("runs"), resume=config.resume and config.out is not None)
         joint = (config.territories or 1) > 1
@@ -144,7 +147,10 @@ def train_on_ranks(config: TrainConfig, *, view: bool) -> int:
     with joined(device) as group:
         check_same(group, config)
         if view:
-            raise ConfigError("--view must be off with several ranks; `voronerf view` shows their last checkpoint")
+            raise ConfigError(
+                f"--view must be off with several ranks, got {world_size()}; `voronerf view` shows their last "
+                "checkpoint"
+            )
         check_joint(config, world_size())
         assert config.out is not None
         reading = config.reading

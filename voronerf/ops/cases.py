@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -114,6 +114,10 @@ class Case:
         comparable: whether all backends give the same tensors.
         call: the public function, if it has another name than the op.
         traced: whether torch can trace it, on every backend.
+        on_devices: choices of further calls for kernels of devices.
+        device_rows: n of a call under a sanitizer: more than a block, where each row has a thread and a call no more.
+        hostile: what of the arguments may be senseless without an access outside of them: "indices", "numbers" for
+            these and floating-point numbers, "" for nothing.
     """
 
     make: Callable[[Draw, int], Arguments]
@@ -126,6 +130,9 @@ class Case:
     comparable: bool = True
     call: str = ""
     traced: bool = True
+    on_devices: Sequence[Arguments] = ()
+    device_rows: int = 40
+    hostile: str = ""
 
 
 def cases() -> dict[str, Case]:

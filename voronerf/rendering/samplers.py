@@ -40,6 +40,7 @@ class Stratified:
         passes: How often a ray is sampled, each time with a number of samples of its own. Several territories need a
             single pass.
         skips: Whether an occupancy grid can leave out samples.
+        whole: The networks of densities, which have a single cell however many the field has.
 
     Args:
         samples: s, of the first pass.
@@ -57,6 +58,7 @@ class Stratified:
 
     passes: ClassVar[int] = 1
     skips: ClassVar[bool] = True
+    whole: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, samples: int, *, space: Space | None = None, backend: str = "auto") -> None:
         if samples < 1:
@@ -309,6 +311,8 @@ class Proposal(Hierarchical):
         >>> Proposal(32, 32).first
         'proposal'
     """
+
+    whole: ClassVar[tuple[str, ...]] = ("proposal",)
 
     @staticmethod
     def networks(cones: bool) -> tuple[str, ...]:

@@ -9,10 +9,11 @@ module whose cells have parameters of their own, and results and gradients are c
 from __future__ import annotations
 
 import contextlib
-import inspect
 import os
+import sys
 import threading
 import time
+import traceback
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -94,7 +95,7 @@ class Choices:
     def say_once(self, topic: str, message: str) -> None:
         """Warns, the first time that a topic comes up, at the line that called the router."""
         if topic not in self._said:
-            files = [frame.filename for frame in inspect.stack(context=0)]
+            files = [frame.f_code.co_filename for frame, _ in traceback.walk_stack(sys._getframe())]
             level = next((i for i, file in enumerate(files) if not file.startswith(_OWN)), len(files))
             warnings.warn(f"{_OP}: {message}", stacklevel=level + 1)
         self._said.add(topic)

@@ -68,8 +68,8 @@ class Cells:
         outside: bool [v], voxels of the grid that stay empty, since they are of other territories; None for none.
 
     Args:
-        renderer: Whose sampler may have an occupancy grid.
-        routers: The networks by name; "field" decides the cells. One named "proposal" is not split.
+        renderer: Whose sampler may have an occupancy grid, and says which networks stay whole.
+        routers: The networks by name; "field" decides the cells.
         plan: The splits to make.
         rule: How they are made.
         generator: Of random choices.
@@ -238,5 +238,5 @@ class Cells:
             optimizer: Of the networks; its moments are inherited, too.
         """
         for name, router in self.routers.items():
-            if name != "proposal":
+            if name not in self.renderer.sampler.whole:
                 router.subdivide(split.diagram, split.parents, optimizer=optimizer, inherit=self.rule.inherit)

@@ -165,16 +165,21 @@ def network_names(config: TrainConfig) -> tuple[str, ...]:
     return SAMPLERS[config.sampling].networks(config.field_type.cones)
 
 
+def _whole(config: TrainConfig, name: str) -> bool:
+    """Whether a network gives densities alone, and has a single cell."""
+    return name in SAMPLERS[config.sampling].whole
+
+
 def make_network(config: TrainConfig, name: str = "field") -> nn.Module:
     """One of the networks of a cell, freshly initialised from torch's global generator."""
-    if name == "proposal":
+    if _whole(config, name):
         return DensityField(position_encoding="integrated" if config.field_type.cones else "frequency", **PROPOSAL)
     return config.field_type.build(config.network_options)
 
 
 def parameter_shapes(config: TrainConfig, name: str) -> dict[str, tuple[torch.Size, bool]]:
     """The shape of each parameter of one network, and whether all cells share it; without memory for any of them."""
-    share = config.router_options.get("share", ()) if name != "proposal" else ()
+    share = () if _whole(config, name) else config.router_options.get("share", ())
     return _shapes(functools.partial(make_network, config, name), share)
 
 
@@ -197,7 +202,7 @@ def count_parameters(config: TrainConfig, width: int | None = None) -> int:
         config = replace(config, width=width)
     total = 0
     for name in network_names(config):
-        cells = 1 if name == "proposal" else config.final_cells
+        cells = 1 if _whole(config, name) else config.final_cells
         for shape, shared in parameter_shapes(config, name).values():
             total += (1 if shared else cells) * shape.numel()
     return total
@@ -308,7 +313,7 @@ def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, V
             temperature=config.temperature,
             backend=config.backend,
             way="fused",  # a run is resumed bit for bit, so nothing depends on timings
-            **({} if name == "proposal" else config.router_options),
+            **({} if _whole(config, name) else config.router_options),
         ).to(device)
         for name, network in networks.items()
     }
@@ -337,7 +342,7 @@ def parameter_groups(
     tables: list[nn.Parameter] = []
     for network, router in routers.items():
         assert isinstance(router, VoronoiRouter)
-        patterns = () if network == "proposal" else config.field_type.sparse_parameters
+        patterns = () if _whole(config, network) else config.field_type.sparse_parameters
         for name, parameter in router.module.named_parameters():
             sparse = any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
             (tables if sparse else dense).append(parameter)

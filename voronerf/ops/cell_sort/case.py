@@ -17,4 +17,6 @@ CASE = Case(
         "k must be at least 1, got 0": {"k": 0},
         "k must be at most 2147483647, got 2147483648": {"k": 2**31},
     },
+    device_rows=260,
+    hostile="indices",
 )

@@ -23,4 +23,5 @@ CASE = Case(
     {"": {}, "packed": {"packed": True}},
     refused={"background must be a tensor, got str": {"background": "x"}},
     differentiable=True,
+    hostile="numbers",
 )

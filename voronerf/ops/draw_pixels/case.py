@@ -15,4 +15,6 @@ def _make(draw: Draw, n: int) -> Arguments:
     return {"seed": draw.integers(-100, 100, 1), "count": n + 1, "below": below, "runs": some}
 
 
-CASE = Case(_make, refused={"below must be at least 1, got 0": {"below": 0, "runs": None}}, traced=False)
+CASE = Case(
+    _make, refused={"below must be at least 1, got 0": {"below": 0, "runs": None}}, traced=False, device_rows=260
+)

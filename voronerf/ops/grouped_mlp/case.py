@@ -65,4 +65,5 @@ CASE = Case(
         "features must be None for layers without a hash grid, got [1]": {"features": torch.zeros(1)},
     },
     differentiable=True,
+    hostile="indices",
 )

@@ -73,5 +73,6 @@ CASE = Case(
         "order must have shape [n] with n = 6, got [3]": {"order": torch.zeros(3, dtype=torch.int32)},
     },
     differentiable=True,
+    hostile="indices",
     compiles=False,
 )

@@ -38,4 +38,6 @@ CASE = Case(
     {"": {}, "of cells": {"k": 2}},
     refused={"grid must be a HashGrid, got dict": {"grid": {}}},
     differentiable=True,
+    on_devices=[{"features": features} for features in (1, 4, 8)],
+    hostile="indices",
 )

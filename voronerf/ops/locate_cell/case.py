@@ -40,4 +40,9 @@ def _make(draw: Draw, n: int) -> Arguments:
     return {"points": draw.points(n, draw.dtype()), **tables}
 
 
-CASE = Case(_make, refused={"depth must be at most 2147483647, got 1099511627776": {"depth": 2**40}})
+CASE = Case(
+    _make,
+    refused={"depth must be at most 2147483647, got 1099511627776": {"depth": 2**40}},
+    device_rows=260,
+    hostile="numbers",
+)

@@ -21,4 +21,6 @@ CASE = Case(
         "grid must be a CentreGrid, got int": {"grid": 3},
     },
     alternatives={"torch cdist": lambda points, centres: torch.cdist(points, centres).argmin(1)},
+    on_devices=({"k": 700}, {"points": "lattice"}, {"dtype": torch.float64}),
+    device_rows=260,
 )

@@ -14,4 +14,4 @@ def _make(draw: Draw, n: int) -> Arguments:
     return {**call, "box": torch.tensor([[-1.0] * 3, [1.0] * 3]), "positions": draw.normal(n, 3)}
 
 
-CASE = Case(_make, in_place=True)
+CASE = Case(_make, in_place=True, device_rows=260)

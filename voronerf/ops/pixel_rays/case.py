@@ -29,4 +29,5 @@ CASE = Case(
         "far must be a number, got NoneType": {"far": None},
         "far must be at most 3.4e+38 or infinite, got 1e+39": {"far": 1e39},
     },
+    on_devices=({"models": None},),
 )

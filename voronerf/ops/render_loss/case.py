@@ -24,5 +24,5 @@ def _make_plain(draw: Draw, n: int) -> Arguments:
     return _make(Draw(n, dtype=torch.float32), n)
 
 
-CASE = Case(_make, differentiable=True)
+CASE = Case(_make, differentiable=True, hostile="numbers")
 CASES = {"render_loss": CASE, "render_loss_gradient": Case(_make_plain, traced=False)}

@@ -15,4 +15,9 @@ def _make(draw: Draw, n: int) -> Arguments:
     return {"weights": draw.uniform(n, s, dtype=dtype) + 0.01, "edges": edges, "count": count, "uniforms": uniforms}
 
 
-CASE = Case(_make, {"": {}, "even": {"jittered": False}}, refused={"count must be at least 1, got 0": {"count": 0}})
+CASE = Case(
+    _make,
+    {"": {}, "even": {"jittered": False}},
+    refused={"count must be at least 1, got 0": {"count": 0}},
+    hostile="numbers",
+)
