@@ -363,8 +363,9 @@ def open_run(
         device: Torch device.
         backend: Backend of the operations.
         memory: Bound on the memory of this process and on what the files of networks take of the system's, such as
-            "512M", for a run of several parts on the CPU. Networks are read as rays meet them, those that were not used
-            for longest are dropped, and their checksums are not compared. Pictures are the same bit for bit.
+            "512M", for a run of several parts or territories on the CPU. Networks are read as rays meet them, those
+            that were not used for longest are dropped, and their checksums are not compared. Pictures are the same bit
+            for bit.
         detail: Draw a part of a joined run by its coarse level, where a voxel of it is no wider than so many pixels;
             0 to draw all by their networks.
 
@@ -404,7 +405,13 @@ def open_run(
     checkpoint = last_checkpoint(path, keep=_shows if pages is None else _shows_without_networks)
     if pages is not None and ("parts" not in checkpoint.values or torch.device(device).type != "cpu"):
         raise ConfigError(
-            f"--memory needs --device cpu and a run of parts, as join, cut and place make; {path} is none"
+            f"--memory needs --device cpu and a run of parts, as join, cut, place and train --territories make;"
+            f" {path} is none"
+        )
+    if pages is not None and any(name.endswith(".average") for name in checkpoint.tensors):
+        raise ConfigError(
+            f"--memory needs networks in files of their own, and {path} was trained after it was joined: its averaged "
+            "weights are in one file. voronerf cut of all of it writes them apart"
         )
     config, _ = stored_values(checkpoint)
     if scene is None and data is None:

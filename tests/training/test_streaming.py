@@ -20,6 +20,7 @@ from voronerf.router import Similarity
 from voronerf.training import streaming
 from voronerf.training.checkpoint import CheckpointError
 from voronerf.training.config import ConfigError, TrainConfig
+from voronerf.training.joint import JointTrainer
 from voronerf.training.trainer import Trainer
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="what is in memory is told on Linux alone")
@@ -75,6 +76,46 @@ def test_pictures_are_the_same_bits_while_networks_come_and_go(joined, scene, tm
     assert {path.name for path in (tmp_path / "cut").rglob("networks-*")} == {
         path.name for path in (tmp_path / "other").rglob("networks-*")
     }
+
+
+def test_a_run_of_territories_comes_and_goes_by_its_averages_alone(scene, tmp_path, monkeypatch) -> None:
+    """Their files have Adam's moments, too, which nobody reads."""
+    config = TrainConfig(
+        out=tmp_path / "run", steps=20, cells=(2,), width=8, rays=64, samples=16, evaluations=1, territories=4,
+        occupancy_resolution=16, field_options=("log2_entries=13", "levels=8"), reservoir=1000,
+    )  # fmt: skip
+    JointTrainer(config, scene).run()
+    whole = open_run(config.out, scene=scene)
+    made = []
+    monkeypatch.setattr(run_module, "Pages", lambda *given: made.append(streaming.Pages(*given)) or made[0])
+    streamed = open_run(config.out, scene=scene, memory="4G")
+    (pages,) = made
+    networks = [sum(p.nbytes for p in router.parameters()) for router in streamed.router.routers]
+    for (name, file), least in zip(pages.files.items(), networks, strict=True):
+        length = (config.out / "checkpoints" / name).stat().st_size
+        assert least <= file.size < least + 20 * mmap.PAGESIZE < length / 2
+    limit, largest = int(4 * 2**30 * (1 - streaming.SPARE)), max(file.size for file in pages.files.values())
+    monkeypatch.setattr(
+        streaming, "anonymous_bytes", lambda: limit - 2 * largest + sum(file.size for file in pages.held.values())
+    )
+    for view in (0, 1):
+        assert torch.equal(streamed.render(view).colour, whole.render(view).colour)
+        assert len(pages.held) == 2
+    assert pages.reads > 4
+
+
+def test_a_run_whose_averages_are_in_one_file_is_refused_a_bound(joined, scene, tmp_path) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(joined, out)
+    Trainer(replace(open_run(out, scene=scene).config, out=out, resume=True, steps=2), scene).run()
+    refuses(
+        "--memory needs networks in files of their own",
+        lambda: open_run(out, scene=scene, memory="4G"),
+        error=ConfigError,
+    )
+    trained = open_run(out, scene=scene)
+    trained.cut(range(trained.router.num_cells), tmp_path / "cut")
+    assert torch.equal(open_run(tmp_path / "cut", scene=scene, memory="4G").render(0).colour, trained.render(0).colour)
 
 
 def test_reading_leaves_nothing_in_the_cache_of_the_system(joined, scene, tmp_path) -> None:

@@ -42,8 +42,8 @@ class Opening:
     backend: str = "auto"
     """Backend of the operations."""
     memory: str | None = None
-    """Bound on memory, such as 512M, for a run of several parts: networks are read as rays meet them, and those that
-    were not used for longest are dropped."""
+    """Bound on memory, such as 512M, for a run of several parts or territories: networks are read as rays meet them,
+    and those that were not used for longest are dropped."""
     detail: float | None = None
     """Draw far parts of a joined run from a coarse level, whose voxels are at most so many pixels wide; 0 is off. The
     default is 1 for view and render with --memory, and 0 else."""
@@ -58,7 +58,8 @@ class Opening:
         """Opens the run; see :func:`voronerf.open_run`. ``pictures``: to be looked at, not to be measured."""
         check_counts(samples=self.samples, fine_samples=self.fine_samples, downscale=self.downscale)
         opened = open_run(run, scene=scene, **{**vars(self), "detail": self.detail or 0.0})
-        if pictures and self.memory is not None and self.detail is None and isinstance(opened.router, Parts):
+        coarse = isinstance(opened.router, Parts) and any(part.coarse for part in opened.router)
+        if pictures and self.memory is not None and self.detail is None and coarse:
             opened.router.detail = 1.0
         return opened
 

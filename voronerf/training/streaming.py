@@ -15,6 +15,7 @@ import os
 import re
 import sys
 from collections import OrderedDict
+from collections.abc import Iterable
 from math import prod
 from pathlib import Path
 
@@ -54,17 +55,22 @@ def anonymous_bytes() -> int:
 
 
 class _File:
-    """The tensors of a safetensors file, in memory of their own that is there or not.
+    """The networks of a safetensors file, in memory of their own that is there or not.
 
     Where it is not, their addresses lead to the file, so that whoever reads them unasked still finds what they hold.
+
+    Attributes:
+        tensors: Weights and averages of weights, by their names; others, such as Adam's moments, are left out.
+        size: Bytes that are read, which `take` makes those of the tensors in use.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.number = _open(path)
         try:
-            self.size = os.fstat(self.number).st_size
-            self.pages = mmap.mmap(-1, self.size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+            self.length = self.size = os.fstat(self.number).st_size
+            self.ranges = [(0, self.length)]
+            self.pages = mmap.mmap(-1, self.length, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
             self.start = ctypes.addressof(ctypes.c_char.from_buffer(self.pages))
             self._read(0, _HEADER)
             self._read(_HEADER, 8 + int.from_bytes(self.pages[:8], "little"))
@@ -73,9 +79,11 @@ class _File:
             header.pop("__metadata__", None)
             self.tensors: dict[str, Tensor] = {}
             for name, entry in header.items():
+                if not (name.startswith("router.module.") or name.endswith(".average")):
+                    continue
                 dtype, (start, end) = _DTYPES[entry["dtype"]], entry["data_offsets"]
                 count = prod(entry["shape"])
-                if end - start != count * dtype.itemsize or first + end > self.size:
+                if end - start != count * dtype.itemsize or first + end > self.length:
                     raise ValueError(f"{name} must have {count * dtype.itemsize} bytes")
                 flat = torch.frombuffer(self.pages, dtype=dtype, count=count, offset=first + start) if count else None
                 self.tensors[name] = (torch.empty(0, dtype=dtype) if flat is None else flat).reshape(entry["shape"])
@@ -83,6 +91,18 @@ class _File:
             os.close(self.number)
             raise CheckpointError(f"{path}: not a readable file of networks: {error}") from None
         self.drop()
+
+    def take(self, tensors: Iterable[Tensor]) -> None:
+        """Reads from now on only the pages of some of its tensors."""
+        ends: list[tuple[int, int]] = []
+        for first, size in sorted((tensor.data_ptr() - self.start, tensor.nbytes) for tensor in tensors):
+            if size and 0 <= first < self.length:
+                low = first // mmap.PAGESIZE * mmap.PAGESIZE
+                high = -(-(first + size) // mmap.PAGESIZE) * mmap.PAGESIZE
+                if ends and low <= ends[-1][1]:
+                    low = ends.pop()[0]
+                ends.append((low, min(high, self.length)))
+        self.ranges, self.size = ends, sum(end - first for first, end in ends)
 
     def read(self) -> None:
         """Reads it.
@@ -92,14 +112,15 @@ class _File:
         """
         self._map(-1)
         try:
-            for first in range(0, self.size, _READ):
-                self._read(first, first + _READ)
+            for low, high in self.ranges:
+                for first in range(low, high, _READ):
+                    self._read(first, min(first + _READ, high))
         except OSError as error:
             raise CheckpointError(f"{self.path}: {error.strerror or error}") from None
 
     def _read(self, first: int, end: int) -> None:
         """Reads some of its bytes, or what there are of them."""
-        end = min(end, self.size)
+        end = min(end, self.length)
         whole = -(-end // mmap.PAGESIZE) * mmap.PAGESIZE  # a read past the cache takes no part of a block
         while first < end:
             room = (ctypes.c_char * (whole - first)).from_address(self.start + first)
@@ -118,7 +139,7 @@ class _File:
         """Puts new memory, or the file, at the addresses of the tensors."""
         rights, flags = mmap.PROT_READ | mmap.PROT_WRITE, mmap.MAP_PRIVATE | _MAP_FIXED
         flags |= mmap.MAP_ANONYMOUS if number < 0 else 0
-        if _libc().mmap(self.start, self.size, rights, flags, number, 0) != self.start:
+        if _libc().mmap(self.start, self.length, rights, flags, number, 0) != self.start:
             raise MemoryError(f"no memory for {self.path}")
 
 
@@ -178,7 +199,8 @@ class Pages:
         return self.files[name].tensors
 
     def watch(self, name: str, router: VoronoiRouter) -> None:
-        """Has a file read before each call of the router that has its tensors."""
+        """Has what a router has of a file read before each call of it."""
+        self.files[name].take([*router.parameters(), *router.buffers()])
         router.register_forward_pre_hook(lambda *_: self.use(name))
 
     def check(self) -> None:
