@@ -314,6 +314,28 @@ def test_what_cannot_be_joined(opened, tmp_path, scene) -> None:
     )
 
 
+def test_pictures_of_all_runs_are_where_the_joined_run_has_them(opened, scene, tmp_path, monkeypatch) -> None:
+    frames = [Similarity.of((3, 0, 0), (0, 0, 90), 0.5), Similarity.of((0, 0, 1), (40, 0, 0))]
+    joined = Run.join(opened, tmp_path / "joined", frames=frames)
+    moved = [editing.moved_cameras(scene.test.cameras, frame).poses for frame in frames]
+    assert torch.allclose(joined.scene.test.cameras.poses, moved[0], atol=1e-5)
+    assert joined.scene.box.equal(joined.source.scene.box)
+    loaded = []
+    monkeypatch.setattr("voronerf.run.load_scene", lambda data, **given: loaded.append(data) or scene)
+    both = open_run(joined.path, data=["a", "b"])
+    assert loaded == ["a", "b"] and both.config.data == "a"
+    assert torch.allclose(both.scene.test.cameras.poses, torch.cat(moved), atol=1e-5)
+    for split, own in ((both.scene.train, scene.train), (both.scene.test, scene.test)):
+        assert torch.equal(split.images, torch.cat((own.images, own.images)))
+        assert split.names == tuple(f"{i}-{name}" for i in (0, 1) for name in own.names)
+    refuses("several scenes must be those", lambda: open_run(joined.path, data=["a", "b", "c"]), error=ConfigError)
+    poses = scene.test.cameras.poses.clone()
+    poses[1, :3, :3] = poses[1, :3, :3].roll(1, 0)  # another camera under the same name
+    monkeypatch.undo()
+    other = replace(scene, test=replace(scene.test, cameras=replace(scene.test.cameras, poses=poses)))
+    assert torch.equal(open_run(joined.path, scene=other).scene.test.cameras.poses, poses)
+
+
 def test_runs_are_aligned_by_shared_images(scene) -> None:
     frame = Similarity.of((1, 2, 3), (10, 20, 30), 1.7)
     moved = {

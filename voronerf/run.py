@@ -14,7 +14,7 @@ from torch import Tensor
 
 from voronerf import editing, updating
 from voronerf.data import Scene, load_scene
-from voronerf.data.record import placed, read_scene, with_refined, within
+from voronerf.data.record import placed, read_scene, recorded, with_refined, within
 from voronerf.data.scene import Split
 from voronerf.diagram import VoronoiDiagram
 from voronerf.editing import check_out
@@ -330,7 +330,7 @@ def open_run(
     path: Path | str,
     *,
     scene: Scene | None = None,
-    data: str | None = None,
+    data: str | Sequence[str] | None = None,
     downscale: int | None = None,
     allow_outside: bool = False,
     samples: int | None = None,
@@ -352,7 +352,8 @@ def open_run(
         path: The run directory.
         scene: The scene, if it is loaded already.
         data: Scene folder; None for that of the training, if it lies in the run directory, the working directory or
-            ``VORONERF_DATA``, since a run may be another person's.
+            ``VORONERF_DATA``, since a run may be another person's. Several for a run that was joined of runs of these,
+            in their order: its scene has the views of all of them, where the run has them.
         downscale: Factor on the images; None for that of the training.
         allow_outside: Also read images that lie outside of the scene folder.
         samples: Samples per ray in the first pass; None for those of the training.
@@ -396,6 +397,7 @@ def open_run(
         >>> folder.cleanup()
     """
     path = Path(path)
+    folders = [data] if isinstance(data, str) else [*(data or ())]
     check_device(device)
     _check_blend(blend)
     check_folders(path)
@@ -414,7 +416,7 @@ def open_run(
             "weights are in one file. voronerf cut of all of it writes them apart"
         )
     config, _ = stored_values(checkpoint)
-    if scene is None and data is None:
+    if scene is None and not folders:
         check_stored_paths(path, data=config.data)
     check_shapes(config, checkpoint)
     routers = open_routers(config, device, checkpoint, pages)
@@ -427,11 +429,15 @@ def open_run(
         router.eval()
     config = replace(
         config,
-        data=config.data if data is None else data,
+        data=folders[0] if folders else config.data,
         downscale=config.downscale if downscale is None else downscale,
     )
-    scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
     several = "parts" in checkpoint.values
+    if scene is None and len(folders) > 1:
+        scene = _joined_scene(
+            [load_scene(each, allow_outside=allow_outside, **config.reading) for each in folders], path
+        )
+    scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
     scene = within(scene, path) if several else scene
     scene = with_refined(scene, path) if config.refine_cameras else scene
     if several and (config.territories or 1) > 1:  # as it was trained: its parts know their own settings
@@ -455,6 +461,21 @@ def open_run(
         del checkpoint, state
         pages.forget(checkpoint_path(path))
     return Run(path, config, scene, routers, renderer)
+
+
+def _joined_scene(scenes: Sequence[Scene], run: Path) -> Scene:
+    """The views of all scenes whose runs were joined.
+
+    Raises:
+        ConfigError: For a run of others, or of one.
+    """
+    found = recorded(scenes, read_scene(run / "scene.json"))
+    if found is None:
+        names = ", ".join(scene.name for scene in scenes)
+        raise ConfigError(
+            f"{run}: several scenes must be those of the runs that it was joined of, in order, got {names}"
+        )
+    return found
 
 
 def _check_blend(blend: float | None) -> None:

@@ -23,7 +23,7 @@ def update(
     data: str,
     out: Path | None = None,
     budget: float | None = None,
-    old: str | None = None,
+    old: tuple[str, ...] = (),
     use_old: bool = True,
     more: bool = False,
     downscale: int | None = None,
@@ -38,7 +38,8 @@ def update(
         out: The new run directory; default that of the run with -updated behind its name.
         budget: Seconds of training; default a tenth of those of the run, and 10 at least.
         old: Scene folder of the pictures before; default as in training, if that lies in the run directory, the working
-            directory or VORONERF_DATA, since a run may be another person's.
+            directory or VORONERF_DATA, since a run may be another person's. Of a run that was joined, the folders of
+            all runs, in their order.
         use_old: Also learn from the pictures before, where they agree with the new ones.
         more: These are more pictures of the same scene: all cells learn, from old and new pictures alike.
         downscale: Factor on the new images; default as in training.
@@ -50,7 +51,7 @@ def update(
     check_out(out)
     if budget is not None and not 0 < budget < float("inf"):
         raise ConfigError(f"--budget must be positive, got {budget}")
-    if old is not None and not use_old:
+    if old and not use_old:
         raise ConfigError("give --old, or --no-use-old, not both")
     record = run / "scene.json"
     if not use_old and not record.is_file():

@@ -5,6 +5,8 @@ With it a run is rendered before the images are read, or where they are not. Fie
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,8 @@ from voronerf.rendering.contraction import Contraction, Perspective
 CONTRACTIONS = {"sphere": Contraction, "perspective": Perspective}
 #: What a text of a scene may be.
 WORDS = {"spacing": ("linear", "disparity"), "background": ("white", None), "kind": KINDS}
+#: How far the turns of cameras that were moved together may differ: a training may have refined each.
+TURN = 0.05
 INTEGERS = {"sizes": torch.int64, "models": torch.int32}
 
 
@@ -61,25 +65,67 @@ def with_refined(scene: Scene, run: Path) -> Scene:
     own, known = scene.train, read_scene(path).train
     if own.names != known.names:
         return scene
-    read, moved = own.cameras, known.cameras
+    return replace(scene, train=replace(own, cameras=_where_they_are(own.cameras, known.cameras)))
+
+
+def _where_they_are(read: Cameras, moved: Cameras) -> Cameras:
+    """Cameras as they were read, with the poses and the focal lengths that a record has of them."""
     # The principal points stay, and so they tell how much larger these images are.
     intrinsics = torch.cat(
         (moved.intrinsics[:, :2] * (read.intrinsics / moved.intrinsics)[:, 2:], read.intrinsics[:, 2:]), 1
     )
-    cameras = replace(read, poses=moved.poses.to(read.poses), intrinsics=intrinsics)
-    return replace(scene, train=replace(own, cameras=cameras))
+    return replace(read, poses=moved.poses.to(read.poses), intrinsics=intrinsics)
 
 
 def within(scene: Scene, run: Path) -> Scene:
-    """A scene with the bounds and the background of the record in a run directory, where there is one.
+    """A scene in the space of the record in a run directory, where there is one, see `recorded` and `placed`.
 
     Raises:
-        SceneError: the record is damaged.
+        SceneError: the record is damaged, or it is of another place.
     """
     path = run / "scene.json"
     if not path.is_file():
         return scene
-    return placed(scene, read_scene(path))
+    known = read_scene(path)
+    return recorded([scene], known) or placed(scene, known)
+
+
+def recorded(scenes: Sequence[Scene], known: Scene) -> Scene | None:
+    """The pictures of scenes where the record of a run that was joined of theirs has their cameras.
+
+    Args:
+        scenes: Those of the first runs, or of all, in the order in which they were joined.
+        known: The record.
+
+    Returns:
+        None if the views of the record do not begin with theirs, each scene moved as a whole.
+
+    Raises:
+        SceneError: One has a background that the others have not.
+    """
+    splits: dict[str, Split] = {}
+    for part in ("train", "test"):
+        read: list[Split] = [getattr(scene, part) for scene in scenes]
+        views: Split = getattr(known, part)
+        plain = [name for split in read for name in split.names]
+        numbered = [f"{number}-{name}" for number, split in enumerate(read) for name in split.names]
+        if [*views.names[: len(plain)]] not in (plain, numbered):
+            return None
+        cameras = views.cameras[torch.arange(len(plain))]
+        first = 0
+        for split in read:
+            turns = cameras.poses[first : first + len(split), :3, :3] @ split.cameras.poses[:, :3, :3].mT.to(
+                cameras.poses
+            )
+            if not torch.allclose(turns, turns[:1].expand_as(turns), atol=TURN):
+                return None
+            first += len(split)
+        every = functools.reduce(Split.joined, read)
+        names, cameras = views.names[: len(plain)], _where_they_are(every.cameras, cameras)
+        splits[part] = replace(every, cameras=cameras, names=names, sightings=None)
+    for scene in scenes:
+        _check_background(scene, known)
+    return replace(scenes[0], train=splits["train"], test=splits["test"], **_space(known))
 
 
 def placed(scene: Scene, known: Scene) -> Scene:
@@ -91,9 +137,7 @@ def placed(scene: Scene, known: Scene) -> Scene:
     Raises:
         SceneError: they cannot be of one place: one has a background that the other has not, or only one was moved.
     """
-    if scene.background != known.background:
-        ours, theirs = (each.background or "none" for each in (known, scene))
-        raise SceneError(f"{scene.name}: background must be that of {known.name}, {ours}, got {theirs}")
+    _check_background(scene, known)
     train, test = scene.train, scene.test
     if known.transform is not None and scene.transform is not None:
         move = known.transform @ torch.linalg.inv(scene.transform)
@@ -103,8 +147,20 @@ def placed(scene: Scene, known: Scene) -> Scene:
     elif known.transform is not None or scene.transform is not None:
         which = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
         raise SceneError(f"{scene.name}: must be in the frame of {known.name}, got one that is {which} (--normalise)")
-    names = ("near", "far", "box", "spacing", "kind", "contraction", "transform")
-    return replace(scene, train=train, test=test, **{name: getattr(known, name) for name in names})
+    return replace(scene, train=train, test=test, **_space(known))
+
+
+def _space(known: Scene) -> dict[str, Any]:
+    """What a scene has of the space of a record."""
+    return {
+        name: getattr(known, name) for name in ("near", "far", "box", "spacing", "kind", "contraction", "transform")
+    }
+
+
+def _check_background(scene: Scene, known: Scene) -> None:
+    if scene.background != known.background:
+        ours, theirs = (each.background or "none" for each in (known, scene))
+        raise SceneError(f"{scene.name}: background must be that of {known.name}, {ours}, got {theirs}")
 
 
 def _moved(part: Split, move: Tensor, scale: float) -> Split:
