@@ -347,6 +347,25 @@ class RunsOfRays(NamedTuple):
     r: int  # int64
     rays: int  # int64
 
+class SeeCells(NamedTuple):
+    centres: Tensor | None  # const float32*
+    child_offsets: Tensor | None  # const int32*
+    child: Tensor | None  # const int32*
+    m: int  # int64
+    depth: int  # int32
+
+class SeeOutputs(NamedTuple):
+    colour: Tensor | None  # float32*
+    opacity: Tensor | None  # float32*
+    depth: Tensor | None  # float32*
+    light: Tensor | None  # float32*
+    heaviest: Tensor | None  # float32*
+
+class SeeRule(NamedTuple):
+    density_scale: float  # float32
+    opaque: float  # float32
+    wave: int  # int64
+
 class Sightings(NamedTuple):
     density: Tensor | None  # const float32*
     depths: Tensor | None  # const float32*
@@ -601,6 +620,9 @@ def run_gradients(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3
 
 # RenderLossInputs, const float32*, const int32*, float32*, float32*, Cpu
 def run_sums(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
+
+# MlpTable, MlpInputs, MarchInputs, SeeCells, SeeRule, SeeOutputs, Cpu
+def see_rays(_0: MlpTable, _1: MlpInputs, _2: MarchInputs, _3: SeeCells, _4: SeeRule, _5: SeeOutputs, _6: Cpu) -> bool: ...
 
 # Sightings, float32*, float32*, float32*, Cpu
 def sighting_gradient(_0: Sightings, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Cpu) -> None: ...

@@ -1,12 +1,6 @@
-#include "rays/march_rays.h"
-
-#include "bindings/bind.h"
+#include "bindings/march_rays.h"
 
 namespace voronerf {
-
-VN_STRUCT(MarchSpace, sphere, perspective);
-VN_STRUCT(MarchInputs, origins, directions, near, far, occupied, box, uniforms, seed, start, r, s, x, y, z, disparity,
-          most, space);
 
 VN_BINDINGS(module) {
   module.cpu("march_rays_count", VN_CPU(march_rays_count_cpu));

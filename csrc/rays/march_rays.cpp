@@ -9,6 +9,7 @@
 #include "common/common.h"
 #include "common/parallel.h"
 #include "rays/march_rays_isa.h"
+#include "rays/march_rooms.h"
 
 namespace voronerf {
 
@@ -35,8 +36,25 @@ void spread_around(const uint8_t* from, uint8_t* to, int64_t i, int64_t size, in
   }
 }
 
-// How far away occupied cells are, see march_rays_isa.h; `memory` is of two grids.
-const uint8_t* rooms(const MarchInputs& in, uint8_t* memory, int threads) {
+void fill_block(Isa isa, const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
+                float* depths, float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
+  VN_FOR_ISA(isa, march_fill(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end))
+}
+
+template <typename Run>
+void for_each_block(int64_t r, int threads, const Run& run) {
+  const int64_t blocks = ceil_div(r, kRays);
+#pragma omp parallel for schedule(dynamic) num_threads(threads) if (threads > 1 && blocks > 1)
+  for (int64_t b = 0; b < blocks; ++b) run(b * kRays, std::min(r, (b + 1) * kRays));
+}
+
+}  // namespace
+
+bool march_leaps(const MarchInputs& in) {
+  return in.uniforms == nullptr && in.seed == nullptr && in.r * in.s >= 4 * in.x * in.y * in.z;
+}
+
+const uint8_t* march_rooms(const MarchInputs& in, uint8_t* memory, int threads) {
   const int64_t slice = in.y * in.z;
   uint8_t *one = memory, *other = memory + in.x * slice;
   parallel_for(in.x, 1, threads, [&](int64_t x) {
@@ -54,29 +72,13 @@ const uint8_t* rooms(const MarchInputs& in, uint8_t* memory, int threads) {
   return other;
 }
 
-void fill_block(Isa isa, const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
-                float* depths, float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
-  VN_FOR_ISA(isa, march_fill(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end))
-}
-
-template <typename Run>
-void for_each_block(int64_t r, int threads, const Run& run) {
-  const int64_t blocks = ceil_div(r, kRays);
-#pragma omp parallel for schedule(dynamic) num_threads(threads) if (threads > 1 && blocks > 1)
-  for (int64_t b = 0; b < blocks; ++b) run(b * kRays, std::min(r, (b + 1) * kRays));
-}
-
-}  // namespace
-
 void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, Isa isa,
                           int threads) {
-  // To look at all cells pays where strata are many more, as in a picture of a photograph; in a step they are not.
   std::unique_ptr<uint8_t[]> memory;
   const uint8_t* room = nullptr;
-  const int64_t cells = in.x * in.y * in.z;
-  if (in.uniforms == nullptr && in.seed == nullptr && in.r * in.s >= 4 * cells) {
-    memory.reset(new uint8_t[2 * cells]);
-    room = rooms(in, memory.get(), threads);
+  if (march_leaps(in)) {
+    memory.reset(new uint8_t[2 * in.x * in.y * in.z]);
+    room = march_rooms(in, memory.get(), threads);
   }
   for_each_block(in.r, threads,
                  [&](int64_t begin, int64_t end) { count_block(isa, in, room, mask, offsets + 1, begin, end); });

@@ -35,6 +35,7 @@ from voronerf.ops.ray_runs.reference import OwnSamples
 from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradient
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
+from voronerf.ops.see_rays import Sight, see_rays
 from voronerf.ops.sighting_gradient import sighting_gradient
 from voronerf.ops.spherical_harmonics import spherical_harmonics
 
@@ -52,6 +53,7 @@ __all__ = [
     "RenderLoss",
     "Rule",
     "Runs",
+    "Sight",
     "Solids",
     "adam",
     "balance_centres",
@@ -80,6 +82,7 @@ __all__ = [
     "routed_mlp",
     "run_gradients",
     "run_sums",
+    "see_rays",
     "sighting_gradient",
     "spherical_harmonics",
 ]

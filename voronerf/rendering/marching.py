@@ -5,16 +5,20 @@ r rays, s strata of a ray. Units as in `voronerf.rendering.volume`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
+from voronerf.fields.radiance import activate_radiance
 from voronerf.ops.composite import composite
+from voronerf.ops.see_rays import NETWORK
+from voronerf.ops.see_rays.reference import Wave, walk
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.field import Field
 from voronerf.rendering.samplers import Occupancy
-from voronerf.rendering.volume import Samples, normalised
+from voronerf.rendering.volume import normalised
+from voronerf.router import VoronoiRouter
 
 OPAQUE = 0.02  # a ray ends when it lets less than this through: what is behind counts as of the colour before it
 #: Samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain. Pictures of
@@ -71,8 +75,7 @@ def render_until_opaque(
         far: [r].
         sampler: which space is empty; the samples are the middles of its strata for pictures.
         background: [3] or [r, 3]; None is black.
-        heaviest: whether to find the heaviest sample of each ray, which takes a tenth of the time of a picture.
-            Without it, `heaviest` is the far end of the ray.
+        heaviest: whether to find the heaviest sample of each ray; without it that part of the result means nothing.
 
     Examples:
         >>> import torch
@@ -86,47 +89,46 @@ def render_until_opaque(
         >>> result.colour, result.depth
         (tensor([[1., 1., 1.]]), tensor([2.2500]))
     """
-    r, contraction = len(rays), sampler.space.contraction
+    contraction = sampler.space.contraction
     wave = WAVE if contraction is None else CONTRACTED_WAVE
-    colour, opacity, depth = torch.zeros_like(rays.origins), torch.zeros_like(near), torch.zeros_like(near)
-    through, top = torch.ones_like(near), torch.zeros_like(near)
-    at = far.clone()
-    live, start = torch.arange(r, device=near.device), None
-    while live.numel() > 0:
-        now = rays if live.numel() == r else rays[live]
-        samples, stop = sampler.march(now, near[live], far[live], start=start, most=wave, picture=True)
-        found = field(samples.inputs, now.directions, samples.ray_index)
-        rgb, sigma = (values.to(near.dtype) for values in found)
-        along = samples.depths, samples.deltas
-        part = composite(sigma, rgb, *along, ray_offsets=samples.ray_offsets, backend=sampler.backend)
-        light = through[live]
-        colour[live] += light[:, None] * part.colour
-        opacity[live] += light * part.opacity
-        depth[live] += light * part.depth
-        if heaviest:
-            weight, place = _heaviest(samples, part.weights, len(live), wave)
-            weight = weight * light
-            better = weight > top[live]
-            top[live[better]], at[live[better]] = weight[better], place[better]
-        light = light * (1 - part.opacity)
-        through[live] = light
-        more = ((stop < sampler.picture_samples) & (light > OPAQUE)).nonzero()[:, 0]
-        live, start = live[more], stop[more]
+    rule: dict[str, Any] = {"wave": wave, "opaque": OPAQUE, "heaviest": heaviest}
+    network = _network(field, rays, sampler)
+    if network is not None:
+        rule |= {"spacing": sampler.space.spacing, "backend": sampler.backend}
+        found = sampler.grid.see(rays, near, far, sampler.picture_samples, **network, **rule)
+    else:
+
+        def look(live: Tensor, start: Tensor | None) -> Wave:
+            now = rays if start is None else rays[live]
+            samples, stop = sampler.march(now, near[live], far[live], start=start, most=wave, picture=True)
+            rgb, sigma = (each.to(near.dtype) for each in field(samples.inputs, now.directions, samples.ray_index))
+            along = samples.depths, samples.deltas
+            seen = composite(sigma, rgb, *along, ray_offsets=samples.ray_offsets, backend=sampler.backend)
+            return Wave(seen, samples.ray_index, samples.ray_offsets, samples.depths, stop)
+
+        found = walk(look, far, sampler.picture_samples, **rule)
+    colour, opacity, depth, through, at = found
     depth = normalised(depth, opacity, far)
     ended = through <= OPAQUE
     colour /= torch.where(ended, opacity, 1)[:, None]
     opacity = torch.where(ended, 1, opacity)
     if background is not None:
         colour += (1 - opacity)[:, None] * background.to(colour)
-    places = rays.origins + at[:, None] * rays.directions
-    places = places if contraction is None else contraction.points(places)
+    places = rays.origins
+    if heaviest:
+        places = rays.origins + at[:, None] * rays.directions
+        places = places if contraction is None else contraction.points(places)
     return Seen(colour, opacity, depth, places)
 
 
-def _heaviest(samples: Samples, weights: Tensor, rays: int, most: int) -> tuple[Tensor, Tensor]:
-    """Weight and depth [r] of the heaviest sample of each ray, of which there are at most `most`; -1 without any."""
-    row = torch.arange(len(weights), device=weights.device) - samples.ray_offsets[samples.ray_index]
-    table = weights.new_full((2, rays * most), -1.0)
-    table[:, samples.ray_index.long() * most + row] = torch.stack((weights, samples.depths))
-    weight, column = table[0].reshape(-1, most).max(dim=1)
-    return weight, table[1].reshape(-1, most).gather(1, column[:, None])[:, 0]
+def _network(field: Field, rays: Rays, sampler: Occupancy) -> dict[str, Any] | None:
+    """What ``see_rays`` asks in the place of a field; None for a field that is more than its networks, and for Warp."""
+    if not isinstance(field, VoronoiRouter) or field.blend > 0 or "warp" in (sampler.backend, field.backend):
+        return None
+    if getattr(type(field.module), "activate", None) is not activate_radiance:
+        return None
+    found = field.table_arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32))
+    if found is None or "cells" in found:  # which each sample has of its own
+        return None
+    network = {name: value for name, value in found.items() if name in NETWORK}
+    return {"network": network, "density_scale": float(cast(Any, field.module).density_scale)}

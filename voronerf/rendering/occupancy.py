@@ -20,6 +20,7 @@ from voronerf.fields.radiance import activate_density, activate_radiance
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.observe_occupancy.reference import cells_of
+from voronerf.ops.see_rays import Sight, see_rays
 from voronerf.rendering.cameras import Rays
 from voronerf.rendering.contraction import Contraction, Perspective
 from voronerf.rendering.field import Field
@@ -261,6 +262,11 @@ class OccupancyGrid:
             contraction=self._numbers,
             backend=backend,
         )
+
+    def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> Sight:
+        """What rays see of networks in occupied cells; see `voronerf.ops.see_rays`, which has the other arguments."""
+        given = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
+        return see_rays(*given, contraction=self._numbers, **rule)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The tensors from which `from_state` makes the same grid, bit for bit."""

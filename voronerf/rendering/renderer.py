@@ -185,11 +185,12 @@ class Renderer:
             places = positions[torch.arange(len(rays), device=places.device), weights.argmax(-1)]
         return Seen(last.colour, last.opacity, last.depth, places)
 
-    def _tiles(self, hit: Tensor, size: tuple[int, int], chunk: int) -> Iterator[Tensor]:
+    def _tiles(self, hit: Tensor, size: tuple[int, int], chunk: int) -> Iterator[Tensor | slice]:
         """The rays of a picture that are to be rendered, int64, in pieces: rows, which is faster, or squares."""
         field = self.field
         if not isinstance(field, Parts) or len(field) - len(field.far) <= FEW_PARTS:
-            yield from hit.nonzero()[:, 0].split(chunk)
+            whole = len(hit) <= chunk and bool(hit.all())
+            yield from (slice(None),) if whole else hit.nonzero()[:, 0].split(chunk)
             return
         width, height = size
         side = max(-(-max(size) // TILES), 1)

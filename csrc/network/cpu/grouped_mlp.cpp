@@ -10,6 +10,7 @@
 #include "common/parallel.h"
 #include "network/cpu/grouped_mlp_isa.h"
 #include "network/cpu/grouped_mlp_planner.h"
+#include "network/cpu/grouped_mlp_rows.h"
 #include "network/cpu/row_tasks.h"
 
 namespace voronerf {
@@ -62,7 +63,7 @@ void pack(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, float
 #endif
   VN_FOR_ISA(isa, mlp_pack(plan, data, cell, own))
 }
-void forward(Isa isa, const MlpPlan& plan, const MlpData& data, const RowTask& task, float* own) {
+void run_rows(Isa isa, const MlpPlan& plan, const MlpData& data, const RowTask& task, float* own) {
 #if VN_HAS_HALF
   if (plan.half) return avx512::mlp_half_forward(plan, data, task.cell, task.begin, task.end, own);
 #endif
@@ -234,7 +235,31 @@ void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& in, float* out, Isa
   data.encoded = shared;
   if (shared) encode_by_level(in, plan, hash, workspace.data() + stride(plan) * threads, isa, threads);
   run_tasks(tasks, plan, data, workspace.data(), isa, threads,
-            [&](const RowTask& task, float* own) { forward(isa, plan, data, task, own); });
+            [&](const RowTask& task, float* own) { run_rows(isa, plan, data, task, own); });
+}
+
+MlpRows::MlpRows(const MlpTable& table, const MlpInputs& in, const MlpGathered& gathered, Isa isa)
+    : planner_(table, gathered, {false, false, false, false, use_half(table, isa)}),
+      hash_(hash_of(table, in)),
+      isa_(isa) {}
+
+int64_t MlpRows::workspace() const {
+  return stride(planner_.plan());
+}
+
+void MlpRows::forward(const MlpInputs& in, float* out, Own& own) const {
+  const MlpPlan& plan = planner_.plan();
+  MlpData data = pointers(in);
+  data.out = out;
+  if (hash_.count > 0) data.hash = &hash_;
+  if (own.packed < 0) prepare(isa_, plan, own.memory);
+  for (int64_t cell = 0; cell < in.k; ++cell) {
+    const RowTask task{cell, in.offsets[cell], in.offsets[cell + 1], -1};
+    if (task.begin == task.end) continue;
+    if (cell != own.packed) pack(isa_, plan, data, cell, own.memory);
+    own.packed = cell;
+    run_rows(isa_, plan, data, task, own.memory);
+  }
 }
 
 void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& given, const MlpGradients& gradients, Isa isa,

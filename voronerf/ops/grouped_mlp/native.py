@@ -169,7 +169,7 @@ def run(out: Tensor, encoded: Tensor, network: Network, offsets: Tensor, order: 
     """Fills the output of sorted rows, or of those that ``order`` int32 [n] sorts."""
     native.on_huge_pages(out)
     native.on_huge_pages(encoded)
-    inputs, key = _inputs(network, offsets, order, encoded), _key(network)
+    inputs, key = inputs_of(network, offsets, order, encoded), key_of(network)
     compiled, machine = native.compiled, native.machine(network.positions)
     if isinstance(machine, compiled.Cuda):
         call, workspace = _on_cuda(key, inputs, machine, backward=False, parameters=False)
@@ -201,7 +201,7 @@ def backward(
     for result in results:
         native.on_huge_pages(result)
     compiled, machine = native.compiled, native.machine(positions)
-    inputs, key = _inputs(network, offsets, order, encoded), _key(network)
+    inputs, key = inputs_of(network, offsets, order, encoded), key_of(network)
     to_directions = results[-2] if wanted[2] else None
     of_samples = None
     if isinstance(machine, compiled.Cuda) and wanted[2] and direction_index is not None and directions is not None:
@@ -226,11 +226,13 @@ def backward(
         results[-2].zero_().index_add_(0, direction_index, of_samples)
 
 
-def _key(network: Network) -> Key:
+def key_of(network: Network) -> Key:
+    """What the compiled table of a network is looked up by."""
     return table_key(network.table, network.positions, network.weights, network.directions)
 
 
-def _inputs(network: Network, offsets: Tensor, order: Tensor | None, encoded: Tensor) -> native.compiled.MlpInputs:
+def inputs_of(network: Network, offsets: Tensor, order: Tensor | None, encoded: Tensor) -> native.compiled.MlpInputs:
+    """What compiled functions read of a network, with rows of its cells by offsets [k + 1] and an order."""
     directions, features = network.directions, network.features
     return native.compiled.MlpInputs(
         positions=network.positions,

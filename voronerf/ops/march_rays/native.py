@@ -37,7 +37,7 @@ def _shapes(*given: Any) -> Marched:
 @custom_op("march_rays_native", fake=_shapes)
 def march_rays(rays: Rays, capacity: int | None) -> Iterator[Marched]:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
-    inputs, machine, (r,) = _inputs(rays), native.machine(rays.near), rays.near.shape
+    inputs, machine, (r,) = inputs_of(rays), native.machine(rays.near), rays.near.shape
     mask = rays.near.new_empty(r, -(-rays.samples // 32), dtype=torch.int32)
     offsets = rays.near.new_empty(r + 1, dtype=torch.int32)
     most = MAX_COUNT if capacity is None else capacity
@@ -48,7 +48,8 @@ def march_rays(rays: Rays, capacity: int | None) -> Iterator[Marched]:
     native.compiled.march_rays_fill(inputs, mask, offsets, rows, *results[1:], machine)
 
 
-def _inputs(rays: Rays) -> native.compiled.MarchInputs:
+def inputs_of(rays: Rays) -> native.compiled.MarchInputs:
+    """What compiled functions read of rays."""
     x, y, z = rays.occupied.shape
     contraction = rays.contraction
     contracted = 0 if contraction is None else contraction.dim()

@@ -1,0 +1,88 @@
+// Samples of several rays at once, from the networks' outputs to their weights: what render_loss and see_rays share.
+//
+// `In` has raw [m,4], deltas [m], offsets [r+1] and density_scale.
+#pragma once
+
+#include "common/elementwise_math.h"
+#include "common/memory_tile.h"
+
+namespace voronerf {
+namespace VN_ISA_NAMESPACE {
+namespace {
+
+constexpr int64_t kChunk = 128;
+constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
+
+// Samples [first, first + count), in the order of their rays, filled up to whole vectors by samples of no extent.
+struct Chunk {
+  alignas(64) float rgb[3][kChunk], shade[3][kChunk];  // shade: the gradient to the colour of the ray
+  alignas(64) float density[kChunk], slope[kChunk];    // slope: of the density to its raw output
+  alignas(64) float deltas[kChunk], optical[kChunk], front[kChunk];
+  alignas(64) float light[kChunk], weights[kChunk];  // the share of the light that reaches a sample
+  alignas(64) float part[kChunk], own[kChunk];
+};
+
+VN_INLINE F32 finite(F32 density) {
+  return density > splat(kOpaque) ? splat(kOpaque) : density;  // a NaN stays one
+}
+
+template <typename In>
+VN_INLINE void activate(const In& in, int64_t first, int64_t count, Chunk& chunk) {
+  const float* raw = in.raw + 4 * first;
+  for (int64_t i = 0; i < count; ++i) {
+    for (int k = 0; k < 3; ++k) chunk.rgb[k][i] = raw[4 * i + k];
+    chunk.density[i] = raw[4 * i + 3];
+    chunk.deltas[i] = in.deltas[first + i];
+  }
+  for (int64_t i = count; i % kLanes != 0; ++i) {
+    for (int k = 0; k < 3; ++k) chunk.rgb[k][i] = 0.0f;
+    chunk.density[i] = chunk.deltas[i] = 0.0f;
+  }
+  const F32 scale = splat(in.density_scale);
+  for (int64_t i = 0; i < count; i += kLanes) {
+    for (int k = 0; k < 3; ++k) store(chunk.rgb[k] + i, sigmoid(load(chunk.rgb[k] + i)));
+    const F32 x = load(chunk.density + i), density = softplus(x) * scale;
+    store(chunk.density + i, density);
+    store(chunk.slope + i, density > splat(kOpaque) ? splat(0.0f) : sigmoid(x) * scale);
+    store(chunk.optical + i, finite(density) * load(chunk.deltas + i));
+  }
+}
+
+// exp(-x) for x >= 0, 0 where float32 has nothing smaller.
+VN_INLINE F32 transmittance(F32 x) {
+  const F32 minus = splat(0.0f) - x;
+  return minus < splat(-87.0f) ? splat(0.0f) : exponential(minus);
+}
+
+// Light and weights from the optical depth in front of samples and their own.
+VN_INLINE void weigh(int64_t count, Chunk& chunk) {
+  for (int64_t i = count; i % kLanes != 0; ++i) chunk.front[i] = 0.0f;
+  for (int64_t i = 0; i < count; i += kLanes) {
+    const F32 light = transmittance(load(chunk.front + i));
+    store(chunk.light + i, light);
+    store(chunk.weights + i, light * (splat(0.0f) - exponential_minus_one(splat(0.0f) - load(chunk.optical + i))));
+  }
+}
+
+// run(ray, begin, end) for the rays from `from` to `to`, with their samples of a chunk by their places in it.
+template <typename In, typename Run>
+VN_INLINE void each_ray(const In& in, int64_t from, int64_t to, int64_t first, int64_t count, const Run& run) {
+  for (int64_t ray = from; ray < to; ++ray) {
+    const int64_t begin = in.offsets[ray] - first, end = in.offsets[ray + 1] - first;
+    run(ray - from, begin < 0 ? 0 : begin, end < count ? end : count);
+  }
+}
+
+// `run(from, to)` for rays whose samples fill a chunk at most, or one longer ray.
+template <typename In, typename Run>
+VN_INLINE void each_chunk(const In& in, int64_t begin, int64_t end, const Run& run) {
+  for (int64_t from = begin, to; from < end; from = to) {
+    to = from + 1;
+    while (to < end && in.offsets[to + 1] - in.offsets[from] <= kChunk) ++to;
+    run(from, to);
+  }
+}
+
+}  // namespace
+}  // namespace VN_ISA_NAMESPACE
+}  // namespace voronerf

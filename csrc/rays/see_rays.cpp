@@ -1,0 +1,233 @@
+// Rays over threads. Each thread has a pool of rays that are under way, and takes a wave of samples of all of them at a
+// time: through the grid, to their cells, through the networks, and to the colours. Nothing of it leaves the
+// second-level cache but the colours. A ray that has ended makes room for the next one of the picture, so that the
+// waves are as large to the end. What a ray sees does not depend on which rays are beside it, nor on the number of
+// threads.
+#include "rays/see_rays.h"
+
+#include <algorithm>
+#include <atomic>
+#include <memory>
+#include <utility>
+#include <vector>
+
+#include "common/common.h"
+#include "common/parallel.h"
+#include "geometry/locate_cell.h"
+#include "geometry/nearest_centre.h"
+#include "network/cpu/grouped_mlp_rows.h"
+#include "network/cpu/row_tasks.h"
+#include "rays/march_rays_isa.h"
+#include "rays/march_rooms.h"
+#include "rays/see_rays_isa.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int64_t kSamples = 8192;  // of a wave, about
+constexpr int64_t kRun = 32;        // rays of the picture that a thread takes at once
+
+void count_strata(Isa isa, const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts) {
+  VN_FOR_ISA(isa, march_count(in, room, mask, counts, 0, in.r))
+}
+void fill_samples(Isa isa, const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
+                  float* depths, float* deltas, float* positions, int32_t* stop) {
+  VN_FOR_ISA(isa, march_fill(in, mask, offsets, ray_index, depths, deltas, positions, stop, 0, in.r))
+}
+void add_wave(Isa isa, const SeenWave& in, int64_t r) {
+  VN_FOR_ISA(isa, see_wave(in, r))
+}
+
+// One call, as its threads read it.
+struct Call {
+  const MlpInputs& network;
+  const MlpRows& rows;
+  const MarchInputs& march;
+  const uint8_t* room;
+  const SeeCells& cells;
+  const SeeRule& rule;
+  const SeeOutputs& out;
+  int64_t directions;  // q
+  Isa isa;
+};
+
+class Pool {
+ public:
+  Pool(const Call& call, float* workspace)
+      : call_(call),
+        own_{workspace},
+        size_(std::clamp<int64_t>(kSamples / call.rule.wave, 64, 8192)),
+        number_(size_),
+        start_(size_),
+        stop_(size_),
+        near_(size_),
+        far_(size_),
+        most_(size_),
+        origins_(3 * size_),
+        along_(3 * size_),
+        directions_(call.directions * size_),
+        front_(size_),
+        mask_(size_ * march_words(call.march.s)),
+        offsets_(size_ + 1),
+        samples_(size_ * call.rule.wave),
+        descent_(call.cells.child == nullptr ? 0 : locate_cell_workspace(call.cells.m, 1)),
+        cell_offsets_(call.network.k + 1) {}
+
+  // False if a place is at no leaf.
+  bool run(Items& items) {
+    while (refill(items) > 0) {
+      if (!wave()) return false;
+      drop();
+    }
+    return true;
+  }
+
+ private:
+  struct Samples {
+    explicit Samples(int64_t count)
+        : ray(count), cell(count), order(count), depths(count), deltas(count), positions(3 * count), raw(4 * count) {}
+    std::vector<int32_t> ray, cell, order;
+    std::vector<float> depths, deltas, positions, raw;
+  };
+
+  int64_t refill(Items& items) {
+    for (; count_ < size_; ++count_) {
+      if (next_ == end_ && !items.take(next_, end_)) {
+        next_ = end_ = 0;
+        break;
+      }
+      const int64_t ray = next_++;
+      number_[count_] = static_cast<int32_t>(ray);
+      start_[count_] = 0;
+      near_[count_] = call_.march.near[ray];
+      far_[count_] = call_.march.far[ray];
+      most_[count_] = 0.0f;
+      front_[count_] = 0.0;
+      std::copy_n(call_.march.origins + 3 * ray, 3, &origins_[3 * count_]);
+      std::copy_n(call_.march.directions + 3 * ray, 3, &along_[3 * count_]);
+      const int64_t q = call_.directions;
+      if (q > 0) std::copy_n(call_.network.directions + q * ray, q, &directions_[q * count_]);
+      std::fill_n(call_.out.colour + 3 * ray, 3, 0.0f);
+      call_.out.opacity[ray] = call_.out.depth[ray] = 0.0f;
+      call_.out.light[ray] = 1.0f;
+      if (call_.out.heaviest != nullptr) call_.out.heaviest[ray] = far_[count_];
+    }
+    return count_;
+  }
+
+  bool wave() {
+    MarchInputs march = call_.march;
+    march.origins = origins_.data(), march.directions = along_.data();
+    march.near = near_.data(), march.far = far_.data();
+    march.start = start_.data();
+    march.r = count_;
+    march.most = call_.rule.wave;
+    count_strata(call_.isa, march, call_.room, mask_.data(), offsets_.data() + 1);
+    offsets_[0] = 0;
+    for (int64_t i = 0; i < count_; ++i) offsets_[i + 1] += offsets_[i];
+    Samples& all = samples_;
+    fill_samples(call_.isa, march, mask_.data(), offsets_.data(), all.ray.data(), all.depths.data(), all.deltas.data(),
+                 all.positions.data(), stop_.data());
+    MlpInputs in = call_.network;
+    in.n = offsets_[count_];
+    in.r = count_;
+    in.positions = all.positions.data();
+    in.directions = call_.directions > 0 ? directions_.data() : nullptr;
+    in.direction_index = call_.directions > 0 ? all.ray.data() : nullptr;
+    if (!sort(in)) return false;
+    call_.rows.forward(in, all.raw.data(), own_);
+    const SeeOutputs& out = call_.out;
+    add_wave(call_.isa,
+             {all.raw.data(), all.depths.data(), all.deltas.data(), offsets_.data(), number_.data(),
+              call_.rule.density_scale, front_.data(), out.heaviest == nullptr ? nullptr : most_.data(), out.colour,
+              out.opacity, out.depth, out.light, out.heaviest},
+             count_);
+    return true;
+  }
+
+  // The samples by their cells.
+  bool sort(MlpInputs& in) {
+    const SeeCells& cells = call_.cells;
+    in.offsets = cell_offsets_.data();
+    if (cells.centres == nullptr) {
+      cell_offsets_[0] = 0, cell_offsets_[1] = static_cast<int32_t>(in.n);
+      return true;
+    }
+    int32_t *cell = samples_.cell.data(), *order = samples_.order.data();
+    if (cells.child == nullptr) {
+      nearest_centre_serial(in.positions, cells.centres, cell, in.n, cells.m, call_.isa);
+    } else if (!locate_cell_cpu(in.positions, cells.centres, cells.child_offsets, cells.child, cell, descent_.data(),
+                                in.n, cells.m, cells.depth, call_.isa, 1)) {
+      return false;
+    }
+    // A counting sort: offsets are where the next row of each cell goes, and then where the last one went.
+    std::fill(cell_offsets_.begin(), cell_offsets_.end(), 0);
+    for (int64_t i = 0; i < in.n; ++i) ++cell_offsets_[cell[i]];
+    int32_t before = 0;
+    for (int32_t& offset : cell_offsets_) before += std::exchange(offset, before);
+    for (int64_t i = 0; i < in.n; ++i) order[cell_offsets_[cell[i]]++] = static_cast<int32_t>(i);
+    std::copy_backward(cell_offsets_.begin(), cell_offsets_.end() - 1, cell_offsets_.end());
+    cell_offsets_[0] = 0;
+    in.order = order;
+    return true;
+  }
+
+  // Rays that have ended.
+  void drop() {
+    int64_t kept = 0;
+    for (int64_t i = 0; i < count_; ++i) {
+      if (stop_[i] >= call_.march.s || !(call_.out.light[number_[i]] > call_.rule.opaque)) continue;
+      const int64_t q = call_.directions;
+      number_[kept] = number_[i], start_[kept] = stop_[i], near_[kept] = near_[i], far_[kept] = far_[i];
+      most_[kept] = most_[i], front_[kept] = front_[i];
+      std::copy_n(&origins_[3 * i], 3, &origins_[3 * kept]);
+      std::copy_n(&along_[3 * i], 3, &along_[3 * kept]);
+      if (q > 0) std::copy_n(&directions_[q * i], q, &directions_[q * kept]);
+      ++kept;
+    }
+    count_ = kept;
+  }
+
+  const Call& call_;
+  MlpRows::Own own_;
+  const int64_t size_;
+  int64_t count_ = 0, next_ = 0, end_ = 0;
+  std::vector<int32_t> number_, start_, stop_;
+  std::vector<float> near_, far_, most_, origins_, along_, directions_;
+  std::vector<double> front_;
+  std::vector<uint32_t> mask_;
+  std::vector<int32_t> offsets_;
+  Samples samples_;
+  std::vector<int32_t> descent_, cell_offsets_;
+};
+
+}  // namespace
+
+bool see_rays_cpu(const MlpTable& table, const MlpInputs& network, const MarchInputs& march, const SeeCells& cells,
+                  const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads) {
+  if (march.r == 0) return true;
+  std::unique_ptr<uint8_t[]> memory;
+  const uint8_t* room = nullptr;
+  if (march_leaps(march)) {
+    memory.reset(new uint8_t[2 * march.x * march.y * march.z]);
+    room = march_rooms(march, memory.get(), threads);
+  }
+  const MlpRows rows(table, network, {cells.centres != nullptr, network.directions != nullptr}, isa);
+  const Workspace workspace(rows.workspace() * std::max(threads, 1));
+  const Call call{network, rows, march, room, cells, rule, out, network.directions == nullptr ? 0 : table.directions,
+                  isa};
+  Items items(march.r, kRun);
+  const int team = static_cast<int>(std::min<int64_t>(threads, ceil_div(march.r, kRun)));
+  std::vector<std::unique_ptr<Pool>> pools;  // made here, as nothing may be thrown in a team
+  for (int thread = 0; thread < team; ++thread) {
+    pools.push_back(std::make_unique<Pool>(call, workspace.data() + thread * rows.workspace()));
+  }
+  std::atomic<bool> sound{true};
+  parallel(team, [&](int thread) {
+    if (!pools[static_cast<size_t>(thread)]->run(items)) sound = false;
+  });
+  return sound;
+}
+
+}  // namespace voronerf

@@ -1,0 +1,39 @@
+// What rays of a picture see, from the walk through the occupancy grid to the colour: r rays, k cells, m centres of all
+// diagrams together. What it computes is said in voronerf/ops/see_rays.
+#pragma once
+
+#include <cstdint>
+
+#include "common/isa.h"
+#include "network/grouped_mlp.h"
+#include "rays/march_rays.h"
+
+namespace voronerf {
+
+// In which cell a place lies, as in nearest_centre.h, or with a child in locate_cell.h; without centres in the only
+// one.
+struct SeeCells {
+  const float* centres;
+  const int32_t *child_offsets, *child;
+  int64_t m;
+  int depth;
+};
+
+struct SeeRule {
+  float density_scale;
+  float opaque;  // a ray ends behind a wave after which no more light than this is left
+  int64_t wave;  // samples of a ray that are evaluated at once
+};
+
+struct SeeOutputs {
+  float* colour;                   // [r,3]
+  float *opacity, *depth, *light;  // [r]: sums of weights and of weights times depth, and what light is left
+  float* heaviest;                 // [r], depth of the heaviest sample, far without any; or null
+};
+
+// The march has no uniforms, seed or start. The network has positions [r,3], which are not read, and directions [r,q]
+// or none. False if a place is not at a leaf after `depth` levels.
+bool see_rays_cpu(const MlpTable& table, const MlpInputs& network, const MarchInputs& march, const SeeCells& cells,
+                  const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads);
+
+}  // namespace voronerf

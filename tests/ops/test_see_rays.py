@@ -1,0 +1,78 @@
+"""What rays of a picture see: one operation against the waves of others."""
+
+import itertools
+
+import pytest
+import torch
+from helpers import on_any_number_of_threads
+from op_cases import refused
+
+from voronerf import MLP, Layer
+from voronerf.ops import see_rays
+from voronerf.ops.cases import Draw
+from voronerf.ops.see_rays.case import CASE
+
+pytestmark = pytest.mark.op("see_rays")
+MOVED = ("origins", "directions", "near", "far")
+CHOICES = [*itertools.product((0, 1, 33, 700), ("hashed", "as they are"), (1, 3), ("linear", "disparity"))]
+
+
+@pytest.mark.native
+@pytest.mark.parametrize(("n", "positions", "cells", "spacing"), CHOICES)
+def test_native_sees_what_the_reference_sees(n, positions, cells, spacing):
+    given = CASE.make(Draw(n, positions=positions, cells=cells, spacing=spacing), n)
+    found, expected = (see_rays(**given, backend=backend) for backend in ("native", "reference"))
+    for name, part, other in zip(found._fields, found, expected, strict=True):
+        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5, msg=name)
+    assert n < 33 or 0.1 < float(found.opacity.mean()) < 1.1
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("kind", [{}, {"cells": 9, "wave": 1}, {"contraction": torch.tensor([0.1, 0, 0, 0.4])}])
+def test_a_ray_sees_the_same_bits_beside_any_others(kind):
+    """On any number of threads, and in any order: which rays share a wave depends on both."""
+    given = CASE.make(Draw(7, **kind), 5000)
+    found = on_any_number_of_threads(lambda: see_rays(**given, backend="native"))
+    order = torch.randperm(5000, generator=torch.Generator().manual_seed(0))
+    moved = {name: given[name][order] for name in MOVED}
+    for part, other in zip(found, see_rays(**{**given, **moved}, backend="native"), strict=True):
+        assert torch.equal(part[order], other)
+
+
+def test_leaps_over_empty_cells_find_the_same():
+    """Strata are many more than the cells of the grid, so that the native rays leap."""
+    given = CASE.make(Draw(3, samples=130, side=4), 40)
+    given["occupied"] = torch.zeros(12, 12, 12, dtype=torch.bool)
+    given["occupied"][5:7, 4:8, 3:9] = True
+    few, many = ({**given, **{name: given[name].repeat_interleave(copies, 0) for name in MOVED}} for copies in (1, 8))
+    assert len(few["near"]) * 130 < 4 * 12**3 <= len(many["near"]) * 130
+    for part, other in zip(see_rays(**few), see_rays(**many), strict=True):
+        assert torch.equal(part, other[::8])
+
+
+def test_a_tree_of_diagrams_tells_the_cells():
+    """Two halves, of which one is halved again: three networks of one colour each."""
+    layers = MLP((Layer(("positions",), 4),), outputs=(0,))
+    colours = torch.tensor([[9.0, -9, -9, 9], [-9, 9, -9, 9], [-9, -9, 9, 9]])
+    network = {"weights": [torch.zeros(3, 4, 3)], "biases": [colours], "layers": layers, "depth": 2}
+    network["centres"] = torch.tensor([[-0.5, 0, 0], [0.5, 0, 0], [0.5, -0.5, 0], [0.5, 0.5, 0]])
+    network["child_offsets"] = torch.tensor([0, 2, 4], dtype=torch.int32)
+    network["child"] = torch.tensor([-1, 1, -2, -3], dtype=torch.int32)
+    origins = torch.tensor([[-0.5, -0.5, -2], [0.5, -0.5, -2], [0.5, 0.5, -2]])
+    ray = origins, torch.tensor([[0.0, 0, 1]]).expand(3, 3), torch.zeros(3), torch.full((3,), 4.0)
+    box, occupied = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.ones(2, 2, 2, dtype=torch.bool)
+    for backend in ("auto", "reference"):
+        seen = see_rays(*ray, occupied, box, 64, network, density_scale=1.0, backend=backend)
+        assert torch.equal(seen.colour.round(decimals=1), torch.eye(3)), backend
+    with refused(ValueError, "see_rays: depth must be the number of levels of the tree, got 1, which is too few"):
+        see_rays(*ray, occupied, box, 64, {**network, "depth": 1}, density_scale=1.0, backend="native")
+
+
+def test_what_is_of_the_samples_is_refused():
+    given = CASE.make(Draw(0), 3)
+    with refused(TypeError, "see_rays: network must hold ... alone, got cells"):
+        see_rays(**{**given, "network": {**given["network"], "cells": torch.zeros(3, dtype=torch.int32)}})
+    layers = MLP((Layer(("positions",), 3),), outputs=(0,))
+    network = {"weights": [torch.zeros(1, 3, 3)], "biases": [None], "layers": layers}
+    with refused(ValueError, "see_rays: layers must put out 4 numbers, colour and density, got 3"):
+        see_rays(**{**given, "network": network})

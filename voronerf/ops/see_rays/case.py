@@ -1,0 +1,45 @@
+"""The case of ``see_rays``."""
+
+from __future__ import annotations
+
+import torch
+
+from voronerf.grids import HashGrid
+from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops.cases import Arguments, Case, Draw
+
+_GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    k, sides = draw.number("cells", 3, 1, 9), [draw.number("side", side, 1, 9) for side in (5, 4, 6)]
+    hashed = draw.among("positions", "hashed", "as they are") == "hashed"
+    encoding = {"position_encoding": "hash", "grid": _GRID} if hashed else {}
+    table = MLP((Layer((POSITIONS,), 6, "relu"), Layer((0, DIRECTIONS), 3), Layer((0,), 1)), (1, 2), **encoding)
+    network: Arguments = {"layers": table, "centres": draw.uniform(k, 3) - 0.5}
+    network["weights"] = [draw.normal(k, o, i) for o, i in table.weight_shapes(3, 3)]
+    network["biases"] = [draw.normal(k, 6), None, 1 + draw.normal(k, 1)]
+    if hashed:
+        network["features"] = draw.normal(*_GRID.table_shape)
+    directions = draw.unit(n)
+    origins = 2 * draw.normal(n, 3) if draw.free else -directions
+    call: Arguments = {"origins": origins, "directions": directions, "network": network}
+    call |= {"near": 0.01 + draw.uniform(n), "far": 3 + draw.uniform(n), "samples": draw.among("samples", 40, 1, 130)}
+    call |= {"occupied": draw.uniform(*sides) < 0.6, "box": torch.tensor([[-1.0] * 3, [1.0] * 3])}
+    call |= {"density_scale": 5.0, "wave": draw.number("wave", 5, 1, 9), "opaque": draw.among("opaque", 0.02, 0.0, 0.5)}
+    call["spacing"] = draw.among("spacing", "linear", "disparity")
+    sphere = draw.uniform(4) + 0.1
+    call["contraction"] = draw.among("contraction", None, sphere, draw.uniform(5, 3) + 0.1)
+    return {**call, "heaviest": draw.among("heaviest", True, False)}
+
+
+CASE = Case(
+    _make,
+    refused={
+        "network must hold weights, biases and layers, got 3": {"network": 3},
+        "wave must be at least 1, got 0": {"wave": 0},
+        "opaque must be 0 or more and below 1, got 1.0": {"opaque": 1.0},
+        "density_scale must be positive, got 0": {"density_scale": 0},
+    },
+    traced=False,
+)

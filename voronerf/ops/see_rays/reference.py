@@ -1,0 +1,145 @@
+"""What rays of a picture see: they are walked in waves, and end when they are opaque. r rays, s strata of a ray."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.ops.composite.reference import Composite, composite
+from voronerf.ops.march_rays.reference import Rays, march_rays
+from voronerf.ops.routed_mlp.reference import routed_mlp
+
+
+class Sight(NamedTuple):
+    """What rays see.
+
+    Attributes:
+        colour: [r, 3], the sum of weight times colour: without a background, and not divided by the opacity.
+        opacity: [r], the sum of the weights.
+        depth: [r], the sum of weight times depth.
+        light: [r], the share of the light that is left.
+        heaviest: [r], the depth of the heaviest sample; the far end for a ray without any.
+
+    Examples:
+        >>> from voronerf.ops import Sight
+        >>> Sight._fields
+        ('colour', 'opacity', 'depth', 'light', 'heaviest')
+    """
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    light: Tensor
+    heaviest: Tensor
+
+
+class Rule(NamedTuple):
+    """How rays are walked; ``voronerf.ops.see_rays`` says what each is."""
+
+    density_scale: float
+    opaque: float
+    wave: int
+    heaviest: bool
+
+
+class Wave(NamedTuple):
+    """Samples of rays, as they were seen.
+
+    Attributes:
+        seen: Of the rays, by these samples alone.
+        ray_index: int32 [m].
+        ray_offsets: int32 [rays + 1].
+        depths: [m].
+        stop: int32 [rays], the strata at which the rays go on.
+    """
+
+    seen: Composite
+    ray_index: Tensor
+    ray_offsets: Tensor
+    depths: Tensor
+    stop: Tensor
+
+
+@dataclass(frozen=True)
+class Operations:
+    """The operations that a wave is made of."""
+
+    march_rays: Callable[..., Any] = march_rays
+    routed_mlp: Callable[..., tuple[Tensor, Tensor]] = routed_mlp
+    composite: Callable[..., Any] = composite
+
+
+REFERENCE = Operations()
+
+
+@torch.no_grad()
+def see_rays(rays: Rays, network: Mapping[str, Any], rule: Rule, operations: Operations = REFERENCE) -> Sight:
+    """Every ray up to the first surface; see ``voronerf.ops.see_rays``."""
+    centres, directions = network.get("centres"), network.get("directions")
+    of_samples = ("positions", "coords", "directions", "direction_index")
+    given = {name: value for name, value in network.items() if name not in of_samples}
+
+    def look(live: Tensor, start: Tensor | None) -> Wave:
+        of_rays = {name: getattr(rays, name)[live] for name in ("origins", "directions", "near", "far")}
+        march = operations.march_rays(rays._replace(**of_rays, start=start, most=rule.wave), None)
+        positions = march.positions.to(network["positions"].dtype)
+        coords = None if centres is None else positions.to(centres.dtype)
+        seen_from: dict[str, Any] = {"directions": None, "direction_index": None}
+        if directions is not None:
+            seen_from = {"directions": directions[live], "direction_index": march.ray_index}
+        raw, _ = operations.routed_mlp(positions=positions, coords=coords, **seen_from, **given)
+        raw = raw.to(rays.near.dtype)
+        density = torch.nn.functional.softplus(raw[:, 3]) * rule.density_scale
+        seen = operations.composite(density, raw[:, :3].sigmoid(), march.depths, march.deltas, march.ray_offsets)
+        return Wave(Composite(*seen), march.ray_index, march.ray_offsets, march.depths, march.stop)
+
+    return walk(look, rays.far, rays.samples, rule.wave, rule.opaque, rule.heaviest)
+
+
+@torch.no_grad()
+def walk(
+    look: Callable[[Tensor, Tensor | None], Wave], far: Tensor, samples: int, wave: int, opaque: float, heaviest: bool
+) -> Sight:
+    """Rays in waves, and what they add up to.
+
+    Args:
+        look: The next wave of some rays, int64, from strata int32 on, or with None from the first.
+        far: [r].
+        samples: s.
+        wave: Samples of a ray in a wave, at the most.
+        opaque: Rays end with a wave after which no more light than this is left.
+        heaviest: Whether to find the heaviest samples.
+    """
+    colour, opacity, depth = far.new_zeros(len(far), 3), torch.zeros_like(far), torch.zeros_like(far)
+    through, top, at = torch.ones_like(far), torch.zeros_like(far), far.clone()
+    live, start = torch.arange(len(far), device=far.device), None
+    while live.numel() > 0:
+        found = look(live, start)
+        part, light = found.seen, through[live]
+        colour[live] += light[:, None] * part.colour
+        opacity[live] += light * part.opacity
+        depth[live] += light * part.depth
+        if heaviest:
+            weight, place = _heaviest(found, wave)
+            weight = weight * light
+            better = weight > top[live]
+            top[live[better]], at[live[better]] = weight[better], place[better]
+        light = light * (1 - part.opacity)
+        through[live] = light
+        more = ((found.stop < samples) & (light > opaque)).nonzero()[:, 0]
+        live, start = live[more], found.stop[more]
+    return Sight(colour, opacity, depth, through, at)
+
+
+def _heaviest(wave: Wave, most: int) -> tuple[Tensor, Tensor]:
+    """Weight and depth [r] of the heaviest sample of each ray, of which there are at most `most`; -1 without any."""
+    weights, rays = wave.seen.weights, len(wave.stop)
+    row = torch.arange(len(weights), device=weights.device) - wave.ray_offsets[wave.ray_index]
+    table = weights.new_full((2, rays * most), -1.0)
+    table[:, wave.ray_index.long() * most + row] = torch.stack((weights, wave.depths))
+    weight, column = table[0].reshape(-1, most).max(dim=1)
+    return weight, table[1].reshape(-1, most).gather(1, column[:, None])[:, 0]
