@@ -1,8 +1,7 @@
 // Rays over threads. Each thread has a pool of rays that are under way, and takes a wave of samples of all of them at a
-// time: through the grid, to their cells, through the networks, and to the colours. Nothing of it leaves the
-// second-level cache but the colours. A ray that has ended makes room for the next one of the picture, so that the
-// waves are as large to the end. What a ray sees does not depend on which rays are beside it, nor on the number of
-// threads.
+// time: through the grid, to their cells, through the networks, and to the colours. A ray that has ended makes room for
+// the next one of the picture, so that the waves are as large to the end. What a ray sees does not depend on which rays
+// are beside it, nor on the number of threads.
 #include "rays/see_rays.h"
 
 #include <algorithm>
@@ -25,8 +24,11 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kSamples = 8192;  // of a wave, about
-constexpr int64_t kRun = 32;        // rays of the picture that a thread takes at once
+// Samples of a wave, about. A quarter as many lie in the second-level cache, but weights of a cell are packed for each
+// wave, and its rows leave tiles half empty: it takes longer.
+constexpr int64_t kSamples = 32768;
+constexpr int64_t kShare = 8;  // pools of a thread in a picture, at least, so that all threads have work to the end
+constexpr int64_t kRun = 32;   // rays of the picture that a thread takes at once
 
 void count_strata(Isa isa, const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts) {
   VN_FOR_ISA(isa, march_count(in, room, mask, counts, 0, in.r))
@@ -50,6 +52,7 @@ struct Call {
   const SeeOutputs& out;
   int64_t directions;  // q
   Isa isa;
+  int threads;
 };
 
 class Pool {
@@ -57,7 +60,8 @@ class Pool {
   Pool(const Call& call, float* workspace)
       : call_(call),
         own_{workspace},
-        size_(std::clamp<int64_t>(kSamples / call.rule.wave, 64, 8192)),
+        size_(
+            std::clamp<int64_t>(std::min(kSamples / call.rule.wave, call.march.r / (kShare * call.threads)), 64, 8192)),
         number_(size_),
         start_(size_),
         stop_(size_),
@@ -215,8 +219,11 @@ bool see_rays_cpu(const MlpTable& table, const MlpInputs& network, const MarchIn
   }
   const MlpRows rows(table, network, {cells.centres != nullptr, network.directions != nullptr}, isa);
   const Workspace workspace(rows.workspace() * std::max(threads, 1));
-  const Call call{network, rows, march, room, cells, rule, out, network.directions == nullptr ? 0 : table.directions,
-                  isa};
+  const Call call{network, rows,
+                  march,   room,
+                  cells,   rule,
+                  out,     network.directions == nullptr ? 0 : table.directions,
+                  isa,     std::max(threads, 1)};
   Items items(march.r, kRun);
   const int team = static_cast<int>(std::min<int64_t>(threads, ceil_div(march.r, kRun)));
   std::vector<std::unique_ptr<Pool>> pools;  // made here, as nothing may be thrown in a team

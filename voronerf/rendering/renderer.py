@@ -243,7 +243,7 @@ class Renderer:
             far: farthest.
             box: [2, 3] outside of which nothing is; rays that miss it show the background without asking the field.
             background: [3], None is black.
-            heaviest: whether to look for each ray's heaviest sample; without it the result has every ray's far end.
+            heaviest: whether to look for each ray's heaviest sample; without it that part of the result means nothing.
             chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples
                 of a ray, 131,072; over ranks 16,384.
         """
@@ -256,8 +256,10 @@ class Renderer:
         colour = torch.zeros_like(rays.origins)
         colour = colour if background is None else background.to(colour).repeat(len(rays), 1)
         opacity, depth = torch.zeros_like(first), torch.full_like(first, far)
-        places = rays.origins + far * rays.directions
-        places = places if self.contraction is None else self.contraction.points(places)
+        places = rays.origins
+        if heaviest:
+            places = rays.origins + far * rays.directions
+            places = places if self.contraction is None else self.contraction.points(places)
         field, eye = self.field, cameras.origins[index]
         pixel = 1 / float(cameras.intrinsics[index, :2].max())
         with field.seen_from(eye, pixel) if isinstance(field, Parts) and field.detail else nullcontext():

@@ -88,7 +88,7 @@ def see_rays(
         >>> box, occupied = torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), torch.ones(1, 1, 1, dtype=torch.bool)
         >>> seen = see_rays(*ray, occupied, box, 64, network, density_scale=1.0)
         >>> seen.colour.round(decimals=2), (seen.depth / seen.opacity).round(decimals=2), float(seen.light) < 0.02
-        (tensor([[0.5000, 0.5000, 0.5000]]), tensor([1.0500]), True)
+        (tensor([[0.5000, 0.5000, 0.5000]]), tensor([1.0600]), True)
     """
     check_integer(_OP, "samples", samples, 1, 65_535)
     check_integer(_OP, "wave", wave, 1, _MOST_WAVE)

@@ -14,7 +14,7 @@ _GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
 def _make(draw: Draw, n: int) -> Arguments:
     k, sides = draw.number("cells", 3, 1, 9), [draw.number("side", side, 1, 9) for side in (5, 4, 6)]
     hashed = draw.among("positions", "hashed", "as they are") == "hashed"
-    encoding = {"position_encoding": "hash", "grid": _GRID} if hashed else {}
+    encoding: Arguments = {"position_encoding": "hash", "grid": _GRID} if hashed else {}
     table = MLP((Layer((POSITIONS,), 6, "relu"), Layer((0, DIRECTIONS), 3), Layer((0,), 1)), (1, 2), **encoding)
     network: Arguments = {"layers": table, "centres": draw.uniform(k, 3) - 0.5}
     network["weights"] = [draw.normal(k, o, i) for o, i in table.weight_shapes(3, 3)]
