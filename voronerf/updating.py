@@ -196,7 +196,8 @@ def train_on(
     """Goes on with a training on other pictures of its scene, in a new run directory, whole or not at all.
 
     The learning rate begins anew: where it went on from its fall, fox had 0.4 dB less of the pictures that came later.
-    What the first pictures showed to be empty is opened: else fox had 0.3 and 0.7 dB less.
+    What the first pictures showed to be empty is opened: else fox at 270 x 480 had 0.3 and 0.7 dB less, though none at
+    1080 x 1920.
 
     Args:
         checkpoint: The last one of the run.
