@@ -119,15 +119,15 @@ def city(out: Path, seconds: float, seeds: list[int]) -> None:
             runs[way] = replace(joined, scene=scene)
         for way, run in runs.items():
             row = {"way": way, "seed": seed, "cells": run.router.num_cells}
-            row["psnr"] = run.evaluate(views=8, lpips="off")["psnr"]
+            row["psnr"] = run.evaluate(lpips="off")["psnr"]
 
             def picture(view: int, run: Run = run):
                 return run.render(view)
 
-            row["seam"] = seam(run.router, scene, picture, views=2, margin=BLEND)
+            row["seam"] = seam(run.router, scene, picture, views=8, margin=BLEND)
             if hasattr(run.router, "parts"):
                 run.router.blend = BLEND
-                row["psnr blended"] = run.evaluate(views=8, lpips="off")["psnr"]
+                row["psnr blended"] = run.evaluate(lpips="off")["psnr"]
                 if seed == seeds[0] and way == "views by position":
                     blended = picture_of_colour(run.render(4).colour)
                 run.router.blend = 0.0
