@@ -195,7 +195,7 @@ def _check_outputs(op: str, raw: Tensor, samples: OwnSamples, density_scale: flo
     given.tensor("raw", raw, _FLOATS, "m", 4)
     floats, whole = (samples.deltas, samples.depths), (samples.ray_index, samples.run_offsets)
     rows = len(raw), len(raw), len(raw), None
-    if all(map(_is_plain, (*floats, *whole), (raw.dtype,) * 2 + INDEX * 2, rows)) and not raw.is_cuda:
+    if all(map(_is_plain, (*floats, *whole), (raw.dtype,) * 2 + INDEX * 2, rows)) and raw.is_cpu:
         given.sizes["q"] = len(samples.run_offsets) - 1
     else:  # which says what is wrong
         given.tensor("deltas", samples.deltas, LIKE_FIRST, "m")
