@@ -319,6 +319,8 @@ def test_pictures_of_all_runs_are_where_the_joined_run_has_them(opened, scene, t
     joined = Run.join(opened, tmp_path / "joined", frames=frames)
     moved = [editing.moved_cameras(scene.test.cameras, frame).poses for frame in frames]
     assert torch.allclose(joined.scene.test.cameras.poses, moved[0], atol=1e-5)
+    resumed = Trainer(replace(joined.config, out=joined.path, resume=True, steps=2, budget=None), scene)
+    assert torch.allclose(resumed.scene.test.cameras.poses, moved[0], atol=1e-5)
     assert joined.scene.box.equal(joined.source.scene.box)
     loaded = []
     monkeypatch.setattr("voronerf.run.load_scene", lambda data, **given: loaded.append(data) or scene)

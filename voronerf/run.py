@@ -330,7 +330,7 @@ def open_run(
     path: Path | str,
     *,
     scene: Scene | None = None,
-    data: str | Sequence[str] | None = None,
+    data: str | Path | Sequence[str | Path] | None = None,
     downscale: int | None = None,
     allow_outside: bool = False,
     samples: int | None = None,
@@ -397,7 +397,7 @@ def open_run(
         >>> folder.cleanup()
     """
     path = Path(path)
-    folders = [data] if isinstance(data, str) else [*(data or ())]
+    folders = [str(data)] if isinstance(data, (str, Path)) else [str(folder) for folder in data or ()]
     check_device(device)
     _check_blend(blend)
     check_folders(path)
@@ -438,9 +438,10 @@ def open_run(
             [load_scene(each, allow_outside=allow_outside, **config.reading) for each in folders], path
         )
     scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
-    scene = within(scene, path) if several else scene
+    territories = (config.territories or 1) > 1
+    scene = within(scene, path, joined=not territories) if several else scene
     scene = with_refined(scene, path) if config.refine_cameras else scene
-    if several and (config.territories or 1) > 1:  # as it was trained: its parts know their own settings
+    if several and territories:  # as it was trained: its parts know their own settings
         config = joint_config(config, scene)
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
     field = routers["field"]

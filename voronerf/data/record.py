@@ -77,8 +77,13 @@ def _where_they_are(read: Cameras, moved: Cameras) -> Cameras:
     return replace(read, poses=moved.poses.to(read.poses), intrinsics=intrinsics)
 
 
-def within(scene: Scene, run: Path) -> Scene:
+def within(scene: Scene, run: Path, *, joined: bool) -> Scene:
     """A scene in the space of the record in a run directory, where there is one, see `recorded` and `placed`.
+
+    Args:
+        scene: As it was read.
+        run: The run directory.
+        joined: Whether the run was made of others, which may have moved its cameras.
 
     Raises:
         SceneError: the record is damaged, or it is of another place.
@@ -87,7 +92,7 @@ def within(scene: Scene, run: Path) -> Scene:
     if not path.is_file():
         return scene
     known = read_scene(path)
-    return recorded([scene], known) or placed(scene, known)
+    return (recorded([scene], known) if joined else None) or placed(scene, known)
 
 
 def recorded(scenes: Sequence[Scene], known: Scene) -> Scene | None:

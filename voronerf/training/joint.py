@@ -127,7 +127,7 @@ class JointTrainer:
         if config.out is None:
             raise ValueError("JointTrainer: config.out must name the run directory, got None")
         if config.resume:  # the space is that of the run, whatever the views
-            scene = within(scene, config.out)
+            scene = within(scene, config.out, joined=False)
         self.out, self.scene, self.config = config.out, scene, config
         self.on_step, self.on_event, self.clock = on_step, on_event, clock or time.perf_counter
         self.device = torch.device(config.device)

@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,7 +14,6 @@ from voronerf.router import Parts, VoronoiRouter
 from voronerf.training.checkpoint import (
     Checkpoint,
     CheckpointError,
-    last_checkpoint,
     load_optimizer_tensors,
     optimizer_tensors,
 )
@@ -91,19 +89,17 @@ def collect(
     return Checkpoint(tensors, values)
 
 
-def resumed_checkpoint(config: TrainConfig, run: Path) -> Checkpoint:
-    """The last checkpoint of a run, whose networks are those of the settings to continue it with.
+def check_resumed(config: TrainConfig, checkpoint: Checkpoint) -> None:
+    """Checks that the networks of a checkpoint are those of the settings to continue it with.
 
     Raises:
-        CheckpointError: When there is no checkpoint, or one of another configuration.
+        CheckpointError: When it is of another configuration.
     """
-    checkpoint = last_checkpoint(run)
     stored, _ = stored_values(checkpoint)
     different = differences(stored, config)
     if different:
         raise CheckpointError(f"{checkpoint.source}: a checkpoint of another configuration: {'; '.join(different)}")
     check_shapes(stored, checkpoint)
-    return checkpoint
 
 
 def load_moments(optimizer: torch.optim.Optimizer, checkpoint: Checkpoint, step: int) -> None:

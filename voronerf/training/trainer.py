@@ -100,14 +100,15 @@ class Trainer:
         if config.out is None:
             raise ValueError("Trainer: config.out must name the run directory, got None")
         if config.resume:  # the space is that of the run, whatever the views
-            scene = within(scene, config.out)
+            checkpoint = last_checkpoint(config.out)
+            scene = within(scene, config.out, joined="parts" in checkpoint.values)
         self.out, self.scene = config.out, scene
         self.on_step, self.on_event, self.clock = on_step, on_event, clock or time.perf_counter
         self.device = torch.device(config.device)
         config = resolve_config(config, scene)
         check_memory(config)
-        if checkpoint is None and config.resume:
-            checkpoint = state.resumed_checkpoint(config, self.out)
+        if config.resume and checkpoint is not None:
+            state.check_resumed(config, checkpoint)
         self.config, self.plan = config, config.planned_splits
         check_backend(config, self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
