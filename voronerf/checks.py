@@ -250,6 +250,13 @@ def check_number(op: str, name: str, value: float) -> None:
         raise ValueError(f"{op}: {name} must be at most {sys.float_info.max:.2g}, got an integer of more digits")
 
 
+def check_positive(op: str, name: str, value: float) -> None:
+    """`check_number`, and ValueError unless it is above 0."""
+    check_number(op, name, value)
+    if not value > 0:
+        raise ValueError(f"{op}: {name} must be positive, got {value}")
+
+
 def check_flag(op: str, name: str, value: bool) -> None:
     """Raises TypeError unless ``value`` is True or False."""
     if not isinstance(value, bool):

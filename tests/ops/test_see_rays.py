@@ -28,6 +28,24 @@ def test_native_sees_what_the_reference_sees(n, positions, cells, spacing):
 
 
 @pytest.mark.native
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64, "autocast"], ids=str)
+def test_networks_of_other_dtypes_are_seen(dtype):
+    """Parameters of another dtype than the rays, and autocast: not by the one operation, but as well."""
+    given = CASE.make(Draw(1), 300)
+    network = dict(given["network"])
+    if isinstance(dtype, torch.dtype):
+        for name in ("weights", "biases"):
+            network[name] = [None if tensor is None else tensor.to(dtype) for tensor in network[name]]
+        network["features"] = network["features"].to(dtype)
+    with torch.autocast("cpu", torch.bfloat16, enabled=dtype == "autocast"):
+        found = see_rays(**{**given, "network": network}, backend="native")
+    allowed = 1e-4 if dtype == torch.float64 else 0.03
+    for part, other in zip(found[:4], see_rays(**given, backend="reference")[:4], strict=True):
+        assert part.dtype == torch.float32
+        torch.testing.assert_close(part, other, rtol=allowed, atol=allowed)
+
+
+@pytest.mark.native
 @pytest.mark.parametrize("kind", [{}, {"cells": 9, "wave": 1}, {"contraction": torch.tensor([0.1, 0, 0, 0.4])}])
 def test_a_ray_sees_the_same_bits_beside_any_others(kind):
     """On any number of threads, and in any order: which rays share a wave depends on both."""

@@ -13,7 +13,16 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import Implementation
-from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_flag, check_integer, check_number, check_range
+from voronerf.checks import (
+    INDEX,
+    LIKE_FIRST,
+    Checked,
+    check_flag,
+    check_integer,
+    check_number,
+    check_positive,
+    check_range,
+)
 from voronerf.ops.composite.reference import check_ray_offsets
 from voronerf.ops.ray_runs.reference import OwnSamples
 
@@ -203,9 +212,7 @@ def _check_outputs(op: str, raw: Tensor, samples: OwnSamples, density_scale: flo
         given.tensor("ray_index", samples.ray_index, INDEX, "m")
         given.tensor("run_offsets", samples.run_offsets, INDEX, "q+1")
     check_ray_offsets(op, samples.run_offsets, len(raw))
-    check_number(op, "density_scale", density_scale)
-    if not density_scale > 0:
-        raise ValueError(f"{op}: density_scale must be positive, got {density_scale}")
+    check_positive(op, "density_scale", density_scale)
     return given
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf import backends
 from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import FLOATING, INDEX, Checked, check_count, check_number, detached
+from voronerf.checks import FLOATING, INDEX, Checked, check_count, check_number, check_positive, detached
 from voronerf.ops.render_loss.reference import Rendered, RenderLoss
 
 _OP = backends.declare(
@@ -136,9 +136,7 @@ def _checked(
     tensors.each_or_all("background", background, wide, "r", 3)
     tensors.no_inference()
     check_count(op, "raw", raw.numel())
-    check_number(op, "density_scale", density_scale)
-    if not density_scale > 0:
-        raise ValueError(f"{op}: density_scale must be positive, got {density_scale}")
+    check_positive(op, "density_scale", density_scale)
     check_number(op, "hidden", hidden)
     if not 0 <= hidden < 1:
         raise ValueError(f"{op}: hidden must lie in [0, 1), got {hidden}")

@@ -19,6 +19,7 @@ from voronerf.checks import (
     check_flag,
     check_integer,
     check_number,
+    check_positive,
     detached,
 )
 from voronerf.ops.composite import composite
@@ -103,9 +104,7 @@ def see_rays(
     given.optional("contraction", contraction, LIKE_FIRST, *((4,) if sphere else (5, 3)))
     check_choice(_OP, "spacing", spacing, ("linear", "disparity"))
     check_flag(_OP, "heaviest", heaviest)
-    check_number(_OP, "density_scale", density_scale)
-    if not density_scale > 0:
-        raise ValueError(f"{_OP}: density_scale must be positive, got {density_scale}")
+    check_positive(_OP, "density_scale", density_scale)
     check_number(_OP, "opaque", opaque)
     if not 0 <= opaque < 1:
         raise ValueError(f"{_OP}: opaque must be 0 or more and below 1, got {opaque}")

@@ -94,7 +94,7 @@ def see_rays(rays: Rays, network: Mapping[str, Any], rule: Rule, operations: Ope
         raw, _ = operations.routed_mlp(positions=positions, coords=coords, **seen_from, **given)
         raw = raw.to(rays.near.dtype)
         density = torch.nn.functional.softplus(raw[:, 3]) * rule.density_scale
-        seen = operations.composite(density, raw[:, :3].sigmoid(), march.depths, march.deltas, march.ray_offsets)
+        seen = operations.composite(density, raw[:, :3].sigmoid(), march.depths, march.deltas, march.ray_offsets, None)
         return Wave(Composite(*seen), march.ray_index, march.ray_offsets, march.depths, march.stop)
 
     return walk(look, rays.far, rays.samples, rule.wave, rule.opaque, rule.heaviest)
