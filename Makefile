@@ -86,7 +86,7 @@ attack: $(VENV)/.built
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/attack $(ATTACK_ARGS)
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info voronerf/_C.*.so .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist *.egg-info voronerf/ops/_core/_C.*.so .mypy_cache .pytest_cache .ruff_cache
 
 $(VENV)/.installed: requirements-ci.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

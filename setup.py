@@ -1,4 +1,4 @@
-"""Build of the compiled module ``voronerf._C``; everything else is in pyproject.toml.
+"""Build of the compiled module ``voronerf.ops._core._C``; everything else is in pyproject.toml.
 
 The extension knows nothing of torch: C++17, pybind11 and, where nvcc is found, CUDA. A build.ninja is written and run,
 so a build is parallel and redoes only what has changed, headers included. Files named ``*_isa.cpp`` are compiled once
@@ -72,7 +72,7 @@ class NinjaBuildExt(build_ext):
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(module, target)
         if stub := stub_of(module):
-            for folder in (ROOT / "voronerf", target.parent):
+            for folder in (ROOT / "voronerf/ops/_core", target.parent):
                 write_if_changed(folder / "_C.pyi", stub)
         print(f"voronerf: {cuda.outcome}")
 
@@ -215,7 +215,7 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     # named, and NaN and infinity are distinguished from numbers. A root that may set errno is a call, which keeps its
     # loop from becoming vectors.
     extra = [*shlex.split(os.environ.get("CXXFLAGS", "")), "-fno-fast-math", "-ffp-contract=off", "-fno-math-errno"]
-    # libgomp is left out of the link: voronerf/native/__init__.py binds the module to the copy that torch has loaded.
+    # libgomp is left out of the link: voronerf/ops/_core/native/__init__.py binds the module to the copy that torch has loaded.
     if cuda.nvcc is not None:
         # nvcc knows where its static runtime is. With that, the module loads on a machine without CUDA.
         linker = [str(cuda.nvcc), "-shared", "-cudart=static", *host_compiler(), "-Xlinker", "--exclude-libs,ALL"]
@@ -306,7 +306,7 @@ print(module.stub, end="")
 """
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     if found.returncode != 0:
-        print(f"voronerf: voronerf/_C.pyi is left as it is: {found.stderr.strip()}")
+        print(f"voronerf: voronerf/ops/_core/_C.pyi is left as it is: {found.stderr.strip()}")
     return found.stdout
 
 
@@ -330,7 +330,10 @@ if __name__ == "__main__":
     setup(
         packages=[*find_packages(include=["voronerf", "voronerf.*"]), "voronerf.kernels"],
         package_dir={"voronerf": "voronerf", "voronerf.kernels": "kernels"},
-        package_data={"voronerf": ["_C.pyi"]},  # which the compiled module is compared with
-        ext_modules=[Extension("voronerf._C", sources=[])],
+        package_data={
+            "voronerf.ops._core": ["_C.pyi"],
+            "voronerf": ["py.typed"],
+        },  # which the compiled module is compared with
+        ext_modules=[Extension("voronerf.ops._core._C", sources=[])],
         cmdclass={"build_ext": NinjaBuildExt},
     )

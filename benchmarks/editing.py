@@ -26,15 +26,15 @@ import torch
 from harness import metadata
 
 from voronerf import Run, open_run
-from voronerf.data import Scene, city_scene
-from voronerf.data.record import read_scene
-from voronerf.evaluation import seam
-from voronerf.evaluation.panels import contact_sheet, picture_of_colour, save_picture
-from voronerf.rendering import orbit_cameras
-from voronerf.rendering.rays import intersect_box
-from voronerf.router import Similarity, Solid
-from voronerf.training.config import TrainConfig
-from voronerf.training.trainer import Trainer
+from voronerf.app.evaluate import seam
+from voronerf.app.evaluate.panels import contact_sheet, picture_of_colour, save_picture
+from voronerf.app.scenes import Scene, city_scene
+from voronerf.app.scenes.record import read_scene
+from voronerf.app.train.config import TrainConfig
+from voronerf.app.train.trainer import Trainer
+from voronerf.nerf import orbit_cameras
+from voronerf.nerf.rays import intersect_box
+from voronerf.town.parts import Similarity, Solid
 
 RESULT = Path(__file__).parent / "results" / "editing.json"
 PICTURES = Path(__file__).parent.parent / "docs" / "images"

@@ -20,7 +20,8 @@ from typing import Any
 
 import torch
 
-from voronerf import __version__, backends
+from voronerf import __version__
+from voronerf.ops._core import backends
 
 Run = Callable[[int], Any]
 """A contender: given the number of the call, runs on the inputs that number stands for. Call 0 is the warm-up."""
@@ -215,7 +216,7 @@ class Others:
 class Peaks:
     """The machine's limits, measured at every query, because the clock of the processor changes.
 
-    On the CPU by ``voronerf.native.measure_peak``; on CUDA by torch's product of large matrices and a large copy,
+    On the CPU by ``voronerf.ops._core.native.measure_peak``; on CUDA by torch's product of large matrices and a large copy,
     which are what a user can reach rather than the limit itself.
     """
 
@@ -232,7 +233,7 @@ class Peaks:
             return self._keep(f"{kind}, torch", _cuda_peak(kind, self.device))
         if backends.missing("native", self.device) is not None:
             return None
-        from voronerf import native
+        from voronerf.ops._core import native
 
         isa = native.describe()["instruction set"]
         try:
@@ -281,7 +282,7 @@ def instruction_set(name: str | None) -> Iterator[None]:
     if name is None:
         yield
         return
-    from voronerf import native
+    from voronerf.ops._core import native
 
     if name not in native.SUPPORTED_ISAS:
         raise ValueError(f"this processor has no {name}")

@@ -23,15 +23,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from voronerf.data import Scene
-from voronerf.evaluation.metrics import psnr, ssim
-from voronerf.evaluation.scores import ViewScore, mean_scores, view_numbers
-from voronerf.rendering.cameras import Rays
-from voronerf.rendering.rays import intersect_box
-from voronerf.rendering.sampling import stratified_depths
-from voronerf.training.batches import RayBatches
-from voronerf.training.networks import pixel_at_the_middle
-from voronerf.training.renderers import make_contraction
+from voronerf.app.evaluate.metrics import psnr, ssim
+from voronerf.app.evaluate.scores import ViewScore, mean_scores, view_numbers
+from voronerf.app.scenes import Scene
+from voronerf.app.train.batches import RayBatches
+from voronerf.app.train.networks import pixel_at_the_middle
+from voronerf.app.train.renderers import make_contraction
+from voronerf.nerf.cameras import Rays
+from voronerf.nerf.rays import intersect_box
+from voronerf.nerf.sampling import stratified_depths
 
 PRIMES = (1, 2654435761 - 2**32, 805459861)
 #: Rays of an evaluation at a time, and cells of the occupancy grid.

@@ -32,7 +32,7 @@ import torch
 from harness import metadata
 from torch.distributed import TCPStore
 
-from voronerf.training.config_checks import ConfigError, check_device
+from voronerf.app.train.config_checks import ConfigError, check_device
 
 #: Blocks along x and y for each number of ranks.
 CITIES = {1: (2, 2), 2: (2, 4), 4: (4, 4), 8: (4, 8), 16: (8, 8), 32: (8, 16)}
@@ -43,12 +43,12 @@ def rank(number: int, size: int, port: int, folder: Path, options: dict[str, Any
     os.environ |= {"RANK": str(number), "LOCAL_RANK": str(number), "WORLD_SIZE": str(size)}
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "TORCHELASTIC_USE_AGENT_STORE": "True"}
     torch.set_num_threads(options["threads"])
-    from voronerf.data import city_scene, load_scene
-    from voronerf.distributed.group import joined
-    from voronerf.training.config import TrainConfig
-    from voronerf.training.joint import JointTrainer
-    from voronerf.training.progress import Progress
-    from voronerf.training.trainer import Trainer
+    from voronerf.app.scenes import city_scene, load_scene
+    from voronerf.app.train.config import TrainConfig
+    from voronerf.app.train.progress import Progress
+    from voronerf.app.train.trainer import Trainer
+    from voronerf.town.distributed.group import joined
+    from voronerf.town.joint import JointTrainer
 
     blocks = tuple(options["blocks"] or CITIES[size])
     if options["data"] is None:
@@ -120,7 +120,7 @@ def rank(number: int, size: int, port: int, folder: Path, options: dict[str, Any
 def measure(size: int, options: dict[str, Any]) -> dict[str, Any]:
     """Trains with so many ranks; medians and the largest of all of them."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["voronerf.cli", "voronerf.training.joint", "voronerf.data.builtin.city"])
+    context.set_forkserver_preload(["voronerf.app.cli", "voronerf.town.joint", "voronerf.app.scenes.builtin.city"])
     stores = [TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False) for _ in range(options["groups"])]
     began, found = time.monotonic(), []
     with tempfile.TemporaryDirectory() as folder:

@@ -42,8 +42,8 @@ from ops import cases_sampling as cases_sampling
 from ops import cases_step as cases_step
 from ops.case import Case, Contender, NotApplicable, Work, dtype_name
 
-from voronerf import backends
-from voronerf.files import write_text
+from voronerf.app.files import write_text
+from voronerf.ops._core import backends
 
 OPTIONAL = {"scipy": "scipy", "faiss": "faiss-cpu", "warp": "warp-lang"}
 """Packages that are used where they are installed, and what to install."""

@@ -30,12 +30,12 @@ from harness import metadata
 from rival_ngp import Rival, RivalConfig
 from turns import take_turns
 
-from voronerf.cli.main import EXPECTED
-from voronerf.data import Scene, load_scene
-from voronerf.evaluation.plots import plot_curves
-from voronerf.files import write_text
-from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.trainer import Trainer
+from voronerf.app.cli.main import EXPECTED
+from voronerf.app.evaluate.plots import plot_curves
+from voronerf.app.files import write_text
+from voronerf.app.scenes import Scene, load_scene
+from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.trainer import Trainer
 
 #: The first word of the side that is the rival.
 RIVAL = "ngp"

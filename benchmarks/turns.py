@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, TypeVar
 
-from voronerf.training.config import ConfigError
-from voronerf.training.trainer import TrainingError
+from voronerf.app.train.config import ConfigError
+from voronerf.app.train.trainer import TrainingError
 
 
 class Training(Protocol):
-    """A training that can take turns, such as ``voronerf.training.trainer.Trainer``."""
+    """A training that can take turns, such as ``voronerf.app.train.trainer.Trainer``."""
 
     seconds: float
 

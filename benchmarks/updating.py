@@ -27,13 +27,13 @@ import torch
 from torch import Tensor
 
 from benchmarks.harness import metadata
-from voronerf.data import Scene, load_scene
-from voronerf.data.scene import Split
-from voronerf.rendering.cameras import Cameras
-from voronerf.rendering.renderer import render_camera
-from voronerf.run import Run, open_run
-from voronerf.training.config import TrainConfig
-from voronerf.training.trainer import Trainer
+from voronerf.app.run import Run, open_run
+from voronerf.app.scenes import Scene, load_scene
+from voronerf.app.scenes.scene import Split
+from voronerf.app.train.config import TrainConfig
+from voronerf.app.train.trainer import Trainer
+from voronerf.nerf.cameras import Cameras
+from voronerf.nerf.renderer import render_camera
 
 RESULT = Path(__file__).parent / "results" / "updating.json"
 #: Where the bucket of Lego's loader is, and the most views of which pictures are compared.

@@ -18,7 +18,7 @@ from nerf_pytorch import NeRF, run_network
 from torch import Tensor, nn
 
 from voronerf import SampleReservoir, VoronoiRouter
-from voronerf.data import load_scene
+from voronerf.app.scenes import load_scene
 
 
 def render(model: nn.Module, rays: Tensor, near: float, far: float, samples: int, jitter: bool) -> tuple[Tensor, ...]:
@@ -37,7 +37,7 @@ def render(model: nn.Module, rays: Tensor, near: float, far: float, samples: int
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", help="a folder that voronerf.data.load_scene reads, or 'builtin'")
+    parser.add_argument("scene", help="a folder that voronerf.app.scenes.load_scene reads, or 'builtin'")
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=120, help="of training")
     parser.add_argument("--width", type=int, default=256, help="channels of the network's hidden layers")

@@ -20,7 +20,7 @@ from typing import Any
 
 import torch
 
-from voronerf.backends import BackendUnavailable
+from voronerf.ops._core.backends import BackendUnavailable
 
 MINIMUM = (1, 10)
 _REMEDY = "install it with `pip install 'voronerf[warp]'` (warp-lang >= 1.10)"

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import warp as wp
 from torch import Tensor
 
-from voronerf.checks import check_range
-from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, launch, on_stream
+from voronerf.ops._core.checks import check_range
+from voronerf.ops._core.custom_op import custom_op
 
 wp.set_module_options({"enable_backward": False})
 

@@ -18,8 +18,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.custom_op import custom_op, in_float32
 from voronerf.kernels._launch import filled, launch
+from voronerf.ops._core.custom_op import custom_op, in_float32
 from voronerf.ops.composite.autograd import Arriving, RaySamples, register
 
 wp.set_module_options({"enable_backward": False})

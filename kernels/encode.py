@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 import warp as wp
 from torch import Tensor
 
-from voronerf.custom_op import custom_op, in_float32
-from voronerf.derivatives import OfOne
 from voronerf.kernels._launch import array, launch
+from voronerf.ops._core.custom_op import custom_op, in_float32
+from voronerf.ops._core.derivatives import OfOne
 from voronerf.ops.frequency_encode.autograd import Encoding, register
 
 wp.set_module_options({"enable_backward": False})

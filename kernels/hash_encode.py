@@ -14,9 +14,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.custom_op import custom_op
-from voronerf.grids import HashGrid
 from voronerf.kernels._launch import array, launch
+from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.grids import HashGrid
 from voronerf.ops.hash_encode.autograd import HashDerivatives, Hashed
 
 wp.set_module_options({"enable_backward": False})

@@ -14,9 +14,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.checks import MAX_COUNT
-from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, filled, launch
+from voronerf.ops._core.checks import MAX_COUNT
+from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops.march_rays.reference import March, Rays
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

@@ -13,8 +13,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, launch, of_both_dtypes
+from voronerf.ops._core.custom_op import custom_op
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

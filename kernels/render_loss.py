@@ -13,9 +13,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from voronerf.custom_op import custom_op
 from voronerf.kernels._launch import array, filled, launch
 from voronerf.kernels.composite import _OPAQUE, _absorbed, _density
+from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops.composite.reference import check_ray_offsets
 from voronerf.ops.render_loss.autograd import Results, register, results
 from voronerf.ops.render_loss.reference import Rendered

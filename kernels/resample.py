@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import warp as wp
 from torch import Tensor
 
-from voronerf.custom_op import custom_op, in_float32
 from voronerf.kernels._launch import array, launch
+from voronerf.ops._core.custom_op import custom_op, in_float32
 
 wp.set_module_options({"enable_backward": False})
 

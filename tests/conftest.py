@@ -28,7 +28,7 @@ from typing import Any
 import pytest
 import torch
 
-from voronerf import backends
+from voronerf.ops._core import backends
 
 # Where there is AMX, torch may multiply bfloat16 networks, if a timing says so; what tests say of the kernels would
 # depend on the processor. test_bfloat16_by_torch.py asks for it.
@@ -85,7 +85,7 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 @pytest.fixture(params=["portable", "neon", "avx2", "avx512", "avx512_bf16"])
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
     """Native CPU kernels with each instruction set that this processor has."""
-    native = pytest.importorskip("voronerf.native")
+    native = pytest.importorskip("voronerf.ops._core.native")
     if request.param not in native.SUPPORTED_ISAS:
         pytest.skip(f"this processor has no {request.param}")
     with native.using_isa(request.param):

@@ -15,7 +15,7 @@ from unittest import mock
 import pytest
 import torch
 
-from voronerf.rendering import Hierarchical, Occupancy, Proposal, Renderer, Space, Stratified
+from voronerf.nerf import Hierarchical, Occupancy, Proposal, Renderer, Space, Stratified
 
 
 def refuses(message, call, *args, error=ValueError, **options):

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from voronerf import backends
-from voronerf.backends import BackendUnavailable, resolve
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import BackendUnavailable, resolve
 
 CPU = torch.device("cpu")
 
@@ -101,11 +101,11 @@ def test_describe_records_the_build() -> None:
 def test_import_needs_neither_extension_nor_warp() -> None:
     code = """
 import sys
-sys.modules["voronerf._C"] = None  # as if it were not built
+sys.modules["voronerf.ops._core._C"] = None  # as if it were not built
 import torch, voronerf
 assert "warp" not in sys.modules
 sys.modules["warp"] = None  # as if it were not installed
-from voronerf import backends
+from voronerf.ops._core import backends
 points = torch.zeros(2, 3)
 run = backends.resolve("nearest_centre", backend="auto", device=points.device, dtype=points.dtype)
 assert run.__module__ == "voronerf.ops.nearest_centre.reference", run
@@ -131,7 +131,7 @@ warp = types.ModuleType("warp")
 warp.__version__ = "1.9.2"
 sys.modules["warp"] = warp
 import torch
-from voronerf import backends
+from voronerf.ops._core import backends
 reason = backends.missing("warp", torch.device("cpu"))
 assert reason.startswith("NVIDIA Warp 1.9.2 is too old; install it with `pip install 'voronerf[warp]'`"), reason
 """
@@ -143,11 +143,11 @@ assert reason.startswith("NVIDIA Warp 1.9.2 is too old; install it with `pip ins
 def test_a_compiled_module_of_another_version_is_refused(stale: str) -> None:
     code = f"""
 import sys, types
-module = types.ModuleType("voronerf._C")
+module = types.ModuleType("voronerf.ops._core._C")
 {stale}
-sys.modules["voronerf._C"] = module
+sys.modules["voronerf.ops._core._C"] = module
 import torch, warnings
-from voronerf import backends
+from voronerf.ops._core import backends
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     reasons = [backends.missing("native", torch.device("cpu")) for _ in range(3)]
@@ -207,7 +207,7 @@ import sys
 sys.meta_path = [finder for finder in sys.meta_path if "editable" not in repr(finder).lower()]
 sys.path.insert(0, {str(Path(__file__).parent.parent)!r})
 import torch
-from voronerf import backends
+from voronerf.ops._core import backends
 reason = backends.missing("warp", torch.device("cpu"))
 assert reason == "the Warp kernels are not installed; run `pip install -e .`", reason
 assert backends.describe()["warp"] == {{"available": False, "reason": reason}}

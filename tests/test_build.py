@@ -75,7 +75,7 @@ def test_every_module_lies_in_a_package():
     setuptools = pytest.importorskip("setuptools")
     modules = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / "voronerf").rglob("*.py")}
     packages = setuptools.find_packages(str(ROOT), include=["voronerf", "voronerf.*"])
-    assert modules == {name.replace(".", "/") for name in packages} and "voronerf/training" in modules
+    assert modules == {name.replace(".", "/") for name in packages} and "voronerf/app/train" in modules
 
 
 def test_clang_on_linux_is_refused_before_it_builds(build, monkeypatch):

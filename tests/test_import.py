@@ -36,9 +36,9 @@ print(sorted({"torch._dynamo", "sympy"} & sys.modules.keys()))
 
 TRAINING = """
 import sys, tempfile, pathlib, torch
-from voronerf.data import builtin_scene
-from voronerf.training.config import TrainConfig
-from voronerf.training.trainer import Trainer
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train.config import TrainConfig
+from voronerf.app.train.trainer import Trainer
 torch.set_num_threads(1)
 scene = builtin_scene(16, train_views=4, test_views=2)
 with tempfile.TemporaryDirectory() as folder:

@@ -114,9 +114,9 @@ def test_backends_alone_choose() -> None:
     ("source", "module", "fault"),
     [
         ("from voronerf.router import VoronoiRouter", "voronerf.ops.nearest_centre", "from a layer above"),
-        ("def f():\n    import voronerf.cli.main", "voronerf.training.trainer", "from a layer above"),
+        ("def f():\n    import voronerf.app.cli.main", "voronerf.app.train.trainer", "from a layer above"),
         ("from voronerf import diagram", "voronerf.ops.cell_sort.reference", "from a layer above"),
-        ("from ..training import trainer", "voronerf.data.blender", "from a layer above"),
+        ("from ..training import trainer", "voronerf.app.scenes.blender", "from a layer above"),
         ("from voronerf import _C", "voronerf.ops.nearest_centre", "only native may"),
         ("import voronerf", "voronerf.ops.nearest_centre", "from a layer above"),
         ("import torch", "voronerf.attic", "belongs to no layer"),

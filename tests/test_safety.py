@@ -8,7 +8,7 @@ import torch
 from helpers import python, same, seeded
 
 import voronerf as v
-from voronerf.layers import MLP, Layer
+from voronerf.ops._core.layers import MLP, Layer
 
 pytestmark = pytest.mark.native
 

@@ -1,4 +1,4 @@
-"""How far a result may be from the same computed in float64; the table itself is in `voronerf/tolerances.py`.
+"""How far a result may be from the same computed in float64; the table itself is in `voronerf/ops/_core/tolerances.py`.
 
 The error of a result is its largest absolute difference from the float64 result, divided by the largest magnitude
 there. It may be twice that of plain PyTorch in the same dtype, plus a floor: the rounding of the result itself, and for
@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf.tolerances import FLOOR
+from voronerf.ops._core.tolerances import FLOOR
 
 
 def error(result: Tensor, exact: Tensor) -> float:

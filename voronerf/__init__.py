@@ -11,7 +11,7 @@ if _command := bool(sys.argv) and sys.argv[0].endswith(("/voronerf", "\\voronerf
     # OpenMP's threads spin for milliseconds by default while they wait for each other, on cores that others may need:
     # beside ten busy processes a step of training takes twenty times as long. Read when torch loads its runtime.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    # Garbage is collected again in voronerf.cli.main: while torch is loaded there is none, and to look for it takes a
+    # Garbage is collected again in voronerf.app.cli.main: while torch is loaded there is none, and to look for it takes a
     # tenth of the time.
     gc.disable()
 
@@ -25,7 +25,7 @@ except ModuleNotFoundError as error:
         sys.exit(f"voronerf: error: {line}")
     raise ImportError(line) from None
 
-from voronerf.backends import BackendUnavailable
+from voronerf.app.run import Run, open_run
 from voronerf.diagram import (
     Balance,
     SampleReservoir,
@@ -36,9 +36,8 @@ from voronerf.diagram import (
     split_diagram,
     uniform_centres,
 )
-from voronerf.fields import HashGridField, NeRF
-from voronerf.grids import HashGrid
-from voronerf.layers import MLP, Layer
+from voronerf.nerf import OccupancyGrid
+from voronerf.nerf.fields import HashGridField, NeRF
 from voronerf.ops import (
     CentreGrid,
     Composite,
@@ -57,9 +56,10 @@ from voronerf.ops import (
     routed_mlp,
     spherical_harmonics,
 )
-from voronerf.rendering import OccupancyGrid
+from voronerf.ops._core.backends import BackendUnavailable
+from voronerf.ops._core.grids import HashGrid
+from voronerf.ops._core.layers import MLP, Layer
 from voronerf.router import VoronoiRouter
-from voronerf.run import Run, open_run
 
 __all__ = [
     "MLP",

@@ -2,7 +2,7 @@
 
 import sys
 
-from voronerf.cli import main
+from voronerf.app.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

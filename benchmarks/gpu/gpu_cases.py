@@ -46,11 +46,11 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     from torch.utils._pytree import tree_leaves, tree_map_only
 
     import voronerf
-    from voronerf import backends
-    from voronerf.fields import NeRF
-    from voronerf.layers import MLP, POSITIONS, Layer
-    from voronerf.ops.cases import Draw
-    from voronerf.ops.cases import cases as every_case
+    from voronerf.nerf.fields import NeRF
+    from voronerf.ops._core import backends
+    from voronerf.ops._core.cases import Draw
+    from voronerf.ops._core.cases import cases as every_case
+    from voronerf.ops._core.layers import MLP, POSITIONS, Layer
     from voronerf.ops.cell_sort.native import sort as sort_cells
     from voronerf.ops.cell_sort.reference import cell_sort as specified
     from voronerf.ops.grouped_mlp.native import using_way
@@ -255,7 +255,7 @@ def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -
     import torch
 
     import voronerf
-    from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+    from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
     kind = getattr(torch, dtype)
     last = Layer((1, DIRECTIONS) if directed else (1,), 4)

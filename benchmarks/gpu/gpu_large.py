@@ -73,7 +73,7 @@ def batch(device: str, name: str, precision: str, n: int) -> dict[str, Any]:
     from ops.networks import NETS
 
     import voronerf
-    from voronerf.layers import MLP, POSITIONS, Layer
+    from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 
     generator = torch.Generator().manual_seed(0)
     layers = NETS.get(name)

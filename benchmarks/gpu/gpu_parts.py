@@ -180,9 +180,9 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
 
 def training(out: Path, data: str, again: Again, device: str = "cuda", seconds: float = 6.0) -> int:
     """Steps, milliseconds of one and PSNR of short trainings of the same number of seconds."""
-    from voronerf.data import load_scene
-    from voronerf.training.config import TrainConfig
-    from voronerf.training.trainer import Trainer
+    from voronerf.app.scenes import load_scene
+    from voronerf.app.train.config import TrainConfig
+    from voronerf.app.train.trainer import Trainer
 
     journal = Journal(out, "training", begun=again.start > 0)
     # Lego at 100 x 100 and at 400 x 400; the built-in scene has one size.

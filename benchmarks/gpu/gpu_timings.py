@@ -290,9 +290,9 @@ def profile(out: Path, again: Again, device: str = "cuda", steps: int = 10) -> i
     from torch.profiler import ProfilerActivity
     from torch.profiler import profile as profiled
 
-    from voronerf.data import load_scene
-    from voronerf.training.config import TrainConfig
-    from voronerf.training.trainer import Trainer
+    from voronerf.app.scenes import load_scene
+    from voronerf.app.train.config import TrainConfig
+    from voronerf.app.train.trainer import Trainer
 
     journal, cuda = Journal(out, "profile", begun=again.start > 0), device == "cuda"
     scene = load_scene("builtin")

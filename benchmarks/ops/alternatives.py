@@ -18,7 +18,7 @@ from torch import Tensor
 from ops.case import BACKWARD, Contender, NotApplicable
 from ops.networks import Batch, with_gradients
 from voronerf import ops
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.ops.grouped_mlp.reference import encode
 
 PIECE = 4096

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from voronerf import backends, ops
-from voronerf.ops import cases as of_ops
-from voronerf.ops.cases import Draw
+from voronerf import ops
+from voronerf.ops._core import backends
+from voronerf.ops._core import cases as of_ops
+from voronerf.ops._core.cases import Draw
 
 from .case import BACKWARD, FORWARD, Case, Contender, Work, relative_error
 

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from ops.case import BACKWARD, FORWARD, Case, Contender, Work, generator, relative_error, rotation
 from voronerf import ops
+from voronerf.nerf.cameras import orbit_cameras
 from voronerf.ops.observe_occupancy.reference import cells_of
-from voronerf.rendering.cameras import orbit_cameras
 
 RAYS, SAMPLES = 1 << 10, 1 << 13
 """Of a step."""

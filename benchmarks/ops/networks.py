@@ -14,8 +14,8 @@ from torch import Tensor
 
 from ops.case import BACKWARD, generator, relative_error, rotation, uniform_points
 from voronerf import ops
-from voronerf.fields import NeRF
-from voronerf.layers import MLP, POSITIONS, Layer
+from voronerf.nerf.fields import NeRF
+from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 from voronerf.ops.grouped_mlp import reference as specification
 
 RAY = 64

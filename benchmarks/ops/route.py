@@ -20,7 +20,7 @@ from ops.case import BACKWARD, Contender, Work, uniform_points
 from ops.cases_lookup import LOOKUPS
 from ops.networks import NETS, Batch, cost, make_batch, network_error, with_gradients
 from voronerf import ops
-from voronerf.layers import MLP
+from voronerf.ops._core.layers import MLP
 
 
 def route_work(

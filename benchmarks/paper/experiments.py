@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from paper.runs import AS_PUBLISHED, Run, Settings, Variant, default_scenes, make_run, open_scene
-from voronerf.training.config import TrainConfig
-from voronerf.training.networks import count_parameters, resolve_config
+from voronerf.app.train.config import TrainConfig
+from voronerf.app.train.networks import count_parameters, resolve_config
 
 FIELDS = {"nerf": "NeRF", "mipnerf": "mip-NeRF"}
 SAMPLINGS = ("stratified", "hierarchical")

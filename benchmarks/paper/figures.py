@@ -15,8 +15,8 @@ from torch import Tensor
 
 from paper import looks as paper_looks
 from paper.slices import picture_of_density
-from voronerf.evaluation.panels import contact_sheet, picture_of_cells, picture_of_error, save_picture
-from voronerf.files import write_bytes
+from voronerf.app.evaluate.panels import contact_sheet, picture_of_cells, picture_of_error, save_picture
+from voronerf.app.files import write_bytes
 
 matplotlib.use("Agg")
 from matplotlib import pyplot

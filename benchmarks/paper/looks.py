@@ -15,12 +15,12 @@ import numpy as np
 import torch
 
 from paper.slices import slice_density, slice_points
-from voronerf.data import Scene
-from voronerf.evaluation.metrics import psnr
-from voronerf.evaluation.scores import render_view
-from voronerf.evaluation.seams import seam
-from voronerf.files import write_bytes
-from voronerf.training.trainer import Trainer
+from voronerf.app.evaluate.metrics import psnr
+from voronerf.app.evaluate.scores import render_view
+from voronerf.app.evaluate.seams import seam
+from voronerf.app.files import write_bytes
+from voronerf.app.scenes import Scene
+from voronerf.app.train.trainer import Trainer
 
 VERSION = 1  # of what a look holds; those of another version are not used
 #: Fraction of the run after the first split at which inherited and random networks are compared.

@@ -23,8 +23,8 @@ from paper import balance, nested
 from paper.experiments import EXPERIMENTS
 from paper.report import ABOUT, write_report
 from paper.runs import Run, Settings, default_scenes, failure, results, train_missing
-from voronerf.files import write_text
-from voronerf.training.config import ConfigError
+from voronerf.app.files import write_text
+from voronerf.app.train.config import ConfigError
 
 
 def say(line: str) -> None:

@@ -22,7 +22,7 @@ from paper.figures import stacked
 from paper.looks import held_out_view
 from paper.runs import Settings, default_scenes, open_scene
 from voronerf import NeRF, SampleReservoir, VoronoiDiagram, VoronoiRouter, frequency_encode, split_diagram
-from voronerf.evaluation.panels import contact_sheet, palette, picture_of_colour, picture_of_error, save_picture
+from voronerf.app.evaluate.panels import contact_sheet, palette, picture_of_colour, picture_of_error, save_picture
 
 CHILDREN, LEVELS = 4, 3
 SPLITS = (0.15, 0.35, 0.55)  # of the budget, a level each

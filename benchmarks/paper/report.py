@@ -10,7 +10,7 @@ from typing import Any
 
 from paper.experiments import CONDITIONS, EXPERIMENTS, Scores
 from paper.figures import draw
-from voronerf.files import write_text
+from voronerf.app.files import write_text
 
 Row = dict[str, Any]
 #: All experiments, in the order of the page.

@@ -21,13 +21,13 @@ from typing import Any
 from turns import take_turns
 
 from paper import looks
-from voronerf.data import BUILTIN, BUILTIN_SIZE, Scene, load_scene
-from voronerf.evaluation.scores import evaluate, mean_scores
-from voronerf.files import write_text
-from voronerf.training.checkpoint import checkpoint_paths
-from voronerf.training.config import ConfigError, TrainConfig
-from voronerf.training.run_directory import read_metrics
-from voronerf.training.trainer import Trainer, TrainingError
+from voronerf.app.evaluate.scores import evaluate, mean_scores
+from voronerf.app.files import write_text
+from voronerf.app.scenes import BUILTIN, BUILTIN_SIZE, Scene, load_scene
+from voronerf.app.train.checkpoint import checkpoint_paths
+from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.run_directory import read_metrics
+from voronerf.app.train.trainer import Trainer, TrainingError
 
 Row = dict[str, Any]
 PUBLISHED_SIZE = 400

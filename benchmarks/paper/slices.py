@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from voronerf.data import Scene
-from voronerf.evaluation.panels import mapped
+from voronerf.app.evaluate.panels import mapped
+from voronerf.app.scenes import Scene
 
 #: Density of the last colour of the map; a wall of this density and a thickness of 0.01 passes a third of the light.
 DENSEST = 100.0

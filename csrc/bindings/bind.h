@@ -139,7 +139,7 @@ class Module {
     py::class_<T>(module_, Opaque<T>::type, py::module_local());
   }
 
-  // What is bound, as a stub for type checkers (voronerf/_C.pyi); its checksum is the module's interface.
+  // What is bound, as a stub for type checkers (voronerf/ops/_core/_C.pyi); its checksum is the module's interface.
   std::string stub() const {
     std::string text;
     for (const auto& entry : declarations_) text += "\n" + entry.second;

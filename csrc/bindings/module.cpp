@@ -1,5 +1,5 @@
-// The Python module voronerf._C, which knows tensors by their dtypes and addresses alone and owns nothing.
-// voronerf/native is its only importer, and has validated shapes and devices and allocated outputs and workspaces.
+// The Python module voronerf.ops._core._C, which knows tensors by their dtypes and addresses alone and owns nothing.
+// voronerf/ops/_core/native is its only importer, and has validated shapes and devices and allocated outputs and workspaces.
 #include "bindings/module.h"
 
 #include "build_info.h"

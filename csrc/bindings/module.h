@@ -1,4 +1,4 @@
-// What a Python module of bindings consists of: voronerf._C, and the emulated CUDA half of the tests.
+// What a Python module of bindings consists of: voronerf.ops._core._C, and the emulated CUDA half of the tests.
 #pragma once
 
 #include <cstdint>

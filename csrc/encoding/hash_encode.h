@@ -13,7 +13,7 @@
 
 namespace voronerf {
 
-// As in voronerf/grids.py; the table's shape without its number of tables.
+// As in voronerf/ops/_core/grids.py; the table's shape without its number of tables.
 struct HashGrid {
   std::vector<GridLevel> levels;
   std::vector<float> low, high;

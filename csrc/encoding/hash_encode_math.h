@@ -15,7 +15,7 @@ namespace voronerf {
 constexpr int kMaxHashLevels = 24;
 constexpr uint32_t kHashPrimeY = 2654435761u, kHashPrimeZ = 805459861u;
 
-// As in voronerf/grids.py.
+// As in voronerf/ops/_core/grids.py.
 struct GridLevel {
   float scale, shift;
   int32_t side;     // stride of the second axis

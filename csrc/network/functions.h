@@ -120,7 +120,7 @@ VN_INLINE F32 gelu_by_tanh(F32 x) {
   return splat(1.5f) * t2 + half * x * s * t3;
 }
 
-// In the order of FUNCTIONS in voronerf/program.py: name, f(x), f'(x), f''(x), f'''(x).
+// In the order of FUNCTIONS in voronerf/ops/_core/program.py: name, f(x), f'(x), f''(x), f'''(x).
 #define VN_FUNCTIONS(DO)                                                                                              \
   DO(copy, x, one, zero, zero)                                                                                        \
   DO(stop, x, zero, zero, zero)                                                                                       \

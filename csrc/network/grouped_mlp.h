@@ -36,7 +36,7 @@ struct MlpLayer {
   std::vector<int> inputs;  // earlier layers, kFromPositions or kFromDirections
 };
 
-// The layer table of voronerf/layers.py.
+// The layer table of voronerf/ops/_core/layers.py.
 struct MlpTable {
   std::vector<MlpLayer> layers;
   std::vector<int> outputs;

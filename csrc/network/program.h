@@ -1,4 +1,4 @@
-// A program of steps on the rows of each cell, with the values of a tile of rows in cache; see voronerf/program.py for
+// A program of steps on the rows of each cell, with the values of a tile of rows in cache; see voronerf/ops/_core/program.py for
 // the steps. The gradient of a program is a program, so there is one function for all derivatives.
 //
 // n rows, k cells, w columns. All tensors are float32 and contiguous. Rows outside all cells (before offsets[0], from

@@ -9,9 +9,9 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from voronerf.cli.main import COMMANDS
-from voronerf.cli.opening import Opening
-from voronerf.training.config import TrainConfig
+from voronerf.app.cli.main import COMMANDS
+from voronerf.app.cli.opening import Opening
+from voronerf.app.train.config import TrainConfig
 
 #: Headings above the settings of `voronerf train`, each before the setting that it names.
 SECTIONS = {

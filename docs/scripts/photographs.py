@@ -14,10 +14,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from voronerf import open_run
-from voronerf.data import load_scene
-from voronerf.evaluation.metrics import psnr, ssim
-from voronerf.evaluation.panels import picture_of_colour
-from voronerf.training.run_directory import stored_config
+from voronerf.app.evaluate.metrics import psnr, ssim
+from voronerf.app.evaluate.panels import picture_of_colour
+from voronerf.app.scenes import load_scene
+from voronerf.app.train.run_directory import stored_config
 
 GAP, LINE, LONGEST = 6, 18, 480
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from attempts import REFUSED, RIGHT, Failed
 
-from voronerf.cli import main
+from voronerf.app.cli import main
 
 for slow in ("matplotlib.pyplot", "imageio_ffmpeg", "rich._emoji_codes"):  # not in every attempt again
     importlib.import_module(slow)

@@ -13,9 +13,9 @@ import commands
 import numpy as np
 from PIL import Image
 
-from voronerf.rendering.cameras import orbit_cameras
+from voronerf.nerf.cameras import orbit_cameras
 
-sys.path.append(str(Path(__file__).parents[1] / "data"))
+sys.path.append(str(Path(__file__).parents[1] / "app" / "scenes"))
 from scene_files import write_colmap, write_images, write_llff
 
 #: Options of a training of some steps.

@@ -16,10 +16,11 @@ from hostile import NUMBERS, TEXTS
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
-from voronerf import MLP, HashGrid, Layer, backends, ops, tolerances
-from voronerf.cli.main import NO_MEMORY
+from voronerf import MLP, HashGrid, Layer, ops
+from voronerf.app.cli.main import NO_MEMORY
 from voronerf.ops import CentreGrid
-from voronerf.ops.cases import SIZES, Draw, cases
+from voronerf.ops._core import backends, tolerances
+from voronerf.ops._core.cases import SIZES, Draw, cases
 from voronerf.ops.grouped_mlp.case import layer_table
 from voronerf.ops.hash_encode.case import hash_grid
 

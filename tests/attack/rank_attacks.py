@@ -16,11 +16,11 @@ from attempts import REFUSED, RIGHT, Failed
 from given import FIELDS, TINY
 from training_attacks import same_runs, same_tensors
 
-from voronerf.cli import main
-from voronerf.distributed import group
-from voronerf.training.checkpoint import checkpoint_path, checkpoint_paths, load_checkpoint, network_files
+from voronerf.app.cli import main
+from voronerf.app.train.checkpoint import checkpoint_path, checkpoint_paths, load_checkpoint, network_files
+from voronerf.town.distributed import group
 
-sys.path.append(str(Path(__file__).parents[1] / "distributed"))
+sys.path.append(str(Path(__file__).parents[1] / "town" / "distributed"))
 from ranks import complaints, said_by, start_ranks
 
 #: The networks of a joint training, which has four territories.

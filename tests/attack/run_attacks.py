@@ -15,7 +15,7 @@ from commands import judged
 from given import FIELDS, copied_run
 from hostile import damaged, flipped, json_text, mutated
 
-from voronerf.training.checkpoint import (
+from voronerf.app.train.checkpoint import (
     Checkpoint,
     CheckpointError,
     checkpoint_path,

@@ -12,8 +12,8 @@ import torch
 from attempts import REFUSED, RIGHT, Failed
 from hostile import damaged, flipped, json_text, mutated
 
-from voronerf.data import SceneError, load_scene
-from voronerf.training.batches import RayBatches
+from voronerf.app.scenes import SceneError, load_scene
+from voronerf.app.train.batches import RayBatches
 
 
 def harmed_store(rng: random.Random, folder: Path, given: Path) -> str:

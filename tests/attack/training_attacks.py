@@ -20,9 +20,9 @@ from commands import judged, run
 from given import FIELDS, TINY
 from hostile import NUMBERS, TEXTS
 
-from voronerf.files import read_json_lines
-from voronerf.training.checkpoint import Checkpoint, checkpoint_path, checkpoint_paths, last_checkpoint
-from voronerf.training.config import CHOICES, TrainConfig
+from voronerf.app.files import read_json_lines
+from voronerf.app.train.checkpoint import Checkpoint, checkpoint_path, checkpoint_paths, last_checkpoint
+from voronerf.app.train.config import CHOICES, TrainConfig
 
 #: The networks of a chain of interrupted trainings.
 VARIANTS = (

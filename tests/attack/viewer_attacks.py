@@ -18,7 +18,7 @@ from hostile import VALUES, damaged
 
 from voronerf import open_run
 
-sys.path.append(str(Path(__file__).parents[1] / "viewer"))
+sys.path.append(str(Path(__file__).parents[1] / "app" / "viewer"))
 
 #: Messages of a client in an attempt.
 MESSAGES = 20
@@ -30,7 +30,7 @@ def hostile_client(rng: random.Random, folder: Path, given: Path) -> str:
     from tab import Tab
     from websockets.exceptions import ConnectionClosed
 
-    from voronerf.viewer import view_run
+    from voronerf.app.viewer import view_run
 
     said: list[str] = []
     handler = logging.Handler()

@@ -28,8 +28,8 @@ from ops import (
 )
 
 import voronerf
-from voronerf import native
-from voronerf.ops import cases as of_ops
+from voronerf.ops._core import cases as of_ops
+from voronerf.ops._core import native
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 CPU = torch.device("cpu")
@@ -165,7 +165,7 @@ def test_alternatives_compute_the_same(name, direction):
         batch = networks.make_batch(net, 300, 5, dtype, direction, CPU, features=features)
         error, done = networks.network_error(batch), []
         for backend in ("reference", "native"):
-            if voronerf.backends.missing(backend, CPU) is None:
+            if voronerf.ops._core.backends.missing(backend, CPU) is None:
                 contender = alternatives.ours(batch, backend)
                 assert error(contender.adapt(contender.run(0))) < tolerance, backend
         for label, set_up in alternatives.alternatives(batch).items():

@@ -19,10 +19,10 @@ from paper.experiments import EXPERIMENTS
 from paper.report import ABOUT
 from PIL import Image
 
-from voronerf.data import builtin_scene
-from voronerf.training import networks, trainer
-from voronerf.training.config import ConfigError
-from voronerf.training.trainer import Trainer, TrainingError
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train import networks, trainer
+from voronerf.app.train.config import ConfigError
+from voronerf.app.train.trainer import Trainer, TrainingError
 
 TINY = {"scene": ("builtin",), "downscale": 20, "budget": 0.25, "seeds": 1, "rays": 48, "samples": 8}
 TINY |= {"evaluations": 2, "eval_views": 1, "final_views": 1, "turn": 0.1, "cells": 4}

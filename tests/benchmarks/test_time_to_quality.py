@@ -9,8 +9,8 @@ import pytest
 import torch
 from helpers import read_json, script
 
-from voronerf.data import builtin_scene
-from voronerf.training.config import ConfigError
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train.config import ConfigError
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 

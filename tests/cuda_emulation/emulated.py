@@ -15,7 +15,7 @@ from unittest import mock
 
 from emulation_build import build, load
 
-from voronerf import native as _native
+from voronerf.ops._core import native as _native
 
 
 @functools.cache

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 import voronerf
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 KIB = 1024
 # Relative error, in the Frobenius norm, of what is multiplied so.

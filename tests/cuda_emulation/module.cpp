@@ -1,4 +1,4 @@
-// The CUDA half of voronerf._C, emulated: the bindings of csrc/bindings over .cu files compiled by g++.
+// The CUDA half of voronerf.ops._core._C, emulated: the bindings of csrc/bindings over .cu files compiled by g++.
 #include "bindings/module.h"
 
 #include <pybind11/pybind11.h>

@@ -4,8 +4,8 @@ import torch
 from emulated import module
 from emulated_networks import KIB
 
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.native import compiled
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops._core.native import compiled
 from voronerf.ops.grouped_mlp import layer_table
 from voronerf.ops.grouped_mlp import native as grouped_mlp
 

@@ -17,9 +17,10 @@ from emulated import emulated
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from voronerf import backends, ops
-from voronerf import native as _native
-from voronerf.ops.cases import Draw, cases
+from voronerf import ops
+from voronerf.ops._core import backends
+from voronerf.ops._core import native as _native
+from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops.cell_sort.native import sort as sort_cells
 from voronerf.ops.grouped_mlp.native import using_way
 

@@ -9,8 +9,8 @@ from emulated import emulated, module
 from emulated_networks import KIB, SKIPS, THICK
 from network_plans import PRECISIONS, SHARED, SIZES, assert_covers, chain, nerf, plain, plan, way
 
-from voronerf.fields import NeRF
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.nerf.fields import NeRF
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 HELD, STORED, IN_POSITIONS, IN_DIRECTIONS = range(4)
 """Numbers of MlpChainFrom."""

@@ -28,8 +28,8 @@ from helpers import refuses, same
 from network_plans import PRECISIONS, WAYS, plain, plan, way
 
 import voronerf
-from voronerf.fields import NeRF
-from voronerf.layers import MLP, POSITIONS, Layer
+from voronerf.nerf.fields import NeRF
+from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 from voronerf.ops.grouped_mlp import layer_table
 from voronerf.ops.grouped_mlp.native import _choose_way, using_way
 

@@ -9,8 +9,8 @@ import torch
 from emulated import emulated
 
 from voronerf.ops import grouped_program
+from voronerf.ops._core.program import Builder, Columns
 from voronerf.ops.grouped_program.case import every_step
-from voronerf.program import Builder, Columns
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "ops"))
 from test_grouped_program import NUMBERS, arguments, check, derivatives, random_program

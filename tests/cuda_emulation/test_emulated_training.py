@@ -6,9 +6,9 @@ from unittest import mock
 import pytest
 from emulated import emulated
 
-from voronerf.data import builtin_scene
-from voronerf.training.config import TrainConfig
-from voronerf.training.trainer import Trainer
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train.config import TrainConfig
+from voronerf.app.train.trainer import Trainer
 
 STEPS = 16
 
@@ -27,7 +27,7 @@ def losses(out, field, precision, *, on_device):
         reservoir=200, reservoir_batches=8, evaluations=1, precision=precision,
     )  # fmt: skip
     found = []
-    with mock.patch("voronerf.training.rates.WARMUP", 0.0), emulated() if on_device else contextlib.nullcontext():
+    with mock.patch("voronerf.app.train.rates.WARMUP", 0.0), emulated() if on_device else contextlib.nullcontext():
         trainer = Trainer(config, builtin_scene(12))
         for trainer.step in range(STEPS):
             if trainer.split_is_due():

@@ -13,7 +13,7 @@ from emulated import module
 from emulation_build import build
 from recorded import recorded
 
-from voronerf import backends
+from voronerf.ops._core import backends
 
 HERE = Path(__file__).resolve().parent
 BUGS = [

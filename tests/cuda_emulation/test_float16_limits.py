@@ -10,7 +10,7 @@ from emulated import emulated
 from emulated_networks import KIB
 
 import voronerf
-from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
+from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer
 
 LARGEST = 65504.0
 WAYS = pytest.mark.parametrize("shared", [227, 1], ids=["fused", "by-layers"])

@@ -15,7 +15,7 @@ import torch
 from emulated import emulated, module
 from helpers import read_json
 
-from voronerf.data import builtin_scene
+from voronerf.app.scenes import builtin_scene
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -227,8 +227,8 @@ def test_what_surrounds_the_networks_is_timed_beside_plain_torch(parts, monkeypa
 def test_training(parts, tmp_path, capsys, monkeypatch):
     # A step takes twenty milliseconds however busy the machine is.
     ticks = itertools.count()
-    monkeypatch.setattr("voronerf.training.trainer.time", SimpleNamespace(perf_counter=lambda: 0.0201 * next(ticks)))
-    monkeypatch.setattr("voronerf.data.load_scene", lambda *_, **__: builtin_scene(16))
+    monkeypatch.setattr("voronerf.app.train.trainer.time", SimpleNamespace(perf_counter=lambda: 0.0201 * next(ticks)))
+    monkeypatch.setattr("voronerf.app.scenes.load_scene", lambda *_, **__: builtin_scene(16))
     small = {name: {**options, "width": 16, "samples": 16, "rays": 256} for name, options in parts.TRAININGS.items()}
     monkeypatch.setattr(parts, "TRAININGS", small)
     assert parts.training(tmp_path, "builtin", parts.Again(("training",), case_seconds=60.0), "cpu", 0.5) == 0
@@ -378,7 +378,7 @@ def test_sizes_and_a_profiled_step(parts, timings, monkeypatch, tmp_path):
     assert timings.sizes(tmp_path, parts.Again(("sizes",), case_seconds=60.0), "cpu", (1 << 10,), (1, 16)) == 0
     rows = read_json(tmp_path / "sizes.json")["rows"]
     assert len(rows) == 14 and all(row["seconds"] > 0 for row in rows)
-    monkeypatch.setattr("voronerf.data.load_scene", lambda *_, **__: builtin_scene(12))
+    monkeypatch.setattr("voronerf.app.scenes.load_scene", lambda *_, **__: builtin_scene(12))
     assert timings.profile(tmp_path, parts.Again(("profile",), case_seconds=60.0), "cpu", 2) == 0
     (row,) = read_json(tmp_path / "profile.json")["steps"]
     assert row["seconds"] > 0 and row["launches"] == row["waits"] == 0
@@ -448,8 +448,8 @@ sys.path[:0] = [{str(ROOT / "benchmarks" / "gpu")!r}]
 import gpu_parts, gpu_check
 gpu_parts.small_cases("cpu"), gpu_parts.captured_steps("cpu", 4)
 import harness, throughput, ops.networks, ops.case
-from voronerf.training.trainer import Trainer
-from voronerf.training.config import TrainConfig
+from voronerf.app.train.trainer import Trainer
+from voronerf.app.train.config import TrainConfig
 print("imported")
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)

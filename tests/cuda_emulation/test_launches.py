@@ -8,9 +8,9 @@ from emulated import emulated
 from launches import asked
 
 import voronerf
-from voronerf.data import builtin_scene
-from voronerf.training.config import TrainConfig
-from voronerf.training.trainer import Trainer
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train.config import TrainConfig
+from voronerf.app.train.trainer import Trainer
 
 LAUNCHES, READS = 26, 0
 """Of a default step. The launches go down only."""
@@ -32,7 +32,7 @@ def test_what_is_asked_is_counted():
 @pytest.fixture
 def on_device(monkeypatch):
     """Tensors of the emulation say that they are on a CPU; here the sampler does not believe them."""
-    monkeypatch.setattr("voronerf.rendering.samplers._on_host", lambda tensor: False)
+    monkeypatch.setattr("voronerf.nerf.samplers._on_host", lambda tensor: False)
 
 
 def trained(out, steps, *, empty=False):
@@ -61,7 +61,7 @@ def test_rows_beyond_the_samples_change_nothing(tmp_path, monkeypatch):
     """With one cell and with four: the host knows the number of samples, or the device alone."""
     found = []
     for known in (True, False):
-        monkeypatch.setattr("voronerf.rendering.samplers._on_host", lambda tensor, known=known: known)
+        monkeypatch.setattr("voronerf.nerf.samplers._on_host", lambda tensor, known=known: known)
         trainer = trained(tmp_path / str(known), 6, empty=True)
         rows = trainer._rows
         assert (rows is None) == known and trainer.router.num_cells == 4

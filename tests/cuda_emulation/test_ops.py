@@ -11,7 +11,7 @@ from helpers import same
 
 import voronerf
 from voronerf import VoronoiDiagram
-from voronerf.layers import MLP, POSITIONS, Layer
+from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 from voronerf.ops.cell_sort.native import WAYS
 from voronerf.ops.cell_sort.native import sort as sort_cells
 from voronerf.ops.draw_pixels import native as draw_pixels

@@ -8,7 +8,7 @@ from emulated_networks import BRANCHED, GAUSSIANS, KIB, WIDE, check
 from helpers import refuses
 from network_plans import PRECISIONS, SHARED, SIZES, assert_covers, nerf, plan, table
 
-from voronerf.fields import DensityField, HashGridField, NeRF
+from voronerf.nerf.fields import DensityField, HashGridField, NeRF
 
 MIB = 1024 * KIB
 # Capability, shared memory that a block may ask for, multiprocessors, second-level cache.

@@ -45,8 +45,8 @@ def test_every_option_of_every_command_is_on_the_page(monkeypatch: pytest.Monkey
     monkeypatch.syspath_prepend(str(ROOT / "docs/scripts"))
     import options
 
-    from voronerf.cli.main import COMMANDS
-    from voronerf.training.config import TrainConfig
+    from voronerf.app.cli.main import COMMANDS
+    from voronerf.app.train.config import TrainConfig
 
     text = options.markdown()
     for command in COMMANDS:
@@ -59,8 +59,8 @@ def test_every_option_of_every_command_is_on_the_page(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("name", [name for name in PAGES if "changelog" not in name])
 def test_options_on_a_page_exist(name: str) -> None:
-    from voronerf.cli.commands import train
-    from voronerf.training.config import TrainConfig
+    from voronerf.app.cli.commands import train
+    from voronerf.app.train.config import TrainConfig
 
     fields = dataclasses.fields(TrainConfig)
     known = {f"--{field.name.replace('_', '-')}" for field in fields}

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 PAGES = Path(__file__).resolve().parents[2] / "docs" / "reference"
-PACKAGES = ("voronerf", *(f"voronerf.{name}" for name in ("ops", "diagram", "router", "fields", "rendering", "data")))
-PACKAGES += ("voronerf.evaluation", "voronerf.step", "voronerf.training", "voronerf.export")
+PACKAGES = ("voronerf", *(f"voronerf.{name}" for name in ("ops", "diagram", "router", "nerf", "nerf.fields", "town")))
+PACKAGES += tuple(f"voronerf.app.{name}" for name in ("scenes", "train", "evaluate", "render", "export"))
 
 
 def resolve(path: str) -> Any:

@@ -9,15 +9,15 @@ import torch
 from helpers import refuses
 
 import voronerf
-from voronerf.layers import ACTIVATIONS
+from voronerf.ops._core.layers import ACTIVATIONS
 
 pytestmark = pytest.mark.native
-native = pytest.importorskip("voronerf.native")
+native = pytest.importorskip("voronerf.ops._core.native")
 
 
 def test_the_stub_is_what_the_build_bound() -> None:
-    stub = Path(voronerf.__file__).with_name("_C.pyi").read_text()
-    assert native.compiled.stub == stub, "build the extension again and commit voronerf/_C.pyi"
+    stub = Path(voronerf.__file__).with_name("ops").joinpath("_core", "_C.pyi").read_text()
+    assert native.compiled.stub == stub, "build the extension again and commit voronerf/ops/_core/_C.pyi"
 
 
 def test_enumerations_have_the_names_that_users_write() -> None:

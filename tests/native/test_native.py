@@ -12,7 +12,8 @@ import torch
 from helpers import refuses
 from torch import Tensor
 
-from voronerf import backends, cell_sort, locate_cell, nearest_centre
+from voronerf import cell_sort, locate_cell, nearest_centre
+from voronerf.ops._core import backends
 from voronerf.ops.cell_sort.reference import cell_sort as reference_sort
 from voronerf.ops.locate_cell.reference import locate_cell as reference_locate
 from voronerf.ops.nearest_centre.reference import distances
@@ -21,7 +22,7 @@ from voronerf.ops.nearest_centre.reference import nearest_centre as reference_ne
 pytestmark = pytest.mark.native
 
 if backends.missing("native", torch.device("cpu")) is None:
-    from voronerf import native as _native
+    from voronerf.ops._core import native as _native
 
 CELLS = (1, 2, 15, 16, 17, 255, 256, 257, 4096)
 # Around the lanes and tiles of every instruction set and the block of a task.
@@ -221,7 +222,7 @@ def run_python(code: str, **environment: str) -> None:
 def test_one_openmp_runtime_and_a_forced_instruction_set() -> None:
     code = """
 import torch, voronerf
-from voronerf import native as _native
+from voronerf.ops._core import native as _native
 assert _native.describe()["instruction set"] == "portable"
 voronerf.nearest_centre(torch.rand(10000, 3), torch.rand(9, 3), backend="native")
 names = ("libgomp", "libiomp", "libomp")
@@ -234,7 +235,7 @@ assert len(loaded) == 1 or (not loaded and not _native.describe()["openmp"]), lo
 def test_an_unknown_instruction_set_is_an_error_whatever_the_backend() -> None:
     code = """
 import torch
-from voronerf import backends
+from voronerf.ops._core import backends
 try:
     backends.resolve("nearest_centre", backend="auto", device=torch.device("cpu"), dtype=torch.float32)
 except ValueError as error:

@@ -123,7 +123,7 @@ def test_large_results_ask_for_huge_pages() -> None:
         pytest.skip("huge pages are switched off here")
     program = """
 import resource, torch
-from voronerf.native import on_huge_pages
+from voronerf.ops._core.native import on_huge_pages
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 before = faults()
 out = torch.empty(1 << 24)
@@ -141,7 +141,7 @@ def test_what_a_step_frees_is_kept() -> None:
         pytest.skip("glibc alone can be asked")
     program = """
 import resource, torch
-from voronerf.native import compiled
+from voronerf.ops._core.native import compiled
 compiled.keep_freed_memory()
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 step = lambda: [torch.ones(1 << 22) for _ in range(16)]

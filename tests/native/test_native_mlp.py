@@ -7,9 +7,9 @@ import torch
 from helpers import all_pairs, on_any_number_of_threads
 from torch import Tensor
 
-from voronerf.grids import HashGrid
-from voronerf.layers import MLP, Layer
 from voronerf.ops import grouped_mlp
+from voronerf.ops._core.grids import HashGrid
+from voronerf.ops._core.layers import MLP, Layer
 
 pytestmark = pytest.mark.native
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 import torch
 
-from voronerf import backends
+from voronerf.ops._core import backends
 
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 HALVES = (torch.float16, torch.bfloat16)

@@ -9,8 +9,8 @@ import torch
 from adam_steps import assert_adam
 from op_cases import refused, strided
 
-from voronerf import native
 from voronerf.ops import Guard, Rule, adam
+from voronerf.ops._core import native
 
 pytestmark = pytest.mark.op("adam")
 

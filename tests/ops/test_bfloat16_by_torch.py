@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from voronerf.cli.info import info
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.native import LEAST_GAIN
+from voronerf.app.cli.info import info
 from voronerf.ops import grouped_mlp, routed_mlp
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops._core.native import LEAST_GAIN
 from voronerf.ops.grouped_mlp import by_torch
 from voronerf.ops.grouped_mlp import native as kernels
 

@@ -11,9 +11,9 @@ from helpers import on_any_number_of_threads, refuses, same
 from op_cases import refusals
 from torch import Tensor
 
-from voronerf import backends
 from voronerf.diagram import VoronoiDiagram, uniform_centres
 from voronerf.ops import CentreGrid, centre_grid, nearest_centre
+from voronerf.ops._core import backends
 
 native = pytest.mark.native
 BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
@@ -99,7 +99,7 @@ def test_ties_of_a_regular_grid(k):
 
 @native
 def test_instruction_sets_and_threads_build_the_same_grid(isa):
-    from voronerf import native
+    from voronerf.ops._core import native
 
     centres = clustered(700)
     points = points_around(centres)[:-1].repeat(3, 1)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from op_cases import refused
 
-from voronerf import checks
+from voronerf.ops._core import checks
 
 
 def test_shape_binds_letters():

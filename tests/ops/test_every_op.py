@@ -20,8 +20,9 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from voronerf import backends, checks, ops
-from voronerf.ops.cases import Draw, cases
+from voronerf import ops
+from voronerf.ops._core import backends, checks
+from voronerf.ops._core.cases import Draw, cases
 
 CASES = cases()
 KINDS = [

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from voronerf.ops import Solids, first_solid
-from voronerf.ops.cases import Draw
+from voronerf.ops._core.cases import Draw
 from voronerf.ops.first_solid.case import CASE
 
 pytestmark = pytest.mark.native

@@ -10,7 +10,7 @@ from op_cases import need, offsets_of
 from torch import Tensor
 
 from voronerf import ops
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 COUNTS = [4, 0, 5]
 N, K = sum(COUNTS), len(COUNTS)

@@ -7,8 +7,8 @@ from op_cases import COUNTS, FLOATS, HALVES, need, offsets_of, refusals
 from tolerances import assert_as_exact
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from voronerf.layers import ACTIVATIONS
 from voronerf.ops import grouped_linear
+from voronerf.ops._core.layers import ACTIVATIONS
 
 pytestmark = pytest.mark.op("grouped_linear")
 

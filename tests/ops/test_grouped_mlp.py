@@ -9,8 +9,8 @@ from op_cases import COUNTS, FLOATS, need, offsets_of, refusals, refused
 from tolerances import assert_as_exact, error
 from torch import Tensor
 
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import frequency_encode, grouped_mlp, integrated_encode, spherical_harmonics
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 pytestmark = pytest.mark.op("grouped_mlp")
 

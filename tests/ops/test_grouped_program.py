@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from voronerf import native
 from voronerf.ops import grouped_program
+from voronerf.ops._core import native
+from voronerf.ops._core.program import FUNCTIONS, PARAMETER, Builder, Columns, Program, gradient
 from voronerf.ops.grouped_program.case import every_step
-from voronerf.program import FUNCTIONS, PARAMETER, Builder, Columns, Program, gradient
 
 NUMBERS = {"softplus": (3.0, 20.0), "sine": (1.7, 0.3), "clamp": (-0.5, 0.6), "power": (1.5, 0.0), "affine": (2.0, 1.0)}
 SIZES = ([0], [1], [5, 0, 24], [96, 1], [97, 0, 3], [0, 95, 200, 23])

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from voronerf.grids import HashGrid
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops._core.grids import HashGrid
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 SOURCES = "MLP: layer 0 must read 'positions', 'directions' or an earlier layer"
 

@@ -8,9 +8,9 @@ from helpers import on_any_number_of_threads
 from op_cases import need, refusals
 from torch import Tensor
 
+from voronerf.nerf import Contraction, Perspective
+from voronerf.nerf.sampling import stratified_depths
 from voronerf.ops import march_rays
-from voronerf.rendering import Contraction, Perspective
-from voronerf.rendering.sampling import stratified_depths
 
 SPHERE = Contraction(torch.tensor([0.1, -0.2, 0.3]), radius=0.7)
 AXES = torch.linalg.qr(torch.tensor([[1.0, 0.2, 0.1], [-0.3, 1.0, 0.2], [0.1, -0.2, 1.0]])).Q

@@ -4,8 +4,8 @@ import pytest
 import torch
 from op_cases import FLOATS, HALVES, need, refusals
 
-from voronerf.backends import BackendUnavailable
 from voronerf.ops import nearest_centre
+from voronerf.ops._core.backends import BackendUnavailable
 
 pytestmark = pytest.mark.op("nearest_centre")
 

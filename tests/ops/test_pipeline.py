@@ -8,8 +8,8 @@ import pytest
 import torch
 import torch._inductor.config as inductor
 
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import cell_sort, composite, grouped_mlp, nearest_centre, resample
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 TABLE = MLP(
     (

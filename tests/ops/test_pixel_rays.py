@@ -5,9 +5,9 @@ import torch
 from helpers import all_pairs
 from op_cases import refusals, refused
 
+from voronerf.nerf import intersect_box
+from voronerf.nerf.cameras import Cameras, look_at
 from voronerf.ops import pixel_rays
-from voronerf.rendering import intersect_box
-from voronerf.rendering.cameras import Cameras, look_at
 
 pytestmark = pytest.mark.op("pixel_rays")
 HEIGHT, WIDTH = 12, 17

@@ -12,8 +12,8 @@ from op_cases import need, refusals, refused
 from tolerances import assert_as_exact
 from torch import Tensor
 
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops import cell_sort, frequency_encode, grouped_mlp, locate_cell, nearest_centre, routed_mlp
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 pytestmark = pytest.mark.op("routed_mlp")
 

@@ -9,7 +9,7 @@ from op_cases import refused
 
 from voronerf import MLP, Layer
 from voronerf.ops import see_rays
-from voronerf.ops.cases import Draw
+from voronerf.ops._core.cases import Draw
 from voronerf.ops.see_rays.case import CASE
 
 pytestmark = pytest.mark.op("see_rays")

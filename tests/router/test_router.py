@@ -13,7 +13,7 @@ from router_fields import masked_loop, perturb
 from torch import Tensor
 
 from voronerf.diagram import VoronoiDiagram
-from voronerf.fields import NeRF
+from voronerf.nerf.fields import NeRF
 from voronerf.router import VoronoiRouter
 
 

@@ -14,7 +14,7 @@ from convention_calls import Truncated
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
-from voronerf.backends import BackendUnavailable
+from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.router import rules
 
 

@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from voronerf import NeRF, VoronoiRouter
-from voronerf.fields import HashGridField
+from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Rays, Renderer, Step
+from voronerf.nerf.adam import Adam
+from voronerf.nerf.average import update_averages
+from voronerf.nerf.fields import HashGridField
 from voronerf.ops import learn_outputs
-from voronerf.rendering import Occupancy, OccupancyGrid, Rays, Renderer
-from voronerf.step import Batch, Step
-from voronerf.training.adam import Adam
-from voronerf.training.average import update_averages
 
 FROZEN, LEARNING = [1, 3], [0, 2]
 OPTIMIZERS = {

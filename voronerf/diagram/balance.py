@@ -122,7 +122,7 @@ def balance(
             (default of
             "centroidal"). "uniform": `uniform_centres` over the bounding box of the samples.
         generator: CPU generator of the draws; None for torch's global one.
-        backend: of the ops, see `voronerf.backends`.
+        backend: of the ops, see `voronerf.ops._core.backends`.
 
     Raises:
         ValueError: a wrong shape, an unknown choice, a value that is not finite, a negative importance, no importance

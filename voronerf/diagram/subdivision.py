@@ -70,7 +70,7 @@ def split_diagram(
             and have no samples); "centroidal": the centroids of their cells, weighted by importance. "random" and
             "uniform" are ablations of the paper.
         generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
-        backend: of the cell queries, see `voronerf.backends`.
+        backend: of the cell queries, see `voronerf.ops._core.backends`.
         **options: arguments of `balance` for "balanced" and "centroidal": method, steps, alpha, neighbours, init.
 
     Returns:

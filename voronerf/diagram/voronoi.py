@@ -18,8 +18,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf import backends, ops
+from voronerf import ops
 from voronerf.diagram.drawing import draw_cell
+from voronerf.ops._core import backends
 
 # A grid is faster than a search of all centres from this many centres on. Making it pays after this many points (see
 # ops.centre_grid).
@@ -155,7 +156,7 @@ class VoronoiDiagram(nn.Module):
 
         Args:
             points: floating [..., 3]; half types are compared in float32, float64 points in float64.
-            backend: see `voronerf.backends`.
+            backend: see `voronerf.ops._core.backends`.
 
         Returns:
             int32 [...]. On each level, ties go to the lowest index, and points that are not finite to the first cell.
@@ -214,7 +215,7 @@ class VoronoiDiagram(nn.Module):
             points: floating [..., 3]; compared in float32.
             temperature: >= 0, in scene units.
             generator: on any device; its numbers are moved to the device of `points`. None for torch's global one.
-            backend: see `voronerf.backends`.
+            backend: see `voronerf.ops._core.backends`.
 
         Returns:
             int32 [...] leaf numbers.

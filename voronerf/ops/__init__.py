@@ -8,8 +8,8 @@ Each raises ValueError for shapes, devices, numbers out of range and an unknown 
 `BackendUnavailable` where the named backend cannot run; what else an operation refuses stands beside it.
 """
 
-from voronerf.grids import HashGrid
-from voronerf.layers import MLP, Layer
+from voronerf.ops._core.grids import HashGrid
+from voronerf.ops._core.layers import MLP, Layer
 from voronerf.ops.adam import Guard, Rule, adam
 from voronerf.ops.balance_centres import balance_centres
 from voronerf.ops.cell_sort import cell_sort

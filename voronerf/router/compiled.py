@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf.compiler import constant_result
+from voronerf.ops._core.compiler import constant_result
 from voronerf.router.double import Double
 from voronerf.router.layout import tensors_of
 

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, fx
 from torch.fx.node import map_arg
 
+from voronerf.ops._core.program import VALUE, Builder, Columns, Program, Step
 from voronerf.ops.grouped_program import grouped_program
-from voronerf.program import VALUE, Builder, Columns, Program, Step
 from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable, name_of
 from voronerf.router.grouping import Grouping, owned_parameters
 from voronerf.router.layout import Call, Results, map_tensors, tensors_of

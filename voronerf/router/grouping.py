@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf import ops
-from voronerf.backends import BackendUnavailable
+from voronerf.ops._core.backends import BackendUnavailable
 
 _LARGE, _PAGE = 1 << 22, 1 << 21  # bytes
 SHARED = "_voronerf_shared"
@@ -199,7 +199,7 @@ def keep_freed_memory() -> Any:
     Gives the compiled module, or None where there is none: then it is left as it is.
     """
     try:
-        from voronerf.native import compiled
+        from voronerf.ops._core.native import compiled
     except BackendUnavailable:
         return None
     compiled.keep_freed_memory()

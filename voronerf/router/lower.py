@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from voronerf.program import PARAMETER, VALUE, Builder, Columns
+from voronerf.ops._core.program import PARAMETER, VALUE, Builder, Columns
 from voronerf.router.grouped import find
 from voronerf.router.layout import map_tensors, tensors_of
 

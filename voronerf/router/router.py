@@ -14,12 +14,12 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor, nn
 
-from voronerf.backends import BACKENDS
-from voronerf.compiler import not_compiled
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.blending import Mixture
 from voronerf.diagram.subdivision import finer_diagram
-from voronerf.layers import for_last_output
+from voronerf.ops._core.backends import BACKENDS
+from voronerf.ops._core.compiler import not_compiled
+from voronerf.ops._core.layers import for_last_output
 from voronerf.ops.routed_mlp import of_one_dtype, routed_mlp
 from voronerf.router.cells import (
     check_module,

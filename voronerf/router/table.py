@@ -10,12 +10,12 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
-from voronerf.layers import MLP
+from voronerf.ops._core.layers import MLP
 
 
 @runtime_checkable
 class LayeredField(Protocol):
-    """A field that describes its network by a layer table, like :class:`voronerf.fields.NeRF`. It runs fused.
+    """A field that describes its network by a layer table, like :class:`voronerf.nerf.fields.NeRF`. It runs fused.
 
     Where the table has a hash grid, the field has a parameter ``features``, [e, f], as :class:`voronerf.HashGridField`.
 

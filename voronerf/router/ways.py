@@ -23,8 +23,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf.backends import BackendUnavailable
 from voronerf.diagram.blending import Mixture
+from voronerf.ops._core.backends import BackendUnavailable
+from voronerf.ops._core.tolerances import agree, agree_gradients
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.cells import clone_module
 from voronerf.router.double import Double, Forbidden
@@ -33,7 +34,6 @@ from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Wa
 from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters
 from voronerf.router.layout import RAY, Call, Results, map_tensors, rebuild, tensors_of
 from voronerf.router.trace import Unfusable, rows_for
-from voronerf.tolerances import agree, agree_gradients
 
 _OP = "VoronoiRouter"
 _FEWEST = 8  # samples below which nothing is found out about a kind of call, and the loop runs

@@ -21,7 +21,7 @@ struct ProgramPack {
   int32_t parameter, o, i, start, width, at;
 };
 
-// In the order of voronerf/ops/grouped_program/native.py and of BINARY in voronerf/program.py.
+// In the order of voronerf/ops/grouped_program/native.py and of BINARY in voronerf/ops/_core/program.py.
 enum {
   kProgramInput,
   kProgramOutput,

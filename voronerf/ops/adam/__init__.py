@@ -8,9 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import check_dtype, check_number, check_same_device, check_shape, check_tensor, check_writable
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, Implementation
+from voronerf.ops._core.checks import (
+    check_dtype,
+    check_number,
+    check_same_device,
+    check_shape,
+    check_tensor,
+    check_writable,
+)
 from voronerf.ops.adam.reference import Guard, Rule
 
 _OP = backends.declare("adam", native=Implementation(EVERYWHERE, (torch.float32,)))

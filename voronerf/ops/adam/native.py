@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from voronerf import native
+from voronerf.ops._core import native
 from voronerf.ops.adam.reference import Guard, Rule
 
 

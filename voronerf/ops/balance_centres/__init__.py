@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import Implementation
-from voronerf.checks import Checked, check_integer, check_number
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import Implementation
+from voronerf.ops._core.checks import Checked, check_integer, check_number
 
 _OP = backends.declare("balance_centres", native=Implementation(("cpu",), (torch.float32,)))
 

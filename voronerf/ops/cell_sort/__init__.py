@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, Checked, check_integer
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, Implementation
+from voronerf.ops._core.checks import INDEX, Checked, check_integer
 
 _OP = backends.declare("cell_sort", native=Implementation(EVERYWHERE, INDEX), warp=Implementation(EVERYWHERE, INDEX))
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from voronerf import native
-from voronerf.checks import check_range
-from voronerf.custom_op import custom_op
+from voronerf.ops._core import native
+from voronerf.ops._core.checks import check_range
+from voronerf.ops._core.custom_op import custom_op
 
 WAYS = native.compiled.CellSortWay
 """Of sorting on CUDA; "automatic" is by the number of cells."""

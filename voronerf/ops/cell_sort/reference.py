@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf.checks import check_range
+from voronerf.ops._core.checks import check_range
 
 
 def cell_sort(cells: Tensor, k: int) -> tuple[Tensor, Tensor]:

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import COORDINATES, Implementation
-from voronerf.checks import FLOATING, Checked
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import COORDINATES, Implementation
+from voronerf.ops._core.checks import FLOATING, Checked
 from voronerf.ops.centre_grid.reference import BRICK_BITS, CELL_BITS, GridTables, centre_table, root_bits
 
 _OP = backends.declare("centre_grid", native=Implementation(("cpu",), COORDINATES))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import FLOATING, INDEX, LIKE_FIRST, Checked, check_count
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.checks import FLOATING, INDEX, LIKE_FIRST, Checked, check_count
 from voronerf.ops.composite.reference import Composite
 
 _OP = backends.declare("composite", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS))

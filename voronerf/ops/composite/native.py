@@ -11,8 +11,8 @@ from typing import Any
 
 from torch import Tensor
 
-from voronerf import native
-from voronerf.custom_op import custom_op, in_float32
+from voronerf.ops._core import native
+from voronerf.ops._core.custom_op import custom_op, in_float32
 from voronerf.ops.composite.autograd import Arriving, RaySamples, register
 
 

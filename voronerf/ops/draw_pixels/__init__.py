@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, Checked, check_integer, check_same_device
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, Implementation
+from voronerf.ops._core.checks import INDEX, Checked, check_integer, check_same_device
 from voronerf.ops.draw_pixels.reference import Runs
 
 _OP = backends.declare("draw_pixels", native=Implementation(EVERYWHERE, (torch.int32,)))

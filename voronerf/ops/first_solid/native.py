@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import native
+from voronerf.ops._core import native
 from voronerf.ops.first_solid.reference import Solids
 
 

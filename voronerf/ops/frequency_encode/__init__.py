@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import FLOATING, Checked, check_flag, check_integer
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.checks import FLOATING, Checked, check_flag, check_integer
 
 _OP = backends.declare(
     "frequency_encode", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS, "encode")

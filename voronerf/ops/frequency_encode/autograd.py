@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from voronerf.custom_op import Op
-from voronerf.derivatives import register_derivatives
+from voronerf.ops._core.custom_op import Op
+from voronerf.ops._core.derivatives import register_derivatives
 from voronerf.ops.frequency_encode.reference import frequency_encode
 from voronerf.ops.integrated_encode.reference import integrated_encode
 

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Sequence
 
 from torch import Tensor
 
-from voronerf import native
-from voronerf.custom_op import custom_op, in_float32
-from voronerf.derivatives import OfOne
+from voronerf.ops._core import native
+from voronerf.ops._core.custom_op import custom_op, in_float32
+from voronerf.ops._core.derivatives import OfOne
 from voronerf.ops.frequency_encode.autograd import Encoding, register
 
 

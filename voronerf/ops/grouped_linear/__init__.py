@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import FLOATING, INDEX, Checked, check_choice, check_same_dtype
-from voronerf.layers import ACTIVATIONS
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.checks import FLOATING, INDEX, Checked, check_choice, check_same_dtype
+from voronerf.ops._core.layers import ACTIVATIONS
 
 _OP = backends.declare("grouped_linear", native=Implementation(EVERYWHERE, FLOATS))
 

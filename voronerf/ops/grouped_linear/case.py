@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.layers import ACTIVATIONS
-from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops._core.layers import ACTIVATIONS
 
 
 def _make(draw: Draw, n: int) -> Arguments:

@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import native
-from voronerf.custom_op import custom_op
-from voronerf.derivatives import asked_for
+from voronerf.ops._core import native
+from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.derivatives import asked_for
 
 
 @custom_op("grouped_linear_native", devices=("cpu",))

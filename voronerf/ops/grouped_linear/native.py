@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import native
+from voronerf.ops._core import native
 from voronerf.ops.grouped_linear.cpu import layer
 from voronerf.ops.grouped_mlp import native as grouped_mlp
 

@@ -6,10 +6,17 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import INDEX, check_count, check_dtype, check_no_inference, check_same_device, check_shape
-from voronerf.layers import MLP
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.checks import (
+    INDEX,
+    check_count,
+    check_dtype,
+    check_no_inference,
+    check_same_device,
+    check_shape,
+)
+from voronerf.ops._core.layers import MLP
 from voronerf.ops.grouped_mlp.checks import check_network
 
 _OP = backends.declare("grouped_mlp", native=Implementation(EVERYWHERE, FLOATS))

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from voronerf import native
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops._core import native
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops.frequency_encode.native import frequency_encode
 from voronerf.ops.grouped_linear.activation import activate
 from voronerf.ops.grouped_mlp.layer_table import Given, encoded_already, storage

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.grids import HashGrid
-from voronerf.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops._core.grids import HashGrid
+from voronerf.ops._core.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
 
 _PLAIN = MLP((Layer((POSITIONS,), 6, "sine"), Layer((0, DIRECTIONS), 4, "sigmoid")), (1, 0), 2, 1)
 # The 16 features of whole vectors: what a forward pass keeps has no padding, which is never written.

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from voronerf.checks import FLOATING, INDEX, check_dtype, check_same_dtype, check_shape, check_tensor
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS
+from voronerf.ops._core.checks import FLOATING, INDEX, check_dtype, check_same_dtype, check_shape, check_tensor
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
 
 
 def check_network(

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf import native
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS
+from voronerf.ops._core import native
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.ops.grouped_mlp.reference import encode_directions, encode_positions
 from voronerf.ops.hash_encode.native import compiled_grid, hash_encode
 

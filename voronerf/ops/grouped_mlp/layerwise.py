@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.layers import DIRECTIONS, POSITIONS
+from voronerf.ops._core.layers import DIRECTIONS, POSITIONS
 from voronerf.ops.grouped_linear.activation import activate
 from voronerf.ops.grouped_linear.cpu import layer as linear
 from voronerf.ops.grouped_linear.reference import grouped_linear as _reference

@@ -18,10 +18,10 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from voronerf import native
-from voronerf.custom_op import custom_op
-from voronerf.derivatives import asked_for
-from voronerf.layers import ACTIVATIONS, MLP, POSITIONS, Layer
+from voronerf.ops._core import native
+from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.derivatives import asked_for
+from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer
 from voronerf.ops.grouped_mlp import by_torch
 from voronerf.ops.grouped_mlp.layer_table import (
     Given,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
 from voronerf.ops.frequency_encode.reference import frequency_encode
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
 from voronerf.ops.hash_encode.reference import hash_encode

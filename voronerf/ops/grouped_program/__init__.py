@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import (
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.checks import (
     INDEX,
     check_count,
     check_dtype,
@@ -20,7 +20,7 @@ from voronerf.checks import (
     check_shape,
     check_tensor,
 )
-from voronerf.program import Program
+from voronerf.ops._core.program import Program
 
 _OP = backends.declare("grouped_program", native=Implementation(EVERYWHERE, FLOATS))
 _HALF = (torch.float16, torch.bfloat16)  # computed in float32
@@ -38,7 +38,7 @@ def grouped_program(
     """Runs a program on the rows of each cell, with the cell's parameters.
 
     A program is a list of steps: layers, activations, sums, products, columns that are moved
-    (:mod:`voronerf.program`). All values of a tile of rows stay in cache. Gradients of every order to inputs and
+    (:mod:`voronerf.ops._core.program`). All values of a tile of rows stay in cache. Gradients of every order to inputs and
     parameters; the gradient of a program is a program itself.
 
     Args:
@@ -61,7 +61,7 @@ def grouped_program(
     Examples:
         >>> import torch
         >>> from voronerf.ops import grouped_program
-        >>> from voronerf.program import Builder
+        >>> from voronerf.ops._core.program import Builder
         >>> b = Builder()
         >>> x = b.input(2)
         >>> y = b.apply("exp", b.linear(x, b.parameter(1, 2), 1))  # exp(W x), W [1, 2]

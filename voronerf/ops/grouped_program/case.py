@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.ops.cases import Arguments, Case, Draw
-from voronerf.program import PARAMETER, Builder, Columns, Program
+from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops._core.program import PARAMETER, Builder, Columns, Program
 
 
 def every_step() -> Program:

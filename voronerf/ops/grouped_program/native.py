@@ -13,11 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import native
-from voronerf.custom_op import custom_op
-from voronerf.derivatives import asked_for
+from voronerf.ops._core import native
+from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.derivatives import asked_for
+from voronerf.ops._core.program import BINARY, FUNCTIONS, PARAMETER, Columns, Program, Step, gradient, merged
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
-from voronerf.program import BINARY, FUNCTIONS, PARAMETER, Columns, Program, Step, gradient, merged
 
 _OPS = ("input", "output", "linear", "function", "binary", "total", "move", "outer", "columns")
 _ORDERS = 3  # of derivatives that the compiled module has

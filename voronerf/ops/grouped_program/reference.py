@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from voronerf.ops._core.program import BINARY, FUNCTIONS, VALUE, Columns, Program, Step
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
 from voronerf.ops.grouped_mlp.reference import cells_of
-from voronerf.program import BINARY, FUNCTIONS, VALUE, Columns, Program, Step
 
 
 def grouped_program(

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import FLOATING, INDEX, Checked
-from voronerf.grids import HashGrid
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.checks import FLOATING, INDEX, Checked
+from voronerf.ops._core.grids import HashGrid
 
 _OP = backends.declare(
     "hash_encode", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.custom_op import Op
-from voronerf.derivatives import aliases, asked_for, second_derivatives
-from voronerf.grids import HashGrid
+from voronerf.ops._core.custom_op import Op
+from voronerf.ops._core.derivatives import aliases, asked_for, second_derivatives
+from voronerf.ops._core.grids import HashGrid
 from voronerf.ops.hash_encode.reference import interpolate
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.grids import HashGrid
-from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops._core.grids import HashGrid
 
 
 def hash_grid(draw: Draw) -> HashGrid:

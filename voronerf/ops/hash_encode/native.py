@@ -11,9 +11,9 @@ from collections.abc import Iterator
 
 from torch import Tensor
 
-from voronerf import native
-from voronerf.custom_op import custom_op
-from voronerf.grids import HashGrid
+from voronerf.ops._core import native
+from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.grids import HashGrid
 from voronerf.ops.hash_encode.autograd import HashDerivatives, Hashed
 
 

@@ -7,8 +7,8 @@ import itertools
 import torch
 from torch import Tensor
 
-from voronerf.checks import check_range
-from voronerf.grids import GridLevel, HashGrid
+from voronerf.ops._core.checks import check_range
+from voronerf.ops._core.grids import GridLevel, HashGrid
 
 _PRIMES = (1, 2654435761, 805459861)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from voronerf.custom_op import in_float32
+from voronerf.ops._core.custom_op import in_float32
 from voronerf.ops.frequency_encode.autograd import Encoding
 from voronerf.ops.frequency_encode.native import encode
 

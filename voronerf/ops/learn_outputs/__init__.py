@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import check_flag, check_shape, detached
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.checks import check_flag, check_shape, detached
 from voronerf.ops.learn_outputs.reference import Tape
 from voronerf.ops.routed_mlp import check_routed, routed_mlp
 

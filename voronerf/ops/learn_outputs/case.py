@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from voronerf.layers import MLP, POSITIONS, Layer
-from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 
 
 def _make(draw: Draw, n: int) -> Arguments:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import native
+from voronerf.ops._core import native
 from voronerf.ops.grouped_mlp import native as grouped_mlp
 from voronerf.ops.learn_outputs import reference
 from voronerf.ops.learn_outputs.reference import Tape, learnt, with_gradients

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import COORDINATES, EVERYWHERE, Implementation
-from voronerf.checks import FLOATING, INDEX, Checked, check_integer
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
+from voronerf.ops._core.checks import FLOATING, INDEX, Checked, check_integer
 from voronerf.ops.nearest_centre import of_one_dtype
 
 _OP = backends.declare(

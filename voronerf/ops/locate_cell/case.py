@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops._core.cases import Arguments, Case, Draw
 
 # Diagram 0 has three centres, the second and third refined by diagrams 1 and 2, and that again by diagram 3.
 _OFFSETS = torch.tensor([0, 3, 5, 7, 10], dtype=torch.int32)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_choice, check_count, check_integer, detached
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, Implementation
+from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_choice, check_count, check_integer, detached
 from voronerf.ops.march_rays.reference import March, Rays
 
 _OP = backends.declare(
@@ -67,7 +67,7 @@ def march_rays(
         most: largest number of samples of a ray, at least 1; None for all.
         capacity: rows of the result, at least 1; None for the number of samples.
         contraction: [4], centre and radius of a sphere; [5, 3], centre, right, up, ahead and (near, a, b) of normalised
-            device coordinates; or None. See ``voronerf.rendering.Contraction`` and ``Perspective``.
+            device coordinates; or None. See ``voronerf.nerf.Contraction`` and ``Perspective``.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import native
-from voronerf.checks import MAX_COUNT
-from voronerf.custom_op import custom_op
+from voronerf.ops._core import native
+from voronerf.ops._core.checks import MAX_COUNT
+from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops.march_rays.reference import Rays
 
 Marched = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]

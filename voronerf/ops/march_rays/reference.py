@@ -149,7 +149,7 @@ def _mixed(x: Tensor) -> Tensor:
 
 
 def contracted(points: list[Tensor], contraction: Tensor | None) -> list[Tensor]:
-    """Three coordinates of points, mapped as ``voronerf.rendering.Contraction`` or ``Perspective`` does it."""
+    """Three coordinates of points, mapped as ``voronerf.nerf.Contraction`` or ``Perspective`` does it."""
     if contraction is None:
         return points
     if contraction.dim() == 1:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import COORDINATES, EVERYWHERE, Implementation
-from voronerf.checks import FLOATING, Checked
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
+from voronerf.ops._core.checks import FLOATING, Checked
 from voronerf.ops.centre_grid import CentreGrid
 from voronerf.ops.nearest_centre_grid import nearest_centre_grid
 

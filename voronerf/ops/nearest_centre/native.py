@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from voronerf import native
-from voronerf.custom_op import custom_op
+from voronerf.ops._core import native
+from voronerf.ops._core.custom_op import custom_op
 
 
 @custom_op("nearest_centre")

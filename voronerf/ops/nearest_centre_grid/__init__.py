@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import COORDINATES, Implementation
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import COORDINATES, Implementation
 from voronerf.ops.centre_grid import CentreGrid
 
 _OP = backends.declare("nearest_centre_grid", native=Implementation(("cpu",), COORDINATES))

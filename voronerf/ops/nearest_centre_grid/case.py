@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops._core.cases import Arguments, Case, Draw
 from voronerf.ops.centre_grid import centre_grid
 from voronerf.ops.nearest_centre.case import CASE as OF_ALL
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import LIKE_FIRST, Checked, check_count, check_number, check_writable, detached
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, Implementation
+from voronerf.ops._core.checks import LIKE_FIRST, Checked, check_count, check_number, check_writable, detached
 from voronerf.ops.observe_occupancy.reference import Observed
 
 _OP = backends.declare(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from voronerf import native
+from voronerf.ops._core import native
 from voronerf.ops.observe_occupancy.reference import Observed
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, Implementation
-from voronerf.checks import INDEX, LIKE_FIRST, Checked, check_number, check_range, detached
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, Implementation
+from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_number, check_range, detached
 from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
 
 _OP = backends.declare("pixel_rays", native=Implementation(EVERYWHERE, (torch.float32,)))

@@ -1,5 +1,5 @@
 """Rays through positions in images, and the lenses that bend them. c cameras, b positions. Frames are those of
-``voronerf.rendering.cameras``."""
+``voronerf.nerf.cameras``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.checks import check_range
+from voronerf.ops._core.checks import check_range
 
 NEWTON_STEPS = 12
 #: The camera models, by their numbers in ``models``.

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 from torch import Tensor
 
-from voronerf import native
-from voronerf.checks import check_range
-from voronerf.custom_op import custom_op
+from voronerf.ops._core import native
+from voronerf.ops._core.checks import check_range
+from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops.pixel_rays.reference import Pixels
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.checks import check_range
+from voronerf.ops._core.checks import check_range
 from voronerf.ops.pixel_rays.lens import camera_rays
 
 

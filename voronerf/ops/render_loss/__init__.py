@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import FLOATING, INDEX, Checked, check_count, check_number, check_positive, detached
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.checks import FLOATING, INDEX, Checked, check_count, check_number, check_positive, detached
 from voronerf.ops.render_loss.reference import Rendered, RenderLoss
 
 _OP = backends.declare(

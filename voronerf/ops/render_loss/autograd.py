@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.custom_op import Op
+from voronerf.ops._core.custom_op import Op
 from voronerf.ops.render_loss.reference import Rendered, render_loss
 
 Results = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 from torch import Tensor
 
-from voronerf import native
-from voronerf.custom_op import custom_op
+from voronerf.ops._core import native
+from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops.render_loss.autograd import Results, register, results
 from voronerf.ops.render_loss.reference import Rendered
 

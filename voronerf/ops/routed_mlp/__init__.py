@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.checks import (
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.checks import (
     INDEX,
     check_count,
     check_dtype,
@@ -21,8 +21,8 @@ from voronerf.checks import (
     check_same_device,
     check_shape,
 )
-from voronerf.compiler import constant_result
-from voronerf.layers import MLP
+from voronerf.ops._core.compiler import constant_result
+from voronerf.ops._core.layers import MLP
 from voronerf.ops.grouped_mlp.checks import check_network
 from voronerf.ops.nearest_centre import of_one_dtype
 from voronerf.ops.routed_mlp.reference import Operations, Where

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops._core.cases import Arguments, Case, Draw
 from voronerf.ops.grouped_mlp.case import GAUSSIANS, network
 from voronerf.ops.locate_cell.case import tree
 

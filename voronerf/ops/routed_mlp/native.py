@@ -15,9 +15,9 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
-from voronerf import native
-from voronerf.custom_op import custom_op
-from voronerf.layers import MLP
+from voronerf.ops._core import native
+from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.layers import MLP
 from voronerf.ops.cell_sort import native as cell_sort
 from voronerf.ops.grouped_mlp import by_torch
 from voronerf.ops.grouped_mlp import native as grouped_mlp

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.checks import check_range
-from voronerf.layers import MLP
+from voronerf.ops._core.checks import check_range
+from voronerf.ops._core.layers import MLP
 from voronerf.ops.cell_sort.reference import cell_sort
 from voronerf.ops.grouped_mlp.reference import check_direction_index, grouped_mlp
 from voronerf.ops.locate_cell.reference import locate_cell

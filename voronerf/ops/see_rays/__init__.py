@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import Implementation
-from voronerf.checks import (
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import Implementation
+from voronerf.ops._core.checks import (
     LIKE_FIRST,
     Checked,
     check_choice,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.grids import HashGrid
-from voronerf.layers import DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.ops.cases import Arguments, Case, Draw
+from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops._core.grids import HashGrid
+from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 _GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
 

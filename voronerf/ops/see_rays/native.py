@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf import native
+from voronerf.ops._core import native
 from voronerf.ops.composite.native import composite
 from voronerf.ops.grouped_mlp import native as grouped_mlp
 from voronerf.ops.grouped_mlp.layer_table import Given, in_float32, table_of

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf import backends
-from voronerf.backends import Implementation
-from voronerf.checks import INDEX, LIKE_FIRST, Checked, detached
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import Implementation
+from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, detached
 
 _OP = backends.declare("sighting_gradient", native=Implementation(("cpu",), (torch.float32,)))
 

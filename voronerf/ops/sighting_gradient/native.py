@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from voronerf import native
+from voronerf.ops._core import native
 from voronerf.ops.sighting_gradient.reference import NEARBY
 
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from voronerf.custom_op import Op
-from voronerf.derivatives import register_derivatives
+from voronerf.ops._core.custom_op import Op
+from voronerf.ops._core.derivatives import register_derivatives
 from voronerf.ops.spherical_harmonics.reference import spherical_harmonics
 
 

@@ -1,0 +1,358 @@
+"""The command line as a user meets it: commands, files, and one line for everything that can go wrong."""
+
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import imageio_ffmpeg
+import pytest
+from cli_commands import TINY, words
+from helpers import python, read_json
+from PIL import Image
+
+from voronerf.app.cli import commands, main
+from voronerf.app.cli.main import COMMANDS
+from voronerf.app.render.paths import CameraPath, write_camera_path
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train.checkpoint import load_checkpoint
+from voronerf.app.train.trainer import Trainer
+from voronerf.nerf import orbit_cameras
+
+
+def succeeds(*parts):
+    assert main(words(*parts)) == 0
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "tiny"
+    succeeds("train --data builtin --out", out, TINY)
+    return out
+
+
+def test_train_writes_the_run_directory(run):
+    names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
+    assert {"config.json", "metrics.jsonl", "summary.json", "checkpoints/last.safetensors", "plots/psnr.png"} <= names
+    (panel,) = (run / "images").glob("*.png")
+    width, height = Image.open(panel).size
+    assert width >= 5 * 16 and height >= 16
+    summary = read_json(run / "summary.json")
+    assert {"psnr", "ssim", "seconds", "steps", "rays_per_second", "parameters", "stages"} <= summary.keys()
+
+
+def test_eval_scores_every_view(run, capsys, fails):
+    succeeds("eval", run, "--views 3 --panels 2")
+    result = read_json(run / "eval.json")
+    assert len(result["views"]) == 3
+    assert result["psnr"] == pytest.approx(sum(v["psnr"] for v in result["views"]) / 3)
+    output = capsys.readouterr().out
+    assert all(v["name"] in output for v in result["views"])
+    assert result["lpips"] is None and result["psnr_of_mean_error"] <= result["psnr"]
+    assert "LPIPS is not computed, images of 16 x 16 are below AlexNet's smallest, 31 x 31" in " ".join(output.split())
+    fails("--lpips must be off or come with larger images", "eval", run, "--lpips", run)
+    fails("nowhere: there is no such file or folder", "eval", run, "--lpips nowhere")
+
+
+@pytest.mark.parametrize("options", ["--samples 4", "--occupancy", "--blend 0.3"])
+def test_pictures_and_videos(run, tmp_path, options):
+    scores = []
+    for given in ("", options):
+        succeeds("eval", run, "--views 1 --panels 1", given)
+        scores.append(read_json(run / "eval.json")["psnr"])
+    assert scores[0] != scores[1] or options == "--occupancy"
+    path = tmp_path / "turn.mp4"
+    succeeds("render", run, "--frames 3 --out", path, options)
+    frames = imageio_ffmpeg.read_frames(str(path))
+    assert next(frames)["size"] == (16, 16) and len(list(frames)) == 3
+
+
+def test_videos_along_a_path(run, tmp_path, fails):
+    succeeds("render", run, "--spiral --frames 2")
+    assert (run / "spiral.mp4").stat().st_size
+    frames = orbit_cameras(3, radius=3, elevation=10, width=24, height=20, focal=25)
+    file = tmp_path / "flight.json"
+    write_camera_path(file, CameraPath(frames, fps=5))
+    for options, size in (("", (24, 20)), ("--downscale 2", (12, 10))):
+        succeeds("render", run, "--path", file, options)
+        video = imageio_ffmpeg.read_frames(str(run / "flight.mp4"))
+        described = next(video)
+        assert (described["size"], described["fps"], len(list(video))) == (size, 5, 3)
+    fails("--spiral must be off with --path", "render", run, "--spiral --path", file)
+    fails("flight.json", "render", run, "--path", tmp_path / "no" / "flight.json")
+    fails("--fps must be 0.01 to 1000, got 0", "render", run, "--fps 0")
+    file.write_text("{}")
+    fails("flight.json: is not a camera path", "render", run, "--path", file)
+
+
+def test_settings_of_a_file(run, tmp_path, fails):
+    again = tmp_path / "again"
+    succeeds("train --config", run / "config.json", "--seed 3 --out", again)
+    first, second = (json.loads((folder / "config.json").read_text()) for folder in (run, again))
+    assert {name for name in first if first[name] != second[name]} == {"seed", "out"}
+    fails("there is no such file", "train --config", tmp_path / "none.json")
+    (tmp_path / "bad.json").write_text('{"cels": [3]}')
+    fails("not a configuration of this version", "train --config", tmp_path / "bad.json")
+    fails("--config must be left out with --resume", "train --resume --config", run / "config.json", "--out", run)
+
+
+def test_exports_of_a_run(run, tmp_path, capsys, fails):
+    pytest.importorskip("trimesh", reason="trimesh is not installed")
+    pytest.importorskip("skimage", reason="scikit-image is not installed")
+    frames = orbit_cameras(2, radius=3, elevation=10, width=8, height=8, focal=9)
+    write_camera_path(tmp_path / "flight.json", CameraPath(frames, fps=5))
+    files = [tmp_path / name for name in ("mesh.glb", "cells.glb", "flight.mp4")]
+    options = f"--resolution 8 --density 0.01 --path {tmp_path / 'flight.json'}"  # of a run of a few steps
+    succeeds("export", run, "--mesh", files[0], "--cells", files[1], "--video", files[2], options)
+    assert all(file.stat().st_size for file in files)
+    assert "3 of 3 cells" in capsys.readouterr().out
+    fails("no surface in the box", "export", run, "--crop 9 9 9 9.5 9.5 9.5 --points", tmp_path / "points.ply")
+    fails("export needs a file: --splat, --points, --mesh", "export", run)
+    fails("the file must end in .glb", "export", run, "--cells cells.stl")
+    fails("--crop must be x y z of a corner and of", "export", run, "--crop 0 0 0 1 1 0 --mesh", files[0])
+
+
+def test_info_names_every_backend(capsys):
+    succeeds("info")
+    output = capsys.readouterr().out
+    for word in ("torch", "reference", "native", "warp", "nearest_centre", "grouped_mlp", "resample"):
+        assert word in output
+
+
+@pytest.mark.warp
+def test_preload_compiles_into_the_cache_of_ones_choice(tmp_path):
+    # In a process of its own, since Warp reads the place once; one file of kernels, since all take a while.
+    code = (
+        "import pkgutil, sys; every = pkgutil.iter_modules; "
+        "pkgutil.iter_modules = lambda path: [m for m in every(path) if m.name in ('observe_occupancy', '_launch')]; "
+        "from voronerf.app.cli import main; sys.exit(main(['preload']))"
+    )
+    said = python("-c", code, env={**os.environ, "WARP_CACHE_PATH": str(tmp_path / "cache")})
+    assert "observe_occupancy" in said and "1 files in" in said and str(tmp_path) in said
+    assert any("observe_occupancy" in str(path) for path in (tmp_path / "cache").rglob("*"))
+
+
+def test_resume_needs_no_setting_again(run, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    # Twice longer, then from a number of steps to a time, and back.
+    for given, steps, budget in (
+        (f"--out {copy} --steps 20", 20, None),
+        (f"--out={copy} --steps 22", 22, None),
+        (f"--out={copy} --budget=0.001", None, 0.001),
+        (f"--out={copy} --steps 24", 24, None),
+    ):
+        succeeds("train --resume", given)
+        config = read_json(copy / "config.json")
+        assert (config["steps"], config["budget"], config["width"]) == (steps, budget, 8)
+        assert steps is None or read_json(copy / "summary.json")["steps"] == steps
+
+
+def test_folders_with_brackets_and_spaces_are_told_as_they_are(run, tmp_path, capsys):
+    copy = tmp_path / "toys[old] :dog: 2"
+    shutil.copytree(run, copy)
+    succeeds("eval", copy, "--views 1 --panels 0")
+    assert f"wrote {copy / 'eval.json'}" in capsys.readouterr().out
+
+
+def test_demo_compares_two_runs(tmp_path, capsys, monkeypatch, fails):
+    # A step takes ten milliseconds however busy the machine is.
+    ticks = itertools.count()
+    monkeypatch.setattr("voronerf.app.train.trainer.time", SimpleNamespace(perf_counter=lambda: 0.0101 * next(ticks)))
+    monkeypatch.setattr("voronerf.app.cli.demo.PICTURE", 32)
+    monkeypatch.setattr("voronerf.app.cli.demo.FRAME", 16)
+    monkeypatch.setattr("voronerf.app.cli.demo.FRAMES", 4)
+    for _ in range(2):  # in the place of the first
+        succeeds("demo --budget 0.3 --size 16 --blocks 1 --cells 3 --out", tmp_path)
+    output = capsys.readouterr().out
+    results = {name: read_json(tmp_path / name / "summary.json") for name in ("one", "cells")}
+    assert (results["one"]["cells"], results["cells"]["cells"]) == (1, 3)
+    for result in results.values():
+        assert result["views"] == 4 and f"{result['psnr']:.2f} dB, SSIM {result['ssim']:.3f}" in output
+    gain = results["cells"]["psnr"] - results["one"]["psnr"]
+    assert f"3 cells are {abs(gain):.2f} dB {'better' if gain >= 0 else 'worse'}" in output
+    assert f"{abs(1 - 10 ** (-gain / 10)):.0%} {'less' if gain >= 0 else 'more'} squared error" in output
+    with Image.open(tmp_path / "wipe.png") as picture:
+        assert picture.width > 2 * 32
+    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "wipe.mp4"))[0] == 4
+    config = read_json(tmp_path / "cells" / "config.json")
+    assert (config["data"], config["downscale"]) == ("builtin-city:1x1", 6)  # 100 // 6 = 16, for who resumes it
+    fails("--size must be 100 over a whole number", "demo --size 60")
+    fails("--cells must be at least 2", "demo --cells 1 --out", tmp_path / "x")
+    fails("blocks must be 1 to 32, got 0", "demo --blocks 0 --out", tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+def test_help_has_units(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["train", "--help"])
+    output = capsys.readouterr().out
+    flags = "data downscale budget steps out seed field width cells split-at backend device"
+    assert stop.value.code == 0 and "seconds" in output and all(f"--{flag}" in output for flag in words(flags))
+
+
+def test_bad_input_is_one_line(run, tmp_path, fails):
+    out = tmp_path / "out"
+    small = "--downscale 20 --out", out
+    fails("there is no such folder", "train --data", tmp_path / "none", *small)
+    fails("is not a scene", "train --data", tmp_path, *small)
+    fails("--cells must be at least 2", "train --cells 0", *small)
+    fails("--device must name a device", "train --device gpu", *small)
+    fails("must not hold a run already", "train --downscale 20 --out", run)
+    fails("--resume needs a checkpoint in --out: there is nothing to resume in", "train --resume", *small)
+    fails("--resume needs --out", "train --resume")
+    fails("there is no checkpoint", "eval", tmp_path)
+    fails("there is no checkpoint", "render", out)
+    fails("--frames must be at least 1, got 0", "render", run, "--frames 0")
+    fails("a video must end in", "render", run, "--out", tmp_path / "turn")
+    fails("--views must be at least 1, got 0", "eval", run, "--views 0")
+    fails("--samples must be at least 1, got 0", "eval", run, "--samples 0")
+    fails("--panels must not be negative", "eval", run, "--panels -1")
+    fails("--blend must be a distance of 0 or more, got -1.0", "eval", run, "--blend -1")
+    fails("--device must name a device that is present, got 'cuda:99'", "preload --device cuda:99")
+    fails(
+        "a checkpoint of another configuration: --lr ", "train --data builtin --out", run, "--resume", TINY, "--lr 0.1"
+    )
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("\x1b]0;owned\x07", r"\x1b]0;owned\x07"),
+        ("\x9b2Jx", r"\x9b2Jx"),
+        ("a\u202egnp", r"a\u202egnp"),
+        ("\udc80", r"\udc80"),
+        ("x" * 10_000, "xxx ... xxx"),
+        ("é", "é"),
+    ],
+)
+def test_what_files_say_is_shown_and_not_obeyed(tmp_path, capsys, name, shown):
+    frame = {"file_path": name, "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 9, "frames": [frame]}))
+    assert main(["train", "--data", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert shown in said and str(tmp_path) in said and len(said) < 1000 and said[:-1].isprintable()
+
+
+def test_arguments_that_a_terminal_would_obey(fails):
+    fails("arguments must have no control characters, got \\x1b[2J", "train --balance \x1b[2J")
+
+
+def test_a_failed_run_leaves_its_folder_usable(tmp_path, fails):
+    train = "train --data builtin --out", tmp_path
+    many = TINY.replace("--cells 3", "--cells 400 --reservoir 400 --reservoir-batches 10")
+    fails("more cells than samples", *train, many)
+    (tmp_path / "checkpoints" / "last.safetensors").unlink()
+    succeeds(*train, TINY)
+    assert (tmp_path / "metrics.jsonl").read_text().count("\n") == 2
+
+
+def test_a_full_disk_is_one_line(monkeypatch, tmp_path, fails):
+    whole, calls = os.fsync, []
+
+    def full(descriptor):
+        calls.append(descriptor)
+        if len(calls) > 3:
+            raise OSError(28, "No space left on device")
+        whole(descriptor)
+
+    command = "train --data builtin --out", tmp_path / "x", TINY
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        fails("No space left on device", *command)
+    assert not list(tmp_path.rglob("*.partial"))
+    succeeds(*command)
+
+
+def no_memory_to_import() -> int:
+    raise SystemError("error return without exception set")
+
+
+def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, fails):
+    monkeypatch.chdir(tmp_path)
+    train = f"train --data builtin --device cpu {TINY}"
+    for message, given in (
+        ("--width 1000000 with 3 cells needs", "--width 1000000"),
+        ("--parameters 1000000000000 needs", f"--field kilonerf --parameters {10**12}"),
+        ("--rays 1000000000 with 8 samples needs", "--rays 1000000000"),
+        ("--rays 64 with 1000000000 samples needs", "--samples 1000000000"),
+        ("samples needs 1180591620717411303424.0 GiB of memory or more", f"--samples {10**400}"),
+        ("--reservoir 1000000000000 needs", "--reservoir 1000000000000"),
+        ("--reservoir-batches 1000000000000 needs", "--reservoir-batches 1000000000000"),
+    ):
+        fails(message, train, given)
+    monkeypatch.setattr("voronerf.app.train.networks.SAMPLE_BYTES", 0)
+    fails("count must be at most 2147483647, got 8000000000000", train, "--rays 8000000000000")
+    monkeypatch.setitem(COMMANDS, "info", no_memory_to_import)
+    fails("not enough memory; try a smaller --width", "info")
+    assert [path.name for path in tmp_path.iterdir()] in ([], ["runs"]) and not list(tmp_path.glob("runs/*"))
+
+
+def test_image_names_that_are_too_long_for_panels(tmp_path, monkeypatch, fails):
+    def scene(name):
+        whole = builtin_scene(16, test_views=1)
+        return lambda *_, **__: replace(whole, test=replace(whole.test, names=(name,)))
+
+    monkeypatch.setattr(commands, "load_scene", scene("x" * 252))
+    fails("--panels must be 0 with image names of more than 251 bytes, got xxx", "train --out", tmp_path / "a", TINY)
+    assert not (tmp_path / "a").exists()
+    monkeypatch.setattr(commands, "load_scene", scene("x" * 251))
+    succeeds("train --out", tmp_path / "a", TINY)
+    assert (tmp_path / "a" / "images" / f"{'x' * 251}.png").is_file()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_signals_leave_a_usable_checkpoint(tmp_path, monkeypatch, capsys):
+    """SIGTERM in a process of its own, the others in this one."""
+    last, steps = tmp_path / "checkpoints" / "last.safetensors", [0]
+
+    def leaves_a_checkpoint(status, output):
+        assert status == 130 and "Traceback" not in output and "--resume" in output, output
+        summary = read_json(tmp_path / "summary.json")
+        assert not summary["complete"] and load_checkpoint(last).values["step"] == summary["steps"] > steps[-1]
+        steps.append(summary["steps"])
+
+    endless = TINY.replace("--steps 16", "--steps 100000 --checkpoint-every 0.2")
+    command = [sys.executable, "-m", "voronerf.app.cli.main", *words("train --data builtin --out", tmp_path, endless)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    deadline = time.monotonic() + 600
+    while not last.exists():
+        assert time.monotonic() < deadline and process.poll() is None, process.stdout and process.stdout.read()
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    output = process.communicate(timeout=600)[0].decode()
+    leaves_a_checkpoint(process.returncode, output)
+
+    train_step = Trainer.train_step
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
+        monkeypatch.setattr(Trainer, "train_step", lambda t, n=number: (signal.raise_signal(n), train_step(t))[1])
+        before = signal.signal(number, signal.SIG_DFL)  # nohup, and the background of a shell, ignore some
+        try:
+            leaves_a_checkpoint(main(words("train --resume --out", tmp_path)), "".join(capsys.readouterr()))
+        finally:
+            signal.signal(number, before)
+    succeeds("eval", tmp_path, "--views 1 --panels 0")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_a_second_signal_ends_at_once(tmp_path, monkeypatch, capsys):
+    def interrupted(trainer):
+        signal.raise_signal(signal.SIGUSR1)
+        assert trainer.stopped
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Trainer, "train_step", interrupted)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests without it
+    try:
+        assert main(words("train --data builtin --out", tmp_path, TINY)) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert "voronerf: interrupted" in capsys.readouterr().err
+    assert not (tmp_path / "checkpoints").exists()

@@ -1,0 +1,117 @@
+"""Scenes written to folders, as Blender's and as captures."""
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from voronerf.app.scenes.lenses import MODELS
+
+Contents = dict[str, Any]
+
+
+def write_blender(folder, scene, angle):
+    """Writes a scene the way Blender's are stored."""
+    for name, split in (("train", scene.train), ("test", scene.test)):
+        (folder / name).mkdir(parents=True)
+        frames = []
+        for index, pose in enumerate(split.cameras.poses):
+            Image.fromarray(split.images[index].numpy()).save(folder / name / f"r_{index}.png")
+            frames.append({"file_path": f"./{name}/r_{index}", "transform_matrix": pose.tolist()})
+        (folder / f"transforms_{name}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+
+
+def write_capture(folder, cameras, **entries):
+    """A capture whose image i is of grey i; its frames are listed from the last to the first."""
+    folder.mkdir(exist_ok=True)
+    frames = []
+    for index, pose in enumerate(cameras.poses):
+        grey = np.full((cameras.height, cameras.width, 3), index, dtype=np.uint8)
+        Image.fromarray(grey).save(folder / f"{index:02d}.png")
+        frames.append({"file_path": f"{index:02d}.png", "transform_matrix": pose.tolist()})
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 20.0, **entries, "frames": frames[::-1]}))
+
+
+def rewrite(folder, change, name="transforms", **options):
+    """Changes the contents of a file of transforms; returns them."""
+    path = folder / f"{name}.json"
+    contents = json.loads(path.read_text())
+    change(contents)
+    path.write_text(json.dumps(contents), **options)
+    return contents
+
+
+def write_images(folder, sizes, **save):
+    """Image i is of grey i, as JPEG."""
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for index, (width, height) in enumerate(sizes):
+        Image.fromarray(np.full((height, width, 3), index, np.uint8)).save(folder / f"images/{index:02d}.jpg", **save)
+
+
+def quaternion(turn):
+    """(w, x, y, z) of a rotation."""
+    values, vectors = np.linalg.eigh(
+        np.array(
+            [
+                [turn[0, 0] - turn[1, 1] - turn[2, 2], 0, 0, 0],
+                [turn[0, 1] + turn[1, 0], turn[1, 1] - turn[0, 0] - turn[2, 2], 0, 0],
+                [turn[0, 2] + turn[2, 0], turn[1, 2] + turn[2, 1], turn[2, 2] - turn[0, 0] - turn[1, 1], 0],
+                [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1], np.trace(turn)],
+            ]
+        )
+        / 3
+    )
+    x, y, z, w = vectors[:, values.argmax()]
+    return np.array([w, x, y, z])
+
+
+def write_colmap(folder, poses, sizes, points, *, binary=True, lenses=None):
+    """A COLMAP model with a camera for each image, in an order that is not that of the names.
+
+    The cameras are of `lenses`, a model and its parameters each, or of SIMPLE_RADIAL. Every image sees every point.
+    """
+    lenses = lenses or [("SIMPLE_RADIAL", (20.0, 6.0, 5.0, 0.02))] * len(sizes)
+    numbers = {name: number for number, (name, _) in MODELS.items()}
+    (folder / "sparse/0").mkdir(parents=True, exist_ok=True)
+    cameras, images = {}, {}
+    for index, (pose, (width, height), lens) in enumerate(zip(np.asarray(poses, np.float64), sizes, lenses)):
+        turn = (pose[:3, :3] * (1, -1, -1)).T
+        cameras[index + 1] = (width, height, *lens)
+        images[index + 1] = (*quaternion(turn), *(-turn @ pose[:3, 3]), index + 1, f"{index:02d}.jpg")
+    order = sorted(images, reverse=True)
+    seen = [(1.0, 1.0, number) for number in range(len(points))]
+    if not binary:
+        lines = [f"{key} {name} {w} {h} {' '.join(map(repr, p))}" for key, (w, h, name, p) in cameras.items()]
+        (folder / "sparse/0/cameras.txt").write_text("# cameras\n" + "\n".join(lines) + "\n")
+        second = " ".join(f"{x} {y} {number}" for x, y, number in seen)
+        lines = [f"{key} {' '.join(str(x) for x in images[key])}\n{second}" for key in order]
+        (folder / "sparse/0/images.txt").write_text("# images\n" + "\n".join(lines) + "\n")
+        track = " ".join(f"{key} 0" for key in order)
+        lines = [f"{i} {' '.join(map(str, p))} 9 9 9 0.5 {track}" for i, p in enumerate(points)]
+        (folder / "sparse/0/points3D.txt").write_text("\n".join(lines) + "\n")
+        return
+    data = [struct.pack("<Q", len(cameras))]
+    data += [struct.pack(f"<IiQQ{len(p)}d", key, numbers[name], w, h, *p) for key, (w, h, name, p) in cameras.items()]
+    (folder / "sparse/0/cameras.bin").write_bytes(b"".join(data))
+    data = [struct.pack("<Q", len(images))]
+    for key in order:
+        *values, camera, name = images[key]
+        data += [struct.pack("<I7dI", key, *values, camera), name.encode() + b"\0", struct.pack("<Q", len(seen))]
+        data += [struct.pack("<ddq", *sighting) for sighting in seen]
+    (folder / "sparse/0/images.bin").write_bytes(b"".join(data))
+    data = [struct.pack("<Q", len(points))]
+    for index, point in enumerate(points):
+        data += [struct.pack("<Q3d3BdQ", index, *point, 9, 9, 9, 0.5, len(order))]
+        data += [struct.pack("<II", key, 0) for key in order]
+    (folder / "sparse/0/points3D.bin").write_bytes(b"".join(data))
+
+
+def write_llff(folder, poses, size, focal, bounds):
+    """LLFF's file: the axes down, right and backwards, the position, and height, width and focal length."""
+    poses = np.asarray(poses, np.float64)
+    lens = np.broadcast_to(np.array([size[1], size[0], focal]), (len(poses), 3))
+    matrix = np.stack((-poses[:, :3, 1], poses[:, :3, 0], poses[:, :3, 2], poses[:, :3, 3], lens), axis=-1)
+    rows = np.concatenate((matrix.reshape(len(poses), 15), np.broadcast_to(bounds, (len(poses), 2))), axis=1)
+    np.save(folder / "poses_bounds.npy", rows)

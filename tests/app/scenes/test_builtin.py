@@ -1,0 +1,158 @@
+"""The built-in scene against its own formulas, and the box that is carved from its masks."""
+
+import numpy as np
+import pytest
+import torch
+from helpers import refuses
+
+from voronerf.app.scenes import builtin_scene, load_scene
+from voronerf.app.scenes.builtin.caster import Caster
+from voronerf.app.scenes.builtin.opaque import bounds, cast
+from voronerf.app.scenes.builtin.opaque_solids import SOLIDS
+from voronerf.app.scenes.builtin.solids import Box, Cylinder, Sphere, Torus, rotation
+from voronerf.app.scenes.carving import carve_box
+from voronerf.nerf.cameras import Cameras
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return builtin_scene(40)
+
+
+def white(points, normals):
+    return np.ones_like(points)
+
+
+def inside(solid, points):
+    """Whether points are in a solid, from its definition."""
+    local = points - np.array(solid.centre)
+    if solid.turn is not None:
+        local = local @ solid.turn
+    x, y, z = local.T
+    if isinstance(solid, Sphere):
+        return x * x + y * y + z * z < solid.radius**2
+    if isinstance(solid, Box):
+        return (np.abs(local) < solid.half).all(axis=-1)
+    if isinstance(solid, Cylinder):
+        return (np.hypot(x, y) < solid.radius) & (np.abs(z) < solid.half_height)
+    assert isinstance(solid, Torus)
+    return np.hypot(np.hypot(x, y) - solid.ring, z) < solid.tube
+
+
+@pytest.mark.parametrize(
+    "solid",
+    [
+        Sphere((0.1, 0.2, -0.1), white, radius=0.5),
+        Box((0.1, 0.0, 0.2), white, turn=rotation("z", 30), half=(0.3, 0.5, 0.2)),
+        Cylinder((0.0, 0.1, 0.0), white, turn=rotation("x", 50), radius=0.3, half_height=0.4),
+        Torus((0.0, 0.1, 0.1), white, turn=rotation("y", 70), ring=0.4, tube=0.12),
+    ],
+    ids=lambda solid: type(solid).__name__,
+)
+def test_hits_against_marching(solid):
+    generator = np.random.default_rng(0)
+    origins = generator.normal(size=(150, 3))
+    origins = (2 * origins / np.linalg.norm(origins, axis=-1, keepdims=True)).astype(np.float32)
+    directions = generator.normal(size=(150, 3)) * 0.35 - origins
+    directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
+    found, _ = Caster([[solid]])(origins, directions)
+    steps = np.arange(0.5, 3.5, 1e-3)
+    hits = 0
+    for origin, direction, distance in zip(origins, directions, found):
+        within = inside(solid, origin + steps[:, None] * direction)
+        hits += within.any()
+        # a ray may graze for less than a step
+        assert np.isfinite(distance) or within.sum() < 20
+        if within.any() and np.isfinite(distance):
+            first = steps[within][0]
+            assert distance <= first + 1e-3 and (distance > first - 3e-3 or within.sum() < 60)
+    assert 20 < hits < 150
+    seen = np.isfinite(found)
+    points = origins[seen] + found[seen, None] * directions[seen]
+    normals, _ = solid.surface(points)
+    assert np.abs(np.linalg.norm(normals, axis=-1) - 1).max() < 1e-4
+    assert inside(solid, points - 5e-3 * normals).mean() > 0.99
+    assert not inside(solid, points + 5e-3 * normals).any()
+    box = solid.bounds()
+    assert (points >= box[0] - 1e-3).all() and (points <= box[1] + 1e-3).all()
+
+
+def test_every_solid_is_seen_and_in_the_box():
+    box = bounds()
+    for solid in SOLIDS:
+        own = solid.bounds()
+        assert (own[0] >= box[0]).all() and (own[1] <= box[1]).all()
+        above = np.array([solid.centre], dtype=np.float32) + np.array([[0.9, -0.8, 2.5]], dtype=np.float32)
+        aim = solid.bounds().mean(axis=0, keepdims=True) - above
+        _, depth = cast(above, aim / np.linalg.norm(aim))
+        assert np.isfinite(depth).all()
+
+
+def test_pixels_are_the_average_of_their_rays(scene):
+    """A pixel against rays cast by the cameras themselves, 3 x 3 of them."""
+    cameras = scene.test.cameras
+    offsets = (torch.arange(3) + 0.5) / 3
+    for y, x in ((12, 20), (25, 14), (30, 25), (1, 1)):
+        v, u = torch.meshgrid(y + offsets, x + offsets, indexing="ij")
+        rays = cameras.rays(4, u.reshape(-1), v.reshape(-1))
+        colour, depth = cast(rays.origins[:1].numpy(), rays.directions.numpy())
+        expected = colour.mean(axis=0) + 1 - np.isfinite(depth).mean()
+        found = scene.test.truth(4, torch.ones(3))[y, x]
+        assert np.abs(found.numpy() - expected).max() < 2.5 / 255
+
+
+def test_shape_and_determinism(scene):
+    assert scene.train.images.shape == (100, 40, 40, 4) and scene.test.images.shape == (25, 40, 40, 4)
+    assert (scene.near, scene.far, scene.background) == (2, 6, "white")
+    again = builtin_scene(40, train_views=100, test_views=1)
+    assert torch.equal(again.train.images, scene.train.images)
+    alpha = scene.train.images[..., 3]
+    assert 0.3 < float((alpha > 0).float().mean()) < 0.6
+    assert ((alpha > 0) & (alpha < 255)).any()  # edges are smooth
+    colours = scene.train.images[..., :3][alpha == 255].float()
+    assert float(colours.min()) < 20 and float(colours.max()) == 255
+    radius = scene.train.cameras.origins.norm(dim=-1)
+    torch.testing.assert_close(radius, torch.full((100,), 4.0), atol=1e-5, rtol=0)
+    nearest = torch.cdist(scene.test.cameras.origins, scene.train.cameras.origins).amin(-1)
+    assert float(nearest.min()) > 0.02  # no test view is a training view
+
+
+def test_views_differ_by_highlights():
+    """The same point of a glossy solid has another colour from elsewhere."""
+    point = np.array([[0.62, 0.30, -0.10 + 0.359]], dtype=np.float32)
+    colours = []
+    for eye in ((-0.6, 1.9, 2.6), (2.6, 0.3, 2.6)):
+        origin = np.array([eye], dtype=np.float32)
+        aim = point - origin
+        colours.append(cast(origin, aim / np.linalg.norm(aim))[0])
+    assert np.abs(colours[0] - colours[1]).max() > 0.02
+
+
+def test_sizes():
+    assert load_scene("builtin", downscale=50).train.images.shape == (100, 2, 2, 4)
+    assert builtin_scene(1, train_views=1, test_views=1).train.images.shape == (1, 1, 1, 4)
+    refuses("size must be >= 1, got 0", builtin_scene, 0)
+    refuses("at least one view", builtin_scene, 4, train_views=0)
+
+
+def test_carved_box_holds_the_scene_and_is_tight(scene):
+    """One wrong mask does not cut it."""
+    masks = scene.train.images[..., 3]
+    wrong = masks.clone()
+    wrong[50] = 0
+    for alpha in (wrong, masks):
+        box = carve_box(scene.train.cameras, alpha, 2.0, 6.0)
+        assert box is not None and scene.box is not None
+        assert (box[0] <= scene.box[0]).all() and (box[1] >= scene.box[1]).all()
+    sides = float((scene.box[1] - scene.box[0]).max())
+    assert (box[1] - scene.box[1]).max() < 0.12 * sides
+    # below the plinth no view from above can carve everything
+    assert (scene.box[0] - box[0])[:2].max() < 0.12 * sides and (scene.box[0] - box[0])[2] < 0.5 * sides
+
+
+def test_no_box_without_silhouettes(scene):
+    cameras, alpha = scene.train.cameras, scene.train.images[..., 3]
+    assert carve_box(cameras, torch.zeros_like(alpha), 2.0, 6.0) is None
+    assert carve_box(cameras, torch.full_like(alpha, 255), 2.0, 6.0) is None
+    parallel = Cameras(torch.eye(4).repeat(100, 1, 1), cameras.intrinsics, 40, 40)
+    assert carve_box(parallel, alpha, 2.0, 6.0) is None

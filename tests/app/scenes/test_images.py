@@ -1,0 +1,115 @@
+"""Decoding and downscaling, against slow averages."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from helpers import python, refuses
+from PIL import Image
+
+from voronerf.app.scenes import SceneError, images
+from voronerf.app.scenes.images import area_average, read_image, read_images
+
+
+def test_area_average_is_that_of_the_composited_image():
+    generator = np.random.default_rng(0)
+    image = generator.integers(0, 256, (13, 10, 4), dtype=np.uint8)
+    image[:6, :, 3] = generator.choice((0, 255), (6, 10))
+    small = area_average(image, 3)
+    assert small.shape == (4, 3, 4)
+    for background in (0.0, 1.0):
+        values = image.astype(np.float64) / 255
+        over = values[..., :3] * values[..., 3:] + background * (1 - values[..., 3:])
+        found = small.astype(np.float64) / 255
+        found = found[..., :3] * found[..., 3:] + background * (1 - found[..., 3:])
+        for y in range(4):
+            for x in range(3):
+                block = over[3 * y : 3 * y + 3, 3 * x : 3 * x + 3].reshape(9, 3).mean(axis=0)
+                assert np.abs(found[y, x] - block).max() <= 1.01 / 255
+
+
+def test_area_average_does_not_bleed_hidden_colours():
+    image = np.zeros((2, 2, 4), dtype=np.uint8)
+    image[0, 0] = (200, 100, 50, 255)
+    image[1, 1] = (0, 255, 0, 0)  # transparent green
+    assert area_average(image, 2)[0, 0].tolist() == [200, 100, 50, 64]
+
+
+def test_opaque_average_and_identity():
+    image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    assert area_average(image, 1) is image
+    assert np.array_equal(area_average(image, 4)[0, 0], np.rint(image.reshape(16, 3).mean(axis=0)))
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 6, 8, 12, 16])
+@pytest.mark.parametrize("size", [(48, 64), (53, 67)])
+def test_jpeg_reduction_is_the_area_average(tmp_path, factor, size):
+    height, width = size
+    y, x = np.mgrid[:height, :width]
+    smooth = np.stack((127 + 100 * np.sin(x / 9), 127 + 100 * np.cos(y / 7), x + y), axis=-1).astype(np.uint8)
+    path = tmp_path / "a.jpg"
+    Image.fromarray(smooth).save(path, quality=97, subsampling=0)
+    found = read_image(path, factor)
+    expected = area_average(smooth, factor)
+    assert found.shape == expected.shape == (height // factor, width // factor, 3)
+    assert np.abs(found.astype(int) - expected.astype(int)).mean() < 2
+
+
+@pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("RGBA", 4), ("L", 3), ("LA", 4), ("P", 3), ("1", 3)])
+def test_modes(tmp_path, mode, channels):
+    path = tmp_path / "a.png"
+    Image.new("RGB", (5, 4), (255, 255, 255)).convert(mode).save(path)
+    pixels = read_image(path, 1)
+    assert pixels.shape == (4, 5, channels)
+    assert (pixels == 255).all()
+
+
+def test_one_image_with_alpha_gives_all_alpha(tmp_path):
+    paths = [tmp_path / "a.png", tmp_path / "b.png"]
+    Image.new("RGB", (3, 2), (1, 2, 3)).save(paths[0])
+    Image.new("RGBA", (3, 2), (4, 5, 6, 7)).save(paths[1])
+    images, sizes, _ = read_images(paths, 1)
+    assert sizes.tolist() == [[3, 2], [3, 2]]
+    assert images[:, 0, 0].tolist() == [[1, 2, 3, 255], [4, 5, 6, 7]]
+    Image.new("RGB", (2, 3), (7, 8, 9)).save(paths[0])
+    images, sizes, _ = read_images(paths, 1)
+    assert images.shape == (2, 3, 3, 4) and sizes.tolist() == [[2, 3], [3, 2]]
+    assert (images[0, :, :2] == torch.tensor([7, 8, 9, 255])).all() and not images[0, :, 2:].any()
+
+
+@pytest.mark.parametrize("factor", [1, 3])
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_bands_of_rows_are_parts_of_the_whole(tmp_path, monkeypatch, mode, factor):
+    whole = np.random.default_rng(0).integers(0, 256, (53, 37, len(mode)), dtype=np.uint8)
+    Image.fromarray(whole).save(tmp_path / "a.png")
+    monkeypatch.setattr(images, "BAND", 200)
+    assert np.array_equal(read_image(tmp_path / "a.png", factor), area_average(whole, factor))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="units of ru_maxrss")
+def test_large_images_are_reduced_one_after_another(tmp_path):
+    """16 million grey pixels each, which are 48 MB in colour and 192 MB as float32."""
+    for index in range(3):
+        Image.new("L", (4000, 4000), index).save(tmp_path / f"{index}.png")
+    code = (
+        "import resource, sys; from pathlib import Path; from voronerf.app.scenes.images import read_images; "
+        "most = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; before = most(); "
+        "read_images(sorted(Path(sys.argv[1]).glob('*.png')), 100); print(most() - before)"
+    )
+    assert int(python("-c", code, tmp_path)) < 40_000
+
+
+def test_what_does_not_fit_into_memory_is_not_decoded(tmp_path, monkeypatch):
+    paths = [tmp_path / f"{index}.png" for index in range(4)]
+    for path in paths:
+        Image.new("RGB", (100, 50)).save(path)
+    needed = 100 * 50 * (4 * 3 + 550)  # of the images, and of a view while it is scored
+    monkeypatch.setattr(images, "available_memory", lambda: needed / 0.75)
+    assert read_images(paths, 1)[0].shape == (4, 50, 100, 3)
+    monkeypatch.setattr(images, "available_memory", lambda: (needed - 1) / 0.75)
+    message = (
+        "0.png: 4 images of 100 x 50 need 0.00 GiB with --downscale 1, more than 75% of the 0.00 GiB that are free"
+    )
+    refuses(message, read_images, paths, 1, keep="memory", error=SceneError)
+    assert read_images(paths, 2)[0].shape == (4, 25, 50, 3)

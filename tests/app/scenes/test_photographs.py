@@ -1,0 +1,387 @@
+"""Folders of photographs: COLMAP's, LLFF's and nerfstudio's readers, what they share, and what they refuse."""
+
+import json
+import os
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import refuses
+from PIL import Image
+from scene_files import rewrite, write_capture, write_colmap, write_images, write_llff
+
+from voronerf import open_run
+from voronerf.app.evaluate.panels import write_panels
+from voronerf.app.scenes import SceneError, load_scene, photographs
+from voronerf.app.train.batches import RayBatches
+from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.networks import make_routers, resolve_config
+from voronerf.app.train.renderers import make_contraction, make_renderer
+from voronerf.app.train.trainer import Trainer
+from voronerf.nerf.cameras import Cameras, orbit_cameras
+
+DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
+COUNT, SIZE = 9, (12, 10)
+POSES = orbit_cameras(COUNT, radius=4, elevation=20, width=12, height=10, focal=20, centre=(1, 2, 3)).poses
+POINTS = np.random.default_rng(0).normal(size=(60, 3)) * 0.4 + (1, 2, 3)
+
+
+def needs(name):
+    if not (DATA / name).is_dir():
+        pytest.skip(f"{DATA / name} is not there; set VORONERF_DATA to a folder that holds {name}")
+    return DATA / name
+
+
+def write_both(folder, sizes=(SIZE,) * COUNT, *, binary=True, **save):
+    write_images(folder, sizes, **save)
+    write_colmap(folder, POSES, sizes, POINTS, binary=binary)
+    write_llff(folder, POSES, SIZE, 20.0, (2.5, 5.5))
+
+
+def every(scene):
+    """Names and poses of all views, in the order of the names."""
+    rows = [*zip(scene.train.names, scene.train.cameras.poses), *zip(scene.test.names, scene.test.cameras.poses)]
+    return [name for name, _ in sorted(rows)], torch.stack([pose for _, pose in sorted(rows)])
+
+
+@pytest.mark.parametrize(("format", "binary"), [("colmap", True), ("colmap", False), ("llff", True)])
+def test_a_folder_is_read_as_it_was_written(tmp_path, format, binary):
+    write_both(tmp_path, binary=binary)
+    scene = load_scene(tmp_path, format=format, normalise=False)
+    names, poses = every(scene)
+    assert names == [f"{index:02d}" for index in range(COUNT)] and scene.test.names == ("00", "08")
+    torch.testing.assert_close(poses, POSES, atol=1e-5, rtol=0)
+    for split in (scene.train, scene.test):
+        assert [int(image[0, 0, 0]) for image in split.images] == [int(name) for name in split.names]
+    lens = scene.train.cameras.intrinsics[0].tolist()
+    assert lens == pytest.approx([20, 20, 6, 5])
+    bent = scene.train.cameras.distortion
+    assert (bent is None) == (format == "llff") and (bent is None or float(bent[0, 0]) == pytest.approx(0.02))
+    depths = -(torch.from_numpy(POINTS)[None] - POSES[:, None, :3, 3].double()) @ POSES[:, :3, 2:3].double()
+    near, far = (2.5, 5.5) if format == "llff" else (float(depths.min()), float(depths.max()))
+    assert scene.near == pytest.approx(0.75 * near, rel=0.05)
+    assert scene.far == pytest.approx(max(1.5 * far, 4 * scene.contraction.radius), rel=0.05)
+    assert any(f"--format {'colmap' if format == 'llff' else 'llff'} would read" in note for note in scene.notes)
+
+
+def test_the_scene_is_normalised_by_a_similarity_that_it_keeps(tmp_path):
+    write_both(tmp_path)
+    scene, plain = load_scene(tmp_path), load_scene(tmp_path, normalise=False)
+    assert scene.kind == "unbounded" and scene.spacing == "disparity" and scene.box is None
+    _, poses = every(scene)
+    assert float(poses[:, :3, 3].norm(dim=-1).max()) == pytest.approx(1, abs=1e-5)
+    assert float(poses[:, :3, 3].mean(0)[:2].norm()) < 1e-5 and float(poses[0, 2, 3]) > 0  # around z, above
+    homogeneous = torch.cat((POSES[:, :3, 3], torch.ones(COUNT, 1)), dim=1).double()
+    torch.testing.assert_close((homogeneous @ scene.transform.T)[:, :3].float(), poses[:, :3, 3])
+    scale = float(torch.linalg.det(scene.transform[:3, :3])) ** (1 / 3)
+    assert scene.near == pytest.approx(scale * plain.near) and scene.far == pytest.approx(max(scale * plain.far, 4))
+    torch.testing.assert_close(plain.contraction.centre, torch.tensor([1.0, 2, 3]), atol=1e-3, rtol=0)
+    assert plain.contraction.radius == pytest.approx(1 / scale) and scene.contraction.radius == 1
+
+
+def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
+    """Of images of two sizes, reduced; a quarter of the rays ends at points."""
+    write_both(tmp_path, [(48, 40) if index % 2 else (32, 56) for index in range(COUNT)])
+    scene = load_scene(tmp_path, downscale=4)
+    points = torch.from_numpy(POINTS) @ scene.transform[:3, :3].T + scene.transform[:3, 3]
+    config = resolve_config(TrainConfig(), scene)
+    space = make_renderer(config, scene, make_routers(config, "cpu")).sampler.space
+    assert (config.sightings, space.full_gradient) == (0.003, 1.0)
+    assert (config.occupancy, config.occupancy_resolution, config.samples) == (True, 128, 256)
+    assert resolve_config(TrainConfig(budget=60), scene).samples == 128
+    batch = RayBatches(scene, torch.device("cpu"), sightings=True).draw(400, torch.Generator().manual_seed(0))
+    assert len(batch.rays) == 400 and len(batch.seen) == 100
+    rays = batch.rays[300:]
+    apart = torch.cdist(rays.origins + batch.seen[:, None] * rays.directions, points.float()).amin(1)
+    assert bool((apart <= 0.75 * batch.seen / scene.train.cameras.intrinsics[:, :2].min()).all())  # within their pixel
+    seen = sum(
+        int(((places >= 0) & (places < torch.tensor(cameras.size(index)))).all(-1).sum())
+        for cameras in [scene.train.cameras]
+        for index in range(len(cameras))
+        for places, _ in [cameras.project(points.float(), index)]
+    )
+    assert len(scene.train.sightings.pixels) == seen > 100
+    without = replace(scene, train=replace(scene.train, sightings=None))
+    assert resolve_config(TrainConfig(), without).sightings == 0
+    with pytest.raises(ConfigError, match="--sightings needs a COLMAP model with points"):
+        resolve_config(TrainConfig(sightings=0.1), without)
+
+
+@pytest.mark.parametrize(("kind", "turn"), [("forward", 0.0), ("inside-out", 180.0), ("unbounded", 0.0)])
+def test_the_kind_is_told_by_the_cameras_and_can_be_set(tmp_path, kind, turn):
+    poses = POSES.clone()
+    if kind == "forward":
+        poses[:, :3, :3] = torch.eye(3)
+        poses[:, :3, 3] *= 0.1
+    elif kind == "inside-out":
+        poses[:, :3, [0, 2]] *= -1
+    write_images(tmp_path, [SIZE] * COUNT)
+    write_llff(tmp_path, poses, SIZE, 20.0, (2.0, 6.0))
+    scene = load_scene(tmp_path)
+    assert scene.kind == kind and any("--kind" in note for note in scene.notes)
+    if kind == "forward":  # y is ahead, the nearest depth at 1
+        torch.testing.assert_close(scene.train.cameras.forward, torch.tensor([[0.0, 1, 0]]).expand(7, 3))
+        assert scene.near == pytest.approx(0.75)
+    assert load_scene(tmp_path, kind="inside-out").kind == "inside-out"
+    refuses("--kind object needs images with transparent pixels", load_scene, tmp_path, kind="object", error=SceneError)
+
+
+def test_images_of_different_sizes_train_and_are_scored_as_they_are(tmp_path):
+    sizes = [SIZE if index % 2 else (8, 14) for index in range(COUNT)]
+    write_both(tmp_path, sizes)
+    scene = load_scene(tmp_path)
+    cameras = scene.train.cameras
+    assert scene.train.images.shape == (7, 14, 12, 3) and (cameras.width, cameras.height) == (12, 14)
+    for index, name in enumerate(scene.train.names):
+        width, height = sizes[int(name)]
+        assert cameras.size(index) == (width, height) and len(cameras.image_rays(index)) == width * height
+        assert scene.train.truth(index, None).shape == (height, width, 3)
+    batches = RayBatches(scene, torch.device("cpu"))
+    assert len(batches) == sum(w * h for number, (w, h) in enumerate(sizes) if number % 8)
+    batch = batches.draw(500, torch.Generator().manual_seed(0))
+    numbers = (batch.target * 255).round()
+    assert (numbers[:, :1] == numbers).all() and set(numbers[:, 0].tolist()) == {1, 2, 3, 4, 5, 6, 7}
+    for number in (1, 2):
+        origin = cameras.origins[scene.train.names.index(f"{number:02d}")]
+        torch.testing.assert_close(batch.rays.origins[numbers[:, 0] == number][0], origin)
+    assert load_scene(tmp_path, downscale=2).train.cameras.size(1) == (4, 7)
+
+
+def test_masks_leave_pixels_out_of_training_and_scores(tmp_path):
+    write_capture(tmp_path, orbit_cameras(9, radius=2, elevation=5, width=12, height=10, focal=12))
+    mask = np.full((10, 12), 255, np.uint8)
+    mask[:, :6] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    rewrite(tmp_path, lambda contents: [frame.update(mask_path="mask.png") for frame in contents["frames"]])
+    scene = load_scene(tmp_path)
+    assert len(RayBatches(scene, torch.device("cpu"))) == 7 * 60
+    assert torch.equal(scene.test.mask(0), torch.from_numpy(mask > 0))
+    assert int(load_scene(tmp_path, downscale=4).train.masks[0].sum()) == 2  # a block with a black pixel is left out
+    for change, reason in (
+        ({"mask_path": "../mask.png"}, "mask_path must lead to a file in the folder of the scene"),
+        ({"mask_path": "none.png"}, "does not exist"),
+        ({"mask_path": 3}, "mask_path must be a file name, got 3"),
+        ({"mask_path": "small.png"}, "small.png: is 3 x 2 pixels"),
+        ({"mask_path": "black.png"}, "black.png: must leave a pixel"),
+    ):
+        Image.new("L", (12, 10)).save(tmp_path / "black.png")
+        Image.new("L", (3, 2), 255).save(tmp_path / "small.png")
+        rewrite(tmp_path, lambda contents, change=change: contents["frames"][1].update(change))
+        refuses(reason, load_scene, tmp_path, error=SceneError)
+
+
+def test_the_corners_that_a_fisheye_does_not_reach_are_left_out(tmp_path):
+    rig = orbit_cameras(9, radius=2, elevation=5, width=20, height=20, focal=6)
+    write_capture(tmp_path, rig, fl_x=6.0, k1=-0.1, is_fisheye=True)  # the angle t is at 6 (t - 0.1 t^3), at most 7.3
+    scene = load_scene(tmp_path)
+    y, x = torch.meshgrid(torch.arange(20) - 9.5, torch.arange(20) - 9.5, indexing="ij")
+    assert torch.equal(scene.train.masks[0], torch.hypot(x, y) < 7.3)
+    short = {"steps": 4, "cells": (), "width": 8, "rays": 32, "samples": 8, "evaluations": 1}
+    summary = Trainer(TrainConfig(out=tmp_path / "run", **short), scene).run()
+    assert 0 < summary["psnr"] < 100 and 0 < summary["ssim"] < 1
+
+
+def test_nerfstudio_files(tmp_path):
+    """Its applied_transform leads from the original coordinates to those of the file; depth is not used."""
+    write_capture(tmp_path, Cameras(POSES, torch.full((9, 4), 12.0), 12, 10))
+    applied = [[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 2]]
+    rewrite(tmp_path, lambda contents: contents.update(applied_transform=applied))
+    rewrite(tmp_path, lambda contents: [frame.update(depth_file_path="d.png") for frame in contents["frames"]])
+    scene = load_scene(tmp_path, normalise=False)
+    assert scene.transform[:3].tolist() == applied and "its depth images are not used" in scene.notes
+    rewrite(tmp_path, lambda contents: contents.update(applied_transform=[[2, 0, 0, 0]] * 3))
+    refuses("applied_transform is not a pose", load_scene, tmp_path, error=SceneError)
+
+
+@pytest.mark.parametrize("format", ["colmap", "llff", "transforms"])
+def test_pixels_are_taken_as_stored_whatever_the_orientation_tag_says(tmp_path, format):
+    """As COLMAP, LLFF and nerfstudio do: their cameras are those of the stored pixels."""
+    tag = Image.Exif()
+    tag[0x0112] = 6  # turned by a quarter
+    write_both(tmp_path, exif=tag)
+    if format == "transforms":
+        frames = [
+            {"file_path": f"images/{index:02d}.jpg", "transform_matrix": pose.tolist()}
+            for index, pose in enumerate(POSES)
+        ]
+        (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
+    assert load_scene(tmp_path, format=format).train.images.shape == (7, 10, 12, 3)
+
+
+def test_which_folder_of_images_and_by_how_much_they_are_reduced(tmp_path, monkeypatch):
+    write_images(tmp_path, [SIZE] * COUNT)
+    write_llff(tmp_path, POSES, (48, 40), 80.0, (2.5, 5.5))
+    (tmp_path / "images").rename(tmp_path / "images_4")
+    for downscale, width in ((1, 12), (4, 12), (8, 6)):
+        cameras = load_scene(tmp_path, downscale=downscale).train.cameras
+        assert cameras.width == width and float(cameras.intrinsics[0, 0]) == pytest.approx(20 * width / 12)
+    monkeypatch.setattr(photographs, "LONGEST_SIDE", 5)  # the images have 12 pixels a side, images_4 says 48
+    scene = load_scene(tmp_path)
+    assert scene.train.cameras.width == 4 and any("images are reduced by 3, to 4 x 3" in note for note in scene.notes)
+    refuses("--downscale must be 1 or a multiple of 4, got 6", load_scene, tmp_path, downscale=6, error=SceneError)
+    (tmp_path / "images_4/00.jpg").unlink()
+    refuses("has poses of 9 images", load_scene, tmp_path, error=SceneError)
+
+
+def test_a_forward_facing_scene_fills_the_cube_of_its_contraction(tmp_path):
+    poses = POSES.clone()
+    poses[:, :3, :3] = torch.eye(3)
+    poses[:, :3, 3] *= 0.1
+    write_images(tmp_path, [SIZE] * COUNT)
+    write_llff(tmp_path, poses, SIZE, 20.0, (2.0, 6.0))
+    for normalise in (True, False):
+        scene = load_scene(tmp_path, normalise=normalise)
+        assert resolve_config(TrainConfig(), scene).contraction == "ndc"
+        space = make_contraction(scene, "ndc")
+        places = []
+        for index in range(7):
+            rays = scene.train.cameras.image_rays(index)
+            ends = torch.linspace(scene.near * 1.2, scene.far, 5)[:, None, None]
+            places.append(space.points(rays.origins + ends * rays.directions).reshape(-1, 3))
+        low, high = torch.cat(places).aminmax(dim=0)
+        assert (low > -1.001).all() and (high < 1.001).all() and (high - low > 1.4).all()
+    again = load_scene(tmp_path, downscale=5)  # drops pixels at the border
+    assert space.slopes == again.contraction.slopes
+    with pytest.raises(ConfigError, match="--contraction ndc needs a forward-facing scene, "):
+        make_contraction(load_scene(tmp_path, kind="unbounded"), "ndc")
+
+
+def test_a_folder_trains_is_scored_and_opened_again(tmp_path):
+    """With images of two sizes and a mask."""
+    rig = orbit_cameras(9, radius=2, elevation=5, width=12, height=14, focal=12)
+    write_capture(tmp_path / "scene", rig)
+    mask = np.full((14, 12), 255, np.uint8)
+    mask[:7] = 0
+
+    def change(contents):
+        for frame in contents["frames"][::2]:
+            Image.new("RGB", (16, 12), (40, 50, 60)).save(tmp_path / "scene" / frame["file_path"])
+        Image.fromarray(mask).save(tmp_path / "scene/mask.png")
+        contents["frames"][1]["mask_path"] = "mask.png"
+
+    rewrite(tmp_path / "scene", change)
+    short = {"steps": 6, "cells": (2,), "split_at": (0.5,), "width": 8, "rays": 32, "samples": 8, "evaluations": 1}
+    config = TrainConfig(str(tmp_path / "scene"), out=tmp_path / "run", kind="inside-out", normalise=False, **short)
+    scene = load_scene(config.data, **config.reading)
+    trainer = Trainer(config, scene)
+    summary = trainer.run()
+    (path, *_) = write_panels(trainer.renderer, trainer.router.diagram, scene, tmp_path, views=2)
+    assert path.is_file()
+    run = open_run(config.out, data=config.data)
+    assert run.scene.kind == "inside-out" and run.scene.near == scene.near
+    assert run.evaluate()["psnr"] == pytest.approx(summary["psnr"])
+    assert run.render(0).colour.shape == scene.test.truth(0, None).shape
+
+
+def broken(path, at, layout, *values):
+    data = bytearray(path.read_bytes())
+    struct.pack_into(layout, data, at, *values)
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda model: broken(model / "images.bin", 0, "<Q", 2**60), "images.bin: is cut short or broken: 11529215"),
+        (lambda model: broken(model / "images.bin", 8 + 64 + 7, "<Q", 2**40), "sightings do not fit into"),
+        (lambda model: broken(model / "points3D.bin", 0, "<Q", 10**6), "points3D.bin: is cut short or broken: 1000000"),
+        (lambda model: broken(model / "images.bin", 12, "<d", np.nan), "image 08.jpg: its pose must be a unit"),
+        (lambda model: broken(model / "cameras.bin", 12, "<i", 77), "camera 1 has model number 77"),
+        (
+            lambda model: broken(model / "cameras.bin", 32, "<d", -1.0),
+            "camera 1 must have a size, finite parameters",
+        ),
+        (lambda model: broken(model / "images.bin", 44, "<d", 1e300), "its pose must be a unit quaternion and a"),
+        (lambda model: broken(model / "images.bin", 8 + 60, "<I", 99), "has camera 99, which cameras.bin has not"),
+        (lambda model: broken(model / "images.bin", 8 + 64, "<6s", b"../../"), "must lie in the folder"),
+        (lambda model: (model / "images.bin").write_bytes((model / "images.bin").read_bytes()[:90]), "is cut short"),
+        (lambda model: (model / "images.bin").write_bytes(bytes(8)), "images.bin: has no images"),
+        (lambda model: (model / "more.bin").symlink_to("/etc/passwd"), "more.bin: must lie in the folder of the scene"),
+        (lambda model: (model.parents[1] / "images/03.jpg").write_bytes(b"no"), "03.jpg: is not an image"),
+        (
+            lambda model: Image.new("RGB", (10, 12)).save(model.parents[1] / "images/03.jpg"),
+            "is 10 x 12 pixels as stored",
+        ),
+    ],
+)
+def test_broken_colmap_folders_are_one_line(tmp_path, damage, reason):
+    write_both(tmp_path)
+    damage(tmp_path / "sparse/0")
+    refuses(reason, load_scene, tmp_path, error=SceneError)
+
+
+def test_numbers_of_points_that_are_none_are_passed_over(tmp_path):
+    """COLMAP writes 2^64 - 1 for a sighting of no point."""
+    write_both(tmp_path, binary=False)
+    model, before = tmp_path / "sparse/0", load_scene(tmp_path)
+    (model / "points3D.txt").write_text((model / "points3D.txt").read_text() + f"{2**63} 1 2 3 0 0 0 1 1 0 2 0 3 0\n")
+    lines = (model / "images.txt").read_text().splitlines()
+    at = next(number for number, line in enumerate(lines) if len(line.split()) >= 30)
+    (model / "images.txt").write_text("\n".join([*lines[:at], f"{lines[at]} 1 2 {2**64 - 1}", *lines[at + 1 :]]) + "\n")
+    after = load_scene(tmp_path)
+    assert torch.equal(before.train.cameras.poses, after.train.cameras.poses)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "reason"),
+    [
+        ("cameras", "1 PINHOLE 12 ten 20 20 6 5", "cameras.txt: line 1 is not that of a camera"),
+        ("cameras", f"1 PINHOLE {10**400} 10 20 20 6 5", "camera 1 must have a size, finite parameters"),
+        ("cameras", "1 PINHOLE 12 10 20 20 6", "camera 1: PINHOLE must have 4 parameters, got 3"),
+        ("images", "1 1 0 0 0 0 0", "images.txt: line 1 is not that of an image"),
+        ("points3D", "7 one 2 3", "points3D.txt: line 1 is not that of a point"),
+    ],
+)
+def test_broken_text_is_one_line(tmp_path, file, text, reason):
+    write_both(tmp_path, binary=False)
+    (tmp_path / f"sparse/0/{file}.txt").write_text(text + "\n")
+    refuses(reason, load_scene, tmp_path, error=SceneError)
+
+
+@pytest.mark.parametrize(
+    ("rows", "reason"),
+    [
+        (np.zeros((9, 16)), "must have 17 numbers for each image, got shape [9, 16]"),
+        (np.full((9, 17), np.nan), "has values that are not finite"),
+        (np.ones((9, 17)), "row 0 is not a pose"),
+        (np.zeros((9, 17), dtype=object), "is no array of NumPy that can be read"),
+    ],
+)
+def test_broken_llff_is_one_line(tmp_path, rows, reason):
+    write_both(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", rows, allow_pickle=True)
+    refuses(reason, load_scene, tmp_path, format="llff", error=SceneError)
+
+
+@pytest.mark.parametrize("header", [(b"}", b" "), (b"(9, 17)", b"(-9,17)"), (b"(9, 17), ", b"(True,17)")])
+def test_an_array_with_a_broken_header_is_one_line(tmp_path, header):
+    write_both(tmp_path)
+    path = tmp_path / "poses_bounds.npy"
+    assert header[0] in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(*header, 1))
+    refuses("is no array of NumPy that can be read", load_scene, tmp_path, format="llff", error=SceneError)
+
+
+def test_formats_and_kinds_are_named(tmp_path):
+    write_both(tmp_path)
+    refuses("format must be colmap or llff, which it has, got blender", load_scene, tmp_path, format="blender")
+    refuses("format must be auto, blender or", load_scene, tmp_path, format="nerf")
+    refuses("kind must be auto, object or", load_scene, tmp_path, kind="outdoor")
+    refuses("builtin: format must be auto and kind auto or object", load_scene, "builtin", kind="forward")
+
+
+@pytest.mark.data
+def test_colmap_and_llff_agree_on_beer():
+    colmap, llff = (every(load_scene(needs("beer"), downscale=16, format=format)) for format in ("colmap", "llff"))
+    assert colmap[0] == llff[0] and len(colmap[0]) == 71
+    torch.testing.assert_close(colmap[1], llff[1], atol=1e-5, rtol=0)
+
+
+@pytest.mark.data
+def test_fern_faces_forward():
+    scene = load_scene(needs("fern"), downscale=24)
+    assert scene.kind == "forward" and scene.train.images.shape == (17, 126, 168, 3)
+    assert scene.near == pytest.approx(0.75) and 5 < scene.far < 10

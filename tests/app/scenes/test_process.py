@@ -1,0 +1,213 @@
+"""`voronerf process` on pictures of two walls with a pattern, and on models that have faults."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from helpers import refuses
+from PIL import Image
+from scene_files import write_images
+
+from voronerf.app.render.video import write_video
+from voronerf.app.scenes import SceneError, load_scene, process
+from voronerf.app.scenes.colmap import read_model
+from voronerf.app.scenes.lenses import colmap_lens
+from voronerf.app.scenes.soundness import camera_faults, lost_cameras
+from voronerf.nerf.cameras import orbit_cameras
+
+pycolmap = pytest.importorskip("pycolmap", reason="voronerf process needs pycolmap")
+COUNT, WIDTH, HEIGHT, FOCAL = 8, 240, 180, 200.0
+
+
+def cameras():
+    return orbit_cameras(40, radius=4.0, elevation=35.0, width=WIDTH, height=HEIGHT, focal=FOCAL)[:COUNT]
+
+
+def pattern(generator):
+    """Grey values [512, 512] with detail of several sizes."""
+    total = np.zeros((512, 512))
+    for size in (16, 32, 64, 128, 256):
+        total += np.kron(generator.normal(size=(size, size)), np.ones((512 // size, 512 // size))) / size**0.25
+    return np.clip(128 + 45 * total, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """A folder of pictures of a floor and a wall behind it."""
+    folder, generator = tmp_path_factory.mktemp("walls"), np.random.default_rng(0)
+    floor, wall, views = pattern(generator), pattern(generator), cameras()
+    back = views.origins.mean(0)[:2] / views.origins.mean(0)[:2].norm()
+    for index in range(COUNT):
+        rays = views.image_rays(index)
+        origin, direction = rays.origins.double(), rays.directions.double()
+        to_floor = (-1 - origin[:, 2]) / direction[:, 2]
+        to_wall = (-2 - origin[:, :2] @ back.double()) / (direction[:, :2] @ back.double())
+        to_floor, to_wall = (torch.where(t > 0, t, 1e3) for t in (to_floor, to_wall))
+        point = (origin + torch.minimum(to_floor, to_wall)[:, None] * direction).numpy()
+        side = point[:, 0] * float(back[1]) - point[:, 1] * float(back[0])
+        u = np.where(to_floor < to_wall, point[:, 0], side)
+        v = np.where(to_floor < to_wall, point[:, 1], point[:, 2])
+        column, row = ((np.clip(x / 8 + 0.5, 0, 0.999) * 512).astype(int) for x in (u, v))
+        grey = np.where(to_floor < to_wall, floor[row, column], wall[row, column])
+        Image.fromarray(grey.reshape(HEIGHT, WIDTH)).convert("RGB").save(folder / f"{index:02} a.png")
+    return folder
+
+
+def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pictures, monkeypatch):
+    monkeypatch.setattr(process, "FEW_IMAGES", 4)  # so that the largest features choose the pairs
+    monkeypatch.setattr(process, "LEAST_SIDE", 64)
+    seen, said = [], []
+
+    def stop(stage, done, total):
+        seen.append(stage)
+        if stage == "matches":
+            raise KeyboardInterrupt
+
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        process.process(pictures, out, progress=stop)
+    assert not (out / "sparse").exists() and set(seen) == {"features", "pairs", "matches"}
+    refuses(
+        "was begun with --max-features 4096, not 500",
+        process.process,
+        pictures,
+        out,
+        max_features=500,
+        error=SceneError,
+    )
+    seen.clear()
+    process.process(pictures, out, say=said.append, progress=lambda *now: seen.append(now))
+    assert "pairs" not in {stage for stage, *_ in seen}  # they were chosen before
+    assert said[-1].startswith(f"wrote {out}: cameras of {COUNT} of {COUNT} images")
+    kept = {"images", "images_2", "sparse", "transforms.json", "colmap"}
+    assert {path.name for path in out.iterdir()} == kept
+    assert Image.open(out / "images_2/00_a.png").size == (WIDTH // 2, HEIGHT // 2)
+    refuses("is a scene already", process.process, pictures, out, error=SceneError)
+
+    images = read_model(out / "sparse/0").images
+    assert abs(images[0].camera.lens.intrinsics[0] / FOCAL - 1) < 0.05
+    found = np.stack([image.pose[:3, 3] for image in images])
+    truth = cameras().origins.double().numpy()
+    steps = [np.linalg.norm(np.diff(places, axis=0), axis=1) for places in (found, truth)]
+    ratio = steps[0] / steps[1]
+    assert ratio.std() / ratio.mean() < 0.05
+
+    scene = load_scene(out)
+    assert len(scene.train) + len(scene.test) == COUNT
+    assert not any("check the cameras" in note for note in scene.notes)
+    other = load_scene(out, format="transforms")
+    torch.testing.assert_close(other.train.cameras.intrinsics, scene.train.cameras.intrinsics)
+    listed = json.loads((out / "transforms.json").read_text())["frames"]
+    for frame, image in zip(listed, images):
+        np.testing.assert_allclose(frame["transform_matrix"], image.pose)
+
+
+def models(tmp_path, monkeypatch, pictures, **found):
+    """Has the mappers find cameras at places [c, 3], or nothing."""
+    asked = []
+
+    def map_images(stages, name):
+        asked.append(name)
+        if found[name] is None:
+            return None
+        origins = found[name]
+        lost = int(lost_cameras(origins).sum())
+        return process.Model(tmp_path, name, [], len(origins) - lost, 0.5, camera_faults(origins))
+
+    monkeypatch.setattr(process, "_match", lambda *_: None)
+    monkeypatch.setattr(process, "_map", map_images)
+    return asked
+
+
+def circle(count=COUNT):
+    angles = torch.arange(count) * (2 * torch.pi / count)
+    return torch.stack((angles.cos(), angles.sin(), 0 * angles), 1).double()
+
+
+def test_a_model_with_faults_is_not_a_scene(tmp_path, monkeypatch, pictures):
+    collapsed = circle() * torch.tensor([1e-6] * (COUNT - 2) + [1.0] * 2)[:, None]
+    asked = models(tmp_path, monkeypatch, pictures, **{"global": collapsed, "incremental": None})
+    said = []
+    with pytest.raises(SceneError, match=r"no sound model of 8 images: the cameras have collapsed.* --matching"):
+        process.process(pictures, tmp_path / "out", say=said.append)
+    assert asked == ["global", "incremental"] and said[-1] == "incremental mapping: no model"
+    assert not (tmp_path / "out/sparse").exists()
+    models(tmp_path, monkeypatch, pictures, **{"global": circle()[:3], "incremental": None})
+    refuses("less than half of the images", process.process, pictures, tmp_path / "out", error=SceneError)
+    models(tmp_path, monkeypatch, pictures, **{"global": None, "incremental": None})
+    refuses("COLMAP finds no model", process.process, pictures, tmp_path / "out", error=SceneError)
+
+
+def test_cameras_far_from_all_others_count_as_missing():
+    origins = circle(40)
+    assert not lost_cameras(origins).any() and camera_faults(origins) == []
+    origins[7] *= 9
+    assert lost_cameras(origins).nonzero().flatten().tolist() == [7]
+    assert camera_faults(origins) == []  # one is not all
+    assert "depths from 0.02 to 3.52e+04" in camera_faults(circle(), torch.tensor([[0.02, 5.0], [1.0, 3.52e4]]))[0]
+    lenses = [colmap_lens("OPENCV", (736, 700, 400, 266, 0.1, 0, p1, 0.01)) for p1 in (0.02, -0.09)]
+    assert [camera_faults(circle(), lenses=[(lens, 800)]) for lens in lenses] == [
+        [],
+        ["a lens is tilted, p1 -0.09 and p2 0.01"],
+    ]
+
+
+def test_a_scene_says_what_is_wrong_with_its_cameras(tmp_path):
+    poses = orbit_cameras(8, radius=4, elevation=20, width=12, height=10, focal=20).poses
+    poses[:6, :3, 3] = poses[0, :3, 3] + 1e-6 * poses[:6, :3, 3]
+    frames = [{"file_path": f"images/{i:02}.jpg", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
+    write_images(tmp_path, [(12, 10)] * 8)
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
+    notes = load_scene(tmp_path).notes
+    assert any(note.startswith("check the cameras: the cameras have collapsed") for note in notes)
+
+
+def test_a_video_is_taken_apart(tmp_path, monkeypatch):
+    shades = torch.arange(20, dtype=torch.uint8).mul(10)[:, None, None, None].expand(20, 10, 12, 3)
+    write_video(tmp_path / "a.mp4", shades.repeat(1, 4, 4, 1), 10)
+    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
+    refuses("no model", process.process, tmp_path / "a.mp4", tmp_path / "out", frames=5, error=SceneError)
+    assert len(list((tmp_path / "out/images").iterdir())) == 5
+
+
+def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):
+    write_images(tmp_path, [(12, 10)] * 2)
+    (tmp_path / "text.mp4").write_text("no video")
+    (tmp_path / "list.mp4").write_text(f"ffconcat version 1.0\nfile {tmp_path}/images/00.jpg\n")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/notes.txt").write_text("keep")
+    before = sorted(tmp_path.rglob("*"))
+    for source, reason in (
+        ("nowhere", "there is no such video or folder"),
+        ("text.mp4", "text.mp4: is no video in a container that is read"),
+        ("list.mp4", "list.mp4: is no video in a container that is read"),
+        ("images", "must have at least 3 images, got 2"),
+    ):
+        refuses(reason, process.process, tmp_path / source, tmp_path / "out", error=SceneError)
+    refuses("full: must not exist yet", process.process, tmp_path / "images", tmp_path / "full", error=SceneError)
+    refuses("matching must be one of auto", process.process, tmp_path, tmp_path / "out", matching="all")
+    refuses("max_features must be at least 100, got 5", process.process, tmp_path, tmp_path / "out", max_features=5)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_image_that_cannot_be_read_is_one_line_and_leaves_nothing(tmp_path, pictures):
+    Image.open(pictures / "01 a.png").save(tmp_path / "whole.jpg")
+    jpeg, png = (tmp_path / "whole.jpg").read_bytes(), (pictures / "01 a.png").read_bytes()
+    for number, (content, reason) in enumerate(
+        (
+            (jpeg[: len(jpeg) // 2], "cannot be read: image file is truncated"),
+            (png[: len(png) // 2], "cannot be read: image file is truncated"),
+            (b"no image" * 9, "is not an image in PNG or JPEG format"),
+            (b"", "is not an image in PNG or JPEG format"),
+            (png[:24] + b"\x10" + png[25:], "has more than 8 bits a channel"),
+            (png[:16] + b"\x7f" + png[17:], "is not an image in PNG or JPEG format"),
+        )
+    ):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        for name in ("00 a.png", "02 a.png", "03 a.png"):
+            (folder / name).write_bytes((pictures / name).read_bytes())
+        (folder / "bad.jpg").write_bytes(content)
+        refuses(f"{folder}/bad.jpg: {reason}", process.process, folder, tmp_path / "out", error=SceneError)
+        assert not (tmp_path / "out").exists()

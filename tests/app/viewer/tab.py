@@ -1,0 +1,162 @@
+"""A browser's tab without a browser: what viser's page sends, and what it is sent."""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+
+import msgspec
+import numpy as np
+import viser
+import zstandard
+from PIL import Image
+from viser.transforms import SO3
+from websockets.sync.client import connect
+
+from voronerf.app.viewer.cameras import FLIP
+
+
+def found(value, buffers):
+    """A value of a message, which may be the number of a buffer behind it."""
+    return buffers[value["__binary_index"]] if isinstance(value, dict) and "__binary_index" in value else value
+
+
+class Tab:
+    """Connects to a viewer, whose thread renders when :meth:`until` waits for something.
+
+    Args:
+        viewer: serves it.
+        cameras: one of them is where it stands at first.
+        index: which.
+        size: of its canvas, width and height.
+        number: how many tabs came before it.
+
+    Attributes:
+        pictures: of the background, uint8 arrays [h, w, 3] in order.
+        gui: properties of the parts of the panel, by label or, for text, by their first words.
+        nodes: what is drawn into the scene, by name.
+        files: what was downloaded, by name.
+    """
+
+    def __init__(self, viewer, cameras, index=0, *, size=(48, 48), number=0) -> None:
+        self.viewer, self.size = viewer, size
+        self.pictures, self.depths, self.gui, self.nodes, self.files, self.notes = [], [], {}, {}, {}, []
+        protocol = f"viser-v{viser.__version__}"
+        self.socket = connect(f"ws://{viewer.host}:{viewer.port}", subprotocols=[protocol], max_size=None)
+        self.number, self.version = number, None
+        self.look(cameras, index)
+
+    def close(self) -> None:
+        self.socket.close()
+
+    def send(self, kind, **values) -> None:
+        self.socket.send(msgspec.msgpack.encode({"type": kind, **values}))
+
+    def look(self, cameras, index=0) -> None:
+        """Goes to a camera; the angle of view is the camera's."""
+        pose = cameras.poses[index].double().numpy()
+        fov = 2 * math.atan(cameras.height / 2 / float(cameras.intrinsics[index, 1]))
+        self.send(
+            "ViewerCameraMessage",
+            wxyz=SO3.from_matrix(pose[:3, :3] @ FLIP).wxyz.tolist(),
+            position=pose[:3, 3].tolist(),
+            fov=fov,
+            near=0.01,
+            far=1000.0,
+            image_height=self.size[1],
+            image_width=self.size[0],
+            look_at=(pose[:3, 3] - pose[:3, 2]).tolist(),
+            up_direction=[0.0, 0.0, 1.0],
+        )
+
+    def set(self, label, value) -> None:
+        """Changes a part of the panel, or presses a button."""
+        self.send("GuiUpdateMessage", uuid=self.gui[label]["uuid"], updates={"value": value})
+
+    def drag(self, name, place, wxyz=(1.0, 0.0, 0.0, 0.0)) -> None:
+        """Drags arrows of the scene to a place, when they are there."""
+        self.until(lambda: name in self.nodes)
+        node = {"name": name, "owner": self.nodes[name].get("owner", "")}
+        self.send("TransformControlsDragStartMessage", **node)
+        self.send("TransformControlsUpdateMessage", wxyz=list(wxyz), position=place, **node)
+        self.send("TransformControlsDragEndMessage", **node)
+
+    def click(self, x, y) -> None:
+        self.send(
+            "ScenePointerMessage",
+            event_type="click",
+            ray_origin=[0.0, 0.0, 0.0],
+            ray_direction=[0.0, 0.0, 1.0],
+            screen_pos=[[x, y]],
+            modifier=None,
+        )
+
+    def read(self) -> None:
+        """Takes what has come."""
+        while True:
+            try:
+                data = self.socket.recv(timeout=0.02)
+            except TimeoutError:
+                return
+            length = int.from_bytes(data[8:16], "little")
+            inner = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + length]))
+            buffers, at = [], 16 + length
+            for size in inner["binaryBufferLengths"]:
+                at += -at % 8
+                buffers.append(data[at : at + size])
+                at += size
+            for message in inner["messages"]:
+                self.take({key: found(value, buffers) for key, value in message.items()})
+
+    def take(self, message) -> None:
+        kind, props = message["type"], message.get("props") or {}
+        if kind == "BackgroundImageMessage" and message["rgb_data"]:
+            self.pictures.append(np.array(Image.open(io.BytesIO(message["rgb_data"]))))
+            self.depths.append(message["depth_data"])
+        elif kind == "GuiUpdateMessage":
+            for part in self.gui.values():
+                if part["uuid"] == message["uuid"]:
+                    part.update(message["updates"])
+        elif kind.startswith("Gui") and "uuid" in message:
+            label = props.get("label") or props.get("_markdown", kind)[:20]
+            self.gui[label] = {
+                "uuid": message["uuid"],
+                "folder": message.get("container_uuid"),
+                "value": message.get("value"),
+                **props,
+            }
+        elif kind == "GuiRemoveMessage":
+            self.gui = {
+                label: part for label, part in self.gui.items() if message["uuid"] not in (part["uuid"], part["folder"])
+            }
+        elif kind == "RemoveSceneNodeMessage":
+            self.nodes = {name: node for name, node in self.nodes.items() if not name.startswith(message["name"])}
+        elif "name" in message and props:
+            self.nodes[message["name"]] = {"kind": kind, "owner": message.get("owner", ""), **props}
+        elif kind == "FileTransferStartDownload":
+            self.files[message["filename"]] = b""
+        elif kind == "FileTransferPart":
+            name = list(self.files)[-1]
+            self.files[name] += message["content"]
+        elif kind == "NotificationShowMessage":
+            self.notes.append(props or message)
+
+    def until(self, done, seconds=20.0):
+        """Lets the viewer render until something holds, and returns it."""
+        end = time.monotonic() + seconds
+        while True:
+            self.viewer.render_next()
+            self.read()
+            found = done()
+            if found:
+                return found
+            assert time.monotonic() < end, f"waited {seconds} s in vain"
+
+    def rest(self):
+        """The sharp picture after a change, when it has come."""
+        client = self.until(lambda: self.viewer.clients.get(self.number))
+        self.until(lambda: client.version != self.version and not (client.wants_sharp or client.wants_coarse))
+        self.version = client.version
+        self.read()
+        return self.pictures[-1]

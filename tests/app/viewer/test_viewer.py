@@ -1,0 +1,623 @@
+"""The viewer, asked as a browser's tab asks it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import shutil
+import socket
+import sys
+import threading
+import time
+from contextlib import closing
+from dataclasses import replace
+from http.client import HTTPConnection
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from helpers import refuses, same
+from PIL import Image
+
+pytest.importorskip("viser", reason="viser is not installed")
+
+import viser
+from tab import Tab
+from websockets.exceptions import ConnectionClosed
+
+from voronerf import Run, open_run
+from voronerf.app.cli import main
+from voronerf.app.cli.opening import crop_box
+from voronerf.app.evaluate.panels import palette
+from voronerf.app.render.paths import CameraPath, read_camera_path, write_camera_path
+from voronerf.app.scenes.record import read_scene
+from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.trainer import Trainer
+from voronerf.app.viewer import Subject, Training, view_run, watch
+from voronerf.app.viewer.cameras import scene_bounds
+from voronerf.app.viewer.pictures import Look, cells_of, render_look
+from voronerf.app.viewer.runs import FILES
+from voronerf.nerf import orbit_cameras
+from voronerf.town import streaming
+from voronerf.town.parts import Similarity
+from voronerf.town.streaming import Pages
+
+
+@pytest.fixture
+def tab(viewer, scene):
+    tab = Tab(viewer, scene.test.cameras)
+    yield tab
+    tab.close()
+
+
+def apart(picture, colour):
+    """Mean difference of a JPEG and the colour [h, w, 3] that it shows, in levels."""
+    shown = (colour.clamp(0, 1) * 255).round().numpy()
+    assert picture.shape == shown.shape
+    return np.abs(picture.astype(float) - shown).mean()
+
+
+def larger(cameras, side):
+    """The same cameras with more pixels."""
+    factor = side / cameras.width
+    return replace(cameras, intrinsics=cameras.intrinsics * factor, width=side, height=side)
+
+
+def test_a_camera_at_rest_sees_what_render_gives(run, scene, tab) -> None:
+    tab.rest()
+    for index, side in ((1, 128), (0, 192)):
+        tab.look(scene.test.cameras, index)
+        tab.set("Pixels", side)
+        assert apart(tab.rest(), run.render(larger(scene.test.cameras, side), index).colour) < 1.5
+    assert min(len(picture) for picture in tab.pictures) < 128  # coarse ones came before
+
+
+def test_a_run_larger_than_its_bound_is_shown_as_a_whole_one(run, scene, tmp_path, monkeypatch) -> None:
+    """`view --memory` of three files, of which two fit: a tab sees what all of them show, whatever it looks at."""
+    monkeypatch.setattr("voronerf.app.viewer.client.SHARP", 128)
+    made, used = [], []
+
+    class Told(Pages):
+        def use(self, name):
+            super().use(name)
+            used.append((name, len(self.held)))
+
+    monkeypatch.setattr("voronerf.app.run.Pages", lambda *given: made.append(Told(*given)) or made[0])
+    thirds = [run.cut(cells, tmp_path / str(cells[0])) for cells in ([0, 1], [2, 3], [4, 5])]
+    whole = Run.join(thirds, tmp_path / "town", frames=[Similarity.of((0.2 * i, 0, 0)) for i in range(3)])
+    bounded = open_run(tmp_path / "town", scene=scene, memory="4G")
+    (pages,) = made
+    assert len(pages.files) == 3 and not pages.reads  # nothing before it is met
+    limit, largest = int(4 * 2**30 * (1 - streaming.SPARE)), max(file.size for file in pages.files.values())
+    monkeypatch.setattr(
+        streaming, "anonymous_bytes", lambda: limit - 2 * largest + sum(file.size for file in pages.held.values())
+    )
+    cameras = larger(scene.test.cameras, 128)
+    with closing(view_run(bounded, port=0)) as viewer, closing(Tab(viewer, scene.test.cameras)) as tab:
+        for index in (0, 1):
+            tab.look(scene.test.cameras, index)
+            shown = whole.render(cameras, index)
+            assert apart(tab.rest(), shown.colour) < 1.5
+        for pane in ("cells", "error", "opacity"):
+            tab.set("Show", pane)
+            picture = tab.rest()
+        assert apart(picture, shown.opacity[..., None].expand(128, 128, 3)) < 1.5
+    assert {name for name, _ in used} == set(pages.files) and max(held for _, held in used) == 2
+    assert pages.reads > 3  # what was dropped came again
+
+
+def test_on_a_phone_the_panel_is_folded_away(viewer, scene, tab):
+    viewer.show_curve([(1.0, 20.0), (2.0, 21.0)])
+    tab.until(lambda: "GuiUplotMessage" in tab.gui)
+    with closing(Tab(viewer, scene.test.cameras, size=(390, 844), number=1)) as phone:
+        phone.until(lambda: "Runs" in phone.gui or "Export" in phone.gui)
+        phone.until(lambda: "GuiUplotMessage" in phone.gui)
+    folder = phone.gui["Controls"]
+    assert folder["folder"] == "root" and folder["expand_by_default"] is False
+    outside = [label for label, part in phone.gui.items() if part["folder"] == "root"]
+    assert outside == ["Controls"] and phone.gui["Show"]["folder"] == phone.gui["GuiUplotMessage"]["folder"]
+    assert "Controls" not in tab.gui and tab.gui["Show"]["folder"] == "root"
+
+
+def test_panes(run, scene, tab) -> None:
+    tab.rest()
+    image = run.render(larger(scene.test.cameras, 128), 0)
+    pictures = {}
+    for pane in ("depth", "opacity", "error", "cells"):
+        tab.set("Show", pane)
+        pictures[pane] = tab.rest()
+    assert apart(pictures["opacity"], image.opacity[..., None].expand(128, 128, 3)) < 1.5
+    solid, near = image.opacity.numpy() > 0.95, torch.nn.functional.max_pool2d(image.opacity[None], 17, 1, 8)[0]
+    empty = near.numpy() < 0.01  # farther from the object than the 8 x 8 blocks in which a JPEG rings
+    assert empty.any() and pictures["depth"][empty].min() > 240 and pictures["depth"][solid].mean() < 200
+    # A pixel of the cells pane has the hue of its leaf.
+    hues = palette(run.diagram.num_cells).numpy().astype(float)
+    leaves = run.diagram.locate(image.heaviest).long().numpy()[solid]
+    shown = pictures["cells"][solid].astype(float)
+    cosine = (hues[leaves] * shown).sum(-1) / np.linalg.norm(hues[leaves], axis=-1) / np.linalg.norm(shown, axis=-1)
+    assert np.mean(cosine > 0.98) > 0.9
+
+
+def test_the_error_of_a_training_view_is_shown_where_the_view_is(run, scene, viewer) -> None:
+    tab = Tab(viewer, scene.train.cameras, 5)
+    tab.rest()
+    tab.set("Show", "error")
+    shown = tab.rest()
+    tab.close()
+    wrong = (run.render(scene.train.cameras, 5).colour.clamp(0, 1) - scene.train.truth(5, torch.ones(3))).abs().mean(-1)
+    brightness = torch.nn.functional.interpolate(
+        torch.from_numpy(shown.astype(np.float32)).mean(-1)[None, None], (24, 24), mode="area"
+    )[0, 0]
+    assert np.corrcoef(wrong.flatten(), brightness.flatten())[0, 1] > 0.8
+
+
+def test_cells_are_described_hidden_and_kept_alone(run, scene, tab) -> None:
+    tab.rest()
+    tab.set("Show", "cells")
+    tab.rest()
+    image = run.render(larger(scene.test.cameras, 128), 0)
+    y, x = divmod(int(torch.where(image.opacity > 0.99, 1 / image.depth, 0).argmax()), 128)
+    leaf = int(run.diagram.locate(image.heaviest[y, x]))
+    info = tab.gui["Click on a cell."]
+
+    def pick(x, y):
+        info["_markdown"] = None
+        tab.click((x + 0.5) / 128, (y + 0.5) / 128)
+        return tab.until(lambda: info["_markdown"])
+
+    text = pick(x, y)
+    assert (
+        f"**Cell {leaf}** of {run.diagram.num_cells}" in text and "samples of the last split" in text and "dB" in text
+    )
+    before = run.diagram.locate(image.heaviest) == leaf
+
+    def shares():
+        """Of the pixels that showed the cell, and of the others that showed something: how many still do."""
+        solid = (image.opacity > 0.95).numpy()
+        now = tab.rest().min(-1) < 235
+        mine = before.numpy() & solid
+        return now[mine].mean(), now[solid & ~mine].mean()
+
+    tab.set("Cell", "hide")
+    hidden = shares()
+    assert pick(x, y) != text
+    tab.set("Cell", "show all")
+    tab.rest()
+    assert pick(x, y) == text
+    tab.set("Cell", "only this")
+    alone = shares()
+    assert hidden[0] < 0.9 and alone[0] > 0.9 and alone[1] < hidden[1]
+    tab.set("Level", 1)
+    tab.rest()
+    assert f"of {int(run.diagram.paths()[:, 0].max()) + 1}" in pick(x, y)
+    assert pick(0, 0) == "Click on a cell."
+
+
+def test_a_crop_leaves_what_is_inside(run, scene, tab) -> None:
+    tab.rest()
+    tab.set("Crop", True)
+    whole = tab.rest()
+    low, high = scene.box.tolist()
+    tab.drag("/crop/high", [*high[:2], (low[2] + high[2]) / 2])
+    part = tab.rest()
+    assert (part[:40].min(-1) < 235).sum() < 0.3 * (whole[:40].min(-1) < 235).sum()
+    assert abs(part[-40:].astype(float) - whole[-40:]).mean() < 3
+
+
+def test_a_crop_is_saved_with_the_run(run, scene, tab, viewer) -> None:
+    tab.rest()
+    tab.set("Crop", True)
+    low, beyond = scene.box[0].tolist(), [-9.0, -9.0, -9.0]
+    tab.drag("/crop/low", [0.1, low[1], low[2]])
+    tab.drag("/crop/high", beyond)  # a corner stays beyond the other
+    client = viewer.clients[0]
+    tab.until(lambda: client.look.crop is not None and client.look.crop[1][0] < 0.3)
+    corners = torch.tensor(client.look.crop)
+    assert bool((corners[0] < corners[1]).all()) and torch.allclose(corners[0], torch.tensor([0.1, *low[1:]]))
+    tab.set("Save crop", True)
+    tab.until(lambda: tab.notes)
+    assert torch.allclose(crop_box(run, "saved"), corners)
+    (run.path / "crop.json").unlink()
+    refuses("--crop saved needs a crop", crop_box, run, "saved", error=ConfigError)
+
+
+def test_a_video_is_exported_inside_of_the_crop(run, scene, tab, viewer) -> None:
+    tab.rest()
+    viewer.clients[0].change(crop=((5.0, 5.0, 5.0), (6.0, 6.0, 6.0)))
+    tab.set("Keyframes", "add")
+    tab.set("Seconds", 1.0)
+    tab.set("File", "video")
+    tab.set("Export", True)
+    (name,) = tab.until(lambda: list(tab.files))
+    file = run.path / "exports" / "video.mp4"
+    assert name.endswith("video.mp4") and file.is_file()
+    frames = list(imageio_ffmpeg.read_frames(str(file)))[1:]
+    assert len(frames) == 24 and min(np.frombuffer(frames[0], np.uint8)) > 240  # nothing is in that box
+    tab.until(lambda: not viewer.busy)
+
+
+def test_an_export_can_be_stopped_and_says_what_is_wrong(run, tab, viewer, monkeypatch) -> None:
+    tab.rest()
+
+    def export(run, file, *, box, track):
+        for number in track(range(1000), "a long work"):
+            if number == 3:
+                tab.set("Stop export", True)
+            assert number < 999
+            time.sleep(0.005)
+
+    def fails(run, file, *, box):
+        raise ConfigError("no such thing")
+
+    monkeypatch.setitem(FILES, "mesh", ("mesh.glb", export))
+    monkeypatch.setitem(FILES, "points", ("points.ply", fails))
+    tab.set("File", "mesh")
+    tab.set("Export", True)
+    tab.until(lambda: "Stopped." in str(tab.gui))
+    tab.set("File", "points")
+    tab.set("Export", True)
+    tab.until(lambda: "no such thing" in str(tab.notes))
+    tab.set("Pixels", 192)
+    assert tab.rest().shape[1] == 192  # it goes on
+
+
+def test_a_run_is_trained_further_and_anew_and_others_are_opened(run, scene, viewer, monkeypatch, tmp_path) -> None:
+    folder = tmp_path / "one"
+    shutil.copytree(run.path, folder)
+    viewer.show(Subject.of(open_run(folder, scene=scene)))
+    viewer.open = lambda path: open_run(path, scene=scene)
+    trained = []
+
+    def train(config, scene):
+        trainer = Trainer(config, scene)
+        training = Training(viewer, trainer)
+        trainer.on_step = training.on_step
+
+        def on_step(now):
+            training.on_step(now)
+            if now.step == first + 5:
+                assert viewer.subject.run is None  # so that nothing can be exported, opened or trained meanwhile
+                tab.until(lambda: "Stop training" in tab.gui)
+                tab.set("Stop training", True)
+            time.sleep(0.01)
+
+        first, trainer.on_step = trainer.step, on_step
+        trained.append(trainer.run())
+        training.close()
+
+    viewer.train = train
+    tab = Tab(viewer, scene.test.cameras)
+    tab.rest()
+    viewer.show(viewer.subject)  # with what can be asked for now
+    tab.until(lambda: "Train" in tab.gui)
+    tab.set("Train", "further")
+    tab.until(lambda: len(trained) == 1 and viewer.subject.run is not None)
+    assert trained[0]["steps"] > 120 and viewer.subject.folder == folder
+    tab.until(lambda: "Train" in tab.gui)
+    tab.set("Cells", 1)
+    tab.set("Train", "anew")
+    tab.until(lambda: len(trained) == 2 and viewer.subject.run is not None)
+    assert viewer.subject.folder == tmp_path / "one-2" and viewer.subject.diagram.num_cells == 1
+    tab.until(lambda: "Open" in tab.gui)
+    tab.set("Open", "one")
+    tab.until(lambda: viewer.subject.folder == folder)
+    tab.rest()
+    tab.close()
+
+
+def test_centres_and_cameras_are_drawn_into_the_scene(run, scene, tab) -> None:
+    tab.rest()
+    assert tab.depths[-1] is None
+    tab.set("Centres", True)
+    tab.rest()
+    tab.set("Cameras", True)
+    tab.rest()
+    assert "/centres" in tab.nodes and sum(name.startswith("/cameras/") for name in tab.nodes) == len(scene.train)
+    assert tab.nodes["/cameras/3"]["_image_data"] is not None
+    depth = np.array(Image.open(io.BytesIO(tab.depths[-1])))[..., :3].astype(np.int64)
+    depth = (depth * np.array((65536, 256, 1))).sum(-1) / 100_000
+    middle = float(run.render(scene.test.cameras, 0).depth[12, 12])
+    assert abs(np.median(depth[60:68, 60:68]) - middle) < 0.3 and depth.max() > 100
+    tab.set("Cameras", False)
+    tab.rest()
+    assert not any(name.startswith("/cameras/") for name in tab.nodes)
+
+
+def test_keyframes_become_a_path_that_render_takes(run, scene, tab, capsys) -> None:
+    tab.rest()
+    for index in (0, 1):
+        tab.look(scene.test.cameras, index)
+        tab.rest()
+        tab.set("Keyframes", "add")
+        tab.until(lambda index=index: f"{index + 1} keyframe" in str(tab.gui["No keyframes."]))
+    tab.set("Seconds", 1.0)
+    tab.set("Save path", True)
+    tab.until(lambda: tab.notes)
+    path = read_camera_path(run.path / "camera_paths" / "path-1.json")
+    assert (len(path.frames), path.fps, path.frames.width) == (24, 24, 128)
+    ends = path.frames.poses[[0, -1]]
+    assert torch.allclose(ends, scene.test.cameras.poses[:2], atol=1e-4)
+    assert torch.allclose(path.keyframes.intrinsics[:, 1] * 24 / 128, scene.test.cameras.intrinsics[:2, 1], rtol=1e-4)
+
+
+def test_keyframes_are_drawn_dragged_and_loaded(run, scene, tab, viewer) -> None:
+    tab.rest()
+    frames = orbit_cameras(5, radius=3.0, elevation=10.0, width=64, height=48, focal=50.0)
+    write_camera_path(run.path / "camera_paths" / "of-nerfstudio.json", CameraPath(frames, 5.0, frames[[0, 2, 4]]))
+    viewer.show(viewer.subject)
+    tab.until(lambda: "of-nerfstudio.json" in str(tab.gui.get("Load path")))
+    tab.set("Load path", "of-nerfstudio.json")
+    tab.until(lambda: "/keyframes/line" in tab.nodes)
+    assert {"/keyframes/0", "/keyframes/1", "/keyframes/2"} <= set(tab.nodes)
+    keyframes = viewer.clients[0].keyframes
+    assert torch.allclose(keyframes.cameras[1].poses, frames.poses[[2]], atol=1e-5)
+    keyframes.select(1)
+    tab.drag("/keyframes/arrows", [0.5, 0.25, 2.0])
+    tab.until(lambda: bool((keyframes.cameras[1].origins == torch.tensor([0.5, 0.25, 2.0])).all()))
+    tab.set("Seconds", 1.0)
+    tab.set("Preview", True)
+    pictures = len(tab.pictures)
+    tab.until(lambda: len(tab.pictures) > pictures)
+    tab.set("Load path", "-")
+    tab.set("Keyframes", "clear")
+    tab.until(lambda: not any(name.startswith("/keyframes/") for name in tab.nodes))
+
+
+def test_a_screenshot_is_the_picture(tab) -> None:
+    tab.rest()
+    tab.set("Screenshot", True)
+    picture = tab.rest()
+    ((name, data),) = tab.until(lambda: [file for file in tab.files.items() if file[1]])
+    assert name.endswith("colour.png")
+    assert np.abs(np.array(Image.open(io.BytesIO(data))).astype(float) - picture).mean() < 1.5
+
+
+def test_each_tab_has_its_own_view_and_a_closed_one_costs_nothing(viewer, scene, tab) -> None:
+    first = tab.rest()
+    other = Tab(viewer, scene.test.cameras, 1, number=1)
+    other.rest()
+    other.set("Show", "opacity")
+    other.rest()
+    count = len(tab.pictures)
+    assert np.array_equal(first, tab.pictures[-1]) and not np.array_equal(first, other.pictures[-1])
+    tab.read()
+    assert len(tab.pictures) == count
+    other.look(scene.test.cameras, 0)
+    other.close()
+    tab.until(lambda: len(viewer.clients) == 1)
+    while viewer.render_next():
+        pass
+
+
+def test_a_camera_may_stand_anywhere(scene, tab) -> None:
+    near = tab.rest()
+    poses = scene.test.cameras.poses.clone()
+    poses[0, :3, 3] *= 3  # beyond where the scene ends for its own cameras
+    tab.look(replace(scene.test.cameras, poses=poses), 0)
+    far = tab.rest()
+    share = (far.min(-1) < 220).sum() / (near.min(-1) < 220).sum()
+    assert 0.06 < share < 0.2
+
+
+def test_cameras_in_a_plane_have_space_around_them(scene) -> None:
+    cameras = orbit_cameras(4, radius=2.0, elevation=0.0, width=8, height=8, focal=9.0)
+    low, high = scene_bounds(replace(scene, box=None, train=replace(scene.train, cameras=cameras)))
+    assert bool((high - low > 1).all()) and bool((low < -2).any()) and bool((high > 2).any())
+
+
+def test_a_canvas_without_pixels_is_passed_over(scene, tab) -> None:
+    picture = tab.rest()
+    tab.size = (0, 0)
+    tab.look(scene.test.cameras, 1)
+    assert np.array_equal(tab.rest(), picture)
+    tab.click(float("nan"), -3.0)
+    tab.until(lambda: tab.viewer.tasks.empty())
+
+
+def test_a_training_is_the_same_with_a_viewer(tmp_path, scene, monkeypatch) -> None:
+    monkeypatch.setattr("voronerf.app.viewer.client.SHARP", 128)
+    settings = {"steps": 40, "cells": (3,), "split_at_steps": (20,), "rays": 128, "samples": 16, "evaluations": 2}
+    plain = Trainer(TrainConfig(out=tmp_path / "plain", **settings), scene)
+    plain.run()
+    watched = Trainer(TrainConfig(out=tmp_path / "watched", **settings), scene)
+    training = watch(watched, port=0)
+    viewer = training.viewer
+    tab = Tab(
+        viewer,
+        scene.test.cameras,
+    )
+    tab.until(lambda: "Show" in tab.gui)
+
+    def on_step(now):
+        if now.step == 10:
+            tab.set("Show", "cells")
+        if now.step == 30:
+            tab.read()
+            tab.set("Pause", True)
+            tab.until(lambda: training.paused)
+            threading.Timer(0.3, tab.set, ("Pause", True)).start()
+        tab.look(scene.test.cameras, now.step % 2)
+        training.on_step(now)
+
+    watched.on_step = on_step
+    watched.run()
+    tab.read()
+    pictures = len(tab.pictures)
+    assert pictures > 5 and "3 cells" in str(tab.gui.values())
+    tab.close()
+    viewer.close()
+    for name, router in plain.routers.items():
+        assert same(dict(router.state_dict()), dict(watched.routers[name].state_dict()))
+    assert [line["psnr"] for line in plain.metrics] == [line["psnr"] for line in watched.metrics]
+
+
+def test_nothing_is_rendered_for_nobody(tmp_path, scene) -> None:
+    trainer = Trainer(TrainConfig(out=tmp_path, steps=4, cells=(), rays=64, samples=8, evaluations=1), scene)
+    training = watch(trainer, port=0)
+    asked = []
+    trainer.renderer.image = lambda *args, **options: asked.append(args)
+    trainer.on_step = training.on_step
+    trainer.advance()
+    training.viewer.close()
+    assert trainer.step == 4 and not asked
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ({"port": 70_000}, "--port must be 0 to 65535, got 70000"),
+        ({"host": "192.0.2.1"}, "--host 192.0.2.1 --port 8080: cannot listen there"),
+        ({"host": "no such host"}, "--host no such host --port 8080: cannot listen there"),
+    ],
+)
+def test_bad_addresses(run, address, message) -> None:
+    refuses(message, view_run, run, error=ConfigError, **address)
+
+
+@pytest.mark.parametrize(
+    ("host", "asked", "origin", "status"),
+    [
+        ("127.0.0.1", "127.0.0.1:{}", None, 101),  # of a program
+        ("127.0.0.1", "127.0.0.1:{}", "http://127.0.0.1:{}", 101),
+        ("127.0.0.1", "localhost:9", "http://localhost:9", 101),  # through a tunnel
+        ("127.0.0.1", "127.0.0.1:{}", "https://example.org", 403),
+        ("127.0.0.1", "127.0.0.1:{}", "http://127.0.0.1:9", 403),
+        ("127.0.0.1", "127.0.0.1:{}", "null", 403),
+        ("127.0.0.1", "example.org:{}", "http://example.org:{}", 403),  # a name that leads here
+        ("127.1", "127.0.0.1:{}", "http://127.0.0.1:{}", 101),
+        ("127.1", "example.org:{}", "http://example.org:{}", 403),
+        ("0.0.0.0", "192.0.2.7:{}", "http://192.0.2.7:{}", 101),  # by whatever address this machine has
+        ("0.0.0.0", f"{socket.gethostname()}:{{}}", f"http://{socket.gethostname()}:{{}}", 101),
+        ("0.0.0.0", "example.org:{}", "http://example.org:{}", 403),
+        ("0.0.0.0", "192.0.2.7:{}", "https://example.com", 403),
+        ("0.0.0.0", "[::1:{}", None, 403),  # no address
+    ],
+)
+def test_pages_of_other_sites_are_refused(run, host, asked, origin, status) -> None:
+    with closing(view_run(run, host=host, port=0)) as viewer:
+        headers = {"Host": asked, "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+        headers |= {"Sec-WebSocket-Key": 22 * "A" + "==", "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}"}
+        headers |= {} if origin is None else {"Origin": origin}
+        with closing(HTTPConnection("127.0.0.1", viewer.port)) as browser:
+            browser.request("GET", "/", headers={name: text.format(viewer.port) for name, text in headers.items()})
+            assert browser.getresponse().status == status
+
+
+BAD = {
+    "half a corner": lambda tab: (tab.set("Crop", True), tab.drag("/crop/low", [1.0])),
+    "a corner nowhere": lambda tab: (tab.set("Crop", True), tab.drag("/crop/high", [float("nan"), 1.0, 1.0])),
+    "a long path": lambda tab: (tab.set("Keyframes", "add"), tab.set("Seconds", 1e9), tab.set("Save path", True)),
+    "a large picture": lambda tab: tab.set("Pixels", 10**6),
+    "another pane": lambda tab: tab.set("Show", "x" * 1000),
+    "a click at no place": lambda tab: tab.click(0.5, None),
+    "a camera of texts": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "position": ["a", "b", "c"]}),
+    "half a camera": lambda tab: tab.send("ViewerCameraMessage", fov=1.0),
+    "no message": lambda tab: tab.socket.send(b"\x93\x01"),
+    "text": lambda tab: tab.socket.send("text"),
+    "a large message": lambda tab: tab.socket.send(bytes(2**20)),
+}
+#: What leaves a client where it is.
+ODD = {
+    "a text for a number": lambda tab: tab.set("Pixels", "many"),
+    "a property": lambda tab: tab.send("GuiUpdateMessage", uuid=tab.gui["Pixels"]["uuid"], updates={"update_cb": 3}),
+    "a public address": lambda tab: tab.send("ShareUrlRequest"),
+    "a camera anywhere": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "position": [1e300, 0.0, 0.0]}),
+    "a turn of no length": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "wxyz": [0.0] * 4}),
+    "no angle": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "fov": 1e-300}),
+    "a thin canvas": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "image_width": 10**9}),
+    "a click far away": lambda tab: tab.click(1e300, float("inf")),
+}
+CAMERA = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.0] * 3, "fov": 1.0, "near": 0.01, "far": 1000.0}
+CAMERA |= {"image_height": 48, "image_width": 48, "look_at": [0.0, 0.0, 1.0], "up_direction": [0.0, 0.0, 1.0]}
+
+
+def test_a_client_harms_itself_at_most(viewer, scene, caplog, capfd) -> None:
+    other = Tab(viewer, scene.test.cameras)
+    other.rest()
+    for number, (name, send) in enumerate({**BAD, **ODD}.items(), 1):
+        caplog.clear()
+        bad = Tab(viewer, scene.test.cameras, number=number)
+        bad.rest()
+        with contextlib.suppress(ConnectionClosed):  # it may be gone before its last message
+            send(bad)
+        end = time.monotonic() + (20.0 if name in BAD else 0.5)
+        while number in viewer.clients and time.monotonic() < end:
+            viewer.render_next()
+            with contextlib.suppress(ConnectionClosed):
+                bad.read()
+        assert (number in viewer.clients) == (name in ODD), name
+        lines = [record.getMessage() for record in caplog.records if record.name.startswith("voronerf")]
+        assert len(lines) == 1 or name in ODD, (name, lines)
+        assert all("\n" not in line and len(line) < 300 for line in lines)
+        bad.close()
+    other.set("Show", "depth")
+    other.rest()
+    other.close()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_port_in_use_is_one_line(run, tmp_path, capsys) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        for command in (["view", str(run.path)], ["train", "--view", "--out", str(tmp_path / "run")]):
+            assert main([*command, "--port", port]) == 1
+            lines = capsys.readouterr().err.splitlines()
+            assert len(lines) == 1 and f"--host 127.0.0.1 --port {port}: cannot listen there" in lines[0]
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_shown_before_its_images_are_there(run, scene, monkeypatch) -> None:
+    monkeypatch.setattr("voronerf.app.viewer.client.SHARP", 128)
+    record = read_scene(run.path / "scene.json")
+    viewer = view_run(open_run(run.path, scene=record), port=0)
+    tab = Tab(viewer, scene.test.cameras)
+    assert apart(tab.rest(), run.render(larger(scene.test.cameras, 128), 0).colour) < 1.5
+    tab.set("Show", "error")
+    grey = tab.rest()
+    tab.set("Cameras", True)
+    tab.rest()
+    assert tab.nodes["/cameras/0"]["_image_data"] is None and grey.std() < 12
+    viewer.do(lambda: viewer.take_images(scene))
+    tab.until(lambda: tab.nodes["/cameras/0"]["_image_data"])
+    assert tab.rest().std() > 20
+    tab.close()
+    viewer.close()
+
+
+def test_without_viser_it_is_one_line(run, monkeypatch, capsys) -> None:
+    for name in [name for name in sys.modules if name.startswith("voronerf.app.viewer")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", str(run.path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "the viewer needs viser: pip install 'voronerf[viewer]'" in line
+
+
+def test_what_is_shown_is_saved_as_a_run(run, scene, viewer, tab) -> None:
+    tab.rest()
+    info, k = tab.gui["Click on a cell."], run.diagram.num_cells
+    (client,) = viewer.list_clients()
+
+    def save():
+        info["_markdown"] = None
+        tab.set("Save what is shown", True)
+        return tab.until(lambda: info["_markdown"])
+
+    assert "Not saved: everything is shown" in save()
+    client.change(hidden=frozenset(range(1, k)))
+    folder = run.path.resolve()
+    assert f"{folder.name}-cut" in save()
+    saved = open_run(folder.parent / f"{folder.name}-cut", scene=scene)
+    assert saved.router.num_cells == 1
+    client.change(hidden=frozenset({0}), crop=((-1.0, -1.0, -1.0), (1.0, 1.0, 0.2)))
+    assert f"{folder.name}-cut-2" in save()
+    cut = open_run(folder.parent / f"{folder.name}-cut-2", scene=scene)
+    assert cut.router.num_cells <= k - 1 and cut.scene.box[1, 2] < 0.4
+    # What is opened again is viewed, hidden and picked like any run.
+    image = cut.render(scene.test.cameras, 0)
+    subject = Subject.of(cut)
+    cells = cells_of(subject, image.heaviest)
+    assert int(cells.max()) < cut.router.num_cells and image.opacity.max() > 0.5
+    gone = render_look(subject, scene.test.cameras[[0]], Look(hidden=frozenset(range(cut.router.num_cells))))
+    assert gone.opacity.max() == 0

@@ -1,0 +1,404 @@
+"""The grid, and rendering through it: what is left out must not be seen."""
+
+import math
+
+import pytest
+import torch
+from helpers import refuses, render_image, renderer_of, seeded
+
+from voronerf import HashGridField, NeRF, VoronoiRouter
+from voronerf.app.train.renderers import through_grid
+from voronerf.nerf import (
+    Batch,
+    Cameras,
+    Contraction,
+    Occupancy,
+    OccupancyGrid,
+    Perspective,
+    Rays,
+    Step,
+    Stratified,
+    intersect_box,
+    orbit_cameras,
+    render_rays,
+    render_until_opaque,
+)
+
+BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+WHITE = torch.ones(3)
+
+
+class Ball:
+    """A coloured ball of radius 0.5 in empty space; counts what it is asked."""
+
+    def __init__(self, density=60.0):
+        self.density, self.asked = density, 0
+
+    def __call__(self, positions, directions, ray_index):
+        assert len(ray_index) == len(positions) and (not len(ray_index) or int(ray_index.max()) < len(directions))
+        self.asked += len(positions)
+        return (positions + 1) / 2, self.density * (positions.norm(dim=-1) < 0.5)
+
+
+def cameras(size=24):
+    return orbit_cameras(2, radius=3.0, elevation=20.0, width=size, height=size, focal=size * 1.1)
+
+
+def grid_of(field, resolution=8, looks=3):
+    grid = OccupancyGrid(BOX, resolution, threshold=0.1)
+    generator = seeded(0)
+    for look in range(looks):
+        grid.update(field, decay=float(look > 0), generator=generator)
+    return grid
+
+
+def tight_grid(resolution=24):
+    """All cells that the ball reaches into, however little, and few others."""
+    grid = OccupancyGrid(BOX, resolution, threshold=0.1)
+    middles = grid.points(torch.arange(resolution**3)).norm(dim=-1)
+    grid.occupied = (middles < 0.5 + 3**0.5 / resolution).reshape(grid.occupied.shape)
+    return grid
+
+
+def test_a_grid_finds_what_is_empty():
+    grid = OccupancyGrid(BOX, (8, 10, 12), threshold=0.1)
+    assert grid.share == 1 and grid.occupied.shape == (8, 10, 12)
+    for look in range(20):
+        grid.update(Ball(), decay=float(look > 0), generator=seeded(look))
+    middles = grid.points(torch.arange(960)).norm(dim=-1).reshape(8, 10, 12)
+    half = (torch.tensor([2 / 8, 2 / 10, 2 / 12]) / 2).norm()
+    assert bool(grid.occupied[middles < 0.5 - half].all())
+    assert not bool(grid.occupied[middles > 0.5 + half].any())
+
+
+def test_cells_that_are_looked_at_fade_and_the_others_stay():
+    grid = OccupancyGrid(BOX, 4, threshold=0.1)
+    grid.update(lambda p, d, i: (p, torch.full((len(p),), 8.0)))
+    seen = torch.arange(0, 64, 2)
+    grid.update(lambda p, d, i: (p, torch.full((len(p),), torch.nan)), seen[:3])
+    grid.update(lambda p, d, i: (p, torch.zeros(len(p))), seen[3:], decay=0.01)
+    density = grid.density.reshape(-1)
+    assert density[seen[:3]].tolist() == [torch.inf] * 3
+    assert bool((density[seen[3:]] == torch.tensor(8.0) * 0.01).all()) and not bool(
+        grid.occupied.reshape(-1)[seen[3:]].any()
+    )
+    assert bool((density[1::2] == 8).all())
+
+
+@pytest.mark.parametrize(
+    "field", [HashGridField(width=8, log2_entries=10), NeRF(width=8, depth=2), NeRF(width=8, view_directions=False)]
+)
+def test_the_density_of_a_router_is_found_without_its_colour(field):
+    for parameter in field.parameters():
+        torch.nn.init.normal_(parameter, generator=torch.Generator().manual_seed(1))
+    router = VoronoiRouter(field, torch.rand(5, 3), share=[n for n, _ in field.named_parameters() if n == "features"])
+    box = torch.tensor([[0.0, 0, 0], [1.0, 1, 1]])
+    grids = [OccupancyGrid(box, 6, threshold=1e-6) for _ in range(2)]
+    for grid, asked in zip(grids, (router, lambda *given: router(*given))):
+        grid.update(asked, generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(grids[0].density, grids[1].density)
+    assert len(grids[0].density.unique()) > 10
+
+
+def test_points_lie_in_their_cells():
+    grid = OccupancyGrid(torch.tensor([[0.0, 10.0, -4.0], [2.0, 13.0, 0.0]]), (2, 3, 4), threshold=1)
+    every = torch.arange(24)
+    assert grid.points(every)[0].tolist() == [0.5, 10.5, -3.5]
+    for _ in range(4):
+        points = grid.points(every, torch.rand(24, 3))
+        place = (points - grid.box[0]).long()
+        assert torch.equal((place[:, 0] * 3 + place[:, 1]) * 4 + place[:, 2], every)
+        assert torch.equal(grid.cells(points), every.int())
+    border = torch.tensor([[-1.0, 10.5, -3.5], [2.0, 13.0, 0.0], [9.0, 99.0, torch.nan]])
+    assert grid.cells(border).tolist() == [0, 23, 20] and grid.cells(border).dtype == torch.int32
+
+
+def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
+    """Rays from all around a ball: its shell stays, the air around it and the inside that no light reaches fade."""
+    grid, ball = OccupancyGrid(BOX, 16, threshold=0.1), Ball(200.0)
+    random = seeded(0)
+    for _ in range(60):
+        origins = 3 * torch.nn.functional.normalize(torch.randn(300, 3, generator=random), dim=1)
+        towards = torch.rand(300, 3, generator=random) * 1.6 - 0.8
+        rays = Rays(origins, torch.nn.functional.normalize(towards - origins, dim=1))
+        near, far, hit = intersect_box(rays.origins, rays.directions, BOX, 0.0, 9.0)
+        given = {"samples": Occupancy(grid, 64), "jitter": True, "generator": random}
+        seen = render_rays(ball, rays[hit], near[hit], far[hit], **given)
+        grid.observe(seen.samples.positions, seen.density, seen.samples.deltas, seen.weights, decay=0.8)
+    distance = grid.points(torch.arange(16**3)).norm(dim=-1).reshape(16, 16, 16)
+    half = 3**0.5 / 16
+    corners = grid.points(torch.arange(16**3)).abs().amax(-1).reshape(16, 16, 16) > 0.8
+    assert not bool(grid.occupied[(distance > 0.5 + half) & ~corners].any())
+    # A ray that slips through a corner of the shell brings single cells behind it back.
+    assert float(grid.occupied[distance < 0.5 - 2.5 * half].float().mean()) < 0.2
+    options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 64, "background": WHITE}
+    plain, quick = (render_image(ball, cameras(), 0, occupancy=each, **options).colour for each in (None, grid))
+    assert float((plain - quick).abs().mean()) < 2e-3
+    before = ball.asked
+    render_rays(ball, rays[hit], near[hit], far[hit], samples=Occupancy(grid, 64))
+    assert (ball.asked - before) * 5 < 64 * int(hit.sum())
+    # A cell comes back when a look finds something there, and fades no further by it.
+    inside = grid.cells(torch.zeros(1, 3))
+    grid.update(ball, inside, decay=1.0)
+    assert float(grid.density.reshape(-1)[inside]) == 200.0
+    # What is not a number counts as dense.
+    grid.observe(torch.full((1, 3), 0.95), torch.tensor([torch.nan]), torch.ones(1), torch.ones(1), decay=0.0)
+    assert bool(grid.occupied[15, 15, 15])
+    refuses("observe: decay must lie in 0..1, got -1", grid.observe, torch.zeros(1, 3), *[torch.zeros(1)] * 3, decay=-1)
+
+
+def test_holes_in_a_surface_are_filled_where_the_field_is_dense():
+    """A cell in the middle of a ball comes back; what stands alone, what is thin and what is air stay empty."""
+    radius = torch.stack(torch.meshgrid(*[torch.linspace(-15 / 16, 15 / 16, 16)] * 3, indexing="ij")).norm(dim=0)
+
+    def emptied(density, contraction=None):
+        grid = OccupancyGrid(BOX, 16, threshold=1.0, contraction=contraction)
+        grid.occupied = radius < 0.5
+        grid.occupied[8, 8, 8] = grid.occupied[10, 8, 8] = False
+        grid.density = 60.0 * grid.occupied
+        before = grid.occupied.clone()
+
+        def field(positions, directions, ray_index):
+            ball, alone = positions.norm(dim=-1) < 0.5, positions[:, 0] > 0.7
+            return positions, torch.where(ball, density, torch.where(alone, 60.0, 0.0))
+
+        grid.fill_holes(field, generator=seeded(0))
+        assert torch.equal(grid.occupied, grid.density >= grid.threshold)
+        assert bool(grid.occupied[before].all())
+        return grid, grid.occupied & ~before
+
+    grid, filled = emptied(60.0)
+    assert bool(filled[8, 8, 8]) and bool(filled[10, 8, 8]) and float(grid.density[8, 8, 8]) == 2.0
+    assert bool((radius[filled] < 0.5 + 3**0.5 / 16).all())
+    assert not bool(emptied(1.5)[1].any())  # thinner than two thresholds
+    # In contracted space densities count by its own units, which are longer ones of the world off the centre.
+    contracted = emptied(1.5, Contraction(torch.zeros(3), 0.2))[1]
+    assert bool(contracted[10, 8, 8]) and not bool(contracted[8, 8, 8])
+
+
+def test_images_are_the_same_with_a_fraction_of_the_samples():
+    dense, sparse = Ball(), Ball()
+    options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 96, "background": WHITE}
+    plain = render_image(dense, cameras(), 0, **options)
+    grid = tight_grid()
+    quick = render_image(sparse, cameras(), 0, occupancy=grid, **options)
+    assert sparse.asked * 8 < dense.asked
+    torch.testing.assert_close(quick.colour, plain.colour, atol=5e-3, rtol=0)
+    torch.testing.assert_close(quick.opacity, plain.opacity, atol=5e-3, rtol=0)
+    solid = plain.opacity > 0.5
+    assert solid.any() and not solid.all()
+    torch.testing.assert_close(quick.depth[solid], plain.depth[solid], atol=2e-2, rtol=0)
+    torch.testing.assert_close(quick.heaviest[solid], plain.heaviest[solid], atol=1e-5, rtol=0)
+    chunked = render_image(Ball(), cameras(), 0, occupancy=grid, chunk=50, **options)
+    torch.testing.assert_close(chunked.colour, quick.colour)
+    bare = render_image(Ball(), cameras(), 0, occupancy=grid, heaviest=False, **options)
+    assert torch.equal(bare.colour, quick.colour) and not torch.equal(bare.heaviest, quick.heaviest)
+    refuses("chunk must be >= 1, got 0", render_image, Ball(), cameras(), 0, occupancy=grid, chunk=0, **options)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        Contraction(torch.zeros(3), 1.0),
+        Perspective(torch.tensor([0.0, 0.0, 3.0]), torch.diag(torch.tensor([1.0, 1.0, -1.0])), 1.0, (0.7, 0.7)),
+    ],
+)
+def test_the_empty_space_of_a_contracted_scene_is_skipped(space):
+    """A ball before a far wall that is as thin as fog: the grid learns both, and pictures lose nothing."""
+    asked, random = [0], seeded(0)
+
+    def scene(positions, directions, ray_index):
+        asked[0] += len(positions)
+        world = space.inverse(positions)
+        return (positions + 2) / 4, 60.0 * (world.norm(dim=-1) < 0.5) + 0.4 * (world[:, 2] < -20)
+
+    poses = torch.eye(4)[None].clone()
+    poses[0, 2, 3] = 3.0
+    camera = Cameras(poses, torch.tensor([[24.0, 24.0, 12.0, 12.0]]), 24, 24)
+    grid = OccupancyGrid(space.cube, 16, threshold=1.0, contraction=space)
+    rays, options = camera.image_rays(0), {"samples": 96, "spacing": "disparity"}
+    ends = torch.full((len(rays),), 1.0), torch.full((len(rays),), 60.0)
+    for _ in range(40):
+        renderer = renderer_of({"field": scene}, contraction=space, occupancy=grid, **options)
+        seen = renderer.render(rays, *ends, jitter=True, generator=random)[-1]
+        grid.observe(seen.samples.positions, seen.density, seen.samples.deltas, seen.weights, decay=0.8)
+        cells = torch.randint(16**3, (256,), generator=random)
+        grid.update(scene, cells, decay=1.0, generator=random)
+    pictures, counts = [], []
+    for occupancy in (None, grid):
+        asked[0] = 0
+        renderer = renderer_of({"field": scene}, contraction=space, occupancy=occupancy, **options)
+        pictures.append(renderer.image(camera, 0, near=1.0, far=60.0))
+        counts.append(asked[0])
+    assert counts[1] * 3 < counts[0]
+    plain, quick = pictures
+    torch.testing.assert_close(quick.colour, plain.colour, atol=2e-2, rtol=0)
+    assert bool((plain.opacity > 0.95).all())  # by the ball or the wall
+    torch.testing.assert_close(quick.heaviest[12, 12], plain.heaviest[12, 12], atol=1e-5, rtol=0)
+    same = OccupancyGrid.from_state(grid.state_dict(), contraction=space)
+    again = renderer_of({"field": scene}, contraction=space, occupancy=same, **options)
+    assert torch.equal(again.image(camera, 0, near=1.0, far=60.0).colour, quick.colour)
+
+
+def test_a_translucent_field_is_walked_to_its_end():
+    """Rays that never become opaque need every wave."""
+    options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 128, "background": WHITE}
+    plain = render_image(Ball(0.7), cameras(), 1, **options)
+    quick = render_image(Ball(0.7), cameras(), 1, occupancy=tight_grid(), **options)
+    torch.testing.assert_close(quick.colour, plain.colour, atol=1e-5, rtol=0)
+    torch.testing.assert_close(quick.opacity, plain.opacity, atol=1e-5, rtol=0)
+    assert 0.2 < float(plain.opacity.max()) < 0.9
+
+
+def test_a_ray_that_ends_has_the_colour_before_its_end():
+    """Through fog of one colour it is that colour, although the last of the light never reached the background."""
+    asked = [0]
+
+    def fog(positions, directions, ray_index):
+        asked[0] += len(positions)
+        return torch.full_like(positions, 0.25), torch.full_like(positions[:, 0], 8.0)
+
+    rays = Rays(torch.tensor([[0.0, 0, -1], [0, 0, 0.9]]), torch.tensor([[0.0, 0, 1]]).expand(2, 3))
+    sampler = Occupancy(OccupancyGrid(BOX, 4, threshold=0.1), 200)
+    ends = torch.zeros(2), torch.tensor([2.0, 0.1])
+    seen = render_until_opaque(fog, rays, *ends, sampler, background=WHITE)
+    left = math.exp(-0.8)  # of the second ray, which does not end
+    torch.testing.assert_close(seen.colour[:, 0], torch.tensor([0.25, 0.25 * (1 - left) + left]))
+    torch.testing.assert_close(seen.opacity, torch.tensor([1.0, 1 - left]))
+    # 1 - exp(-8 t) is 0.98 at t = 0.49; the mean distance of what is seen of the fog until there
+    assert asked[0] < 200 + 64 and 0.1 < float(seen.depth[0]) < 0.125
+
+
+def test_pictures_have_twice_the_strata_of_a_training_up_to_a_bound():
+    grid = OccupancyGrid(BOX, 4, threshold=0.1)
+    found = {samples: through_grid(Stratified(samples), grid).picture_samples for samples in (64, 128, 256, 512)}
+    assert found == {64: 128, 128: 256, 256: 384, 512: 512}
+    assert through_grid(Stratified(64), grid, picture_samples=300).picture_samples == 300
+
+
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_training_samples_and_gradients_are_those_of_the_dense_form(backend):
+    rays = cameras(9).image_rays(0)
+    near, far, hit = intersect_box(rays.origins, rays.directions, BOX, 1.0, 5.0)
+    rays, near, far = rays[hit], near[hit], far[hit]
+    background = torch.rand(len(rays), 3)
+    grid = OccupancyGrid(BOX * 1.01, 6, threshold=0.1)
+    found = []
+    for sampler in (Stratified(20, backend=backend), Occupancy(grid, 20, backend=backend)):
+        scale = torch.tensor(2.0, requires_grad=True)
+        field = lambda p, d, i, scale=scale: ((p * scale).sigmoid(), p.square().sum(-1) * scale)  # noqa: E731
+        result = render_rays(field, rays, near, far, samples=sampler, background=background)
+        result.colour.square().sum().backward()
+        found.append((result.colour, result.opacity, result.depth, result.weights, scale.grad))
+        assert result.samples.positions.shape == (20 * len(rays), 3)
+    for a, b in zip(*found):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-4)
+
+
+def test_rays_that_meet_nothing_show_the_background():
+    grid = grid_of(lambda p, d, i: (p, torch.zeros(len(p))))
+    assert grid.share == 0
+    rays = Rays(torch.zeros(3, 3), torch.eye(3))
+    ends = torch.full((3,), 0.1), torch.full((3,), 0.9)
+    asked = Ball()
+    seen = render_until_opaque(asked, rays, *ends, Occupancy(grid, 8), background=WHITE)
+    assert asked.asked == 0
+    assert torch.equal(seen.colour, torch.ones(3, 3)) and torch.equal(seen.depth, ends[1])
+    assert torch.equal(seen.heaviest, 0.9 * torch.eye(3))
+    parameter = torch.ones((), requires_grad=True)
+    field = lambda p, d, i: (p * parameter, p[:, 0] * parameter)  # noqa: E731
+    marched = render_rays(field, rays, *ends, samples=Occupancy(grid, 8))
+    marched.colour.sum().backward()
+    assert torch.equal(marched.colour.detach(), torch.zeros(3, 3)) and parameter.grad == 0
+
+
+def test_state_goes_round():
+    grid = grid_of(Ball(), resolution=(3, 4, 5))
+    other = OccupancyGrid.from_state(grid.state_dict())
+    for name, value in grid.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name])
+    # A grid's own tensors change in place, and leave those that it was made of.
+    given = grid.state_dict()
+    other = OccupancyGrid.from_state(given)
+    other.observe(torch.zeros(1, 3), *(torch.ones(1) for _ in range(3)), decay=0.5)
+    assert torch.equal(given["density"], grid.density) and not torch.equal(other.density, grid.density)
+    state = grid.state_dict()
+    del state["density"]
+    rule = "OccupancyGrid: state must hold density, got box, occupied, threshold"
+    refuses(rule, OccupancyGrid.from_state, state)
+    rule = "density and occupied of one shape [x, y, z], got [3] and [3, 4, 5]"
+    refuses(rule, OccupancyGrid.from_state, state | {"density": torch.zeros(3)})
+
+
+def test_refuses_what_is_no_grid():
+    for box, resolution, options, message in (
+        (BOX.flip(0), 8, {}, "box must be finite corners"),
+        (BOX * torch.inf, 8, {}, "box must be finite corners"),
+        (BOX, (3, 0, 3), {}, "resolution must be one or three numbers >= 1, got (3, 0, 3)"),
+        (BOX, 8, {"threshold": 0}, "threshold must be positive and finite, got 0"),
+        (BOX, 8, {"remembered": 0.5}, "remembered must be at least 1 and finite, got 0.5"),
+    ):
+        refuses(message, OccupancyGrid, box, resolution, **{"threshold": 1, **options})
+    # 2**32 would be cell 0 in the lowest 32 bits.
+    update = OccupancyGrid(BOX, 4, threshold=0.1).update
+    for cell in (-1, 64, 2**32):
+        refuses("cells must lie in 0 to 63, got", update, Ball(), torch.tensor([cell]))
+    refuses("decay must lie in 0..1, got 2", update, Ball(), decay=2)
+
+
+def test_pictures_have_samples_of_their_own():
+    given = {"near": 1.0, "far": 5.0, "box": BOX, "background": WHITE}
+    pictures = [
+        renderer_of({"field": Ball()}, samples=samples, picture_samples=own, occupancy=tight_grid()).image(
+            cameras(), 0, **given
+        )
+        for samples, own in ((48, None), (24, 48), (24, None))
+    ]
+    assert torch.equal(pictures[0].colour, pictures[1].colour)
+    assert not torch.equal(pictures[0].colour, pictures[2].colour)
+
+
+def ends(rays):
+    return torch.ones(len(rays)), torch.full((len(rays),), 5.0)
+
+
+@pytest.mark.parametrize(("full_gradient", "sightings"), [(None, 0), (4.0, 0), (None, 0.1), (4.0, 0.1)])
+@pytest.mark.parametrize("field", [NeRF(width=16, depth=2), HashGridField(width=16, levels=2, log2_entries=10)])
+def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sightings):
+    """With the loss on points that the last rays end at, before, in and behind the grid."""
+    grid = tight_grid()
+    router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **getattr(field, "router_options", {}))
+    rays = cameras().image_rays(0)
+    target, background = torch.rand(len(rays), 3), torch.rand(len(rays), 3)
+    options = {"samples": 24, "occupancy": grid, "full_gradient": full_gradient}
+    renderer = renderer_of({"field": router}, **options)
+
+    seen = torch.linspace(1.5, 4.5, 200) if sightings else None
+
+    def compare(renderer):
+        batch = Batch(rays, *ends(rays), target, background, seen)
+        found = Step(renderer, sightings=sightings).run(batch, torch.Generator().manual_seed(3))
+        return found, torch.autograd.grad(found.loss, list(router.parameters()))
+
+    found, gradients = compare(renderer)
+    plain = renderer_of({"field": lambda *given: router(*given)}, **options)  # a field without a table
+    expected, same = compare(plain)
+    assert len(found.weights) > 0 and torch.equal(found.samples.positions, expected.samples.positions)
+    for part, other in zip((*found[:4], found.importance(), *gradients), (*expected[:4], expected.importance(), *same)):
+        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-6)
+
+
+def test_samples_that_no_light_reaches_have_no_gradient():
+    """Those behind the surface of a solid field; what is left is the gradient to a thousandth."""
+    field = HashGridField(width=16, levels=2, log2_entries=10)
+    torch.nn.init.constant_(field.density.bias, 10.0)
+    router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **field.router_options)
+    rays, gradients = cameras().image_rays(0), []
+    for of in (router, lambda *given: router(*given)):  # the second is a field without a table
+        renderer = renderer_of({"field": of}, samples=96, occupancy=tight_grid())
+        batch = Batch(rays, *ends(rays), torch.zeros(len(rays), 3))
+        found = Step(renderer).run(batch, torch.Generator().manual_seed(3))
+        gradients.append(torch.autograd.grad(found.loss, router.module.features)[0])
+    some, every = gradients
+    assert 0 < some.count_nonzero() < every.count_nonzero()
+    assert (some - every).norm() < 1e-3 * every.norm()

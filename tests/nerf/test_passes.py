@@ -1,0 +1,224 @@
+"""Several passes along a ray, against slow loops and pictures that are known."""
+
+import math
+
+import pytest
+import torch
+from helpers import refuses, renderer_of, same, seeded
+from torch import Tensor
+
+from voronerf.nerf import (
+    Batch,
+    Contraction,
+    Hierarchical,
+    Occupancy,
+    OccupancyGrid,
+    Rays,
+    Renderer,
+    Space,
+    Step,
+    Stratified,
+    render_rays,
+)
+from voronerf.nerf.sampling import (
+    PADDING,
+    blurred_weights,
+    interlevel_loss,
+    strata_uniforms,
+    stratified_edges,
+    union_depths,
+)
+
+WHITE = torch.ones(3)
+
+
+class Slab:
+    """Red fog of a density between two heights, nothing elsewhere; counts what it is asked."""
+
+    def __init__(self, low=-0.05, high=0.05, density=30.0):
+        self.low, self.high, self.density = low, high, density
+        self.asked: list[Tensor] = []
+
+    def __call__(self, positions, directions, ray_index):
+        self.asked.append(positions)
+        inside = (positions[:, 2] > self.low) & (positions[:, 2] < self.high)
+        return torch.tensor((0.9, 0.2, 0.1)).expand(len(positions), 3), self.density * inside
+
+
+def rays(count=3):
+    """Straight down from height 2, one beside the other."""
+    origins = torch.tensor((0.0, 0.0, 2.0)).repeat(count, 1)
+    origins[:, 0] = torch.arange(count)
+    return Rays(origins, torch.tensor((0.0, 0.0, -1.0)).repeat(count, 1), torch.full((count,), 0.01))
+
+
+def test_a_second_pass_finds_a_thin_surface():
+    """A slab a fortieth of the ray thick: 16 strata see it with a wrong thickness, the second pass does not."""
+    expected = 1 - math.exp(-30 * 0.1)
+    one = renderer_of({"field": Slab()}, samples=17).render(rays(), 0.0, 4.0)
+    assert len(one) == 1 and abs(float(one[0].opacity[0]) - expected) > 0.04
+    for fields, cones in (({"field": Slab(), "coarse": Slab()}, False), ({"field": Slab()}, True)):
+        passes = renderer_of(fields, samples=17, fine_samples=64, cones=cones).render(rays(), 0.0, 4.0)
+        assert len(passes) == 2
+        assert abs(float(passes[1].opacity[0]) - expected) < 0.02
+        # Fog of density 30 from 1.95 on, a tenth thick: the mean of an exponential cut off there.
+        within = 1 / 30 - 0.1 * math.exp(-3) / expected
+        assert float(passes[1].depth[0]) == pytest.approx(1.95 + within, abs=0.005)
+
+
+def test_who_is_asked_about_what():
+    for first, options, of_first, of_field in (
+        ("coarse", {"fine_samples": 4}, [[3 * 8, 3]], [[3 * 12, 3]]),
+        ("proposal", {"fine_samples": 4}, [[3 * 8, 3]], [[3 * 4, 3]]),
+        (None, {"fine_samples": 4, "cones": True}, [], [[3 * 8, 6], [3 * 4, 6]]),
+        (None, {}, [], [[3 * 8, 3]]),
+    ):
+        field, other = Slab(), Slab()
+        fields = {"field": field} if first is None else {"field": field, first: other}
+        renderer_of(fields, samples=8, **options).render(rays(), 0.0, 4.0)
+        assert [list(p.shape) for p in other.asked] == of_first
+        assert [list(p.shape) for p in field.asked] == of_field
+
+
+def test_one_pass_is_render_rays():
+    options = {"background": WHITE, "jitter": True}
+    sampler = Stratified(9, space=Space(spacing="disparity"))
+    (got,) = Renderer({"field": Slab()}, sampler).render(rays(), 1.0, 3.0, generator=seeded(4), **options)
+    other = render_rays(Slab(), rays(), 1.0, 3.0, samples=sampler, generator=seeded(4), **options)
+    assert same(got[:-1], other[:-1]) and same(got.samples, other.samples)
+
+
+def test_union_against_slow_loop():
+    generator = seeded(0)
+    edges = torch.rand(5, 9, generator=generator).cumsum(1)
+    weights = torch.rand(5, 8, generator=generator)
+    weights[3] = 0
+    depths = (edges[:, 1:] + edges[:, :-1]) / 2
+    every, ends = union_depths(depths, edges, weights, 4)
+    for ray in range(5):
+        mass = weights[ray] if ray != 3 else torch.ones(8)
+        cumulative = torch.cat((torch.zeros(1), mass.cumsum(0))) / mass.sum()
+        new = []
+        for i in range(4):
+            u = (i + 0.5) / 4
+            b = max(j for j in range(8) if float(cumulative[j]) <= u)
+            inside = (u - cumulative[b]) / (cumulative[b + 1] - cumulative[b])
+            new.append(edges[ray, b] + inside * (edges[ray, b + 1] - edges[ray, b]))
+        expected = torch.stack([*new, *depths[ray]]).sort().values
+        torch.testing.assert_close(every[ray], expected)
+        for i in range(11):
+            assert float(ends[ray, i + 1]) == pytest.approx(float(expected[i] + expected[i + 1]) / 2, abs=1e-6)
+        assert ends[ray, 0] == edges[ray, 0] and ends[ray, -1] == edges[ray, -1]
+
+
+def test_blurred_weights_against_slow_loop():
+    weights = torch.rand(4, 7, generator=seeded(0))
+    got = blurred_weights(weights)
+    for ray in range(4):
+        w = [float(x) for x in weights[ray]]
+        for k in range(7):
+            left, right = w[max(k - 1, 0)], w[min(k + 1, 6)]
+            expected = (max(left, w[k]) + max(w[k], right)) / 2 + PADDING
+            assert float(got[ray, k]) == pytest.approx(expected, rel=1e-5)
+    assert (got > weights).all()
+    assert float(blurred_weights(torch.ones(1, 1))) == pytest.approx(1 + PADDING)
+
+
+def test_interlevel_loss_against_slow_loop():
+    generator = seeded(0)
+    edges = torch.rand(6, 6, generator=generator).cumsum(1) + 0.5
+    found = torch.rand(6, 5, generator=generator).cumsum(1)
+    found[0] = torch.linspace(0, 10, 5)  # reaches beyond at both ends
+    weights, bounds = torch.rand(6, 5, generator=generator), torch.rand(6, 4, generator=generator) / 3
+    expected = 0.0
+    for r in range(6):
+        for i in range(5):
+            touched = [
+                float(bounds[r, j])
+                for j in range(4)
+                if float(found[r, j + 1]) > float(edges[r, i]) and float(found[r, j]) < float(edges[r, i + 1])
+            ]
+            w = float(weights[r, i])
+            expected += max(0.0, w - sum(touched)) ** 2 / (w + 1e-7) / 6
+    weights.requires_grad_(), bounds.requires_grad_()
+    loss = interlevel_loss(edges, weights, found, bounds)
+    assert float(loss.detach()) == pytest.approx(expected, rel=1e-5)
+    loss.backward()
+    assert weights.grad is None and bounds.grad is not None
+    assert float(bounds.grad.max()) < 1e-6 and float(bounds.grad.min()) < -0.01
+
+
+def test_a_proposal_that_bounds_the_weights_costs_nothing():
+    edges, weights = torch.linspace(0, 1, 9)[None], torch.rand(1, 8)
+    bounds = weights.reshape(1, 4, 2).sum(2)
+    assert float(interlevel_loss(edges, weights, edges[:, ::2].contiguous(), bounds)) == pytest.approx(0, abs=1e-9)
+
+
+def test_losses():
+    target, higher = torch.rand(3, 3), Slab(0.2, 0.8)
+    near, far = torch.zeros(3), torch.full((3,), 4.0)
+    for others, cones, share in (({}, True, 0.1), ({"coarse": higher}, False, 1.0), ({"proposal": higher}, False, 0)):
+        renderer = renderer_of({"field": Slab(), **others}, samples=6, fine_samples=5, cones=cones)
+        first, last = renderer.render(rays(), near, far, background=WHITE, jitter=True, generator=seeded(2))
+        expected = (last.colour - target).square().mean() + share * (first.colour - target).square().mean()
+        if "proposal" in others:
+            given = (x for each in (last, first) for x in (each.samples.edges, each.samples.by_ray(each.weights)))
+            expected = expected + interlevel_loss(*given)
+        found = Step(renderer).run(Batch(rays(), near, far, target, WHITE), seeded(2))
+        torch.testing.assert_close(found.loss, expected)
+        torch.testing.assert_close(found.error, (last.colour - target).square().sum(1))
+
+
+@pytest.mark.parametrize("spacing", ["linear", "disparity"])
+@pytest.mark.parametrize("samples", [1, 2, 33])
+def test_jittered_edges_cover_the_ray(spacing, samples):
+    near, far = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([4.0, 2.0, 30.0])
+    even = stratified_edges(near, far, samples, jitter=False, spacing=spacing)
+    for seed in range(5):
+        generator = seeded(seed)
+        edges = stratified_edges(near, far, samples, jitter=True, spacing=spacing, generator=generator)
+        assert edges.shape == even.shape == (3, samples + 1)
+        assert torch.equal(edges[:, 0], near) and torch.equal(edges[:, -1], far)
+        assert (edges.diff(dim=1) >= 0).all()
+        if samples > 1:
+            assert not torch.equal(edges, even)
+
+
+def test_uniforms_are_one_in_each_stratum():
+    u = strata_uniforms(500, 7, torch.zeros(()), True, seeded(0))
+    assert u is not None and torch.equal((u * 7).floor(), torch.arange(7.0).expand(500, 7))
+    assert float((u * 7 % 1).mean()) == pytest.approx(0.5, abs=0.02)
+    assert strata_uniforms(5, 7, torch.zeros(()), False, None) is None
+
+
+def test_training_draws_differ_and_pictures_do_not():
+    for fields, cones in (({"field": Slab(), "coarse": Slab()}, False), ({"field": Slab(), "proposal": Slab()}, False),
+                          ({"field": Slab()}, True)):  # fmt: skip
+        renderer = renderer_of(fields, samples=8, fine_samples=8, cones=cones)
+        seeds = [seeded(seed) for seed in (0, 0, 1)]
+        a, b, c = (renderer.render(rays(), 0.0, 4.0, jitter=True, generator=seed)[-1] for seed in seeds)
+        assert torch.equal(a.samples.depths, b.samples.depths) and not torch.equal(a.samples.depths, c.samples.depths)
+        still = [renderer.render(rays(), 0.0, 4.0)[-1].samples.depths for _ in range(2)]
+        assert torch.equal(*still)
+
+
+def test_contracted_positions_are_what_the_field_sees():
+    space = Contraction(torch.zeros(3), 0.5)
+    for cones in (False, True):
+        field = Slab()
+        passes = renderer_of({"field": field}, samples=8, cones=cones, contraction=space).render(rays(), 0.0, 400.0)
+        assert torch.equal(passes[0].samples.positions, field.asked[0][:, :3])
+        assert float(passes[0].samples.positions.norm(dim=-1).max()) < 1
+
+
+def test_refusals():
+    grid, sphere = (
+        OccupancyGrid(torch.tensor([[-1.0] * 3, [1.0] * 3]), 2, threshold=1.0),
+        Contraction(torch.zeros(3), 1.0),
+    )
+    refuses("fields must be field, got ['coarse']", Renderer, {"coarse": Slab()}, Stratified(3))
+    refuses("fields must be field and coarse, got ['field']", Renderer, {"field": Slab()}, Hierarchical(3, 3))
+    refuses("Stratified: samples must be >= 1, got 0", Stratified, 0)
+    refuses("Hierarchical: fine_samples must be >= 1, got 0", Hierarchical, 3, 0)
+    for space in (Space(sphere), Space(cones=True)):
+        refuses("grid must be of points, and in the space of the contraction", Occupancy, grid, 3, space=space)

@@ -1,0 +1,137 @@
+"""Camera paths: the file, smooth ways through keyframes, spirals."""
+
+import json
+import math
+
+import pytest
+import torch
+from helpers import read_json, refuses
+
+from voronerf.app.render.paths import CameraPath, read_camera_path, smooth_path, spiral_cameras, write_camera_path
+from voronerf.nerf import Cameras, focus_point, orbit_cameras, turntable_cameras
+from voronerf.nerf.cameras import look_at
+
+LEVEL = [1, 0, 0, 4, 0, 0, -1, -5, 0, 1, 0, 6, 0, 0, 0, 1]  # at (4, -5, 6), looking along +y, z up
+
+
+def by_hand(**changes):
+    """The least that nerfstudio's own reader asks for."""
+    frame = {"camera_to_world": LEVEL, "fov": 90, "aspect": 2}
+    return {"render_width": 80, "render_height": 40, "camera_path": [frame, frame], **changes}
+
+
+def test_a_file_of_nerfstudio(tmp_path):
+    file = tmp_path / "path.json"
+    keyframe = {"matrix": [float(x) for x in LEVEL], "fov": 60.0, "aspect": 2.0, "override_transition_sec": None}
+    extra = {
+        "camera_type": "perspective",
+        "fps": 30,
+        "seconds": 4.0,
+        "is_cycle": True,
+        "crop": {"crop_scale": [1, 1, 1]},
+    }
+    file.write_text(json.dumps(by_hand(keyframes=[keyframe], **extra)))
+    path = read_camera_path(file)
+    assert (len(path.frames), path.fps, path.closed, path.frames.width, path.frames.height) == (2, 30, True, 80, 40)
+    assert path.frames.origins[1].tolist() == [4, -5, 6] and path.frames.forward[1].tolist() == [0, 1, 0]
+    torch.testing.assert_close(path.frames.intrinsics[0], torch.tensor([20.0, 20, 40, 20]))  # 90 degrees are vertical
+    assert path.keyframes.intrinsics[0, 1] == pytest.approx(20 / math.tan(math.radians(30)))
+    file.write_text(json.dumps(by_hand(keyframes=[])))
+    assert read_camera_path(file).keyframes is None and read_camera_path(file).fps == 24
+
+
+def test_what_is_written_is_read(tmp_path):
+    keyframes = orbit_cameras(3, radius=2, elevation=30, width=640, height=480, focal=500)
+    path = CameraPath(smooth_path(keyframes, 7, closed=True), 12.5, keyframes, closed=True)
+    write_camera_path(tmp_path / "new" / "path.json", path)
+    read = read_camera_path(tmp_path / "new" / "path.json")
+    assert (read.fps, read.closed, read.frames.width, read.frames.height) == (12.5, True, 640, 480)
+    for ours, theirs in ((path.frames, read.frames), (keyframes, read.keyframes)):
+        assert torch.equal(ours.poses, theirs.poses)
+        torch.testing.assert_close(ours.intrinsics, theirs.intrinsics)
+    entries = read_json(tmp_path / "new" / "path.json")
+    assert entries["seconds"] == 7 / 12.5 and entries["camera_path"][0].keys() == {"camera_to_world", "fov", "aspect"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "rule"),
+    [
+        ({"camera_path": 3}, "is not a camera path: it must have a list camera_path"),
+        ({"camera_path": []}, "camera_path must be a list of 1 to 100000 frames, got 0 of them"),
+        ({"camera_path": [7]}, "camera_path[0].camera_to_world must be 16 numbers, got None"),
+        ({"camera_path": [{"camera_to_world": LEVEL[:12], "fov": 50}]}, "camera_to_world must be 16 numbers, got [1"),
+        ({"camera_path": [{"camera_to_world": [math.nan] * 16, "fov": 50}]}, "1e+09, got nan"),
+        (
+            {"camera_path": [{"camera_to_world": [10**400] * 16, "fov": 50}]},
+            "must be a number of -1e+09 to 1e+09, got 1",
+        ),
+        (
+            {"camera_path": [{"camera_to_world": [2.0, *LEVEL[1:]], "fov": 50}]},
+            "[0].camera_to_world must be a rotation",
+        ),
+        ({"camera_path": [{"camera_to_world": [-1.0, *LEVEL[1:]], "fov": 50}]}, "must be a rotation and a position"),
+        (
+            {"camera_path": [{"camera_to_world": LEVEL, "fov": 180}]},
+            "[0].fov must be a number of 0.01 to 179.9, got 180",
+        ),
+        ({"keyframes": {"a": 1}}, "keyframes must be a list of 1 to 100000 frames, got {'a': 1}"),
+        ({"render_width": 10**9}, "render_width must be an integer of 1 to 8192, got 1000000000"),
+        ({"render_height": True}, "render_height must be an integer of 1 to 8192, got True"),
+        ({"fps": "fast"}, "fps must be a number of 0.01 to 1000, got 'fast'"),
+        ({"camera_type": "fisheye"}, "camera_type must be perspective, got 'fisheye'"),
+    ],
+)
+def test_files_that_are_no_paths(tmp_path, changes, rule):
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps(by_hand(**changes)))
+    refuses(f"{file}: ", read_camera_path, file)
+    refuses(rule, read_camera_path, file)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_smooth_paths_pass_their_keyframes_evenly(closed):
+    keyframes = orbit_cameras(6, radius=2, elevation=20, width=64, height=48, focal=70)
+    keyframes.intrinsics[3, :2] = 140
+    steps, count = 10, 60 if closed else 51
+    frames = smooth_path(keyframes, count, closed=closed)
+    torch.testing.assert_close(frames.poses[::steps], keyframes.poses, atol=1e-5, rtol=0)
+    torch.testing.assert_close(frames.intrinsics[::steps], keyframes.intrinsics)
+    turns = frames.poses[:, :3, :3]
+    torch.testing.assert_close(turns @ turns.mT, torch.eye(3).expand(count, 3, 3), atol=1e-5, rtol=0)
+    moves = (frames.poses.roll(-1, 0) - frames.poses).flatten(1).norm(dim=-1)[: count - (not closed)]
+    assert moves.max() < 2 * moves.min()  # no jump, also not from the last frame to the first
+    assert smooth_path(keyframes[:1], 3).poses.sub(keyframes.poses[0]).abs().max() < 1e-5
+    refuses("keyframes and count must be at least 1, got 6 and 0", smooth_path, keyframes, 0)
+
+
+def test_a_spiral_around_an_object_stays_among_its_cameras():
+    cameras = [
+        orbit_cameras(8, radius=3, elevation=e, width=32, height=24, focal=40, centre=(1, 0, 0)) for e in (10, 50)
+    ]
+    seen = Cameras(*(torch.cat([getattr(c, name) for c in cameras]) for name in ("poses", "intrinsics")), 32, 24)
+    frames = spiral_cameras(seen, 40, near=1, far=5)
+    focus = focus_point(seen)
+    torch.testing.assert_close((frames.origins - focus).norm(dim=-1), torch.full((40,), 3.0), atol=1e-3, rtol=0)
+    pixels, depth = zip(*(frames.project(focus[None], index) for index in range(40)))
+    torch.testing.assert_close(torch.cat(pixels), torch.tensor([[16.0, 12]]).expand(40, 2), atol=1e-2, rtol=0)
+    height = (frames.origins - focus)[:, 2] / 3
+    assert height.min().asin().rad2deg() >= 9.9 and height.max().asin().rad2deg() == pytest.approx(50, abs=0.5)
+    assert min(torch.cat(depth)) > 0 and (frames.width, frames.height) == (32, 24)
+
+
+@pytest.mark.parametrize("towards", [0.0, 4.0])  # parallel cameras, and ones that look at a point
+def test_a_spiral_before_a_scene_looks_where_its_cameras_do(towards):
+    x, z = torch.meshgrid(torch.linspace(-0.5, 0.5, 4), torch.linspace(-0.3, 0.3, 3), indexing="ij")
+    origins = torch.stack((x, torch.full_like(x, -4), z), -1).reshape(-1, 3)
+    target = torch.zeros(3) if towards else origins + torch.tensor([0.0, 4, 0])
+    poses = look_at(origins, target, torch.tensor([0.0, 0, 1]))
+    seen = Cameras(poses, torch.tensor([[40.0, 40, 16, 12]]).repeat(12, 1), 32, 24)
+    frames = spiral_cameras(seen, 30, near=2, far=1e6)
+    offset = frames.origins - torch.tensor([0.0, -4, 0])
+    assert (offset.abs().amax(0) <= torch.tensor([0.51, 0.2, 0.31])).all() and offset[:, 0].abs().max() > 0.45
+    assert frames.forward[:, 1].min() > 0.97
+    middle = torch.tensor([[0.0, 0 if towards else 4, 0]])  # at the focus, or at 1 / (0.25 / near)
+    pixels = torch.cat([frames.project(middle, index)[0] for index in range(30)])
+    torch.testing.assert_close(pixels, torch.tensor([[16.0, 12]]).expand(30, 2), atol=0.05, rtol=0)
+    assert len(turntable_cameras(seen, 5)) == 5
+    refuses("count must be at least 1, got 0", spiral_cameras, seen, 0, near=1, far=2)

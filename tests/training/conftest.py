@@ -1,8 +1,0 @@
-import pytest
-
-from voronerf.data import builtin_scene
-
-
-@pytest.fixture(scope="session")
-def scene():
-    return builtin_scene(16)

@@ -1,0 +1,131 @@
+"""What a running training shows: a live line on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import math
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from voronerf.app.train.progress import Progress as TrainingProgress
+
+LONGEST_LINE = 900
+
+
+def printable(text: str) -> str:
+    """Text with its control characters escaped, since a terminal would obey them."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def one_line(text: str) -> str:
+    """Printable text as a line of at most `LONGEST_LINE` characters, shortened in its middle."""
+    line = printable(" ".join(text.split()))
+    head, tail = 2 * LONGEST_LINE // 3, LONGEST_LINE // 3 - 5
+    return line if len(line) <= LONGEST_LINE else f"{line[:head]} ... {line[-tail:]}"
+
+
+class _Rate(ProgressColumn):
+    """Rays per second, in thousands."""
+
+    def render(self, task: Task) -> Text:
+        return Text(f"{task.fields['speed'] / 1000:6.1f} k rays/s")
+
+
+class TrainingDisplay:
+    """Shows step, stage, rays/s, loss, PSNR and the time left; the trainer's callbacks are its two methods.
+
+    Its ``progress`` is the live line, which shows while it is entered.
+
+    Args:
+        console: Where to write; its own detection of a terminal decides between a live line and plain ones.
+        label: Name of the run.
+        quiet: Leave out lines that stay.
+    """
+
+    def __init__(self, console: Console, label: str, *, quiet: bool = False) -> None:
+        self.console, self.quiet = console, quiet
+        self.progress = Progress(
+            TextColumn("[bold]{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:3.0f} %"),
+            TextColumn("step {task.fields[step]}"),
+            TextColumn("{task.fields[stage]}"),
+            _Rate(),
+            TextColumn("loss {task.fields[loss]:.5f}"),
+            TextColumn("{task.fields[psnr]}"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+            refresh_per_second=4,
+        )
+        self.task = self.progress.add_task(
+            escape(printable(label)), total=1.0, step=0, stage="", speed=0.0, loss=0.0, psnr=""
+        )
+        self.loss = math.nan  # until the first is read
+
+    def on_step(self, now: TrainingProgress) -> None:
+        """Shows the state after a step; the loss is smoothed over about twenty steps."""
+        self.loss = now.loss if math.isnan(self.loss) else 0.95 * self.loss + 0.05 * now.loss
+        self.progress.update(
+            self.task,
+            completed=now.fraction,
+            step=now.step,
+            stage="coarse" if now.cells == 1 else f"{now.cells} cells",
+            speed=now.rays_per_second,
+            loss=self.loss,
+            psnr="" if now.psnr is None else f"psnr {now.psnr:.2f} dB",
+        )
+
+    def on_event(self, line: str) -> None:
+        """Prints a line that stays, above the live one."""
+        if self.quiet:
+            return
+        self.console.print(printable(line), highlight=False, markup=False, emoji=False)
+
+
+class StageDisplay:
+    """Shows the stages of a long command: a bar for each on a terminal, with the time left; plain lines elsewhere.
+
+    Its ``progress`` are the bars, which show while it is entered.
+
+    Args:
+        console: Where to write.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.progress = Progress(
+            TextColumn("[bold]{task.description:<10}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[count]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+            refresh_per_second=4,
+        )
+        self.tasks: dict[str, TaskID] = {}
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        """Shows how much of a stage is done; a total of 0 is not known."""
+        if stage not in self.tasks:
+            self.tasks[stage] = self.progress.add_task(stage, total=None, count="")
+            if not self.console.is_terminal:
+                self.say(stage)
+        count = f"{done} of {total}" if total else str(done or "")
+        self.progress.update(self.tasks[stage], completed=done, total=total or None, count=count)
+
+    def say(self, line: str) -> None:
+        """Prints a line that stays."""
+        self.console.print(printable(line), highlight=False, markup=False, emoji=False, soft_wrap=True)

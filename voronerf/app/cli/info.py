@@ -1,0 +1,83 @@
+"""``voronerf info``: what an installation can use, and the extras of the package."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from rich.markup import escape
+from rich.table import Table
+
+from voronerf.app.cli.commands import console, say
+from voronerf.app.run import open_run
+from voronerf.nerf import Step
+from voronerf.ops._core import backends
+
+
+class Extra(NamedTuple):
+    """What an extra of the package adds, and the modules that it installs."""
+
+    adds: str
+    modules: tuple[str, ...]
+
+
+EXTRAS = {
+    "export": Extra("voronerf export: points, meshes, cells", ("trimesh", "skimage", "scipy")),
+    "viewer": Extra("voronerf view and train --view, in the browser", ("viser",)),
+    "colmap": Extra("voronerf process: cameras of a video or of pictures", ("pycolmap",)),
+    "nerfstudio": Extra("ns-train voronerf, in nerfstudio", ("nerfstudio",)),
+    "warp": Extra("kernels in NVIDIA Warp (--backend warp)", ("warp",)),
+    "tensorboard": Extra("train --tensorboard", ("tensorboard",)),
+    "dev": Extra("checks of the sources", ("ruff", "mypy")),
+}
+
+
+def info(run: Path | None = None, /) -> int:
+    """Show what this installation can use: build, instruction set, extras, backends, and why something is missing.
+
+    Args:
+        run: A run directory: show instead how a step of its training is computed, and why not in a faster way.
+    """
+    if run is not None:
+        opened = open_run(run)
+        step = Step(opened.renderer, sightings=opened.config.sightings or 0.0)
+        for line in step.explain(opened.config.territories or 1).splitlines():
+            say(line)
+        return 0
+    for name, value in backends.describe().items():
+        values = value if isinstance(value, dict) else {"": value}
+        for key, entry in values.items():
+            text = ", ".join(map(str, entry)) or "none" if isinstance(entry, list) else str(entry)
+            console.print(f"{f'{name} {key}'.strip():26} {text}", highlight=False, markup=False)
+    if backends.missing("native", torch.device("cpu")) is None:
+        by_torch = importlib.import_module("voronerf.ops.grouped_mlp.by_torch")
+        kernels = importlib.import_module("voronerf.ops.grouped_mlp.native")
+        text = by_torch.describe(kernels.fused)
+        console.print(f"{'native bfloat16 by torch':26} {text}", highlight=False, markup=False)
+    for name, extra in EXTRAS.items():
+        text = f"{extra.adds}: {_state(name, extra.modules)}"
+        console.print(f"{f'extra {name}':26} {text}", highlight=False, markup=False)
+    rows = {(row.op, row.backend): row for row in backends.table()}
+    missing = dict.fromkeys(row.reason for row in rows.values() if row.dtypes and row.reason)
+    numbers = {reason: number for number, reason in enumerate(missing, 1)}
+    table = Table("op", *backends.BACKENDS, title="where each implementation runs, and for which dtypes")
+    for op in backends.ops():
+        texts = []
+        for row in (rows[op, backend] for backend in backends.BACKENDS):
+            where = f"{', '.join(row.devices)}: {', '.join(row.dtypes)}" if row.devices else ""
+            note = f" [{numbers[row.reason]}]" if row.reason in numbers else ""
+            texts.append(escape((where + note).strip() or "-"))
+        table.add_row(op, *texts)
+    console.print(table)
+    for reason, number in numbers.items():
+        console.print(f"[{number}] {reason}", highlight=False, markup=False)
+    return 0
+
+
+def _state(name: str, modules: Sequence[str]) -> str:
+    missing = [module for module in modules if importlib.util.find_spec(module) is None]
+    return f"no {', '.join(missing)}; pip install 'voronerf[{name}]'" if missing else "there"

@@ -1,0 +1,88 @@
+"""The options of every command that opens a trained run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from torch import Tensor, tensor
+
+from voronerf.app.run import Run, open_run, read_crop
+from voronerf.app.scenes import Scene
+from voronerf.app.scenes.record import read_scene
+from voronerf.app.train.config import ConfigError
+from voronerf.town.parts import Parts
+
+#: Six numbers of a box, or the one that the viewer has saved.
+Crop = tuple[float, float, float, float, float, float] | Literal["saved"] | None
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How a run is opened; what is None is as in training."""
+
+    data: str | None = None
+    """Scene folder; default as in training, if that lies in the run directory, the working directory or VORONERF_DATA,
+    since a run may be another person's."""
+    downscale: int | None = None
+    """Factor on the images, and on the frames of a camera path; default as in training, and 1 for a path."""
+    allow_outside: bool = False
+    """Also read images that lie outside of the scene folder."""
+    samples: int | None = None
+    """Samples per ray in the first pass; default as in training."""
+    fine_samples: int | None = None
+    """Samples per ray in the second pass; default as in training."""
+    occupancy: bool = False
+    """Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses its own grid."""
+    blend: float | None = None
+    """Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off."""
+    device: str = "cpu"
+    """Torch device."""
+    backend: str = "auto"
+    """Backend of the operations."""
+    memory: str | None = None
+    """Bound on memory, such as 512M, for a run of several parts or territories: networks are read as rays meet them,
+    and those that were not used for longest are dropped."""
+    detail: float | None = None
+    """Draw far parts of a joined run from a coarse level, whose voxels are at most so many pixels wide; 0 is off. The
+    default is 1 for view and render with --memory, and 0 else."""
+
+    def open_without_images(self, run: Path, *, pictures: bool = False) -> Run:
+        """Opens the run with the cameras of its record, unless other data or other sizes are asked for."""
+        record = run / "scene.json"
+        known = self.data is None and self.downscale is None and record.is_file()
+        return self.open(run, scene=read_scene(record) if known else None, pictures=pictures)
+
+    def open(self, run: Path, *, scene: Scene | None = None, pictures: bool = False) -> Run:
+        """Opens the run; see :func:`voronerf.open_run`. ``pictures``: to be looked at, not to be measured."""
+        check_counts(samples=self.samples, fine_samples=self.fine_samples, downscale=self.downscale)
+        opened = open_run(run, scene=scene, **{**vars(self), "detail": self.detail or 0.0})
+        coarse = isinstance(opened.router, Parts) and any(part.coarse for part in opened.router)
+        if pictures and self.memory is not None and self.detail is None and coarse:
+            opened.router.detail = 1.0
+        return opened
+
+
+AS_IN_TRAINING = Opening()
+
+
+def check_counts(**counts: int | None) -> None:
+    """Raises ConfigError for an option below 1; None stands for its default."""
+    for name, value in counts.items():
+        if value is not None and value < 1:
+            raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+
+
+def crop_box(run: Run, crop: Crop) -> Tensor | None:
+    """The box [2, 3] of --crop, or None.
+
+    Raises:
+        ConfigError: No crop was saved with the run.
+    """
+    if crop != "saved":
+        return None if crop is None else tensor(crop).view(2, 3)
+    box = read_crop(run.path)
+    if box is None:
+        raise ConfigError(f"--crop saved needs a crop, which the viewer saves with the run: {run.path} has none")
+    return box

@@ -1,0 +1,22 @@
+"""Scores and pictures of a trained scene: PSNR, SSIM, LPIPS, panels, videos, seams, curves.
+
+Pictures are in ``panels``, ``plots`` and ``video``, which import matplotlib, Pillow or ffmpeg.
+"""
+
+from voronerf.app.evaluate.lpips import Lpips, LpipsError, find_lpips
+from voronerf.app.evaluate.metrics import psnr, ssim
+from voronerf.app.evaluate.scores import ViewScore, evaluate, mean_scores, score_views
+from voronerf.app.evaluate.seams import seam
+
+__all__ = [
+    "Lpips",
+    "LpipsError",
+    "ViewScore",
+    "evaluate",
+    "find_lpips",
+    "mean_scores",
+    "psnr",
+    "score_views",
+    "seam",
+    "ssim",
+]

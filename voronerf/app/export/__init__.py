@@ -1,0 +1,18 @@
+"""Takes a trained run away: coloured points, a mesh, the cells of its diagram, cameras. Needs the extra `export`."""
+
+from voronerf.app.export.cameras import export_cameras
+from voronerf.app.export.cells import cell_meshes, export_cells
+from voronerf.app.export.mesh import export_mesh
+from voronerf.app.export.points import export_points
+from voronerf.app.export.splats import export_splats
+from voronerf.app.export.video import export_video
+
+__all__ = [
+    "cell_meshes",
+    "export_cameras",
+    "export_cells",
+    "export_mesh",
+    "export_points",
+    "export_splats",
+    "export_video",
+]

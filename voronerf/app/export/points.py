@@ -1,0 +1,86 @@
+"""The surface of a trained run as coloured points with normals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from voronerf.app.export.space import VIEWS, box_of, check_export, placed, training_views, write_geometry
+from voronerf.app.run import Run
+from voronerf.app.train.config import ConfigError
+
+SUFFIXES = (".ply",)
+#: Points that a normal is computed from.
+NEIGHBOURS = 16
+
+
+def export_points(
+    run: Run, path: Path | str, *, count: int = 200_000, box: Tensor | None = None, to_files: bool = False
+) -> Any:
+    """Writes what the pixels of training views show as .ply, and returns it as a ``trimesh.Trimesh`` without faces.
+
+    Each point has the colour of its pixel, and a normal towards its camera: the direction in which it and its nearest
+    neighbours spread the least.
+
+    Args:
+        run: trained run, as `open_run` opens it.
+        path: file to write, .ply.
+        count: points at the most, drawn at random where the views have more.
+        box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
+        to_files: whether positions are those of the scene's files, in metres if those are, rather than the scene's.
+
+    Raises:
+        ConfigError: a count below 1, no box, or views that show nothing in it.
+        ImportError: trimesh or scipy is missing.
+        ValueError: another suffix.
+        OSError: the file cannot be written.
+
+    Examples:
+        >>> from voronerf import Run
+        >>> from voronerf.app.export import export_points
+        >>> def middle(run: Run) -> list:
+        ...     return export_points(run, "scene.ply", count=10_000).vertices.mean(0).tolist()
+    """
+    path = Path(path)
+    check_export(path, SUFFIXES)
+    points = placed(run, _surface(run, count, box), to_files)
+    write_geometry(path, points, vertex_normal=True)
+    return points
+
+
+def _surface(run: Run, count: int, box: Tensor | None) -> Any:
+    import trimesh
+    from scipy.spatial import cKDTree
+
+    if count < 1:
+        raise ConfigError(f"--count must be at least 1, got {count}")
+    cameras = run.scene.train.cameras
+    # Many pixels show the background; of an object often seven in eight.
+    side = int((8 * count / min(VIEWS, len(cameras)) * max(cameras.width / cameras.height, 1)) ** 0.5) + 1
+    low, high = box_of(run, box)
+    points, colours, towards = [], [], []
+    for view in training_views(run, side):
+        shown = view.distance.isfinite() & ((view.surface >= low) & (view.surface <= high)).all(-1)
+        points.append(view.surface[shown])
+        colours.append(view.colour[shown])
+        towards.append(view.camera.origins.cpu() - view.surface[shown])
+    found = torch.cat(points)
+    if len(found) == 0:
+        raise ConfigError(f"{run.path}: the training views show no surface in the box")
+    chosen = torch.randperm(len(found), generator=torch.Generator().manual_seed(0))[:count]
+    found, colour, toward = found[chosen], torch.cat(colours)[chosen], torch.cat(towards)[chosen]
+    _, near = cKDTree(found.numpy()).query(found.numpy(), k=min(NEIGHBOURS, len(found)))
+    around = found[torch.from_numpy(np.asarray(near)).view(len(found), -1)]
+    spread = around - around.mean(1, keepdim=True)
+    normals = torch.linalg.eigh(spread.mT @ spread)[1][..., 0]
+    normals = torch.where((normals * toward).sum(-1, keepdim=True) < 0, -normals, normals)
+    return trimesh.Trimesh(
+        found.numpy(),
+        vertex_normals=normals.numpy(),
+        vertex_colors=(colour.clamp(0, 1) * 255).round().to(torch.uint8).numpy(),
+        process=False,
+    )

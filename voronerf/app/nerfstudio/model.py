@@ -1,0 +1,285 @@
+"""The model: voronerf's networks, renderer, occupancy grid and splits between nerfstudio's rays and its losses."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.model_components import renderers
+from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.utils import colormaps
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor, nn
+
+from voronerf.app.evaluate.panels import palette
+from voronerf.app.nerfstudio.scene import scene_of, seen_from_inside
+from voronerf.app.train.config import TrainConfig
+from voronerf.app.train.networks import make_routers, parameter_groups, resolve_config
+from voronerf.app.train.renderers import make_grid, make_renderer
+from voronerf.nerf import Batch, Cells, Found, Rays, Step, intersect_box
+
+
+@dataclasses.dataclass
+class VoronerfModelConfig(ModelConfig):
+    """Settings of the model, by the names of ``voronerf train``."""
+
+    _target: type = dataclasses.field(default_factory=lambda: VoronerfModel)
+    enable_collider: bool = False
+    """Not used: the scene gives near and far."""
+    eval_num_rays_per_chunk: int = 1 << 15
+    field: str = "hashgrid"
+    """Kind of network: hashgrid, nerf, mipnerf or kilonerf."""
+    field_options: tuple[str, ...] = ()
+    """Further options of the field, each as NAME=VALUE, such as log2_entries=19."""
+    width: int | None = None
+    """Channels of the networks' hidden layers; default that of the field."""
+    cells: tuple[int, ...] = (16,)
+    """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again."""
+    split_at: tuple[float, ...] | None = None
+    """When to split, as fractions of max_num_iterations, one per level; default: 0.2, or evenly spaced from 0.15 to
+    0.5."""
+    sampling: str = "stratified"
+    """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something;
+    or proposal, where a small density network places the samples."""
+    samples: int | None = None
+    """Samples per ray of the first pass; default: by the cameras where empty space is skipped, else 64, and 32 for two
+    passes."""
+    fine_samples: int = 32
+    """Samples per ray of the second pass."""
+    contraction: Literal["auto", "none", "sphere"] = "auto"
+    """Only the scene box (none), or all of space, with what is outside of a sphere mapped into a shell (sphere); auto
+    is the box if all cameras stand outside of it."""
+    occupancy: bool = True
+    """Skip empty space, where samples are stratified in the scene box."""
+
+    def train_config(self, *, contracted: bool) -> TrainConfig:
+        """The settings that ``voronerf train`` would have.
+
+        Raises:
+            ConfigError: For a value out of range, or settings that exclude each other.
+        """
+        return TrainConfig(
+            seed=torch.initial_seed() % 2**31,
+            field=self.field,
+            field_options=self.field_options,
+            width=self.width,
+            cells=self.cells,
+            split_at=self.split_at,
+            sampling=self.sampling,
+            samples=self.samples,
+            fine_samples=self.fine_samples,
+            contraction="sphere" if contracted else "none",
+            occupancy=self.occupancy,
+        )
+
+
+class VoronerfModel(Model):
+    """Renders nerfstudio's rays by a network for each Voronoi cell, and splits the cells on the way.
+
+    The metadata of the training images must hold their ``cameras``, and may hold a ``background`` [3] in 0..1.
+    """
+
+    config: VoronerfModelConfig
+
+    def populate_modules(self) -> None:
+        """Makes the networks of one cell, from the cameras and the scene box."""
+        super().populate_modules()
+        metadata, device = self.kwargs["metadata"], self.kwargs["device"]
+        cameras, box = metadata["cameras"], self.scene_box.aabb
+        auto = self.config.contraction == "auto"
+        contracted = seen_from_inside(cameras, box) if auto else self.config.contraction == "sphere"
+        self.scene = scene_of(cameras, box, contracted=contracted)
+        self.settings = resolve_config(self.config.train_config(contracted=contracted), self.scene)
+        self.bounds = None if self.scene.box is None else self.scene.box.to(device)
+        background = metadata.get("background")
+        self.background = None if background is None else background.to(device)
+        self.routers = make_routers(self.settings, device)
+        self.networks = nn.ModuleDict(self.routers)  # whose parameters torch finds
+        grid = make_grid(self.settings, self.scene, device) if self.settings.occupancy else None
+        self.renderer = make_renderer(self.settings, self.scene, self.routers, occupancy=grid)
+        self.learner = Step(self.renderer)
+        self.cells = Cells(
+            self.renderer,
+            self.routers,
+            self.settings.planned_splits,
+            self.settings.split_rule,
+            generator=torch.Generator().manual_seed(self.settings.seed),
+        )
+        self._found: Found | None = None
+
+    @property
+    def num_cells(self) -> int:
+        """Cells of the diagram."""
+        return self.routers["field"].num_cells
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """The networks, "fields", and the tables of hash grids, "tables", if there are any."""
+        dense, tables = parameter_groups(self.routers, self.settings)
+        return {"fields": dense, "tables": tables} if tables else {"fields": dense}
+
+    # --- training --------------------------------------------------------------------------------------------------
+
+    def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:
+        """What comes before and after each step of nerfstudio's trainer."""
+        trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
+        assert trainer is not None and optimizers is not None
+        steps, optimizer = trainer.config.max_num_iterations, optimizers.optimizers["fields"]
+
+        def before(step: int) -> None:
+            if self.cells.is_due(step / steps, step):
+                self._split(step, optimizer)
+            self.cells.revisit(step)
+            if not self.routers["field"].training:  # since the cells were looked at again, or a picture was made
+                self.renderer.train()
+
+        def after(step: int) -> None:
+            found, self._found = self._found, None
+            assert found is not None
+            self.cells.observe(found)
+            if self.cells.planned is not None:
+                self.cells.reservoir.add(found.samples.positions, found.importance())
+
+        return [
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before, update_every_num_iters=1),
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after, update_every_num_iters=1),
+        ]
+
+    def _split(self, step: int, optimizer: torch.optim.Optimizer) -> None:
+        """Splits the cells by the kept samples; parameters stay the same objects, with other shapes."""
+        split, kept = self.cells.find_split(), len(self.cells.reservoir)
+        self.cells.splits += 1
+        self.cells.empty_reservoir()
+        if split is None or not split.balances:
+            CONSOLE.log(f"voronerf: no cell split at step {step}, none holds enough of the {kept} samples")
+            return
+        self.cells.divide(split, optimizer)
+        CONSOLE.log(f"voronerf: {self.num_cells} cells at step {step}")
+
+    # --- rays ------------------------------------------------------------------------------------------------------
+
+    def _rays(self, bundle: RayBundle) -> tuple[Rays, Tensor, Tensor]:
+        """Their rays as ours, and where each enters and leaves the scene, [r] and [r]."""
+        # A cone's radius is 2 / sqrt(12) of the width of its pixel (mip-NeRF, section 3.1).
+        radii = (bundle.pixel_area[:, 0] / 3).sqrt() if self.renderer.cones else None
+        rays = Rays(bundle.origins, bundle.directions, radii)
+        near, far, _ = intersect_box(rays.origins, rays.directions, self.bounds, self.scene.near, self.scene.far)
+        if bundle.nears is not None and bundle.fars is not None:  # the crop box of the viewer
+            near = near.maximum(bundle.nears[:, 0])
+            far = far.minimum(bundle.fars[:, 0]).maximum(near)
+        return rays, near, far
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        """Colour, accumulation and depth of rays, and ``cells``, the colour of the cell that each shows.
+
+        In training the rays as they came: what they see is found together with the loss, see :meth:`get_loss_dict`.
+        """
+        rays, near, far = self._rays(ray_bundle)
+        return {"rays": (rays, near, far)} if self.training else self._see(rays, near, far)
+
+    @torch.no_grad()
+    def _see(self, rays: Rays, near: Tensor, far: Tensor) -> dict[str, Tensor]:
+        colour, opacity, depth, places = self.renderer.see(rays, near, far)
+        background = renderers.BACKGROUND_COLOR_OVERRIDE  # of the viewer and of ns-render
+        background = self.background if background is None else background.to(colour)
+        cells = self.routers["field"].diagram.locate(places)
+        shown = palette(self.num_cells).to(colour)[cells.long()] / 255
+        return {
+            "rgb": _over(colour, opacity, background).clamp(0, 1),
+            "accumulation": opacity[:, None],
+            "depth": depth[:, None],
+            "cells": _over(shown * opacity[:, None], opacity, torch.ones_like(shown[0])),
+        }
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """An image [h, w, 4] without its background, for ``ns-export``."""
+        opacity = outputs["accumulation"]
+        behind = 0.0 if self.background is None else self.background * (1 - opacity)
+        return torch.cat(((outputs[output_name] - behind) / opacity.clamp_min(1e-10), opacity), dim=-1).clamp(0, 1)
+
+    # --- losses and scores -----------------------------------------------------------------------------------------
+
+    def _truth(self, batch: dict[str, Tensor], background: Tensor | None) -> Tensor:
+        """The colours [..., 3] of a batch, over a background where it has an alpha channel."""
+        image = batch["image"].to(self.device)
+        return image if image.shape[-1] == 3 else _over(image[..., :3] * image[..., 3:], image[..., 3], background)
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: Any = None
+    ) -> dict[str, Tensor]:
+        """The loss of our trainer; images with an alpha channel lie over a colour that is drawn for each ray."""
+        if "rays" not in outputs:
+            return {"rgb_loss": (outputs["rgb"] - self._truth(batch, self.background)).square().mean()}
+        return {"rgb_loss": self._learn(outputs, batch).loss}
+
+    def _learn(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> Found:
+        """What a training step finds, once for the outputs of a batch: losses and metrics ask for it."""
+        if "found" not in outputs:
+            rays, near, far = outputs["rays"]
+            background = self.background if batch["image"].shape[-1] == 3 else torch.rand_like(rays.origins)
+            target = self._truth(batch, background)
+            outputs["found"] = self._found = self.learner.run(Batch(rays, near, far, target, background))
+        found: Found = outputs["found"]
+        return found
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """PSNR in dB of the rays of a batch, and the number of cells."""
+        if "rays" in outputs:
+            error = self._learn(outputs, batch).error.mean() / 3
+        else:
+            error = (outputs["rgb"] - self._truth(batch, self.background)).square().mean()
+        return {"psnr": -10 * error.log10(), "cells": torch.tensor(float(self.num_cells))}
+
+    @functools.cached_property  # not a part of the model's state; its weights are downloaded where it is first asked
+    def lpips(self) -> nn.Module:
+        """LPIPS as the other methods of nerfstudio compute it."""
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+        return LearnedPerceptualImagePatchSimilarity(normalize=True).to(self.device)
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """PSNR, SSIM and LPIPS of an image, and pictures: truth beside render, accumulation, depth, cells."""
+        from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+        truth, rgb, opacity = self._truth(batch, self.background), outputs["rgb"], outputs["accumulation"]
+        pair = tuple(image.movedim(-1, 0)[None] for image in (truth, rgb))
+        scores = {
+            "psnr": float(peak_signal_noise_ratio(*pair, data_range=1.0)),
+            "ssim": float(structural_similarity_index_measure(*pair, data_range=1.0)),
+            "lpips": float(self.lpips(*pair)),
+        }
+        pictures = {
+            "img": torch.cat((truth, rgb), dim=1),
+            "accumulation": colormaps.apply_colormap(opacity),
+            "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation=opacity),
+            "cells": outputs["cells"],
+        }
+        return scores, pictures
+
+    # --- checkpoints -----------------------------------------------------------------------------------------------
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What nerfstudio's checkpoints hold beside the parameters and the diagram."""
+        grid = self.renderer.occupancy
+        return {
+            "splits": self.cells.splits,
+            "reservoir": self.cells.reservoir.state_dict(),
+            "occupancy": None if grid is None else grid.state_dict(),
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Goes on from :meth:`get_extra_state`; the cells follow from the parameters."""
+        self.cells.splits = state["splits"]
+        self.cells.reservoir.load_state_dict(state["reservoir"])
+        if self.renderer.occupancy is not None and state["occupancy"] is not None:
+            self.renderer.occupancy.load_state_dict(state["occupancy"])
+
+
+def _over(colour: Tensor, opacity: Tensor, background: Tensor | None) -> Tensor:
+    """Colours [..., 3] on black, of opacity [...], over a background [3] or [..., 3]; None is black."""
+    return colour if background is None else colour + (1 - opacity[..., None]) * background

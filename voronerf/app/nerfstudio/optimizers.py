@@ -1,0 +1,69 @@
+"""Optimisers and schedulers for nerfstudio's trainer, with the settings of ``voronerf train``."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
+from nerfstudio.engine.optimizers import OptimizerConfig
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from torch import nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from voronerf.nerf.adam import Adam
+
+
+@dataclasses.dataclass
+class AdamConfig(OptimizerConfig):
+    """Adam as :func:`voronerf.app.train.networks.make_optimizer` makes it."""
+
+    _target: type = Adam
+    lr: float = 0.02
+    eps: float = 1e-15
+    betas: tuple[float, float] = (0.9, 0.99)
+    """Decay of the averages of gradients and of their squares."""
+    sparse: bool = False
+    """On a CPU, leave entries without a gradient as they are."""
+
+    def setup(self, params: Iterable[nn.Parameter]) -> Adam:
+        """The optimiser of one group of parameters."""
+        params = list(params)
+        sparse = self.sparse and params[0].device.type == "cpu"
+        groups = [{"params": params, "sparse": sparse}]
+        return Adam(groups, lr=self.lr, betas=self.betas, eps=self.eps)
+
+
+@dataclasses.dataclass
+class DecaySchedulerConfig(SchedulerConfig):
+    """A linear rise of the learning rate and then an exponential decay, in numbers that a checkpoint can hold.
+
+    nerfstudio's own scheduler stores numbers of numpy, which torch 2.6 and newer refuse to load from a checkpoint.
+    """
+
+    _target: type = dataclasses.field(default_factory=lambda: DecayScheduler)
+    lr_final: float = 0.001
+    """Learning rate at the end."""
+    warmup_steps: int = 100
+    """Steps over which the learning rate rises from a hundredth, a fiftieth of the run at most."""
+    max_steps: int | None = None
+    """Steps until the end; default: max_num_iterations of the trainer."""
+
+
+class DecayScheduler(Scheduler):
+    """The scheduler of :class:`DecaySchedulerConfig`."""
+
+    config: DecaySchedulerConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> Any:
+        """The scheduler of one optimiser, whose learning rate at the start is ``lr_init``."""
+        config, steps = self.config, self.config.max_steps
+        assert steps is not None
+        warmup = max(1, min(config.warmup_steps, steps // 50))
+
+        def factor(step: int) -> float:
+            rise = min(1.0, 0.01 + 0.99 * step / warmup)
+            return rise * (config.lr_final / lr_init) ** min(1.0, step / steps)
+
+        return LambdaLR(optimizer, factor)

@@ -1,0 +1,299 @@
+"""Ways of a camera through a scene: spirals, smooth paths through keyframes, and nerfstudio's file of a path.
+
+c cameras, f frames. Poses and pixels as in :mod:`voronerf.nerf.cameras`.
+
+The file is JSON: `render_width`, `render_height`, `fps`, and a list `camera_path` with a frame each, whose
+`camera_to_world` has the 16 numbers of a pose row by row and whose `fov` is the vertical angle of view in degrees.
+Viewers keep the keyframes beside them: a list `keyframes` with `matrix` and `fov`, and `is_cycle`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.app.files import json_text, read_json, write_text
+from voronerf.nerf.cameras import Cameras, focus_point, look_at
+
+#: Frames of a path; at 24 a second they take more than an hour.
+MOST_FRAMES = 100_000
+#: Pixels along a side of a frame.
+LONGEST_SIDE = 8192
+#: Distance from the origin.
+FARTHEST = 1e9
+#: By which the product of a rotation and its transpose may differ from 1.
+ORTHONORMAL = 2e-3
+#: Above this length of their mean direction, cameras look one way rather than around or about something.
+ONE_WAY = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPath:
+    """The frames of a video, and the keyframes that they were made from.
+
+    Attributes:
+        frames: a camera for each, of the size of the video.
+        fps: frames a second.
+        keyframes: of the same size, or None.
+        closed: whether the last keyframe is followed by the first.
+
+    Examples:
+        >>> from voronerf.nerf import orbit_cameras
+        >>> from voronerf.app.render.paths import CameraPath, smooth_path
+        >>> keyframes = orbit_cameras(4, radius=3.0, elevation=20.0, width=64, height=48, focal=70.0)
+        >>> path = CameraPath(smooth_path(keyframes, 48, closed=True), fps=24, keyframes=keyframes, closed=True)
+        >>> len(path.frames)
+        48
+    """
+
+    frames: Cameras
+    fps: float
+    keyframes: Cameras | None = None
+    closed: bool = False
+
+
+def read_camera_path(file: Path | str) -> CameraPath:
+    """Reads a path that nerfstudio's viewer or :func:`write_camera_path` has saved.
+
+    Positions are those of the scene that is rendered. Crops, times and transitions of the file have no effect.
+
+    Raises:
+        ValueError: the file is no such path, of another type of camera than perspective, or too large; it names the
+            file, the frame and the field.
+        OSError: it cannot be read.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from voronerf.nerf import orbit_cameras
+        >>> from voronerf.app.render.paths import CameraPath, read_camera_path, write_camera_path
+        >>> frames = orbit_cameras(24, radius=3.0, elevation=20.0, width=64, height=48, focal=70.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_camera_path(Path(folder) / "path.json", CameraPath(frames, fps=24))
+        ...     path = read_camera_path(Path(folder) / "path.json")
+        >>> path.frames.width, path.frames.height, path.fps, path.keyframes
+        (64, 48, 24.0, None)
+    """
+    entries = read_json(Path(file))
+    if not isinstance(entries, dict) or not isinstance(entries.get("camera_path"), list):
+        raise ValueError(f"{file}: is not a camera path: it must have a list camera_path")
+    kind = entries.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise ValueError(f"{file}: camera_type must be perspective, got {kind!r:.60}")
+    sizes = {}
+    for name in ("render_width", "render_height"):
+        size = entries.get(name)
+        if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= LONGEST_SIDE:
+            raise ValueError(f"{file}: {name} must be an integer of 1 to {LONGEST_SIDE}, got {size!r:.60}")
+        sizes[name] = size
+    size = sizes["render_width"], sizes["render_height"]
+    fps = _number(entries.get("fps", 24), 0.01, 1000, f"{file}: fps")
+    frames = _read_cameras(entries["camera_path"], "camera_to_world", size, f"{file}: camera_path")
+    keyframes = entries.get("keyframes") or None
+    if keyframes is not None:
+        keyframes = _read_cameras(keyframes, "matrix", size, f"{file}: keyframes")
+    return CameraPath(frames, fps, keyframes, entries.get("is_cycle") is True)
+
+
+def write_camera_path(file: Path | str, path: CameraPath) -> None:
+    """Writes a path that nerfstudio and :func:`read_camera_path` read.
+
+    The file keeps poses, size and the vertical angle of view; the principal point becomes the middle of the frame.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from voronerf.nerf import orbit_cameras
+        >>> from voronerf.app.render.paths import CameraPath, read_camera_path, write_camera_path
+        >>> frames = orbit_cameras(24, radius=3.0, elevation=20.0, width=64, height=48, focal=70.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_camera_path(Path(folder) / "path.json", CameraPath(frames, fps=24))
+        ...     len(read_camera_path(Path(folder) / "path.json").frames)
+        24
+    """
+    size = {"render_height": path.frames.height, "render_width": path.frames.width}
+    keyframes = [] if path.keyframes is None else _entries(path.keyframes, "matrix")
+    entries = {
+        "camera_type": "perspective",
+        **size,
+        "fps": path.fps,
+        "seconds": len(path.frames) / path.fps,
+        "is_cycle": path.closed,
+        "smoothness_value": 0.0,
+        "default_fov": keyframes[0]["fov"] if keyframes else 50.0,
+        "default_transition_sec": len(path.frames) / path.fps / max(len(keyframes) - (not path.closed), 1),
+        "keyframes": keyframes,
+        "camera_path": _entries(path.frames, "camera_to_world"),
+    }
+    write_text(Path(file), json_text(entries, indent=1) + "\n")
+
+
+def smooth_path(keyframes: Cameras, count: int, *, closed: bool = False) -> Cameras:
+    """A smooth path through keyframes, by Catmull-Rom splines of the positions and of the rotations as quaternions.
+
+    Args:
+        keyframes: at least one.
+        count: frames; each pair of keyframes has the same share of them.
+        closed: whether the path goes back to the first keyframe; its last frame is then the one before that.
+
+    Raises:
+        ValueError: no keyframe, or no frame.
+
+    Examples:
+        >>> from voronerf.nerf import orbit_cameras
+        >>> from voronerf.app.render.paths import smooth_path
+        >>> keyframes = orbit_cameras(3, radius=3.0, elevation=0.0, width=64, height=48, focal=70.0)
+        >>> frames = smooth_path(keyframes, 5)
+        >>> bool((frames.poses[2] - keyframes.poses[1]).abs().max() < 1e-5)
+        True
+    """
+    n = len(keyframes)
+    if n < 1 or count < 1:
+        raise ValueError(f"smooth_path: keyframes and count must be at least 1, got {n} and {count}")
+    device = keyframes.poses.device
+    steps = torch.arange(count, dtype=torch.float64, device=device)
+    at = steps * n / count if closed else steps * (n - 1) / max(count - 1, 1)
+    first = at.floor().long().clamp(max=n - 1)
+    t = (at - first)[:, None]
+    around = first[:, None] + torch.arange(-1, 3, device=device)  # [f, 4], the keyframes that bear on a frame
+    around = around % n if closed else around.clamp(0, n - 1)
+    weights = torch.cat(
+        (-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, t**3 - t**2), dim=-1
+    ).div(2)[:, :, None]
+    positions = (keyframes.origins.double()[around] * weights).sum(1)
+    turns = quaternions(keyframes.poses[:, :3, :3].double())[around]
+    turns = torch.where((turns * turns[:, 1:2]).sum(-1, keepdim=True) < 0, -turns, turns)  # q and -q are one rotation
+    poses = torch.eye(4, dtype=torch.float64, device=device).repeat(count, 1, 1)
+    poses[:, :3, :3] = rotations(torch.nn.functional.normalize((turns * weights).sum(1), dim=-1))
+    poses[:, :3, 3] = positions
+    intrinsics = keyframes.intrinsics
+    intrinsics = torch.lerp(intrinsics[around[:, 1]], intrinsics[around[:, 2]], t.to(intrinsics))
+    return Cameras(poses.float(), intrinsics, keyframes.width, keyframes.height)
+
+
+def spiral_cameras(cameras: Cameras, count: int, *, near: float, far: float) -> Cameras:
+    """Two turns that stay where the given cameras are, and end where they began.
+
+    Around cameras that look one way, it is the spiral of LLFF (Mildenhall et al. 2019): it has their extent, and looks
+    at what they look at. Otherwise it goes around their focus at their mean distance, up and down between their
+    elevations.
+
+    Args:
+        cameras: such as those of the training views; size and focal length are theirs.
+        count: frames.
+        near: where the scene begins along a ray.
+        far: where it ends; both say what parallel cameras look at.
+
+    Raises:
+        ValueError: no frame.
+
+    Examples:
+        >>> from voronerf.nerf import orbit_cameras
+        >>> from voronerf.app.render.paths import spiral_cameras
+        >>> seen = orbit_cameras(8, radius=2.0, elevation=20.0, width=64, height=64, focal=70.0)
+        >>> frames = spiral_cameras(seen, 60, near=1.0, far=3.0)
+        >>> bool((frames.origins.norm(dim=-1) - 2).abs().max() < 1e-4)
+        True
+    """
+    if count < 1:
+        raise ValueError(f"spiral_cameras: count must be at least 1, got {count}")
+    poses = cameras.poses.double()
+    angles = torch.arange(count, dtype=torch.float64, device=poses.device) * (4 * math.pi / count)
+    centre, forward = poses[:, :3, 3].mean(0), -poses[:, :3, 2].mean(0)
+    focus = focus_point(cameras)
+    if focus is None or forward.norm() > ONE_WAY:
+        mean = look_at((centre - forward)[None], centre, poses[:, :3, 1].mean(0))[0]
+        mean[:3, 3] = centre
+        extent = torch.quantile(((poses[:, :3, 3] - centre) @ mean[:3, :3]).abs(), 0.9, dim=0)
+        depth = 1 / (0.25 / near + 0.75 / far)
+        if focus is not None:
+            depth = float((focus.double() - centre) @ -mean[:3, 2])
+        swing = torch.stack((angles.cos(), -angles.sin(), -(angles / 2).sin()), dim=-1) * extent
+        target, up = centre - depth * mean[:3, 2], mean[:3, 1]
+        origins = centre + swing @ mean[:3, :3].T
+    else:
+        target, up = focus.double(), poses.new_tensor((0.0, 0.0, 1.0))
+        offset = poses[:, :3, 3] - target
+        radius = offset.norm(dim=-1)
+        climbs = (offset[:, 2] / radius.clamp_min(1e-9)).clamp(-0.95, 0.95).asin()
+        low, high = torch.quantile(climbs, climbs.new_tensor((0.1, 0.9)))
+        climb = (low + high) / 2 + (high - low) / 2 * (angles / 2).sin()
+        around = torch.stack((angles.cos() * climb.cos(), angles.sin() * climb.cos(), climb.sin()), dim=-1)
+        origins = target + radius.mean() * around
+    focal = float(cameras.intrinsics[:, :2].mean())
+    intrinsics = cameras.intrinsics.new_tensor((focal, focal, cameras.width / 2, cameras.height / 2)).repeat(count, 1)
+    return Cameras(look_at(origins, target, up).float(), intrinsics, cameras.width, cameras.height)
+
+
+def _read_cameras(entries: Any, key: str, size: tuple[int, int], where: str) -> Cameras:
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_FRAMES:
+        got = f"{len(entries)} of them" if isinstance(entries, list) else f"{entries!r:.60}"
+        raise ValueError(f"{where} must be a list of 1 to {MOST_FRAMES} frames, got {got}")
+    (width, height), matrices, focals = size, [], []
+    for number, entry in enumerate(entries):
+        at = f"{where}[{number}]"
+        matrix = entry.get(key) if isinstance(entry, dict) else None
+        if not isinstance(matrix, list) or len(matrix) != 16:
+            raise ValueError(f"{at}.{key} must be 16 numbers, got {matrix!r:.60}")
+        matrices.append([_number(value, -FARTHEST, FARTHEST, f"{at}.{key}") for value in matrix])
+        fov = _number(entry.get("fov"), 0.01, 179.9, f"{at}.fov")
+        focals.append(height / 2 / math.tan(math.radians(fov) / 2))
+    poses = torch.tensor(matrices, dtype=torch.float64).view(-1, 4, 4)
+    rotations = poses[:, :3, :3]
+    unlike = (rotations @ rotations.mT - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2)) > ORTHONORMAL
+    unlike |= (torch.linalg.det(rotations) < 0) | (poses[:, 3] != poses.new_tensor((0, 0, 0, 1))).any(-1)
+    if unlike.any():
+        raise ValueError(f"{where}[{int(unlike.nonzero()[0])}].{key} must be a rotation and a position")
+    focal = torch.tensor(focals)
+    middle = torch.tensor((width / 2, height / 2)).repeat(len(focals), 1)
+    return Cameras(poses.float(), torch.cat((focal[:, None], focal[:, None], middle), dim=-1), width, height)
+
+
+def _number(value: object, lowest: float, highest: float, where: str) -> float:
+    # The comparison takes integers of any size, and NaN fails it.
+    if isinstance(value, int | float) and not isinstance(value, bool) and lowest <= value <= highest:
+        return float(value)
+    raise ValueError(f"{where} must be a number of {lowest:g} to {highest:g}, got {value!r:.60}")
+
+
+def _entries(cameras: Cameras, key: str) -> list[dict[str, Any]]:
+    aspect = cameras.width / cameras.height
+    angles = 2 * torch.atan(cameras.height / 2 / cameras.intrinsics[:, 1].double()).rad2deg()
+    return [
+        {key: pose, "fov": fov, "aspect": aspect}
+        for pose, fov in zip(cameras.poses.flatten(1).tolist(), angles.tolist())
+    ]
+
+
+def quaternions(rotations: Tensor) -> Tensor:
+    """Unit quaternions (w, x, y, z) [c, 4] of rotations [c, 3, 3], of either sign.
+
+    They are the eigenvectors of the largest eigenvalue of a symmetric matrix (Bar-Itzhack 2000), which is stable for
+    every rotation.
+    """
+    r = rotations.mT
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in r.unbind(-2))
+    rows = (
+        (xx + yy + zz, yz - zy, zx - xz, xy - yx),
+        (yz - zy, xx - yy - zz, xy + yx, zx + xz),
+        (zx - xz, xy + yx, yy - xx - zz, yz + zy),
+        (xy - yx, zx + xz, yz + zy, zz - xx - yy),
+    )
+    matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    return torch.linalg.eigh(matrix)[1][..., -1]
+
+
+def rotations(quaternions: Tensor) -> Tensor:
+    """Rotations [c, 3, 3] of unit quaternions (w, x, y, z) [c, 4]."""
+    w, x, y, z = quaternions.unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

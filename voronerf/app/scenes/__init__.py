@@ -1,0 +1,137 @@
+"""Scenes: loaders of Blender synthetic scenes and of photographs, and scenes computed from formulas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from voronerf.app.scenes.blender import load_blender
+from voronerf.app.scenes.builtin import builtin_scene, city_scene, rich_scene
+from voronerf.app.scenes.builtin.city import city_of
+from voronerf.app.scenes.colmap import find_model, load_colmap
+from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.llff import FILE, load_llff
+from voronerf.app.scenes.metashape import FILE as METASHAPE
+from voronerf.app.scenes.metashape import load_metashape
+from voronerf.app.scenes.photographs import Reading
+from voronerf.app.scenes.polycam import find_polycam, load_polycam
+from voronerf.app.scenes.record3d import find_record3d, load_record3d
+from voronerf.app.scenes.scene import KINDS, Scene, Split
+from voronerf.app.scenes.transforms import load_transforms
+
+__all__ = ["Scene", "SceneError", "Split", "builtin_scene", "city_scene", "load_scene", "rich_scene"]
+
+BUILTIN_SIZE = 100
+BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene}
+CITY = "builtin-city"  # of one block, or with their number: builtin-city:4x4
+
+
+class Format(NamedTuple):
+    """What shows that a folder has a format, how it is loaded, and how it is told if not by a file of that name."""
+
+    sign: str
+    load: Callable[[Path, Reading], Scene]
+    find: Callable[[Path], Path | None] | None = None
+
+    def held(self, folder: Path) -> bool:
+        """Whether a folder has it."""
+        return (folder / self.sign).is_file() if self.find is None else self.find(folder) is not None
+
+
+#: In the order in which a folder is tried.
+FORMATS = {
+    "blender": Format("transforms_train.json", load_blender),
+    "colmap": Format("a COLMAP model in sparse/0", load_colmap, find_model),
+    "transforms": Format("transforms.json", load_transforms),
+    "llff": Format(FILE, load_llff),
+    "metashape": Format(METASHAPE, load_metashape),
+    "polycam": Format("Polycam's keyframes/cameras", load_polycam, find_polycam),
+    "record3d": Format("Record3D's metadata.json with rgb", load_record3d, find_record3d),
+}
+
+
+def is_builtin(source: str | Path | None) -> bool:
+    """Whether a source names a scene that is computed, and no folder."""
+    return source in BUILTIN or str(source).partition(":")[0] == CITY
+
+
+def load_scene(
+    source: str | Path,
+    *,
+    downscale: int | None = None,
+    allow_outside: bool = False,
+    format: str = "auto",
+    kind: str = "auto",
+    normalise: bool = True,
+    images: str = "auto",
+) -> Scene:
+    """Loads a scene.
+
+    Args:
+        source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of 16, with
+            "builtin-city:4x4,rebuilt=5" for other buildings on block 5, or a folder with `transforms_train.json`
+            (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, LLFF's
+            `poses_bounds.npy`, Metashape's `cameras.xml`, Polycam's `keyframes` or Record3D's `metadata.json`.
+        downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,
+            and for photographs the least factor that leaves at most 512 pixels a side.
+        allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
+            or a link.
+        format: of a folder, one of `FORMATS` such as "colmap"; "auto" is the first of them that it holds.
+        kind: of photographs: "object" (on white), "forward" (the cameras look the same way), "inside-out" or
+            "unbounded"; "auto" tells it by transparent pixels and by the cameras.
+        normalise: move, turn and scale photographs so that the origin is in the middle, z is up and the farthest camera
+            at distance 1; else the coordinates of the files are kept.
+        images: of a folder: keep them in "memory"; on "disk", decoded once into a file of the cache (VORONERF_CACHE, or
+            `voronerf` in the user's caches) that is mapped into memory; or "auto": on disk if they do not fit.
+
+    Raises:
+        SceneError: the data cannot be used; one line that names the file and what is wrong with it.
+
+    Examples:
+        >>> from voronerf.app.scenes import load_scene
+        >>> scene = load_scene("builtin", downscale=20)  # or a folder
+        >>> scene.name, len(scene.train), len(scene.test), scene.train.images.shape[1:]
+        ('builtin', 100, 25, torch.Size([5, 5, 4]))
+    """
+    if downscale is not None and downscale < 1:
+        raise SceneError(f"{source}: downscale must be >= 1, got {downscale}")
+    for name, given, known in (("format", format, FORMATS), ("kind", kind, KINDS)):
+        if given != "auto" and given not in known:
+            raise SceneError(f"{source}: {name} must be auto, {' or '.join(known)}, got {given!r:.60}")
+    if images not in ("auto", "memory", "disk"):
+        raise SceneError(f"{source}: images must be auto, memory or disk, got {images!r:.60}")
+    if is_builtin(source):
+        if format != "auto" or kind not in ("auto", "object"):
+            raise SceneError(f"{source}: format must be auto and kind auto or object, got {format} and {kind}")
+        downscale = downscale or 1
+        if downscale > BUILTIN_SIZE:
+            raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
+        name, size = str(source), BUILTIN_SIZE // downscale
+        if name not in BUILTIN:
+            return city_of(size, name.partition(":")[2] or "1x1", images)
+        if images == "disk":
+            raise SceneError(
+                f"{source}: images must be auto or memory for a built-in scene other than a city, got disk"
+            )
+        return BUILTIN[name](size)
+    folder = Path(source)
+    if not folder.exists():
+        raise SceneError(f"{folder}: there is no such folder")
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: is not a folder")
+    held = [name for name, each in FORMATS.items() if each.held(folder)]
+    if "transforms" in held and find_model(folder) == folder / "colmap/sparse/0":
+        held.remove("colmap")  # nerfstudio's, whose transforms.json was made of it and says more
+        held.append("colmap")
+    if not held:
+        raise SceneError(
+            f"{folder}: is not a scene, it has none of {', '.join(each.sign for each in FORMATS.values())}"
+        )
+    if format != "auto" and format not in held:
+        raise SceneError(f"{folder}: format must be {' or '.join(held)}, which it has, got {format}")
+    chosen = held[0] if format == "auto" else format
+    scene = FORMATS[chosen].load(folder, Reading(downscale, allow_outside, kind, normalise, images))
+    others = tuple(f"--format {name} would read {FORMATS[name].sign}" for name in held if name != chosen)
+    return replace(scene, notes=(*scene.notes, *others))

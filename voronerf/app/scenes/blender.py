@@ -1,0 +1,106 @@
+"""Blender synthetic scenes (Mildenhall et al. 2020): `transforms_train.json`, `transforms_test.json`, RGBA images.
+
+The object sits at the origin, cameras look at it from about 4 units away, and the background is white.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from voronerf.app.scenes.carving import carve_box
+from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.images import read_images
+from voronerf.app.scenes.photographs import Reading, distinct_names
+from voronerf.app.scenes.scene import Scene, Split
+from voronerf.app.scenes.transforms import Frame, Listed, capture_scene, focal_length, has_lens, number, read_transforms
+from voronerf.nerf.cameras import Cameras
+
+log = logging.getLogger(__name__)
+
+NEAR, FAR = 2.0, 6.0
+
+
+def load_blender(folder: Path, reading: Reading) -> Scene:
+    """Loads a Blender synthetic scene.
+
+    The test views are those of `transforms_test.json`, or of `transforms_val.json` if the former is missing. Entries
+    such as `fl_x`, `cx` or `k1`, which Blender's files do not have, mark a capture that was split before. It is loaded
+    like `load_transforms` does, with that split.
+
+    Args:
+        folder: holds `transforms_train.json`.
+        reading: how it is read; images are reduced by averaging areas of the composited image.
+
+    Returns:
+        The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
+        the training views; without alpha the box is None. For a capture see `load_transforms`.
+
+    Raises:
+        SceneError: a file is missing, broken or inconsistent.
+    """
+    train_file = folder / "transforms_train.json"
+    choices = [folder / "transforms_test.json", folder / "transforms_val.json"]
+    test_file = next((path for path in choices if path.is_file()), None)
+    if test_file is None:
+        raise SceneError(
+            f"{folder}: has transforms_train.json but neither transforms_test.json nor transforms_val.json"
+        )
+    entries, train_frames = read_transforms(train_file, reading.allow_outside)
+    test_entries, test_frames = read_transforms(test_file, reading.allow_outside)
+
+    if has_lens(entries, train_frames) or has_lens(test_entries, test_frames):
+        files = ((train_file, entries, train_frames), (test_file, test_entries, test_frames))
+        if "near" in entries or "far" in entries:
+            log.warning("%s: near and far are not used, since the scene of a capture is moved and scaled", train_file)
+        listed = [Listed(path, of_file, frame) for path, of_file, frames in files for frame in frames]
+        return capture_scene(folder, listed, torch.arange(len(listed)) >= len(train_frames), reading)
+
+    if reading.kind not in ("auto", "object"):
+        raise SceneError(f"{train_file}: --kind must be auto or object for a Blender scene, got {reading.kind}")
+    near = number(entries, "near", train_file, positive=True) or NEAR
+    far = number(entries, "far", train_file, positive=True) or FAR
+    if near >= far:
+        raise SceneError(f"{train_file}: near must be below far, got {near} and {far}")
+
+    downscale = reading.downscale or 1
+    paths = [frame.path for frame in (*train_frames, *test_frames)]
+    images, sizes, on_disk = read_images(paths, downscale, keep=reading.images, name=folder.resolve().name)
+    count = len(train_frames)
+    train = _split(entries, train_file, train_frames, images[:count], sizes[:count], downscale, on_disk)
+    test = _split(test_entries, test_file, test_frames, images[count:], sizes[count:], downscale, on_disk)
+    box = carve_box(train.cameras, train.images[..., 3], near, far) if images.shape[-1] == 4 else None
+    return Scene(
+        folder.resolve().name,
+        train,
+        test,
+        near,
+        far,
+        box,
+        "linear",
+        "white",
+        notes=("Blender scene, an object on white",),
+    )
+
+
+def _split(
+    entries: dict[str, Any],
+    path: Path,
+    frames: list[Frame],
+    images: torch.Tensor,
+    sizes: torch.Tensor,
+    downscale: int,
+    on_disk: bool,
+) -> Split:
+    intrinsics = []
+    for width, height in sizes.tolist():
+        focal = focal_length(entries, "camera_angle_x", width, path)
+        if focal is None:
+            raise SceneError(f"{path}: camera_angle_x must be an angle between 0 and pi, got None")
+        intrinsics.append((focal, focal, width / 2, height / 2))
+    poses = torch.stack([frame.pose for frame in frames]).float()
+    cameras = Cameras.of_images(poses, torch.tensor(intrinsics), sizes).downscaled(downscale)
+    return Split(cameras, images, tuple(distinct_names([frame.path for frame in frames], path.parent)), on_disk=on_disk)

@@ -1,0 +1,160 @@
+"""The built-in city: blocks x blocks of streets, for scenes that grow while their detail stays as fine.
+
+Facades with windows, ledges and bricks, shops, trees, lamps and parked cars; some 90 solids on each block, which is one
+scene unit wide. Each block adds the same number of views from its streets and from above, on white.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import re
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from voronerf.app.scenes.builtin.caster import Caster
+from voronerf.app.scenes.builtin.city_solids import city
+from voronerf.app.scenes.builtin.opaque import SUPERSAMPLES, bounds, render_views, see
+from voronerf.app.scenes.builtin.solids import Array, rotation
+from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.scene import Scene, Split
+from voronerf.app.scenes.store import Make, stored
+from voronerf.nerf.cameras import Cameras, look_at
+
+TRAIN_VIEWS, TEST_VIEWS = 40, 8  # of a block; half of them from the street
+MOST = 32  # blocks a side
+FORMULA = 1  # of what is in the city: raised by a change, so that no store has the old one
+NEAR = 0.02
+STREET_ANGLE, ABOVE_ANGLE = 1.2, 0.75  # fields of view, radians
+
+
+def city_scene(
+    size: int = 100,
+    *,
+    blocks: int | tuple[int, int] = 1,
+    train_views: int = TRAIN_VIEWS,
+    test_views: int = TEST_VIEWS,
+    rebuilt: int | None = None,
+    images: str = "memory",
+) -> Scene:
+    """Computes the city.
+
+    Args:
+        size: of the square images, pixels.
+        blocks: on each side, or along x and along y, 1 to 32.
+        train_views: of each block, every other one from its streets and the rest from above.
+        test_views: of each block, at other places than the training views.
+        rebuilt: the block that has other buildings, trees and cars, 0 to blocks**2 - 1, row by row; or None. The views
+            and all other blocks are the same: for what happens when a scene changes.
+        images: "memory"; "cached", which also keeps them in a store of the cache, where a next call finds them; or
+            "disk", which maps them from there.
+
+    Raises:
+        ValueError: a size or number of views below 1, too many blocks, a block that there is not, or another place for
+            the images.
+        SceneError: the store cannot be written.
+
+    Examples:
+        >>> from voronerf.app.scenes import city_scene
+        >>> scene = city_scene(4, blocks=2, train_views=2, test_views=1)
+        >>> scene.name, len(scene.train), len(scene.test)
+        ('builtin-city-2x2', 8, 4)
+    """
+    for name, value in (("size", size), ("train_views", train_views), ("test_views", test_views)):
+        if value < 1:
+            raise ValueError(f"city_scene: {name} must be >= 1, got {value}")
+    sides = (blocks, blocks) if isinstance(blocks, int) else tuple(blocks)
+    if len(sides) != 2 or not 1 <= min(sides) <= max(sides) <= MOST:
+        raise ValueError(f"city_scene: blocks must be 1 to {MOST}, got {blocks}")
+    if rebuilt is not None and not 0 <= rebuilt < sides[0] * sides[1]:
+        raise ValueError(f"city_scene: rebuilt must be a block of 0 to {sides[0] * sides[1] - 1}, got {rebuilt}")
+    if images not in ("memory", "cached", "disk"):
+        raise ValueError(f"city_scene: images must be memory, cached or disk, got {images!r:.60}")
+    groups, name = city(sides, rebuilt), f"builtin-city-{sides[0]}x{sides[1]}"
+    name += "" if rebuilt is None else f"-rebuilt-{rebuilt}"
+    made_of = sides[0] if sides[0] == sides[1] else list(sides)
+    solids = [solid for group in groups for solid in group]
+    box = bounds(solids)
+    look = functools.partial(see, caster=Caster(groups))
+
+    def views(part: str, seed: int, count: int) -> Split:
+        cameras = city_cameras(size, sides, count, seed)
+
+        def keep(shape: tuple[int, int, int, int], make: Make) -> Tensor:
+            found = stored(f"{name}-{part}", [made_of, size, count, seed], FORMULA, shape, make, os.cpu_count() or 1)
+            return found if images == "disk" else found.clone()
+
+        kept = None if images == "memory" else keep
+        found = render_views(cameras, part, look, box=box, supersamples=SUPERSAMPLES, keep=kept)
+        return replace(found, on_disk=images == "disk")
+
+    train, test = views("train", 0, train_views), views("test", 1, test_views)
+    far = math.hypot(*sides) + 3
+    return Scene(name, train, test, NEAR, far, torch.from_numpy(box), "linear", "white")
+
+
+def city_views(cameras: Cameras, blocks: tuple[int, int]) -> Split:
+    """The city from other cameras, which are square and have one focal length; in memory."""
+    groups = city(blocks, None)
+    solids = [solid for group in groups for solid in group]
+    look = functools.partial(see, caster=Caster(groups))
+    return render_views(cameras, "view", look, box=bounds(solids), supersamples=SUPERSAMPLES)
+
+
+def city_of(size: int, text: str, images: str) -> Scene:
+    """The city of blocks such as "4x4", "4x8" or "4x4,rebuilt=5"; in the cache if it is larger than one block.
+
+    Raises:
+        SceneError: other blocks than these.
+    """
+    blocks, comma, rest = text.partition(",")
+    found, number = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", blocks), re.fullmatch(r"rebuilt=(\d{1,4})", rest)
+    if found is None or max(int(found[1]), int(found[2])) > MOST:
+        raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, 2x4, ... or {MOST}x{MOST}, got {blocks!r:.60}")
+    sides = int(found[1]), int(found[2])
+    most = sides[0] * sides[1] - 1
+    if comma and (number is None or int(number[1]) > most):
+        raise SceneError(f"builtin-city: after the blocks must come rebuilt=0 to rebuilt={most}, got {rest!r:.60}")
+    where = "disk" if images == "disk" else "memory" if blocks == "1x1" else "cached"
+    return city_scene(size, blocks=sides, rebuilt=None if number is None else int(number[1]), images=where)
+
+
+def city_cameras(size: int, blocks: tuple[int, int], views: int, seed: int) -> Cameras:
+    """The cameras of each block in turn: from the middle of a street beside it, and from above its roofs."""
+    random = np.random.default_rng((seed, 2))
+    eyes, aims, angles = [], [], []
+    for row in range(blocks[1]):
+        for column in range(blocks[0]):
+            middle = np.array((column + 0.5 - blocks[0] / 2, row + 0.5 - blocks[1] / 2, 0))
+            for view in range(views):
+                eye, aim = (_in_the_street if view % 2 == 0 else _above)(random)
+                eyes.append(middle + eye)
+                aims.append(middle + aim)
+                angles.append(STREET_ANGLE if view % 2 == 0 else ABOVE_ANGLE)
+    up = torch.tensor((0.0, 0.0, 1.0))
+    poses = look_at(torch.from_numpy(np.stack(eyes)).float(), torch.from_numpy(np.stack(aims)).float(), up)
+    focal = 0.5 * size / (0.5 * torch.tensor(angles)).tan()
+    middles = torch.full_like(focal, size / 2)
+    return Cameras(poses, torch.stack((focal, focal, middles, middles), dim=1), size, size)
+
+
+def _in_the_street(random: np.random.Generator) -> tuple[Array, Array]:
+    """Eye and aim on a side of a block: near the middle of the street, along it or at the houses."""
+    along, off, height = random.uniform(-0.5, 0.5), random.uniform(0.47, 0.5), random.uniform(0.05, 0.16)
+    turn, climb = random.uniform(-0.1, 1.2), random.uniform(-0.12, 0.25)
+    eye = np.array((along, -off, height))
+    gaze = np.array((-np.sign(along) * np.cos(turn), np.sin(turn), climb))
+    side = rotation("z", 90.0 * int(random.integers(4)))
+    return np.float32(side @ eye), np.float32(side @ (eye + gaze))
+
+
+def _above(random: np.random.Generator) -> tuple[Array, Array]:
+    """Eye and aim of a view from above all roofs."""
+    aim = np.array((*random.uniform(-0.4, 0.4, size=2), 0.12))
+    azimuth, climb, distance = random.uniform(0, 2 * np.pi), random.uniform(0.5, 1.25), random.uniform(1.5, 2.3)
+    away = np.array((np.cos(climb) * np.cos(azimuth), np.cos(climb) * np.sin(azimuth), np.sin(climb)))
+    return np.float32(aim + distance * away), np.float32(aim)

@@ -1,0 +1,131 @@
+"""The solids of the built-in scene, and the textures of their surfaces."""
+
+from __future__ import annotations
+
+import colorsys
+import math
+
+import numpy as np
+
+from voronerf.app.scenes.builtin.solids import Array, Box, Cylinder, Solid, Sphere, Texture, Torus, rotation
+
+Colour = tuple[float, float, float]
+
+FLOOR = -0.46  # height of the plinth's top
+MOSAIC: tuple[Colour, ...] = (
+    (0.86, 0.79, 0.66),
+    (0.72, 0.68, 0.62),
+    (0.84, 0.68, 0.52),
+    (0.68, 0.74, 0.70),
+    (0.90, 0.74, 0.50),
+)
+
+
+def _paint(colour: Colour) -> Array:
+    return np.array(colour, dtype=np.float32)
+
+
+def _pick(colours: tuple[Colour, ...], index: Array) -> Array:
+    """Colours by index, rounded down and repeating: [n] -> [n, 3]."""
+    return np.array(colours, dtype=np.float32)[np.floor(index).astype(np.int64) % len(colours)]
+
+
+def _azimuth(points: Array) -> Array:
+    """Angle around the z axis as a share of the full turn, 0..1, [n]."""
+    x, y, _ = points.T
+    turn: Array = np.arctan2(y, x) / np.float32(2 * math.pi)
+    return turn + np.float32(0.5)
+
+
+def plain(colour: Colour) -> Texture:
+    """One colour."""
+    return lambda points, normals: np.broadcast_to(_paint(colour), points.shape)
+
+
+def mosaic(points: Array, normals: Array) -> Array:
+    """Rings of tiles in five colours; a striped band on the rim."""
+    x, y, _ = points.T
+    ring = np.floor(np.hypot(x, y) / 0.1686)
+    sector = np.floor(_azimuth(points) * (6 * ring + 5))
+    top = _pick(MOSAIC, ring * 3 + sector * 2 + ring * sector % 3)
+    rim = _pick(((0.62, 0.56, 0.52), (0.80, 0.74, 0.68)), _azimuth(points) * 36)
+    return np.where(normals[:, 2:] > 0.5, top, rim)
+
+
+def checker(points: Array, normals: Array) -> Array:
+    """A fine checker of longitudes and latitudes."""
+    climb = np.arccos(np.clip(normals[:, 2], -1, 1)) / math.pi
+    return _pick(((0.86, 0.22, 0.20), (0.97, 0.62, 0.48)), np.floor(_azimuth(points) * 14) + np.floor(climb * 7))
+
+
+def diagonals(points: Array, normals: Array) -> Array:
+    """Diagonal stripes, in other colours on each pair of faces."""
+    stripe = np.floor((points.sum(axis=-1) + 9) / 0.15) % 2
+    pair = np.argmax(np.abs(normals), axis=-1)
+    dark_and_light = (
+        (0.16, 0.34, 0.74),
+        (0.40, 0.62, 0.92),
+        (0.12, 0.40, 0.58),
+        (0.40, 0.74, 0.80),
+        (0.34, 0.32, 0.68),
+        (0.58, 0.56, 0.88),
+    )
+    return _pick(dark_and_light, 2 * pair + stripe)
+
+
+def bricks(points: Array, normals: Array) -> Array:
+    """Courses of bricks of three reds in pale mortar; rings on top."""
+    x, y, z = points.T
+    height = (z + 1) / 0.105
+    course = np.floor(height)
+    along = _azimuth(points) * 11 + 0.5 * (course % 2)
+    mortar = (height % 1 < 0.2) | (along % 1 < 0.12)
+    brick = _pick(((0.66, 0.26, 0.18), (0.76, 0.36, 0.24), (0.56, 0.20, 0.17)), np.floor(along) * 2 + course)
+    side = np.where(mortar[:, None], _paint((0.80, 0.62, 0.50)), brick)
+    rings = _pick(((0.90, 0.70, 0.52), (0.55, 0.30, 0.28)), np.hypot(x, y) / 0.1034)
+    return np.where(np.abs(normals[:, 2:]) > 0.5, rings, side)
+
+
+def barber_pole(points: Array, normals: Array) -> Array:
+    """Two-coloured helix."""
+    return _pick(((0.95, 0.94, 0.92), (0.46, 0.50, 0.60)), 2 * _azimuth(points) + points[:, 2] / 0.16)
+
+
+def globe(points: Array, normals: Array) -> Array:
+    """Continents in a sea."""
+    x, y, z = normals.T
+    land = np.sin(4 * x + 1.3) * np.sin(5 * y + 0.4) + 0.7 * np.sin(6 * z + 2 * x) > 0.15
+    shade = (0.5 + 0.5 * np.sin(9 * x) * np.sin(9 * y + 4 * z))[:, None]
+    ground = _paint((0.24, 0.52, 0.20)) * (1 - shade) + _paint((0.86, 0.74, 0.42)) * shade
+    sea = _paint((0.08, 0.26, 0.58)) * (1 - shade) + _paint((0.16, 0.52, 0.76)) * shade
+    return np.where(land[:, None], ground, sea).astype(np.float32)
+
+
+def spiral(points: Array, normals: Array) -> Array:
+    """Bands wound around the tube that meet themselves after a full turn in either direction."""
+    outward = (normals[:, :2] * points[:, :2]).sum(axis=-1) / np.hypot(points[:, 0], points[:, 1])
+    tube = np.arctan2(normals[:, 2], outward) / (2 * math.pi)
+    return _pick(((0.20, 0.66, 0.34), (0.56, 0.84, 0.40), (0.86, 0.92, 0.52)), _azimuth(points) * 12 + 3 * tube)
+
+
+def _solids() -> tuple[Solid, ...]:
+    """Everything in the scene."""
+    parts: list[Solid] = [
+        Cylinder((0, 0, FLOOR - 0.08), mosaic, 0.08, 10, radius=1.18, half_height=0.08),
+        Sphere((0.62, 0.30, FLOOR + 0.36), checker, 0.55, 40, rotation("x", 24), radius=0.36),
+        Box((-0.60, 0.38, FLOOR + 0.30), diagonals, 0.15, 12, rotation("z", 28), half=(0.27, 0.27, 0.30)),
+        Cylinder((-0.02, -0.70, FLOOR + 0.21), bricks, 0.10, 10, radius=0.31, half_height=0.21),
+        Cylinder((0, 0, FLOOR + 0.50), barber_pole, 0.25, 20, radius=0.13, half_height=0.50),
+        Sphere((0, 0, FLOOR + 1.22), globe, 0.45, 30, radius=0.24),
+        Torus((0, 0, FLOOR + 0.66), spiral, 0.40, 30, rotation("x", -20), ring=0.38, tube=0.105),
+    ]
+    count = 12
+    for index in range(count):
+        azimuth = 2 * math.pi * (index + 0.5) / count
+        colour = colorsys.hsv_to_rgb(index / count, 0.75, 0.92)
+        place = (1.05 * math.cos(azimuth), 1.05 * math.sin(azimuth), FLOOR + 0.095)
+        parts.append(Sphere(place, plain(colour), 0.6, 40, radius=0.095))
+    return tuple(parts)
+
+
+SOLIDS = _solids()

@@ -1,0 +1,154 @@
+"""A tight box around an object, from its silhouettes (space carving; Kutulakos and Seitz 2000, without colours).
+
+c images of h x w pixels, n voxels. NumPy does the work, one thread for each view: parallel loops inside small array
+operations would cost more than the operations themselves on a busy machine.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from voronerf.nerf.cameras import Cameras, focus_point
+
+Array = NDArray[np.float32]
+
+RESOLUTIONS = (24, 32, 48)
+MASK_PIXELS, MOST_MASK_PIXELS = 100, 1000  # of the shorter side, and at most of the longer one
+VIEWS = 100
+GROWTHS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # widths by which masks are widened, pixels
+MARGIN = GROWTHS[-1] + 1
+SEEN_BY = 0.25  # an object is in the picture in at least this share of the views
+MISSED_BY = 1  # views whose masks may be wrong about a voxel
+OUTSIDE = 1e-3  # share of the masks' pixels whose rays may miss the box
+
+
+def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tensor | None:
+    """The bounding box of the voxels that no mask rules out.
+
+    A voxel is removed if two views see it entirely outside their mask. Each mask is widened by the size of the voxel in
+    pixels, so that the box does not cut the object. The box is larger than the object by one or two voxels, each about
+    a fortieth of the object's size, and by concave parts that no silhouette shows.
+
+    Args:
+        cameras: c cameras without lens distortion that look at the object from around it.
+        alpha: uint8 [c, h, w]; a pixel with alpha > 0 shows the object. Zero beside smaller images.
+        near: distance before which there is nothing.
+        far: distance behind which there is nothing; the search covers a cube of half side (far - near) / 2.
+
+    Returns:
+        float32 [2, 3], or None if there is no such box: nothing or everything is opaque, the lens distorts, the cameras
+        have no common focus, or the rays of more than a thousandth of the masks' pixels would miss the box.
+    """
+    every = -(-len(cameras) // VIEWS)
+    cameras, visible = cameras[::every], (alpha[::every] > 0).numpy()
+    focus = focus_point(cameras)
+    if focus is None or cameras.distortion is not None or not visible.any() or visible.all():
+        return None
+    shrink = max(1, min(visible.shape[1:]) // MASK_PIXELS, max(visible.shape[1:]) // MOST_MASK_PIXELS)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        views = list(pool.map(lambda index: _View(cameras, index, visible[index], shrink), range(len(cameras))))
+        centre, half = focus.numpy(), np.float32((far - near) / 2)
+        box = np.stack((centre - half, centre + half))
+        for resolution in RESOLUTIONS:
+            carved = _carve(views, pool, box, resolution)
+            if carved is None:
+                return None
+            box = carved
+    return torch.from_numpy(box) if _share_outside(cameras, visible, box) <= OUTSIDE else None
+
+
+class _View:
+    """One camera and its mask, widened by each of GROWTHS."""
+
+    def __init__(self, cameras: Cameras, index: int, visible: NDArray[np.bool_], shrink: int) -> None:
+        width, height = cameras.size(index)
+        visible = visible[:height, :width]
+        self.pose: Array = cameras.poses[index].numpy()
+        self.fx, self.fy, self.cx, self.cy = (cameras.intrinsics[index] / shrink).tolist()
+        mask = _block_any(visible, shrink)
+        self.height, self.width = mask.shape
+        # A view that shows the whole object also rules out what lies outside its picture.
+        self.whole = not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
+        mask = np.pad(mask, MARGIN)
+        levels = []
+        done = 0
+        for grow in GROWTHS:
+            for _ in range(grow - done):
+                mask = _widen(mask)
+            levels.append(mask)
+            done = grow
+        levels.append(np.ones_like(mask))  # for voxels that are wider still
+        self.masks = np.stack(levels)
+
+    def judge(self, points: Array, radius: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(seen [n], missed [n]): the balls that this view sees, and those of them that lie outside its mask."""
+        x, y, z = (points - self.pose[:3, 3]).T
+        local = [self.pose[0, i] * x + self.pose[1, i] * y + self.pose[2, i] * z for i in range(3)]
+        depth = -local[2]
+        ahead = depth > 2 * radius  # a ball that reaches behind the camera is not judged
+        safe = np.maximum(depth, radius)
+        column = np.floor(self.cx + self.fx * local[0] / safe)
+        row = np.floor(self.cy - self.fy * local[1] / safe)
+        inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
+        seen = ahead & (inside | self.whole)
+        reach = radius * max(self.fx, self.fy) / np.maximum(depth - radius, radius) + 1
+        level = np.searchsorted(np.array(GROWTHS, dtype=np.float32), reach)
+        height, width = self.masks.shape[1:]
+        column = np.clip(column + MARGIN, 0, width - 1).astype(np.int64)
+        row = np.clip(row + MARGIN, 0, height - 1).astype(np.int64)
+        return seen, seen & ~self.masks.reshape(-1)[(level * height + row) * width + column]
+
+
+def _carve(views: list[_View], pool: ThreadPoolExecutor, box: Array, resolution: int) -> Array | None:
+    """Carves a grid of resolution^3 voxels in `box`; returns the box of the voxels that are left."""
+    size = (box[1] - box[0]) / np.float32(resolution)
+    steps = np.arange(resolution, dtype=np.float32) + np.float32(0.5)
+    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = box[0] + grid * size
+    radius = 0.5 * float(np.linalg.norm(size))
+    seen, missed = np.zeros(len(points), dtype=np.int32), np.zeros(len(points), dtype=np.int32)
+    for view_seen, view_missed in pool.map(lambda view: view.judge(points, radius), views):
+        seen += view_seen
+        missed += view_missed
+    stays = (seen >= SEEN_BY * len(views)) & (missed <= MISSED_BY)
+    if not stays.any():
+        return None
+    kept = points[stays]
+    return np.stack((kept.min(axis=0) - size / 2, kept.max(axis=0) + size / 2))
+
+
+def _block_any(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
+    """For each block whether any pixel is set; incomplete blocks at the right and bottom count."""
+    height, width = mask.shape
+    padded = np.pad(mask, ((0, -height % size), (0, -width % size)))
+    blocks = padded.reshape(padded.shape[0] // size, size, padded.shape[1] // size, size)
+    return np.asarray(blocks.any(axis=(1, 3)))
+
+
+def _widen(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Dilates a mask by one pixel on each side, corners included."""
+    rows = mask.copy()
+    rows[1:] |= mask[:-1]
+    rows[:-1] |= mask[1:]
+    result = rows.copy()
+    result[:, 1:] |= rows[:, :-1]
+    result[:, :-1] |= rows[:, 1:]
+    return result
+
+
+def _share_outside(cameras: Cameras, visible: NDArray[np.bool_], box: Array) -> float:
+    """Share of the masks' pixels whose rays miss the box."""
+    image, row, column = visible.nonzero()
+    step = max(1, len(image) // 20_000)
+    chosen = [torch.from_numpy(index[::step].copy()) for index in (image, column, row)]
+    rays = cameras.rays(chosen[0], chosen[1], chosen[2])
+    corners = torch.from_numpy(box)
+    low, high = (corners[0] - rays.origins) / rays.directions, (corners[1] - rays.origins) / rays.directions
+    hit = torch.minimum(low, high).amax(-1) <= torch.maximum(low, high).amin(-1)
+    return 1 - float(hit.float().mean())

@@ -1,0 +1,280 @@
+"""Reads image files as uint8 tensors and reduces them on the way, in little more memory than the scene will take."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.store import stored
+from voronerf.ops._core.checks import available_memory
+
+#: Decided by the content of a file. Pillow would read others too, some of them by starting another program.
+FORMATS = ("PNG", "JPEG")
+UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_DEPTH = 24  # offset of the bits a channel
+#: Share of the free memory that a scene may need; the rest is for the networks.
+SHARE = 0.75
+#: Bytes for each pixel while a view is rendered and scored, most of them for SSIM.
+VIEW = 550
+#: Images are decoded by up to four threads while those in hand take at most this many bytes.
+THREADS, IN_HAND = 4, 2**26
+#: Pixels that are converted and averaged at a time.
+BAND = 2**20
+
+
+class Header(NamedTuple):
+    """What an image file says of itself: (width, height), an alpha channel, bytes of memory to decode it."""
+
+    size: tuple[int, int]
+    alpha: bool
+    decoded: int
+
+
+def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Averages blocks of `factor` x `factor` pixels; columns and rows that fill no block are dropped.
+
+    With alpha, premultiplied colours are averaged, which equals averaging the image composited on any background. The
+    result is straight colour and alpha. Rounding both to 8 bits changes the composited colour by at most one level.
+
+    Args:
+        image: [h, w, 3] or [h, w, 4].
+        factor: >= 1.
+
+    Returns:
+        [h // factor, w // factor, 3 or 4].
+    """
+    if factor == 1:
+        return image
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    values = image[: height * factor, : width * factor].astype(np.float32)
+    if image.shape[2] == 4:
+        values[..., :3] *= values[..., 3:]
+    values = values.reshape(height, factor, width, factor, image.shape[2]).mean(axis=(1, 3))
+    if image.shape[2] == 4:
+        values[..., :3] /= np.maximum(values[..., 3:], 1e-6)
+    return np.rint(values).clip(0, 255).astype(np.uint8)
+
+
+def read_header(path: Path, factor: int) -> Header:
+    """Reads the header of an image file, without its pixels.
+
+    Args:
+        path: image file, PNG or JPEG.
+        factor: of the reduction, >= 1.
+
+    Raises:
+        SceneError: the file is neither PNG nor JPEG, has more than 8 bits a channel or too few pixels.
+    """
+    with _opened(path) as file:
+        size, alpha = file.size, _has_alpha(file)
+        if factor > min(size):
+            raise SceneError(f"{path}: downscaling by {factor} leaves no pixel of {size[0]} x {size[1]}")
+        _reduce_while_decoding(file, factor)
+        # Pillow keeps colours in four bytes a pixel.
+        return Header(size, alpha, file.width * file.height * (1 if len(file.getbands()) == 1 else 4))
+
+
+def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
+    """Decodes one image file.
+
+    Orientation tags are ignored: poses and intrinsics belong to the pixels as stored. JPEG files are reduced by up to 8
+    while they are decoded, from the low frequencies of each block of 8 x 8 pixels, which saves time and memory.
+
+    Args:
+        path: image file, PNG or JPEG.
+        factor: of the reduction, from 1 to the number of pixels of the shorter side.
+
+    Returns:
+        [h, w, 3], or [h, w, 4] with an alpha channel.
+
+    Raises:
+        SceneError: the file is no image that can be read, or is truncated.
+    """
+    with _opened(path) as file:
+        width, height = (side // factor for side in file.size)
+        mode = "RGBA" if _has_alpha(file) else "RGB"
+        rest = _reduce_while_decoding(file, factor)
+        pixels = np.empty((height, width, len(mode)), dtype=np.uint8)
+        rows = max(1, BAND // (width * rest**2))
+        for top in range(0, height, rows):
+            bottom = min(top + rows, height)
+            band = file.crop((0, top * rest, width * rest, bottom * rest)).convert(mode)
+            pixels[top:bottom] = area_average(np.asarray(band), rest)
+        return pixels
+
+
+class Decoded(NamedTuple):
+    """What `read_images` gives.
+
+    Attributes:
+        images: uint8 [c, h, w, 3], or [c, h, w, 4] where any image has an alpha channel, with the smaller ones in the
+            upper left corner and zeros around them.
+        sizes: int64 [c, 2], (width, height) of the files.
+        on_disk: the images are mapped from a file of the cache, and must not be written to.
+    """
+
+    images: Tensor
+    sizes: Tensor
+    on_disk: bool
+
+
+def read_images(
+    paths: Sequence[Path], factor: int, *, keep: str = "auto", name: str = "images", most_channels: int = 4
+) -> Decoded:
+    """Decodes images; memory holds the result and one image, or several small ones.
+
+    Args:
+        paths: at least one file.
+        factor: of the reduction, >= 1.
+        keep: in "memory"; on "disk", see `voronerf.app.scenes.store`; or "auto": on disk what does not fit into memory.
+        name: of the scene.
+        most_channels: 3 leaves alpha out.
+
+    Raises:
+        SceneError: as `read_header` and `read_image`, more than fit into memory, or a store that cannot be written.
+    """
+    headers = [read_header(path, factor) for path in paths]
+    sizes = torch.tensor([header.size for header in headers])
+    size = sizes.amax(0).tolist()
+    differ = bool((sizes != sizes[:1]).any())
+    channels = min(4 if any(header.alpha for header in headers) else 3, most_channels)
+    shape = (len(paths), size[1] // factor, size[0] // factor, channels)
+    decoded = max(header.decoded for header in headers)
+    threads = max(1, min(THREADS, IN_HAND // decoded))
+    pixels = shape[1] * shape[2]
+    needed, free = len(paths) * pixels * channels + max(decoded, pixels * VIEW), available_memory()
+
+    def make(index: int) -> NDArray[np.uint8]:
+        found = read_image(paths[index], factor)
+        if found.shape == shape[1:]:
+            return found
+        image = np.zeros(shape[1:], dtype=np.uint8)
+        place = image[: found.shape[0], : found.shape[1]]
+        place[..., 3:] = 255
+        place[..., : found.shape[2]] = found[..., :channels]
+        return image
+
+    if keep == "disk" or (keep == "auto" and needed > SHARE * free):
+        sources = [str(path.absolute()) for path in paths]
+        return Decoded(stored(name, [sources, factor], _times(paths), shape, make, threads), sizes, True)
+    if needed > SHARE * free:
+        raise SceneError(
+            f"{paths[0]}: {len(paths)} images of {'up to ' * differ}{size[0]} x {size[1]} need {needed / 2**30:.2f} "
+            f"GiB with --downscale {factor}, more than {SHARE:.0%} of the {free / 2**30:.2f} GiB that are free; use a "
+            "larger --downscale, fewer or smaller images, or --images disk"
+        )
+    images = np.zeros(shape, dtype=np.uint8)
+
+    def fill(index: int) -> None:
+        images[index] = make(index)
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(fill, range(len(paths))))
+    return Decoded(torch.from_numpy(images), sizes, False)
+
+
+def _times(paths: Sequence[Path | None]) -> list[tuple[int, int, int] | None]:
+    """Size and times of each file: that of its content, which can be set, and that of its last change in any way."""
+    found = [None if path is None else path.stat() for path in paths]
+    return [None if stat is None else (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for stat in found]
+
+
+def read_masks(
+    masks: Sequence[Path | None],
+    paths: Sequence[Path],
+    sizes: Tensor,
+    factor: int,
+    *,
+    on_disk: bool = False,
+    name: str = "images",
+) -> Tensor | None:
+    """Decodes the masks of images: black pixels do not count, nor does a block that has one.
+
+    Args:
+        masks: the mask file of each image, or None if the whole image counts.
+        paths: of the images.
+        sizes: int64 [c, 2], (width, height) of the images, and of their masks.
+        factor: of the reduction.
+        on_disk: map them from a file of the cache, as the images.
+        name: of the scene.
+
+    Returns:
+        bool [c, h, w], False around smaller images; None if no image has a mask.
+
+    Raises:
+        SceneError: as `read_image`, a mask of another size than its image, or one that leaves nothing.
+    """
+    if not any(masks):
+        return None
+    width, height = (sizes.amax(0) // factor).tolist()
+    shape = (len(masks), height, width)
+
+    def make(index: int) -> NDArray[np.uint8]:
+        mask, path, size = masks[index], paths[index], sizes[index].tolist()
+        width, height = (side // factor for side in size)
+        place = np.zeros(shape[1:], dtype=np.uint8)
+        place[:height, :width] = 1
+        if mask is None:
+            return place
+        with _opened(mask) as file:
+            if list(file.size) != size:
+                raise SceneError(
+                    f"{mask}: is {file.size[0]} x {file.size[1]} pixels, {path.name} is {size[0]} x {size[1]}"
+                )
+            kept = np.asarray(file.convert("L"))[: height * factor, : width * factor] > 0
+        place[:height, :width] = kept.reshape(height, factor, width, factor).all(axis=(1, 3))
+        if not place.any():
+            raise SceneError(f"{mask}: must leave a pixel, or with --downscale a block of pixels, of {path.name}")
+        return place
+
+    if on_disk:
+        sources = [None if mask is None else str(mask.absolute()) for mask in masks]
+        return stored(f"{name}-masks", [sources, factor], _times(masks), shape, make, 1).view(torch.bool)
+    return torch.from_numpy(np.stack([make(index) for index in range(len(masks))])).view(torch.bool)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """An image file whose pixels are not decoded yet."""
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(PNG_DEPTH + 1)
+            stream.seek(0)
+            # Pillow rounds most of these to 8 bits without a word.
+            if start.startswith(PNG_SIGNATURE) and start[PNG_DEPTH:] == b"\x10":
+                raise SceneError(f"{path}: has more than 8 bits a channel, which is not supported")
+            with Image.open(stream, formats=FORMATS) as file:
+                yield file
+    except SceneError:
+        raise
+    except UNREADABLE as error:
+        unknown = isinstance(error, Image.UnidentifiedImageError)
+        reason = f"is not an image in {' or '.join(FORMATS)} format" if unknown else f"cannot be read: {error}"
+        raise SceneError(f"{path}: {reason}") from None
+
+
+def _has_alpha(file: Image.Image) -> bool:
+    return "A" in file.getbands() or "transparency" in file.info
+
+
+def _reduce_while_decoding(file: Image.Image, factor: int) -> int:
+    """Lets a JPEG file be decoded in a part of its size; returns the factor that is left."""
+    if file.format != "JPEG" or factor % 2:
+        return factor
+    size = file.size
+    step = next(step for step in (8, 4, 2) if factor % step == 0)
+    file.draft("RGB", (size[0] // step, size[1] // step))
+    return factor if file.size == size else factor // step

@@ -1,0 +1,74 @@
+"""Captures as LLFF's `poses_bounds.npy` (Mildenhall et al. 2019), with `images` or `images_N` beside it.
+
+A row for each image in the order of their names: a pose of 3 x 5, whose columns are the axes down, right and backwards,
+the position, and height, width and focal length in pixels of `images`; then the depths between which its points lie.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.folders import choose_images, listed_images, stay_inside
+from voronerf.app.scenes.lenses import PERSPECTIVE, Lens
+from voronerf.app.scenes.photographs import Photographs, Reading, View, hold_out, photograph_scene
+from voronerf.app.scenes.scene import Scene
+from voronerf.app.scenes.transforms import LARGEST, ORTHONORMAL
+
+FILE = "poses_bounds.npy"
+COLUMNS = 17
+#: Rows that a file may have; each is an image.
+MOST = 1_000_000
+
+
+def load_llff(folder: Path, reading: Reading) -> Scene:
+    """Loads an LLFF capture; every 8th image is held out for testing.
+
+    Raises:
+        SceneError: the file is broken, or the images are not as many as its rows.
+    """
+    path = folder / FILE
+    stay_inside(path, folder, reading.allow_outside)
+    rows = _read(path)
+    chosen = choose_images(folder, reading.downscale, float(rows[:, [4, 9]].max()))
+    stay_inside(chosen.path, folder, reading.allow_outside)
+    files = listed_images(chosen.path)
+    if len(files) != len(rows):
+        raise SceneError(f"{path}: has poses of {len(rows)} images, {chosen.path} has {len(files)} images")
+    views = []
+    for number, (file, row) in enumerate(zip(files, rows)):
+        stay_inside(file, folder, reading.allow_outside)
+        matrix, (near, far) = row[:15].reshape(3, 5), row[15:]
+        height, width, focal = matrix[:, 4].tolist()
+        pose = np.eye(4)
+        pose[:3] = np.stack((matrix[:, 1], -matrix[:, 0], matrix[:, 2], matrix[:, 3]), axis=1)
+        turn = pose[:3, :3]
+        if np.abs(turn.T @ turn - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(turn) < 0:
+            raise SceneError(f"{path}: row {number} is not a pose, its axes are no rotation")
+        if not (min(height, width, focal) >= 1 and 0 < near < far):
+            given = ", ".join(f"{value:g}" for value in row[[4, 9, 14, 15, 16]])
+            raise SceneError(f"{path}: row {number} must have a size, a focal length and 0 < near < far, got {given}")
+        lens = Lens((focal, focal, width / 2, height / 2), (0.0,) * 8, PERSPECTIVE)
+        views.append(View(file, torch.from_numpy(pose), lens, (width, height), bounds=(float(near), float(far))))
+    about = (f"LLFF's {FILE} of {len(views)} images", *chosen.notes)
+    return photograph_scene(folder, Photographs(path, views, hold_out(len(views)), chosen.factor, about), reading)
+
+
+def _read(path: Path) -> np.ndarray:
+    try:
+        rows = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # a header is a line of Python, with whatever shape
+        raise SceneError(f"{path}: is no array of NumPy that can be read: {error!s:.80}") from None
+    if not (isinstance(rows, np.ndarray) and rows.ndim == 2 and rows.shape[1] == COLUMNS and 0 < len(rows) <= MOST):
+        raise SceneError(
+            f"{path}: must have {COLUMNS} numbers for each image, got shape {list(getattr(rows, 'shape', []))}"
+        )
+    if rows.dtype.kind != "f":
+        raise SceneError(f"{path}: must have floating-point numbers, got {rows.dtype}")
+    rows = np.array(rows, dtype=np.float64)
+    if not (np.abs(rows) <= LARGEST).all():
+        raise SceneError(f"{path}: has values that are not finite, or above {LARGEST:.0e}")
+    return rows

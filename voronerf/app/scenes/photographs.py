@@ -1,0 +1,391 @@
+"""From photographs with known cameras to a scene: which kind it is, where it lies, and how near and far it reaches.
+
+c images, n sparse points. A scene is moved, turned and scaled so that the networks meet the same numbers whatever the
+units of its files: what the cameras look at becomes the origin, their mean up direction the z axis, and the farthest
+camera is at distance 1.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.app.scenes.carving import carve_box
+from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.images import read_images, read_masks
+from voronerf.app.scenes.lenses import PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
+from voronerf.app.scenes.scene import Scene, Sightings, Split
+from voronerf.app.scenes.soundness import camera_faults, lost_cameras
+from voronerf.nerf.cameras import Cameras, focus_point
+from voronerf.nerf.contraction import Contraction, Perspective
+
+HOLD_OUT = 8
+# To which images are reduced where nobody says by how much: about what minutes of training can learn.
+LONGEST_SIDE = 512
+# Near bound without bounds of the views, as a share of the distance from the focus to the nearest camera; closer things
+# are rarely in focus.
+NEAR = 0.35
+# Smallest near bound, as a share of the distance of the farthest camera; disparity needs a near bound above 0.
+NEAREST = 0.05
+FAR = 4.0
+# Smallest near bound that points give; half of the samples lie before twice the near bound.
+LEAST_NEAR = 0.02
+# Of the bounds of the views: things may be a little nearer than the nearest point, and farther than the farthest.
+NEARER, FARTHER = 0.75, 1.5
+# Mean of the viewing directions, a unit vector each, from which on they count as one direction.
+PARALLEL = 0.95
+KIND_LINES = {
+    "object": "an object on white, from the images' alpha",
+    "forward": "forward facing, the cameras look the same way",
+    "inside-out": "inside-out, the cameras look away from each other",
+    "unbounded": "unbounded, the cameras look at one place with surroundings",
+}
+
+
+class View(NamedTuple):
+    """A photograph: its file, its pose float64 [4, 4], camera to world, its lens and the (width, height) that this is
+    for; and where known its mask, the depths between which its points lie, and the points float64 [s, 3] themselves."""
+
+    path: Path
+    pose: Tensor
+    lens: Lens
+    size: tuple[float, float]
+    mask: Path | None = None
+    bounds: tuple[float, float] | None = None
+    points: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a folder is read, the options of `load_scene`."""
+
+    downscale: int | None = None
+    allow_outside: bool = False
+    kind: str = "auto"
+    normalise: bool = True
+    images: str = "auto"
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """What a loader found.
+
+    Attributes:
+        source: the file to name in errors.
+        views: in the order of their names.
+        held_out: bool [c], the test views.
+        factor: by which the files are still to be reduced.
+        notes: what the loader has to say.
+        transform: float64 [4, 4], from the original coordinates to those of the poses.
+    """
+
+    source: Path
+    views: Sequence[View]
+    held_out: Tensor
+    factor: int
+    notes: tuple[str, ...] = ()
+    transform: Tensor | None = None
+
+
+def least_factor(longest: float) -> int:
+    """The factor that leaves a side of so many pixels at most `LONGEST_SIDE`."""
+    return max(math.ceil(longest / LONGEST_SIDE), 1)
+
+
+def distinct_names(paths: list[Path], folder: Path) -> list[str]:
+    """A unique name for each image, under which pictures of it are stored.
+
+    The names are the stems of the files if these differ; otherwise the paths inside the folder of the scene, such as
+    a_00 for a/00.png; and if a file is listed twice, the paths behind the number of the image.
+    """
+    names = [path.stem for path in paths]
+    if len(set(names)) < len(names):
+        inside = [Path(os.path.relpath(path, folder)).with_suffix("") for path in paths]
+        names = ["_".join(part for part in path.parts if part != "..") for path in inside]
+    if len(set(names)) < len(names):
+        names = [f"{position:04d}_{name}" for position, name in enumerate(names)]
+    return names
+
+
+def hold_out(count: int) -> Tensor:
+    """Every 8th of `count` images, from the first."""
+    return torch.arange(count) % HOLD_OUT == 0
+
+
+def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scene:
+    """Makes the scene of photographs.
+
+    Raises:
+        SceneError: an image cannot be read or has another shape than its camera, a lens cannot be inverted, or the kind
+            does not fit.
+    """
+    if len(found.views) < 2 or not bool(found.held_out.any()) or bool(found.held_out.all()):
+        raise SceneError(f"{found.source}: one image is too few, one is held out for testing")
+    # Training views first, so that the images of either part are a slice and no copy.
+    order = torch.cat(((~found.held_out).nonzero()[:, 0], found.held_out.nonzero()[:, 0])).tolist()
+    views, count = [found.views[index] for index in order], int((~found.held_out).sum())
+    paths = [view.path for view in views]
+    name = folder.resolve().name
+    images, sizes, on_disk = read_images(paths, found.factor, keep=reading.images, name=name)
+    masks = read_masks([view.mask for view in views], paths, sizes, found.factor, on_disk=on_disk, name=name)
+    alpha = images.shape[-1] == 4 and any(bool((image[..., 3] < 255).any()) for image in images)
+
+    poses = torch.stack([view.pose for view in views])
+    kind = _kind(poses, alpha, reading.kind, found.source)
+    if kind != "object" and images.shape[-1] == 4:
+        # its own store: a part of each pixel cannot be drawn from a mapped file without a copy
+        opaque = read_images(paths, found.factor, keep="disk", name=name, most_channels=3).images if on_disk else None
+        images = images[..., :3].contiguous() if opaque is None else opaque
+    bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64)
+    frame = find_frame(poses, kind, bounds if len(bounds) else None)
+    if not reading.normalise:
+        frame = frame.undone()
+    cameras = _cameras(frame.poses(poses), views, sizes, found.source)
+    contraction = _contraction(kind, frame, cameras)
+    cameras = cameras.downscaled(found.factor)
+    masks = _without_dark_corners(cameras, masks, found.source, views)
+    near, far, box = frame.near, frame.far, None
+    if kind == "object":
+        box = carve_box(cameras[:count], images[:count, ..., 3], near, far)
+
+    names = tuple(distinct_names(paths, folder))
+    parts = [
+        Split(cameras[part], images[part], names[part], None if masks is None else masks[part], on_disk)
+        for part in (slice(count), slice(count, None))
+    ]
+    parts[0] = replace(parts[0], sightings=find_sightings(parts[0], views[:count], frame))
+    faults = camera_faults(poses[:, :3, 3], bounds, ((view.lens, view.size[0]) for view in views))
+    if lost := int(lost_cameras(poses[:, :3, 3]).sum()):
+        faults.append(f"{lost} of {len(poses)} lie far from all others")
+    notes = [*found.notes, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
+    if reading.downscale is None and found.factor > 1:
+        size = f"{cameras.width} x {cameras.height}"
+        notes.append(f"images are reduced by {found.factor}, to {size} (--downscale 1 keeps their size)")
+    to_scene = frame.matrix if found.transform is None else frame.matrix @ found.transform
+    return Scene(
+        name,
+        parts[0],
+        parts[1],
+        near,
+        far,
+        box,
+        "linear" if kind == "object" else "disparity",
+        "white" if kind == "object" else None,
+        kind,
+        contraction,
+        to_scene,
+        tuple(notes),
+    )
+
+
+def find_sightings(split: Split, views: Sequence[View], frame: Frame) -> Sightings | None:
+    """Where the views of a split see their points: those that lie in the image, and where the mask counts."""
+    pixels, distances = [], []
+    for index, view in enumerate(views):
+        if view.points is None:
+            continue
+        points = (view.points @ frame.matrix[:3, :3].T + frame.matrix[:3, 3]).float()
+        places, depth = split.cameras.project(points, index)
+        inside = (depth > 0) & (places >= 0).all(-1) & (places < torch.tensor(split.cameras.size(index))).all(-1)
+        points, (column, row) = points[inside], places[inside].long().unbind(-1)
+        if (mask := split.mask(index)) is not None:
+            points, row, column = (part[mask[row, column]] for part in (points, row, column))
+        pixels.append((index * split.cameras.height + row) * split.cameras.width + column)
+        distances.append((points - split.cameras.origins[index]).norm(dim=-1))
+    if not sum(map(len, pixels)):
+        return None
+    return Sightings(torch.cat(pixels), torch.cat(distances))
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where a scene lies: a similarity, and what is measured in the space behind it.
+
+    Attributes:
+        matrix: float64 [4, 4], from the coordinates of the files to those of the scene.
+        near: distance along a ray at which the scene begins.
+        far: distance along a ray at which it ends.
+        centre: float64 [3], the middle of the foreground.
+        radius: of the foreground.
+        axes: float64 [3, 3], its rows are the directions right, up and ahead.
+        measured: near and far come from the points.
+    """
+
+    matrix: Tensor
+    near: float
+    far: float
+    centre: Tensor
+    radius: float
+    axes: Tensor
+    measured: bool
+
+    @property
+    def scale(self) -> float:
+        """Lengths in the scene over those in the files."""
+        return float(torch.linalg.det(self.matrix[:3, :3])) ** (1 / 3)
+
+    def poses(self, poses: Tensor) -> Tensor:
+        """Poses float64 [c, 4, 4] in the scene, rigid as before."""
+        moved = self.matrix @ poses
+        moved[:, :3, :3] /= self.scale
+        return moved
+
+    def undone(self) -> Frame:
+        """The same space in the coordinates of the files."""
+        back = torch.linalg.inv(self.matrix)
+        return Frame(
+            torch.eye(4, dtype=torch.float64),
+            self.near / self.scale,
+            self.far / self.scale,
+            back[:3, :3] @ self.centre + back[:3, 3],
+            self.radius / self.scale,
+            self.axes @ self.matrix[:3, :3] / self.scale,
+            self.measured,
+        )
+
+
+def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None) -> Frame:
+    """Finds the coordinates of a scene.
+
+    The cameras' focus becomes the origin, or their middle where they have none in common; their mean up direction
+    becomes z, and for a forward-facing scene their mean direction becomes y. The farthest camera is at distance 1; with
+    bounds, the nearest near bound of a forward-facing scene, and the median far bound of one that is seen from within.
+
+    Args:
+        poses: float64 [c, 4, 4].
+        kind: of the scene.
+        bounds: float64 [m, 2], the least and the largest depth of the points of m views.
+    """
+    cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
+    outward = kind in ("forward", "inside-out")
+    centre = None if outward else focus_point(cameras)
+    if centre is None:
+        centre = cameras.origins.mean(0)
+    turn = _upright(poses[:, :3, 1].mean(0), cameras.forward.mean(0) if kind == "forward" else None)
+    distances = (cameras.origins - centre).norm(dim=-1)
+    length = float(distances.max())
+    if outward and bounds is not None:
+        length = float(bounds[:, 0].min() if kind == "forward" else bounds[:, 1].median())
+    length = length if length > 0 else 1.0
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = turn / length
+    matrix[:3, 3] = -turn @ centre / length
+    nearest = float(distances.min()) / length
+    near, far, measured = max(NEAR * nearest, NEAREST), FAR, False
+    if kind == "object":
+        near, far = 0.05 * nearest, 2.0
+    elif bounds is not None:
+        measured = True
+        near = max(NEARER * float(bounds[:, 0].min()) / length, LEAST_NEAR)
+        far = max(FARTHER * float(bounds[:, 1].max()) / length, FAR)
+    axes = torch.eye(3, dtype=torch.float64)[[0, 2, 1]]
+    return Frame(matrix, near, far, torch.zeros(3, dtype=torch.float64), 1.0, axes, measured)
+
+
+def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Perspective | None:
+    """Of a scene without a box: a cube around all that forward-facing cameras see, or a ball."""
+    centre = frame.centre.float()
+    if kind == "object":
+        return None
+    if kind != "forward" or cameras.models is not None:  # a fisheye may see to the side, or behind
+        return Contraction(centre, frame.radius)
+    slopes = torch.zeros(2)
+    axes = frame.axes.float()
+    for index in range(len(cameras)):
+        width, height = cameras.size(index)
+        rays = cameras.rays(index, torch.tensor([0.0, width, 0.0, width]), torch.tensor([0.0, 0.0, height, height]))
+        for distance in (frame.near, frame.far):
+            local = (rays.origins + distance * rays.directions - centre) @ axes.T
+            slopes = torch.maximum(slopes, (local[:, :2].abs() / local[:, 2:].clamp_min(frame.near / 2)).amax(0))
+    return Perspective(centre, axes, frame.near, (float(slopes[0]), float(slopes[1])))
+
+
+def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
+    """A rotation [3, 3] that turns `up` to z, and `forward`, if given, to y; leaves a direction of no length alone."""
+    if forward is not None and forward.norm() > 0.1:
+        y = torch.nn.functional.normalize(forward, dim=0)
+        x = torch.linalg.cross(y, up)
+        if x.norm() > 1e-3:
+            x = torch.nn.functional.normalize(x, dim=0)
+            return torch.stack((x, y, torch.linalg.cross(x, y)))
+    if up.norm() <= 0.1:
+        return torch.eye(3, dtype=up.dtype)
+    z = up / up.norm()
+    spare = torch.eye(3, dtype=up.dtype)[int(z.abs().argmin())]
+    x = torch.nn.functional.normalize(torch.linalg.cross(spare, z), dim=0)
+    return torch.stack((x, torch.linalg.cross(z, x), z))
+
+
+def _kind(poses: Tensor, alpha: bool, asked: str, source: Path) -> str:
+    """The kind that was asked for, or the one that alpha and cameras show."""
+    if asked == "object" and not alpha:
+        raise SceneError(f"{source}: --kind object needs images with transparent pixels, these are opaque")
+    if asked != "auto":
+        return asked
+    if alpha:
+        return "object"
+    cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
+    forward = cameras.forward
+    if float(forward.mean(0).norm()) > PARALLEL:
+        return "forward"
+    return "unbounded" if focus_point(cameras) is not None else "inside-out"
+
+
+def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) -> Cameras:
+    """Cameras of the image files, whose size may be another one of the same shape than the lens is for."""
+    intrinsics = []
+    for view, (width, height) in zip(views, sizes.tolist()):
+        across, down = width / view.size[0], height / view.size[1]
+        # Reduced images have sizes of whole pixels; exporters that scale images may write fractions.
+        if abs(across - down) * max(view.size) > 2:
+            raise SceneError(
+                f"{view.path}: is {width} x {height} pixels as stored, but {source} says {view.size[0]:g} x "
+                f"{view.size[1]:g}"
+            )
+        fx, fy, cx, cy = view.lens.intrinsics
+        intrinsics.append((fx * across, fy * down, cx * across, cy * down))
+    bent = torch.tensor([view.lens.coefficients for view in views])
+    models = torch.tensor([view.lens.model for view in views], dtype=torch.int32)
+    others = models if bool((models != PERSPECTIVE).any()) else None
+    distortion = bent if others is not None or bool(bent.any()) else None
+    return Cameras.of_images(poses.float(), torch.tensor(intrinsics), sizes, distortion, others)
+
+
+def _without_dark_corners(cameras: Cameras, masks: Tensor | None, source: Path, views: Sequence[View]) -> Tensor | None:
+    """The masks without the pixels that no ray of a fisheye or an FOV lens reaches.
+
+    Raises:
+        SceneError: such pixels of a perspective lens, whose model is then a wrong one.
+    """
+    inverts = lens_inverts(cameras)
+    if bool(inverts.all()):
+        return masks
+    perspective = torch.tensor([view.lens.model == PERSPECTIVE for view in views])
+    if bool((wrong := perspective & ~inverts).any()):
+        name = views[int(wrong.int().argmax())].path.name
+        raise SceneError(f"{source}: the lens distortion of {name} cannot be inverted inside the image")
+    if masks is None:
+        masks = torch.ones(len(cameras), cameras.height, cameras.width, dtype=torch.bool)
+    masks = masks.clone()  # it may be mapped from a file
+    for index in (~inverts).nonzero()[:, 0].tolist():
+        width, height = cameras.size(index)
+        masks[index, :height, :width] &= pixels_with_rays(cameras, index)
+    return masks
+
+
+def _note(kind: str, frame: Frame, reading: Reading) -> str:
+    asked = "" if reading.kind == "auto" else ", as asked"
+    origin = "the sparse points" if frame.measured else "the cameras"
+    where = (
+        f"moved, turned and scaled by {frame.scale:.4g}"
+        if reading.normalise
+        else "in the coordinates of its files (--no-normalise)"
+    )
+    return f"{KIND_LINES[kind]}{asked} (--kind); {where}; near {frame.near:.3g} and far {frame.far:.3g} from {origin}"

@@ -1,0 +1,459 @@
+"""From a video or a folder of images to a scene: COLMAP finds the cameras, by pycolmap.
+
+Its stages leave what they found in `OUT/colmap`, where a stopped process goes on and COLMAP's own program can look:
+
+    features   `database.db`: the features of each image
+    pairs      `few.db`: the largest features of each image, matched between all; `pairs.json`: those that share some
+    matches    `database.db`: matches of those pairs
+    cameras    `global` and, if that model has faults, `incremental`: the better of both becomes `OUT/sparse/0`
+
+Matching the largest features first is the preemptive matching of Wu 2013, "Towards Linear-time Incremental Structure
+from Motion", section 4; the global mapper is that of Pan et al. 2024, "Global Structure-from-Motion Revisited".
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from PIL import Image
+
+from voronerf.app.files import write_text
+from voronerf.app.scenes.colmap import FILES, ColmapImage, depth_bounds, points_seen, read_model
+from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.folders import listed_images
+from voronerf.app.scenes.images import read_header, read_image
+from voronerf.app.scenes.lenses import MODELS
+from voronerf.app.scenes.soundness import camera_faults, lost_cameras
+from voronerf.app.scenes.transforms import Shot, write_transforms
+
+#: Of a video. A playlist would name other files.
+CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
+LEAST_IMAGES = 3
+MATCHINGS = ("auto", "exhaustive", "sequential")
+MAPPERS = ("auto", "global", "incremental")
+#: "auto" matches at most so many images all with all.
+FEW_IMAGES = 40
+#: Of the largest features of an image that choose its pairs; with how many images it is matched, and how many matches
+#: of the largest features make a pair. Images are also matched with this many that follow by name.
+LARGEST_FEATURES, NEIGHBOURS, LEAST_MATCHES, FOLLOWING = 800, 20, 10, 2
+#: "sequential" matches an image with so many that follow, and with as many at distances of powers of two.
+SEQUENTIAL = 10
+#: Shares of the images with a camera: below the first a model is refused, below the second other mappers are tried.
+LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
+#: Mean error of the points of a sound model, in pixels.
+LARGEST_ERROR = 2.0
+#: Reduced images are written while their longer side has so many pixels.
+LEAST_SIDE = 256
+
+Progress = Callable[[str, int, int], None]
+Pair = tuple[str, str]
+Item = TypeVar("Item")
+
+
+class Settings(NamedTuple):
+    """What the stages are asked to do; a folder of other settings is not gone on with."""
+
+    source: str
+    frames: int
+    matching: str
+    camera_model: str
+    max_features: int
+
+
+@dataclass(frozen=True)
+class Model:
+    """What a mapper found."""
+
+    folder: Path  # of its files
+    mapper: str  # "global" or "incremental"
+    images: list[ColmapImage]  # in the order of their names
+    placed: int  # images whose camera lies with others
+    error: float  # mean distance of the points from where they were seen, in pixels
+    faults: list[str]  # what is wrong with it, as parts of a line
+
+
+def process(
+    source: Path,
+    out: Path,
+    *,
+    frames: int = 150,
+    matching: str = "auto",
+    camera_model: str = "SIMPLE_RADIAL",
+    mapper: str = "auto",
+    max_features: int = 4096,
+    verbose: bool = False,
+    say: Callable[[str], None] = print,
+    progress: Progress = lambda stage, done, total: None,
+) -> None:
+    """Makes a scene: `out/images`, reduced copies, a COLMAP model in `out/sparse/0` and `out/transforms.json`.
+
+    The images of a video, and images of one size, share a camera; else each has its own. `out/colmap` keeps what each
+    stage found, and a process with the same settings goes on there. `out/sparse/0` appears when all is done.
+
+    Args:
+        source: a video, or a folder of PNG or JPEG images.
+        out: the folder to make. It must not exist, be empty, or be that of a process that was stopped.
+        frames: of a video, evenly spread.
+        matching: which images are matched: "exhaustive", all with all; "sequential", with those next to them by name;
+            "auto", those whose largest features match, and the next two by name.
+        camera_model: COLMAP's name of the model of the lens.
+        mapper: "global", "incremental", or "auto": global, and incremental too if its model has faults.
+        max_features: of an image.
+        verbose: show what COLMAP says.
+        say: takes a line about each step.
+        progress: takes the name of a stage, how much of it is done and how much there is; 0 where that is not known.
+
+    Raises:
+        ValueError: an unknown matching, mapper or model of a lens, or too few features.
+        SceneError: the source is neither, or COLMAP finds no model that is sound.
+        ImportError: pycolmap is not installed.
+        OSError: a file cannot be written.
+    """
+    names = [name for name, _ in MODELS.values()]
+    for argument, value, known in (
+        ("matching", matching, MATCHINGS),
+        ("mapper", mapper, MAPPERS),
+        ("camera_model", camera_model, names),
+    ):
+        if value not in known:
+            raise ValueError(f"process: {argument} must be one of {', '.join(known)}, got {value!r:.60}")
+    if max_features < 100:
+        raise ValueError(f"process: max_features must be at least 100, got {max_features}")
+    try:
+        import pycolmap
+    except ImportError:
+        raise ImportError("voronerf process needs pycolmap: pip install 'voronerf[colmap]'") from None
+    if not source.exists():
+        raise SceneError(f"{source}: there is no such video or folder")
+    settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features)
+    work = _begin(out, settings)
+    level = pycolmap.logging.Level
+    pycolmap.logging.minloglevel = (level.INFO if verbose else level.FATAL).value
+    pycolmap.logging.alsologtostderr = verbose
+    if not (images := out / "images").is_dir():
+        _gather(source, out, frames)
+    files = listed_images(images)
+    shared = len({read_header(path, 1).size for path in files}) == 1
+    say(f"{len(files)} images with {'one camera' if shared else 'a camera each'}; {work} keeps what COLMAP finds")
+    stages = Stages(pycolmap, work, images, progress)
+    _match(stages, [path.name for path in files], settings, shared)
+    models: list[Model] = []
+    for name in ("global", "incremental"):
+        # The other mapper has its say if the first one's model is not good.
+        if mapper == name or (mapper == "auto" and not (models and _is_good(models[0], len(files)))):
+            model = _map(stages, name)
+            say(f"{name} mapping: {_described(model, len(files))}")
+            models += [model] if model is not None else []
+    if not models:
+        raise SceneError(f"{source}: COLMAP finds no model: the images must overlap, be sharp and differ in place")
+    best = max(models, key=lambda model: (not model.faults, model.placed, -model.error))
+    rest = "; ".join(best.faults)
+    if best.placed < LEAST_SHARE * len(files) and not rest:
+        rest = "less than half of the images have a camera"
+    if rest:
+        raise SceneError(
+            f"{out}: no sound model of {len(files)} images: {rest}. Try --matching exhaustive, --max-features 8192, "
+            f"another --camera-model, or more images; {work} has what was found"
+        )
+    _write_reduced(files, out)
+    shown = [
+        Shot(
+            f"images/{each.name}", torch.from_numpy(each.pose), each.camera.lens, each.camera.width, each.camera.height
+        )
+        for each in best.images
+    ]
+    with contextlib.suppress(SceneError):  # for a lens that only COLMAP has
+        write_transforms(out / "transforms.json", shown)
+    (out / "sparse").mkdir(exist_ok=True)
+    part = out / "sparse" / ".0"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    for name in FILES:
+        shutil.copyfile(best.folder / f"{name}.bin", part / f"{name}.bin")
+    os.replace(part, out / "sparse" / "0")
+    say(f"wrote {out}: cameras of {best.placed} of {len(files)} images; voronerf train --data {out}")
+
+
+def _begin(out: Path, settings: Settings) -> Path:
+    """The folder of the stages, new or that of a process with the same settings that was stopped."""
+    work = out / "colmap"
+    noted = work / "settings.json"
+    if noted.is_file():
+        found, asked = json.loads(noted.read_text()), settings._asdict()
+        if other := [name for name, value in asked.items() if found.get(name) != value]:
+            name = other[0]
+            raise SceneError(
+                f"{work}: was begun with --{name.replace('_', '-')} {found.get(name)}, not {asked[name]}; give the "
+                "same, or another folder"
+            )
+        if (out / "sparse" / "0").exists():
+            raise SceneError(f"{out}: is a scene already")
+        return work
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise SceneError(f"{out}: must not exist yet, be an empty folder, or be that of a process that was stopped")
+    work.mkdir(parents=True)
+    write_text(noted, json.dumps(settings._asdict(), indent=1))
+    return work
+
+
+def _gather(source: Path, out: Path, frames: int) -> None:
+    """Copies the images of a folder, or takes those of a video, to `out/images`.
+
+    COLMAP's lists of pairs separate names by spaces: names have `_` in their place.
+    """
+    part = out / ".images"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    try:
+        if source.is_dir():
+            for path in listed_images(source):
+                read_image(path, min(8, *read_header(path, 1).size))  # COLMAP would take one that is cut off
+                copy = part / "_".join(path.name.split())
+                if copy.exists():
+                    raise SceneError(f"{path}: another image has this name with _ in the place of spaces")
+                shutil.copyfile(path, copy)
+        else:
+            _take_frames(source, part, frames)
+        count = len(listed_images(part))
+        if count < LEAST_IMAGES:
+            raise SceneError(f"{source}: must have at least {LEAST_IMAGES} images, got {count}")
+    except BaseException:
+        for made in (part, out / "colmap"):
+            shutil.rmtree(made, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            out.rmdir()
+        raise
+    os.replace(part, out / "images")
+
+
+def _take_frames(video: Path, folder: Path, count: int) -> None:
+    """Writes frames of a video as JPEG; ffmpeg turns those of a phone upright."""
+    import imageio_ffmpeg
+
+    read = ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS, "-i", f"file:{video}"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", *read]
+    told = subprocess.run(command, capture_output=True, text=True, errors="replace").stderr
+    length = re.search(r"Duration: (\d+):(\d+):(\d+\.\d+)", told)
+    seconds = sum(float(part) * unit for part, unit in zip(length.groups(), (3600, 60, 1))) if length else 0.0
+    if not seconds or " Video: " not in told:
+        raise SceneError(f"{video}: is no video in a container that is read ({CONTAINERS})")
+    options = ["-map", "0:v:0", "-vf", f"fps={count / seconds:.9g}", "-frames:v", str(count), "-q:v", "2"]
+    made = subprocess.run(
+        [*command, *options, str(folder / "%05d.jpg")], capture_output=True, text=True, errors="replace"
+    )
+    if made.returncode:
+        reason = (made.stderr.strip().splitlines() or ["no reason"])[-1]
+        raise SceneError(f"{video}: ffmpeg cannot read it: {reason:.200}")
+
+
+# Stages ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Stages:
+    """What all stages work on."""
+
+    colmap: Any  # the module pycolmap
+    work: Path  # the folder of what the stages leave
+    images: Path  # the folder of the images
+    progress: Progress  # as of :func:`process`
+
+    @property
+    def database(self) -> Path:
+        """Features and matches of all images."""
+        return self.work / "database.db"
+
+    def in_parts(self, name: str, items: Sequence[Item], size: int, work: Callable[[Sequence[Item]], None]) -> None:
+        """Does the work of a stage in parts, so that it can be shown and stopped; COLMAP passes over what is done.
+
+        Raises:
+            SceneError: COLMAP fails.
+        """
+        for first in range(0, len(items), size):
+            self.progress(name, first, len(items))
+            with _told(name):
+                work(items[first : first + size])
+        self.progress(name, len(items), len(items))
+
+
+@contextlib.contextmanager
+def _told(stage: str) -> Iterator[None]:
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        raise SceneError(f"pycolmap: {stage}: {' '.join(str(error).split())[:300]}") from None
+
+
+def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: bool) -> None:
+    """Finds the features of the images, and matches them."""
+    colmap, database = stages.colmap, stages.database
+    extraction = colmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = settings.max_features
+    reader = colmap.ImageReaderOptions(camera_model=settings.camera_model)
+
+    def extract(some: Sequence[str]) -> None:
+        colmap.extract_features(
+            database,
+            stages.images,
+            image_names=list(some),
+            camera_mode=colmap.CameraMode.SINGLE if shared else colmap.CameraMode.PER_IMAGE,
+            reader_options=reader,
+            extraction_options=extraction,
+        )
+        if shared:
+            reader.existing_camera_id = 1  # for the next images
+
+    def match(where: Path, name: str, pairs: Sequence[Pair]) -> None:
+        listed = stages.work / "part.txt"
+
+        def match_part(some: Sequence[Pair]) -> None:
+            listed.write_text("".join(f"{a} {b}\n" for a, b in some))
+            colmap.match_image_pairs(where, pairing_options=colmap.ImportedPairingOptions(match_list_path=listed))
+
+        stages.in_parts(name, pairs, 64, match_part)
+        listed.unlink(missing_ok=True)
+
+    stages.in_parts("features", names, 4, extract)
+    if settings.matching == "sequential":
+        steps = {*range(1, SEQUENTIAL + 1), *(2**i for i in range(SEQUENTIAL))}
+        pairs = [pair for step in sorted(steps) for pair in zip(names, names[step:])]
+    else:
+        pairs = list(itertools.combinations(names, 2))
+        if settings.matching == "auto" and len(names) > FEW_IMAGES:
+            few, chosen = stages.work / "few.db", stages.work / "pairs.json"
+            if not chosen.is_file():
+                if not few.is_file():
+                    _keep_largest(colmap, database, few)
+                match(few, "pairs", pairs)
+                write_text(chosen, json.dumps(_choose_pairs(colmap, few)))
+            pairs = [(a, b) for a, b in json.loads(chosen.read_text())]
+    match(database, "matches", pairs)
+
+
+def _keep_largest(colmap: Any, database: Path, few: Path) -> None:
+    """Copies a database with the largest features of each image alone."""
+    part = few.with_suffix(".part")
+    shutil.copyfile(database, part)
+    with colmap.Database.open(part) as opened:
+        kept = {}
+        for image in opened.read_all_images():
+            places, described = opened.read_keypoints(image.image_id), opened.read_descriptors(image.image_id)
+            # A feature is x, y and a scale, or x, y and an affine shape of 2 x 2.
+            a, *rest = places[:, 2:].T
+            area = np.abs(a * rest[2] - rest[0] * rest[1]) if len(rest) == 3 else a**2
+            top = np.argsort(-area, kind="stable")[:LARGEST_FEATURES]
+            kept[image.image_id] = places[top], type(described)(data=described.data[top], type=described.type)
+        opened.clear_keypoints()
+        opened.clear_descriptors()
+        for number, (places, described) in kept.items():
+            opened.write_keypoints(number, places)
+            opened.write_descriptors(number, described)
+    os.replace(part, few)
+
+
+def _choose_pairs(colmap: Any, few: Path) -> list[Pair]:
+    """The names of the images that are worth matching with all features: each with its best, and the next by name."""
+    with colmap.Database.open(few) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        numbers, matches = opened.read_two_view_geometry_num_inliers()
+    shared: dict[str, list[tuple[int, str]]] = {name: [] for name in names.values()}
+    for number, count in zip(numbers, matches):
+        a, b = (names[image] for image in colmap.pair_id_to_image_pair(number))
+        if count >= LEAST_MATCHES:
+            shared[a].append((count, b))
+            shared[b].append((count, a))
+    pairs = {tuple(sorted((a, b))) for a, best in shared.items() for _, b in sorted(best, reverse=True)[:NEIGHBOURS]}
+    ordered = sorted(shared)
+    for step in range(1, FOLLOWING + 1):
+        pairs.update(zip(ordered, ordered[step:]))
+    return sorted((a, b) for a, b in pairs)
+
+
+def _map(stages: Stages, name: str) -> Model | None:
+    """The largest model of a mapper, or None if it finds none."""
+    colmap, folder = stages.colmap, stages.work / name
+    if not folder.is_dir():
+        part = stages.work / f".{name}"
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        errors: list[Exception] = []
+
+        def find() -> None:
+            try:
+                if name == "global":
+                    options = colmap.GlobalPipelineOptions(random_seed=0)
+                    colmap.global_mapping(stages.database, stages.images, part, options)
+                else:
+                    options = colmap.IncrementalPipelineOptions(random_seed=0)
+                    colmap.incremental_mapping(stages.database, stages.images, part, options)
+            except Exception as error:
+                errors.append(error)
+
+        # In a thread, since Ctrl-C does not reach COLMAP.
+        thread = threading.Thread(target=find, daemon=True)
+        thread.start()
+        while thread.is_alive():
+            stages.progress(f"{name} mapping", 0, 0)
+            thread.join(0.5)
+        with _told("mapping"):
+            for failure in errors:
+                raise failure
+        os.replace(part, folder)
+    found = [path for path in folder.iterdir() if (path / "images.bin").is_file()]
+    if not found:
+        return None
+    largest = max(found, key=lambda path: len(read_model(path).images))
+    model = read_model(largest)
+    origins = torch.from_numpy(np.stack([image.pose[:3, 3] for image in model.images]))
+    bounds = [bound for image in model.images if (bound := depth_bounds(image, points_seen(image, model))) is not None]
+    lenses = ((image.camera.lens, image.camera.width) for image in model.images)
+    lost = int(lost_cameras(origins).sum())  # which count as images without a camera
+    faults = camera_faults(origins, torch.tensor(bounds), lenses)
+    error = float(colmap.Reconstruction(largest).compute_mean_reprojection_error())
+    if error > LARGEST_ERROR:
+        faults.append(f"its points are off by {error:.2f} pixels")
+    return Model(largest, name, model.images, len(origins) - lost, error, faults)
+
+
+def _is_good(model: Model, images: int) -> bool:
+    return not model.faults and model.placed >= GOOD_SHARE * images
+
+
+def _described(model: Model | None, images: int) -> str:
+    if model is None:
+        return "no model"
+    rest = "".join(f"; {fault}" for fault in model.faults)
+    return f"{model.placed} of {images} images, points off by {model.error:.2f} pixels{rest}"
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def _write_reduced(files: Sequence[Path], out: Path) -> None:
+    """Writes `images_2` and `images_4`, reduced by area."""
+    longest = max(max(read_header(path, 1).size) for path in files)
+    for factor in (2, 4):
+        folder = out / f"images_{factor}"
+        if longest // factor < LEAST_SIDE or folder.is_dir():
+            continue
+        part = out / f".images_{factor}"
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        for path in files:
+            with Image.open(path) as image:
+                quality = {} if path.suffix.lower() == ".png" else {"quality": 95}
+                image.reduce(factor).save(part / path.name, **quality)
+        os.replace(part, folder)

@@ -1,0 +1,240 @@
+"""A scene without its images, as the file ``scene.json`` of a run directory: cameras and space.
+
+With it a run is rendered before the images are read, or where they are not. Fields as in `Scene` and `Cameras`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.app.files import json_text, read_json, write_text
+from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.scene import KINDS, Scene, Split
+from voronerf.nerf.cameras import Cameras
+from voronerf.nerf.contraction import Contraction, Perspective
+
+CONTRACTIONS = {"sphere": Contraction, "perspective": Perspective}
+#: What a text of a scene may be.
+WORDS = {"spacing": ("linear", "disparity"), "background": ("white", None), "kind": KINDS}
+#: How far the turns of cameras that were moved together may differ: a training may have refined each.
+TURN = 0.05
+INTEGERS = {"sizes": torch.int64, "models": torch.int32}
+
+
+def write_scene(path: Path, scene: Scene, *, refined: Cameras | None = None) -> None:
+    """Writes a scene without its images.
+
+    Args:
+        path: The file.
+        scene: The scene.
+        refined: The training cameras as a training has moved them; None for those of the scene.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    values = {name: getattr(scene, name) for name in ("name", "near", "far", *WORDS)}
+    for name in ("box", "transform"):
+        values[name] = _plain(getattr(scene, name))
+    if scene.contraction is not None:
+        kind = next(name for name, its in CONTRACTIONS.items() if isinstance(scene.contraction, its))
+        values["contraction"] = {"kind": kind, **_of_fields(scene.contraction)}
+    for part in ("train", "test"):
+        split = getattr(scene, part)
+        values[part] = {"names": list(split.names), **_of_fields(split.cameras)}
+    if refined is not None:
+        values["train"] |= _of_fields(refined)
+    write_text(path, json_text(values) + "\n")
+
+
+def with_refined(scene: Scene, run: Path) -> Scene:
+    """A scene with the training cameras that a run has moved, where its pictures are those of the run.
+
+    Raises:
+        SceneError: the record in the run directory is damaged.
+    """
+    path = run / "scene.json"
+    if not path.is_file():
+        return scene
+    own, known = scene.train, read_scene(path).train
+    if own.names != known.names:
+        return scene
+    return replace(scene, train=replace(own, cameras=_where_they_are(own.cameras, known.cameras)))
+
+
+def _where_they_are(read: Cameras, moved: Cameras) -> Cameras:
+    """Cameras as they were read, with the poses and the focal lengths that a record has of them."""
+    # The principal points stay, and so they tell how much larger these images are.
+    intrinsics = torch.cat(
+        (moved.intrinsics[:, :2] * (read.intrinsics / moved.intrinsics)[:, 2:], read.intrinsics[:, 2:]), 1
+    )
+    return replace(read, poses=moved.poses.to(read.poses), intrinsics=intrinsics)
+
+
+def within(scene: Scene, run: Path, *, joined: bool) -> Scene:
+    """A scene in the space of the record in a run directory, where there is one, see `recorded` and `placed`.
+
+    Args:
+        scene: As it was read.
+        run: The run directory.
+        joined: Whether the run was made of others, which may have moved its cameras.
+
+    Raises:
+        SceneError: the record is damaged, or it is of another place.
+    """
+    path = run / "scene.json"
+    if not path.is_file():
+        return scene
+    known = read_scene(path)
+    return (recorded([scene], known) if joined else None) or placed(scene, known)
+
+
+def recorded(scenes: Sequence[Scene], known: Scene) -> Scene | None:
+    """The pictures of scenes where the record of a run that was joined of theirs has their cameras.
+
+    Args:
+        scenes: Those of the first runs, or of all, in the order in which they were joined.
+        known: The record.
+
+    Returns:
+        None if the views of the record do not begin with theirs, each scene moved as a whole.
+
+    Raises:
+        SceneError: One has a background that the others have not.
+    """
+    splits: dict[str, Split] = {}
+    for part in ("train", "test"):
+        read: list[Split] = [getattr(scene, part) for scene in scenes]
+        views: Split = getattr(known, part)
+        plain = [name for split in read for name in split.names]
+        numbered = [f"{number}-{name}" for number, split in enumerate(read) for name in split.names]
+        if [*views.names[: len(plain)]] not in (plain, numbered):
+            return None
+        cameras = views.cameras[torch.arange(len(plain))]
+        first = 0
+        for split in read:
+            turns = cameras.poses[first : first + len(split), :3, :3] @ split.cameras.poses[:, :3, :3].mT.to(
+                cameras.poses
+            )
+            if not torch.allclose(turns, turns[:1].expand_as(turns), atol=TURN):
+                return None
+            first += len(split)
+        every = functools.reduce(Split.joined, read)
+        names, cameras = views.names[: len(plain)], _where_they_are(every.cameras, cameras)
+        splits[part] = replace(every, cameras=cameras, names=names, sightings=None)
+    for scene in scenes:
+        _check_background(scene, known)
+    return replace(scenes[0], train=splits["train"], test=splits["test"], **_space(known))
+
+
+def placed(scene: Scene, known: Scene) -> Scene:
+    """The views of a scene in the space of another one of the same place.
+
+    Photographs are moved, turned and scaled as they are read, by what the cameras of their folder say. They are moved
+    here to where the other scene's would be.
+
+    Raises:
+        SceneError: they cannot be of one place: one has a background that the other has not, or only one was moved.
+    """
+    _check_background(scene, known)
+    train, test = scene.train, scene.test
+    if known.transform is not None and scene.transform is not None:
+        move = known.transform @ torch.linalg.inv(scene.transform)
+        if not torch.allclose(move, torch.eye(4, dtype=move.dtype), atol=1e-6):
+            scale = float(torch.linalg.det(move[:3, :3]).abs()) ** (1 / 3)
+            train, test = (_moved(part, move, scale) for part in (train, test))
+    elif known.transform is not None or scene.transform is not None:
+        which = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
+        raise SceneError(f"{scene.name}: must be in the frame of {known.name}, got one that is {which} (--normalise)")
+    return replace(scene, train=train, test=test, **_space(known))
+
+
+def _space(known: Scene) -> dict[str, Any]:
+    """What a scene has of the space of a record."""
+    return {
+        name: getattr(known, name) for name in ("near", "far", "box", "spacing", "kind", "contraction", "transform")
+    }
+
+
+def _check_background(scene: Scene, known: Scene) -> None:
+    if scene.background != known.background:
+        ours, theirs = (each.background or "none" for each in (known, scene))
+        raise SceneError(f"{scene.name}: background must be that of {known.name}, {ours}, got {theirs}")
+
+
+def _moved(part: Split, move: Tensor, scale: float) -> Split:
+    """The views after a similarity [4, 4] of that scale."""
+    seen = part.sightings
+    seen = None if seen is None else seen._replace(distances=scale * seen.distances)
+    return replace(part, cameras=part.cameras.moved(move), sightings=seen)
+
+
+def read_scene(path: Path) -> Scene:
+    """Reads what :func:`write_scene` has written: a scene whose splits have no images.
+
+    Raises:
+        SceneError: the file is not a record of a scene; the message names it.
+        OSError: it cannot be read.
+    """
+    try:
+        values = read_json(path)
+        words = {name: values[name] for name in WORDS}
+        for name, word in words.items():
+            if word not in WORDS[name]:
+                raise ValueError(f"{name} must be one of {WORDS[name]}, got {word!r:.60}")
+        near, far = float(values["near"]), float(values["far"])
+        if not 0 <= near < far < float("inf"):
+            raise ValueError(f"near and far must satisfy 0 <= near < far, got {near} and {far}")
+        kinds = values.get("contraction")
+        contraction = None if kinds is None else _made(CONTRACTIONS[kinds.pop("kind")], kinds)
+        box = _tensor("box", values["box"])
+        if box is not None and (box.shape != (2, 3) or not bool((box[0] < box[1]).all())):
+            raise ValueError("box must be its lowest and highest corner")
+        transform = _tensor("transform", values["transform"], torch.float64)
+        train, test = _split(values["train"]), _split(values["test"])
+        return Scene(
+            str(values["name"]), train, test, near, far, box, contraction=contraction, transform=transform, **words
+        )
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RuntimeError) as error:
+        raise SceneError(f"{path}: is not the record of a scene: {error}") from None
+
+
+def _split(values: dict[str, Any]) -> Split:
+    names = tuple(map(str, values.pop("names")))
+    if not all(isinstance(values[side], int) for side in ("width", "height")):
+        raise ValueError(f"width and height must be integers, got {values['width']!r:.60}, {values['height']!r:.60}")
+    cameras = _made(Cameras, values)
+    if len(names) != len(cameras) or not names:
+        raise ValueError(f"names must be as many as poses and at least one, got {len(names)} and {len(cameras)}")
+    return Split(cameras, torch.empty(0, 1, 1, 3, dtype=torch.uint8), names)
+
+
+def _of_fields(value: Any) -> dict[str, Any]:
+    return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, Tensor) else value
+
+
+def _made(kind: type, values: dict[str, Any]) -> Any:
+    """A dataclass of tensors and numbers."""
+    given = {name: _tensor(name, value) if isinstance(value, list) else value for name, value in values.items()}
+    if "slopes" in given:
+        given["slopes"] = tuple(values["slopes"])
+    return kind(**given)
+
+
+def _tensor(name: str, value: Any, dtype: torch.dtype = torch.float32) -> Tensor | None:
+    if value is None:
+        return None
+    tensor = torch.tensor(value, dtype=INTEGERS.get(name, dtype))
+    if not bool(tensor.isfinite().all()):
+        raise ValueError(f"{name} must be finite")
+    return tensor

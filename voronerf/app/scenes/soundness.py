@@ -1,0 +1,87 @@
+"""What is wrong with the cameras that were found for photographs: signs of a reconstruction that has collapsed.
+
+c cameras, in any coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from voronerf.app.scenes.lenses import Lens
+
+#: A camera is lost if its nearest neighbour is farther than this many times the median distance between neighbours.
+LOST = 8.0
+#: Cameras have collapsed if their median distance to the nearest other one, times their number, is below this share of
+#: their mean distance to the middle. Cameras that are spread evenly on a circle have 6.
+COLLAPSED = 0.05
+#: The largest ratio of the depths that the cameras see.
+DEEPEST = 1e4
+#: Focal lengths over the width of an image: fields of view of 4 to 127 degrees.
+FOCAL_LENGTHS = (0.25, 15.0)
+#: How much the focal lengths of the two axes may differ, and how large the first coefficient of a lens and those of its
+#: tilt (p1, p2) may be.
+ASPECT, BENT, TILTED = 0.05, 1.0, 0.05
+
+
+def lost_cameras(origins: Tensor) -> Tensor:
+    """Which cameras [c, 3] lie far away from all others, bool [c]."""
+    nearest = _nearest(origins)
+    return nearest > LOST * nearest.median()
+
+
+def camera_faults(
+    origins: Tensor, bounds: Tensor | None = None, lenses: Iterable[tuple[Lens, float]] = ()
+) -> list[str]:
+    """What is wrong with cameras, as parts of a line; empty if they are sound.
+
+    Args:
+        origins: [c, 3], their positions.
+        bounds: [m, 2], the least and the largest depth of what they see, outliers left out; None if it is unknown.
+        lenses: each with the width of its images in pixels.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.app.scenes.soundness import camera_faults
+        >>> angles = torch.arange(40) * 0.157
+        >>> circle = torch.stack((angles.cos(), angles.sin(), 0 * angles), 1)
+        >>> camera_faults(circle)
+        []
+        >>> circle[:30] *= 1e-5
+        >>> camera_faults(circle)
+        ['the cameras have collapsed: half of them lie within 1.57e-06 of another one, and 0.35 from the middle']
+    """
+    faults = []
+    if len(origins) >= 3:
+        near = float(_nearest(origins).median())
+        extent = float((origins - origins.mean(0)).norm(dim=-1).mean())
+        if near * len(origins) < COLLAPSED * extent:
+            where = f"half of them lie within {near:.3g} of another one, and {extent:.3g} from the middle"
+            faults.append(f"the cameras have collapsed: {where}")
+    if bounds is not None and len(bounds):
+        near, far = float(bounds[:, 0].min()), float(bounds[:, 1].max())
+        if far > DEEPEST * near:
+            faults.append(f"the points lie at depths from {near:.3g} to {far:.3g}")
+    for lens, width in dict.fromkeys(lenses):
+        fx, fy, *_ = lens.intrinsics
+        if not FOCAL_LENGTHS[0] <= fx / width <= FOCAL_LENGTHS[1]:
+            faults.append(f"a focal length of {fx / width:.3g} image widths is unlikely")
+        elif abs(fy / fx - 1) > ASPECT:
+            faults.append(f"the focal lengths of the two axes differ, {fx:.4g} and {fy:.4g}")
+        elif abs(lens.coefficients[0]) > BENT:
+            faults.append(f"the first coefficient of a lens is {lens.coefficients[0]:.3g}")
+        elif max(abs(tilt) for tilt in lens.coefficients[2:4]) > TILTED:
+            faults.append(f"a lens is tilted, p1 {lens.coefficients[2]:.3g} and p2 {lens.coefficients[3]:.3g}")
+    return list(dict.fromkeys(faults))
+
+
+def _nearest(origins: Tensor) -> Tensor:
+    """The distance of each camera to the nearest other one, [c]."""
+    found = torch.empty(len(origins), dtype=origins.dtype)
+    for rows in torch.arange(len(origins)).split(1024):
+        distances = torch.cdist(origins[rows], origins)
+        distances[torch.arange(len(rows)), rows] = float("inf")
+        found[rows] = distances.amin(1)
+    return found

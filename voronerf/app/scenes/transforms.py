@@ -1,0 +1,413 @@
+"""Captures as `transforms.json`, with intrinsics, lens distortion and poses (instant-ngp, nerfstudio).
+
+Blender's `transforms_*.json` share its frames, poses and numbers. Poses are OpenGL's, as everywhere.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import posixpath
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from voronerf.app.files import leads_outside, read_json, write_text
+from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.images import read_header
+from voronerf.app.scenes.lenses import COEFFICIENTS, FISHEYE, FOV, PERSPECTIVE, Lens
+from voronerf.app.scenes.photographs import Photographs, Reading, View, hold_out, least_factor, photograph_scene
+from voronerf.app.scenes.scene import Scene
+
+log = logging.getLogger(__name__)
+
+SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+ORTHONORMAL = 2e-3
+#: Of numbers and, where they are positive, its inverse the smallest; far from where float32 ends, even squared.
+LARGEST = 1e9
+#: Of a focal length, in sides of the image, and its inverse the smallest: fields of view of 0.06 to 179.9 degrees.
+LONGEST = 1000
+SPLITS = ("train_filenames", "test_filenames", "val_filenames")
+PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
+FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "distortion_params", "camera_model", "is_fisheye")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's distortion_params
+# k4 of a perspective camera belongs to r^8 in nerfstudio, and to the divisor in OpenCV.
+UNSUPPORTED = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a transforms file: its path, its pose float64 [4, 4], its entries, and the path of its mask."""
+
+    path: Path
+    pose: Tensor
+    entries: dict[str, Any]
+    mask: Path | None = None
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        SceneError: the file cannot be read, or holds something else; names it.
+    """
+    values = _read(path)
+    if not isinstance(values, dict):
+        raise SceneError(f"{path}: must be an object of JSON")
+    return values
+
+
+def _read(path: Path) -> Any:
+    try:
+        return read_json(path)
+    except ValueError as error:
+        raise SceneError(str(error)) from None
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, Any], list[Frame]]:
+    """Reads a transforms file and finds its images.
+
+    Images that are listed but missing are left out, with one line in the log (logger `voronerf.app.scenes.transforms`, level
+    WARNING) that says how many.
+
+    Args:
+        path: the JSON file.
+        allow_outside: also take images that lie outside of its folder.
+
+    Returns:
+        (the file's top-level entries, the frames whose image exists, in the file's order).
+
+    Raises:
+        SceneError: the file does not parse, has no frames, no image of any frame exists, one lies outside of the
+            folder, or a matrix is not a pose.
+    """
+    entries = _read(path)
+    frames = entries.get("frames") if isinstance(entries, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise SceneError(f"{path}: has no frames")
+
+    found = []
+    for position, frame in enumerate(frames):
+        name = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(name, str) or "\0" in name:
+            raise SceneError(f"{path}: frame {position} has no file_path")
+        pose = pose_of(frame.get("transform_matrix"), f"{path}: frame {position} ({name})")
+        image = _find_image(path.parent, name, allow_outside, f"{path}: frame {position} ({name})")
+        if image is not None:
+            found.append(Frame(image, pose, frame, _mask(path, frame, allow_outside, f"frame {position} ({name})")))
+    if not found:
+        raise SceneError(
+            f"{path}: none of its {len(frames)} images exists, the first is {path.parent / frames[0]['file_path']}"
+        )
+    if len(found) < len(frames):
+        missing = len(frames) - len(found)
+        log.warning("%s: %d of %d listed images are missing and are skipped", path, missing, len(frames))
+    return entries, found
+
+
+def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = False) -> float | None:
+    """A finite number of a transforms file; None if the entry is missing.
+
+    Raises:
+        SceneError: the entry is not a number, out of range, or not positive where it must be.
+    """
+    value = entries.get(key)
+    if value is None:
+        return None
+    # The comparisons take integers of any size; NaN fails them.
+    if not is_number(value) or not abs(value) <= LARGEST:
+        raise SceneError(f"{path}: {key} must be a finite number up to {LARGEST:.0e}, got {value!r:.60}")
+    if positive and not value >= 1 / LARGEST:
+        raise SceneError(f"{path}: {key} must be positive, got {value!r}")
+    return float(value)
+
+
+def is_number(value: object) -> bool:
+    """Whether a value of JSON is a number, which a boolean is to Python."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def focal_length(entries: dict[str, Any], key: str, side: int, path: Path) -> float | None:
+    """A focal length in pixels, from itself or from an angle of view; None if the entry is missing.
+
+    Args:
+        entries: of the file or a frame.
+        key: "fl_x" or "fl_y", "camera_angle_x" or "camera_angle_y".
+        side: pixels of the image along that axis.
+        path: the file, for messages.
+
+    Raises:
+        SceneError: the entry is no such number, or nothing that a camera has.
+    """
+    value = number(entries, key, path, positive=True)
+    if value is None:
+        return None
+    if key.startswith("camera_angle"):
+        if value >= math.pi:
+            raise SceneError(f"{path}: {key} must be an angle between 0 and pi, got {value}")
+        focal = 0.5 * side / math.tan(0.5 * value)
+    else:
+        focal = value
+    if not 1 / LONGEST <= focal / side <= LONGEST:
+        raise SceneError(
+            f"{path}: {key} must give a focal length of {1 / LONGEST:g} to {LONGEST} times the {side} pixels of the "
+            f"image, got {value:g}"
+        )
+    return focal
+
+
+def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Path | None:
+    """Finds an image file; Blender's files leave out the suffix, and files from Windows may have its separators."""
+    for spelt in dict.fromkeys((name, name.replace("\\", "/"))):
+        for suffix in SUFFIXES:
+            path = Path(f"{folder / spelt}{suffix}")
+            _check_inside(path, folder, allow_outside, f"{where}: file_path")
+            if os.path.isfile(path):
+                return path
+    return None
+
+
+def _mask(path: Path, entries: dict[str, Any], allow_outside: bool, where: str) -> Path | None:
+    """The mask of a frame; None without one."""
+    name = entries.get("mask_path")
+    if name is None:
+        return None
+    if not isinstance(name, str) or "\0" in name:
+        raise SceneError(f"{path}: {where}: mask_path must be a file name, got {name!r:.60}")
+    mask = path.parent / name.replace("\\", "/")
+    _check_inside(mask, path.parent, allow_outside, f"{path}: {where}: mask_path")
+    if not mask.is_file():
+        raise SceneError(f"{path}: {where}: its mask {mask} does not exist")
+    return mask
+
+
+def _check_inside(path: Path, folder: Path, allow_outside: bool, what: str) -> None:
+    if not allow_outside and leads_outside(path, folder):
+        raise SceneError(f"{what} must lead to a file in the folder of the scene; --allow-outside reads others")
+
+
+def pose_of(matrix: object, where: str, key: str = "transform_matrix") -> Tensor:
+    """Checks that rows of numbers are a rigid motion; float64 [4, 4]."""
+    rows = matrix if isinstance(matrix, list) else [None]
+    try:
+        if not all(isinstance(row, list) and all(map(is_number, row)) for row in rows):
+            raise TypeError
+        values = np.array(rows, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise SceneError(f"{where}: {key} is not a matrix of numbers") from None
+    if values.shape not in ((4, 4), (3, 4)):
+        raise SceneError(f"{where}: {key} must be 4 x 4, got shape {list(values.shape)}")
+    if not (np.abs(values) <= LARGEST).all():
+        raise SceneError(f"{where}: {key} has values that are not finite, or above {LARGEST:.0e}")
+    rotation = values[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > ORTHONORMAL or np.linalg.det(rotation) < 0:
+        raise SceneError(
+            f"{where}: {key} is not a pose, its upper left 3 x 3 is not a rotation "
+            f"(determinant {np.linalg.det(rotation):.3g}, off orthonormal by {error:.2g})"
+        )
+    if values.shape[0] == 4 and np.abs(values[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise SceneError(f"{where}: {key} is not a pose, its last row must be 0 0 0 1")
+    pose = np.eye(4)
+    pose[:3] = values[:3]
+    return torch.from_numpy(pose)
+
+
+def load_transforms(folder: Path, reading: Reading) -> Scene:
+    """Loads a capture; every 8th image in the order of their names is held out for testing.
+
+    Where the file has nerfstudio's `train_filenames`, `test_filenames` or `val_filenames`, they decide instead.
+    Validation images are for testing if there are no others, and are else left out.
+
+    Args:
+        folder: holds `transforms.json`.
+        reading: how it is read.
+
+    Raises:
+        SceneError: the file is broken, its lens model is not supported, or it has fewer than two images.
+    """
+    path = folder / "transforms.json"
+    entries, frames = read_transforms(path, reading.allow_outside)
+    frames = sorted(frames, key=lambda frame: frame.path.as_posix())
+    if len(frames) < 2:
+        raise SceneError(f"{path}: one image is too few, one is held out for testing")
+    declared = _declared_split(path, entries, frames)
+    if declared is None:
+        held_out = hold_out(len(frames))
+    else:
+        frames, held_out = declared
+    return capture_scene(folder, [Listed(path, entries, frame) for frame in frames], held_out, reading)
+
+
+def _declared_split(path: Path, entries: dict[str, Any], frames: list[Frame]) -> tuple[list[Frame], Tensor] | None:
+    """The frames that nerfstudio's lists of file names choose, and which are held out; None without such lists.
+
+    Where one list is missing or empty, the images of no other list take its place.
+    """
+    lists: dict[str, set[str]] = {}
+    for key in SPLITS:
+        names = entries.get(key)
+        if names is not None and not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+            raise SceneError(f"{path}: {key} must be a list of file names, got {names!r:.60}")
+        lists[key] = {_plain(name) for name in names or ()}
+    every = {_plain(frame["file_path"]) for frame in entries["frames"]}
+    for key, names in lists.items():
+        if unknown := sorted(names - every):
+            raise SceneError(f"{path}: {key} has {unknown[0]}, which is no file_path of a frame")
+    train, test, validation = lists.values()
+    if not (train or test or validation):
+        return None
+    test = test or validation
+    train, test = train or every - test - validation, test or every - train
+    if both := sorted(train & test):
+        raise SceneError(f"{path}: train_filenames and the images for testing must differ, both have {both[0]}")
+    if unused := len(every - train - test - validation):
+        log.warning("%s: %d images are in none of %s and are left out", path, unused, ", ".join(SPLITS))
+    names = [_plain(frame.entries["file_path"]) for frame in frames]
+    chosen = [(frame, name in test) for frame, name in zip(frames, names) if name in train | test]
+    held_out = torch.tensor([held for _, held in chosen], dtype=torch.bool)
+    for part, there in (("training", bool((~held_out).any())), ("testing", bool(held_out.any()))):
+        if not there:
+            raise SceneError(f"{path}: {', '.join(SPLITS)} leave no image for {part}")
+    return [frame for frame, _ in chosen], held_out
+
+
+def _plain(name: str) -> str:
+    """A file name in one spelling, so that ./images/a.png is images/a.png."""
+    return posixpath.normpath(name.replace("\\", "/"))
+
+
+class Listed(NamedTuple):
+    """A frame, the file that lists it, and the entries of that file, which the frame may override."""
+
+    path: Path
+    entries: dict[str, Any]
+    frame: Frame
+
+
+def has_lens(entries: dict[str, Any], frames: Sequence[Frame]) -> bool:
+    """Whether a transforms file describes lenses as captures do; Blender's files give the field of view alone."""
+    return any(given.get(key) is not None for given in (entries, *(f.entries for f in frames)) for key in LENS)
+
+
+def capture_scene(
+    folder: Path, listed: Sequence[Listed], held_out: Tensor, reading: Reading, about: str | None = None
+) -> Scene:
+    """Makes the scene of a capture from its frames, see `load_transforms`.
+
+    Args:
+        folder: of the scene.
+        listed: its c images.
+        held_out: bool [c], the test views.
+        reading: how it is read.
+        about: a line about the files; default: the name of the first.
+
+    Raises:
+        SceneError: as `load_transforms`.
+    """
+    path, entries, _ = listed[0]
+    notes = [about or f"{path.name} of {len(listed)} images"]
+    if any(entry.frame.entries.get("depth_file_path") is not None for entry in listed):
+        notes.append("its depth images are not used")
+    applied = entries.get("applied_transform")
+    transform = None if applied is None else pose_of(applied, str(path), "applied_transform")
+    views = [_view(*entry, reading.downscale or 1) for entry in listed]
+    factor = reading.downscale or least_factor(max(max(view.size) for view in views))
+    return photograph_scene(folder, Photographs(path, views, held_out, factor, tuple(notes), transform), reading)
+
+
+def _view(path: Path, entries: dict[str, Any], frame: Frame, downscale: int) -> View:
+    values = {**_named_distortion(entries, path), **_named_distortion(frame.entries, path)}
+    model = FISHEYE if _is_fisheye(values, path) else PERSPECTIVE
+    size = read_header(frame.path, downscale).size
+    given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
+    coefficients = tuple(given.get(key, 0.0) for key in COEFFICIENTS[model])
+    lens = Lens(_intrinsics(values, size, path, frame), coefficients, model)
+    return View(frame.path, frame.pose, lens, size, frame.mask)
+
+
+def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame: Frame) -> tuple[float, ...]:
+    """(fx, fy, cx, cy) in pixels."""
+    width, height = size
+    for key, actual in (("w", width), ("h", height)):
+        stated = number(values, key, path, positive=True)
+        if stated is not None and abs(stated - actual) >= 1:  # exporters that scale images may write fractions
+            raise SceneError(f"{frame.path}: is {width} x {height} pixels, but {path} says {key} = {stated:g}")
+    fx, fy = (
+        focal_length(values, f"fl_{axis}", side, path) or focal_length(values, f"camera_angle_{axis}", side, path)
+        for axis, side in zip("xy", size)
+    )
+    if fx is None and fy is None:
+        raise SceneError(f"{path}: has no focal length (fl_x or camera_angle_x)")
+    fx, fy = fx or fy, fy or fx
+    cx, cy = number(values, "cx", path), number(values, "cy", path)
+    assert fx is not None and fy is not None
+    return fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
+
+
+def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The entries with k1, k2... in the place of nerfstudio's distortion_params."""
+    given = entries.get("distortion_params")
+    if given is None or given == []:
+        return entries
+    if not isinstance(given, list) or len(given) != len(DISTORTION):
+        raise SceneError(f"{path}: distortion_params must be six numbers, {', '.join(DISTORTION)}, got {given!r:.60}")
+    return {**entries, **dict(zip(DISTORTION, given))}
+
+
+def _is_fisheye(values: dict[str, Any], path: Path) -> bool:
+    """Whether a camera is a fisheye; checks that its model is known and all of it is used."""
+    model = values.get("camera_model", "OPENCV")
+    if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS:
+        names = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
+        raise SceneError(f"{path}: camera model {model!s:.60} is not supported, only {names}")
+    fisheye = model in FISHEYE_MODELS or bool(values.get("is_fisheye"))
+    refused = ("p1", "p2", *UNSUPPORTED[1:]) if fisheye else UNSUPPORTED
+    used = [key for key in refused if number(values, key, path)]
+    if used:
+        known = "k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, k3, p1, p2"
+        raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only {known}")
+    return fisheye
+
+
+class Shot(NamedTuple):
+    """One image to be written: its file, its pose [4, 4] and its lens."""
+
+    file: str
+    pose: Tensor
+    lens: Lens
+    width: int
+    height: int
+
+
+def write_transforms(path: Path, shots: Sequence[Shot], **entries: Any) -> None:
+    """Writes cameras as nerfstudio and instant-ngp read them, with further entries of the file.
+
+    Raises:
+        SceneError: a lens is none that they have.
+        OSError: the file cannot be written.
+    """
+    frames = []
+    for shot in shots:
+        (fx, fy, cx, cy), coefficients, model = shot.lens
+        values = {name: value for name, value in zip(COEFFICIENTS[model], coefficients) if value}
+        known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "p1", "p2", "k3")
+        if model == FOV or not values.keys() <= set(known):
+            raise SceneError(f"{path}: the lens of {shot.file} is none that transforms.json has")
+        lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": shot.width, "h": shot.height}
+        lens |= {name: values.get(name, 0.0) for name in known}
+        kind = {"camera_model": "OPENCV_FISHEYE" if model == FISHEYE else "OPENCV"}
+        frames.append({"file_path": shot.file, "transform_matrix": shot.pose.tolist(), **lens, **kind})
+    shared = {key: value for key, value in frames[0].items() if all(frame.get(key) == value for frame in frames)}
+    rest = [{key: value for key, value in frame.items() if key not in shared} for frame in frames]
+    write_text(path, json.dumps({**shared, **entries, "frames": rest}, indent=1))

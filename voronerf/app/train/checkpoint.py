@@ -1,0 +1,384 @@
+"""Checkpoints: safetensors files, written atomically, read without pickle, and refused where a bit of them changed.
+
+The tensors are those of the routers with their diagrams, of the optimiser, of the sample reservoir and of the random
+generators. Everything else (configuration, counters, stages) is JSON in the metadata of the file, beside a checksum for
+each tensor and one for the JSON.
+
+A joint training writes a file for each territory, a checkpoint of its own, and then the checkpoint that names them. The
+networks of an edited run of several parts are in files whose names are hashes of what is in them: networks that did not
+change are not written again, and equal ones are stored once.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import re
+import threading
+import warnings
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from voronerf.app.files import parse_json, rename, write_bytes
+from voronerf.town.distributed.group import Group, RankLost
+
+FORMAT = "voronerf-checkpoint-2"
+#: The name of the checksum of the JSON, beside those of the tensors.
+_VALUES = "values"
+#: What `keep` of `load_checkpoint` is asked about the networks of all parts.
+NETWORKS = "part-*.router-*"
+#: The file of the networks of one router of a part.
+_NETWORKS = re.compile(r"(networks|part)-[0-9a-z-]+\.safetensors")
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be read, or that belongs to another configuration; the message names the file."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The contents of a checkpoint: tensors by name, everything else as JSON values, and the file that errors name."""
+
+    tensors: dict[str, Tensor]
+    values: dict[str, Any]
+    source: str = "checkpoint"
+
+    def group(self, prefix: str) -> dict[str, Tensor]:
+        """The tensors below ``prefix.``, without it."""
+        return {name[len(prefix) + 1 :]: t for name, t in self.tensors.items() if name.startswith(prefix + ".")}
+
+
+def checkpoint_path(run: Path) -> Path:
+    """Where a run directory keeps its last checkpoint."""
+    return run / "checkpoints" / "last.safetensors"
+
+
+def checkpoint_paths(run: Path) -> list[Path]:
+    """The checkpoints that a run directory has, the last first: last, last-1, last-2..."""
+    last = checkpoint_path(run)
+    earlier = [p for p in last.parent.glob("last-*.safetensors") if p.stem[5:].isdecimal()]
+    return [last] * last.is_file() + sorted(earlier, key=lambda path: int(path.stem[5:]))
+
+
+def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
+    """Writes the last checkpoint of a run; the one before becomes ``last-1``, and ``keep`` of them stay.
+
+    Raises:
+        OSError: When it cannot be written; the older ones are then untouched.
+    """
+    last = checkpoint_path(run)
+    written = last.with_name("new.safetensors")
+    save_checkpoint(written, checkpoint)
+    # From the oldest on, so that a crash at any moment leaves a gap in the numbers and no fewer checkpoints.
+    for number, path in reversed(list(enumerate(checkpoint_paths(run), 1))):
+        if number < keep:
+            rename(path, last.with_name(f"last-{number}.safetensors"))
+        else:
+            path.unlink()
+    rename(written, last)
+    _remove_parts(run)
+
+
+def part_path(run: Path, token: str, number: int) -> Path:
+    """Where a territory keeps its part of one checkpoint, whose token is like no other."""
+    return checkpoint_path(run).with_name(f"part-{token}-{number}.safetensors")
+
+
+def _remove_parts(run: Path) -> None:
+    """Removes parts and networks that no checkpoint of a run names; none while it has a file that cannot be read."""
+    named: set[str] = set()
+    for path in checkpoint_paths(run):
+        try:
+            with safe_open(path, framework="pt") as file:
+                named |= set(network_files(parse_json(file.metadata()[_VALUES])))
+        except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, OSError):
+            return
+    for path in checkpoint_path(run).parent.glob("*.safetensors"):
+        if _NETWORKS.fullmatch(path.name) and path.name not in named:
+            path.unlink(missing_ok=True)
+
+
+def network_files(values: dict[str, Any]) -> list[str]:
+    """The names of the files with the networks of parts, which the JSON of a checkpoint tells."""
+    return [str(router["file"]) for part in values.get("parts", ()) for router in part["routers"]]
+
+
+class CheckpointWriter:
+    """Writes the checkpoints of a run one after the other, beside what the caller does.
+
+    In a joint training all ranks call the same methods. Each writes the files of its territories; when all are there,
+    rank 0 writes the checkpoint that names them, which counts from that moment on.
+
+    Args:
+        run: The run directory.
+        keep: How many checkpoints stay.
+        group: The ranks of a joint training; None for this process alone.
+    """
+
+    def __init__(self, run: Path, keep: int, group: Group | None = None) -> None:
+        self.run, self.keep, self.group = run, keep, group
+        self._thread: threading.Thread | None = None
+        self._error: BaseException | None = None
+        self._index: Callable[[], Checkpoint] | None = None  # makes a checkpoint whose parts are being written
+
+    @property
+    def busy(self) -> bool:
+        """Whether a checkpoint is being written; over ranks, where that differs, a new one waits for the one before."""
+        return self.group is None and self._writes
+
+    @property
+    def ready(self) -> bool:
+        """Whether this rank has written its parts, for a checkpoint that is not there yet."""
+        return self._index is not None and not self._writes and self._error is None
+
+    @property
+    def _writes(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def write(self, checkpoint: Checkpoint) -> None:
+        """Begins to write a checkpoint, after the one before; its tensors must not change.
+
+        Raises:
+            OSError: When the one before could not be written.
+        """
+        self.wait()
+        self._begin(functools.partial(keep_checkpoint, self.run, checkpoint, self.keep))
+
+    def write_parts(self, parts: Mapping[Path, Checkpoint], index: Callable[[], Checkpoint]) -> None:
+        """Begins to write the parts of a checkpoint; :meth:`commit` writes the checkpoint itself.
+
+        Args:
+            parts: Those of this rank by their files; their tensors must not change.
+            index: Makes the checkpoint that names the parts of all ranks, which are written then; asked on rank 0.
+
+        Raises:
+            OSError: When the checkpoint before could not be written.
+            RankLost: When that is so on another rank.
+        """
+        self.wait()
+
+        def save_all() -> None:
+            for path, part in parts.items():
+                save_checkpoint(path, part)
+
+        self._index = index
+        self._begin(save_all)
+
+    def commit(self) -> None:
+        """Begins to write the checkpoint itself, when all ranks are :attr:`ready`."""
+        self._join()
+        index, self._index = self._index, None
+        if index is not None and (self.group is None or self.group.rank == 0):
+            self._begin(lambda: keep_checkpoint(self.run, index(), self.keep))
+
+    def wait(self) -> None:
+        """Returns when the checkpoint is written, on all ranks.
+
+        Raises:
+            OSError: When it could not be.
+            RankLost: When it could not be on another rank.
+        """
+        self._join_all()
+        if self._index is not None:
+            self.commit()
+            self._join_all()
+
+    def _begin(self, work: Callable[[], None]) -> None:
+        self._error = MemoryError("no memory for the thread that writes a checkpoint")  # until that has done so
+
+        def run() -> None:
+            try:
+                work()
+            except BaseException as error:
+                self._error = error
+            else:
+                self._error = None
+
+        # The end of the process does not wait for it: a second Ctrl-C is to end it at once.
+        self._thread = threading.Thread(target=run, daemon=True)
+        self._thread.start()
+
+    def _join(self) -> None:
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def _join_all(self) -> None:
+        failure: OSError | None = None
+        try:
+            self._join()
+        except OSError as error:
+            failure = error
+        failed = torch.tensor(float(failure is not None), device="cpu" if self.group is None else self.group.device)
+        if (failed if self.group is None else self.group.largest(failed)) > 0:
+            raise failure or RankLost("another rank could not write the checkpoint")
+
+
+def _all(name: str) -> bool:
+    return True
+
+
+def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
+    """The last checkpoint of a run that can be read; a warning tells of those passed over.
+
+    Args:
+        run: The run directory.
+        keep: See :func:`load_checkpoint`.
+
+    Raises:
+        CheckpointError: When there is none.
+    """
+    paths = checkpoint_paths(run) or [checkpoint_path(run)]
+    errors = []
+    for path in paths:
+        try:
+            found = load_checkpoint(path, keep=keep)
+        except CheckpointError as error:
+            errors.append(error)
+            continue
+        if errors:
+            warnings.warn(f"{errors[0]}; {path.name} takes its place", stacklevel=2)
+        return found
+    raise errors[0]
+
+
+def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Writes a checkpoint atomically, after the networks of its parts, if it has any.
+
+    Raises:
+        OSError: When it cannot be written; an older checkpoint at ``path`` is then untouched.
+    """
+    if "parts" in checkpoint.values:
+        checkpoint = _write_networks(path.parent, checkpoint)
+    values = json.dumps(checkpoint.values)
+    sums = {name: _checksum(tensor) for name, tensor in checkpoint.tensors.items()}
+    sums[_VALUES] = zlib.crc32(values.encode())
+    metadata = {"format": FORMAT, "values": values, "checksums": json.dumps(sums)}
+    write_bytes(path, save(checkpoint.tensors, metadata))
+
+
+def _write_networks(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
+    """Writes the networks of parts into files of a folder; the checkpoint without them, which names the files."""
+    tensors, parts = dict(checkpoint.tensors), []
+    for i, part in enumerate(checkpoint.values["parts"]):
+        routers = []
+        for j, router in enumerate(part["routers"]):
+            prefix = f"part-{i}.router-{j}."
+            own = {name[len(prefix) :]: tensors.pop(name) for name in sorted(tensors) if name.startswith(prefix)}
+            if not own and "file" in router:  # whoever made the checkpoint has written it
+                routers.append(router)
+                continue
+            kind = {name: value for name, value in router.items() if name != "file"}
+            digest = hashlib.sha256(json.dumps(kind, sort_keys=True).encode())
+            for name, tensor in own.items():
+                digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
+                digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+            path = folder / f"networks-{digest.hexdigest()}.safetensors"
+            if not path.is_file():
+                save_checkpoint(path, Checkpoint(own, kind))
+            routers.append({**kind, "file": path.name})
+        parts.append({**part, "routers": routers})
+    return replace(checkpoint, tensors=tensors, values={**checkpoint.values, "parts": parts})
+
+
+def _read_networks(path: Path, values: dict[str, Any], keep: Callable[[str], bool]) -> dict[str, Tensor]:
+    """The tensors of the networks of parts, those of one file once.
+
+    Raises:
+        CheckpointError: When a file is missing, damaged or no file of networks.
+    """
+    tensors: dict[str, Tensor] = {}
+    if not keep(NETWORKS):
+        return tensors
+    files: dict[str, Checkpoint] = {}
+    for i, part in enumerate(values.get("parts", ())):
+        for j, router in enumerate(part["routers"]):
+            name = str(router["file"])
+            if not _NETWORKS.fullmatch(name):
+                raise CheckpointError(f"{path}: parts must name files of networks beside it, got {name!r:.100}")
+            if name not in files:
+                files[name] = load_checkpoint(path.with_name(name))
+            tensors |= {f"part-{i}.router-{j}.{key}": tensor for key, tensor in files[name].tensors.items()}
+    return tensors
+
+
+def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
+    """Reads a checkpoint onto the CPU.
+
+    Its tensors are pages of the file: the system drops what is not in use.
+
+    Args:
+        path: The file.
+        keep: Which tensors, by their names, are asked for. All are checked.
+
+    Raises:
+        CheckpointError: When the file is missing, truncated, damaged or no checkpoint of this version.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path}: there is no checkpoint")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise CheckpointError(f"{path}: not a {FORMAT} file, its format is {metadata.get('format')!r}")
+            sums = parse_json(metadata["checksums"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        found = {name: _checksum(tensor) for name, tensor in tensors.items()}
+        found[_VALUES] = zlib.crc32(metadata["values"].encode())
+        for name in sorted(sums.keys() | found.keys()):
+            if sums.get(name) != found.get(name):
+                what = "has another checksum" if name in found else "is missing"
+                raise CheckpointError(f"{path}: a damaged checkpoint, {name} {what}")
+        values = parse_json(metadata["values"])
+        tensors = {name: tensor for name, tensor in tensors.items() if keep(name)} | _read_networks(path, values, keep)
+        return Checkpoint(tensors, values, str(path))
+    except CheckpointError:
+        raise
+    except (SafetensorError, ValueError, KeyError, AttributeError, OSError) as error:
+        raise CheckpointError(f"{path}: not a readable checkpoint: {error}") from None
+
+
+def _checksum(tensor: Tensor) -> int:
+    """Of the elements, the shape and the dtype; it differs wherever a single bit does."""
+    kind = zlib.crc32(f"{tensor.dtype} {list(tensor.shape)}".encode())
+    return zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, kind)
+
+
+def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """The optimiser's per-parameter state as tensors named ``INDEX.KEY`` (all of Adam's state is tensors)."""
+    state = optimizer.state_dict()["state"]
+    return {f"{index}.{key}": torch.as_tensor(value) for index, s in state.items() for key, value in s.items()}
+
+
+def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
+    """The inverse of :func:`optimizer_tensors`; groups and learning rates stay the optimiser's own.
+
+    Raises:
+        ValueError: When a parameter's moments are missing, have another shape, or are of no parameter.
+    """
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in tensors.items():
+        index, _, key = name.partition(".")
+        if not (index.isdecimal() and int(index) < len(parameters) and key):
+            raise ValueError(f"optimizer.{name} must be of one of {len(parameters)} parameters")
+        state.setdefault(int(index), {})[key] = tensor.clone()  # the optimiser updates its state in place
+    for number, entries in state.items():
+        for key in ("exp_avg", "exp_avg_sq", *entries):
+            wanted = [] if key == "step" else list(parameters[number].shape)
+            came = list(entries[key].shape) if key in entries else None
+            if came != wanted:
+                raise ValueError(f"optimizer.{number}.{key} must have shape {wanted}, got {came or 'nothing'}")
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

@@ -1,0 +1,99 @@
+"""Cameras of a browser as cameras of the renderer, and the view of a scene that is nearest to one.
+
+A browser's camera has OpenCV's axes (x right, y down, z forward), its canvas square pixels, and `fov` is vertical.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from voronerf.app.scenes import Scene
+from voronerf.nerf.cameras import Cameras, focus_point
+
+#: From OpenCV's axes to OpenGL's, and back.
+FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+def make_camera(
+    rotation: NDArray[np.floating], position: NDArray[np.floating], fov: float, aspect: float, longest: int
+) -> Cameras:
+    """One camera that fills a canvas.
+
+    Args:
+        rotation: [3, 3], camera to world, in OpenCV's axes.
+        position: [3], in scene units.
+        fov: vertical, in radians.
+        aspect: width over height of the canvas.
+        longest: pixels along the longer side.
+
+    Examples:
+        >>> import numpy as np
+        >>> from voronerf.app.viewer.cameras import make_camera
+        >>> camera = make_camera(np.eye(3), np.zeros(3), fov=1.0, aspect=1.5, longest=300)
+        >>> camera.width, camera.height, camera.forward
+        (300, 200, tensor([[-0., -0., 1.]]))
+    """
+    width = longest if aspect >= 1 else max(1, round(longest * aspect))
+    height = longest if aspect < 1 else max(1, round(longest / aspect))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation @ FLIP, position
+    # Whole pixels change the aspect a little; the picture is stretched over the canvas again.
+    down = height / 2 / math.tan(fov / 2)
+    across = down * width / (height * aspect)
+    intrinsics = torch.tensor([[across, down, width / 2, height / 2]])
+    return Cameras(torch.from_numpy(pose).float()[None], intrinsics, width, height)
+
+
+def crop_camera(camera: Cameras, left: int, top: int, width: int, height: int) -> Cameras:
+    """A camera that sees `width` x `height` pixels of another."""
+    offset = camera.intrinsics.new_tensor((0, 0, left, top))
+    return replace(camera, intrinsics=camera.intrinsics - offset, width=width, height=height)
+
+
+def axial_depth(camera: Cameras, depth: Tensor) -> Tensor:
+    """Distances along rays [h, w] as distances along the optical axis."""
+    fx, fy, cx, cy = camera.intrinsics[0].to(depth).unbind()
+    u = (torch.arange(camera.width).to(depth) + 0.5 - cx) / fx
+    v = (torch.arange(camera.height).to(depth) + 0.5 - cy) / fy
+    return depth / (1 + u.square() + v.square()[:, None]).sqrt()
+
+
+def scene_bounds(scene: Scene) -> Tensor:
+    """The scene's box [2, 3], or without one a box around the cameras and what is before them."""
+    if scene.box is not None:
+        return scene.box.cpu()
+    cameras = scene.train.cameras
+    places = torch.cat((cameras.origins, cameras.origins + cameras.forward * cameras.origins.std().clamp_min(0.5)))
+    low, high = places.amin(0), places.amax(0)
+    margin = (high - low).amax() / 2
+    return torch.stack((low - margin, high + margin))
+
+
+def look_point(scene: Scene, cameras: Cameras, index: int) -> Tensor:
+    """What one of several cameras looks at, as the point [3] to turn around: on its axis, beside the scene's focus."""
+    focus = focus_point(scene.train.cameras)
+    centre = scene_bounds(scene).mean(0) if focus is None else focus
+    origin, forward = cameras.origins[index], cameras.forward[index]
+    return origin + forward * ((centre - origin) @ forward).clamp_min(0.1)
+
+
+def nearest_view(cameras: Cameras, origin: Tensor, forward: Tensor) -> int:
+    """The number of the camera that is nearest in place and direction.
+
+    Places count in units of the cameras' mean distance from their centre.
+
+    Args:
+        cameras: c of them.
+        origin: [3].
+        forward: unit [3].
+    """
+    centre = cameras.origins.mean(0)
+    unit = (cameras.origins - centre).norm(dim=-1).mean().clamp_min(1e-6)
+    apart = ((cameras.origins - origin) / unit).square().sum(-1) + (cameras.forward - forward).square().sum(-1)
+    return int(apart.argmin())

@@ -1,0 +1,317 @@
+"""One browser: its camera, what it wants to see, and its panel."""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import viser
+from PIL import Image
+from torch import Tensor
+from viser.transforms import SO3
+from viser.uplot import Scale, Series
+
+from voronerf.app.evaluate.panels import palette
+from voronerf.app.train.config import ConfigError
+from voronerf.app.viewer.cameras import FLIP, look_point, make_camera, scene_bounds
+from voronerf.app.viewer.cells import describe_cell
+from voronerf.app.viewer.crop import CropBox
+from voronerf.app.viewer.door import chosen
+from voronerf.app.viewer.path import Keyframes
+from voronerf.app.viewer.pictures import PANES, Look, cell_at, cells_of, groups_of, save_shown
+from voronerf.app.viewer.runs import Exports, Runs
+from voronerf.nerf.cameras import Cameras
+
+if TYPE_CHECKING:
+    from voronerf.app.viewer.viewer import Viewer
+
+#: Pixels along the longer side of the sharp picture, at first and at most.
+SHARP, LARGEST = 512, 2048
+#: Training views that are drawn at most, evenly spread, and the longer side of their pictures.
+MOST_VIEWS, THUMBNAIL = 200, 96
+NO_CELL = "Click on a cell."
+#: Pixels across an upright canvas below which the panel lies over the picture, as on a phone.
+NARROW = 576
+#: Pixels around the curve: above, right, below, left. Without them its labels are cut off.
+PADDING = (14, 14, 0, 0)
+
+
+class Client:
+    """A browser that has connected.
+
+    Attributes:
+        camera: its camera, with so many pixels along the longer side.
+        look: what it shows.
+        longest: pixels along the longer side of its sharp picture.
+        version: counts what changes its picture.
+        moved_at: when that was last.
+        wants_coarse: a picture now.
+        wants_sharp: a better one, when the camera rests.
+        drawn_at: when the last sharp picture was done.
+        cost: seconds that it took.
+    """
+
+    def __init__(self, handle: viser.ClientHandle, viewer: Viewer) -> None:
+        self.handle, self.viewer = handle, viewer
+        self.longest = SHARP
+        self.version, self.moved_at, self.drawn_at, self.cost = 0, 0.0, 0.0, 0.0
+        self.wants_coarse = self.wants_sharp = True
+        start = viewer.server.initial_camera
+        self.camera: Callable[[int], Cameras] = partial(make_camera, np.eye(3), start.position, start.fov, 1.0)
+        self._look_around()
+        self._start()
+        handle.camera.on_update(self._moved)
+        handle.scene.on_click()(self._clicked)
+
+    def _start(self) -> None:
+        self.look = Look(level=self.viewer.subject.diagram.depth)
+        self.picked: int | None = None
+        self.wants_screenshot = False
+        self.nodes: dict[str, list[Any]] = {kind: [] for kind in ("centres", "cameras", "crop", "keyframes")}
+        self.curve: viser.GuiUplotHandle | None = None
+        width, height = self.handle.camera.image_width, self.handle.camera.image_height
+        phone = 0 < width < min(NARROW, height)
+        self.panel = self.handle.gui.add_folder("Controls", expand_by_default=False) if phone else nullcontext()
+        with self.panel:
+            self._build()
+        self.draw_curve()
+
+    def on_subject(self) -> None:
+        """Shows another subject, from its first test view."""
+        for kind in self.nodes:
+            self.clear(kind)
+        self.handle.gui.reset()
+        self._start()
+        self.stand(self.viewer.subject.scene.test.cameras, 0)
+        self.change()
+
+    def tell(self, title: str, body: str) -> None:
+        """Shows a note for some seconds."""
+        self.handle.add_notification(title, body, auto_close_seconds=15.0)
+
+    # --- what it sees ----------------------------------------------------------------------------------------------
+
+    @property
+    def shows_nodes(self) -> bool:
+        """Whether something is drawn into the scene."""
+        return any(self.nodes.values())
+
+    async def _moved(self, _: object) -> None:
+        self.viewer.serve_client(self, self._look_around)
+        self.change()
+
+    def _look_around(self) -> None:
+        """Takes the browser's camera, unless its canvas has no pixels or its numbers are none."""
+        now = self.handle.camera
+        numbers = (*now.wxyz, *now.position, now.fov)
+        there = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)
+        if there and np.isfinite(numbers).all() and 0 < now.fov < math.pi:
+            self.camera = partial(make_camera, SO3(now.wxyz).as_matrix(), now.position, now.fov, now.aspect)
+
+    def change(self, **look: Any) -> None:
+        """Asks for new pictures, with other values of its `Look`."""
+        self.look = replace(self.look, **look)
+        self.version += 1
+        self.moved_at = time.perf_counter()
+        self.wants_coarse = self.wants_sharp = True
+        self.viewer.wake.set()
+
+    def on_diagram(self) -> None:
+        """Follows a split: cells have other numbers now."""
+        self.picked = None
+        depth = self.viewer.subject.diagram.depth
+        self.level.max, self.level.visible = max(depth, 2), depth > 1
+        self.level.value = depth  # type: ignore[misc]
+        self.info.content = NO_CELL
+        if self.nodes["centres"]:
+            self._show_centres(True)
+        self.change(level=depth, hidden=frozenset())
+
+    def on_images(self) -> None:
+        """Shows what needs the images of the scene, which are there now."""
+        if self.nodes["cameras"]:
+            self._show_cameras(True)
+        self.change()
+
+    # --- the panel -------------------------------------------------------------------------------------------------
+
+    def _build(self) -> None:
+        gui, depth, run = self.handle.gui, self.viewer.subject.diagram.depth, self.viewer.subject.run
+        pane = gui.add_dropdown("Show", PANES, initial_value="colour", hint="What each pixel shows.")
+        self.on(pane.on_update, lambda: self.change(pane=chosen(pane)))
+        size = gui.add_slider("Pixels", 128, LARGEST, 64, SHARP, hint="Along the longer side of a picture at rest.")
+        self.on(size.on_update, lambda: self._resize(chosen(size)))
+        with gui.add_folder("Cells", expand_by_default=False):
+            self.level = gui.add_slider("Level", 1, max(depth, 2), 1, depth, visible=depth > 1)
+            self.on(self.level.on_update, lambda: self.change(level=chosen(self.level)))
+            self.info = gui.add_markdown(NO_CELL)
+            hide = gui.add_button_group("Cell", ("hide", "only this", "show all"))
+            self.on(hide.on_click, lambda: self._hide(hide.value))
+            if run is not None:
+                save = gui.add_button("Save what is shown", hint="As a run of its own, beside this one.")
+                self.on(save.on_click, lambda: self.viewer.do(lambda: self.viewer.serve_client(self, self._save)))
+        with gui.add_folder("Scene", expand_by_default=False):
+            centres = gui.add_checkbox("Centres", False)
+            self.on(centres.on_update, lambda: self._show_centres(centres.value))
+            cameras = gui.add_checkbox("Cameras", False, hint="The training views; click on one to stand there.")
+            self.on(cameras.on_update, lambda: self._show_cameras(cameras.value))
+            self.crop = CropBox(self)
+        with gui.add_folder("Camera", expand_by_default=False):
+            self.keyframes = Keyframes(self, self.viewer.subject.folder)
+            shot = gui.add_button("Screenshot", icon=viser.Icon.CAMERA)
+            self.on(shot.on_click, self._ask_screenshot)
+        if run is not None:
+            with gui.add_folder("Export", expand_by_default=False):
+                Exports(self, run)
+            if self.viewer.open is not None:
+                with gui.add_folder("Runs", expand_by_default=False):
+                    Runs(self, run)
+
+    def draw_curve(self) -> None:
+        """Draws PSNR in dB over training seconds, from the second evaluation on."""
+        if len(self.viewer.points) < 2:
+            return
+        seconds, psnr = np.array(self.viewer.points, dtype=np.float64).T
+        if self.curve is not None:
+            self.curve.data = (seconds, psnr)
+            return
+        series = (Series(label="s"), Series(label="PSNR [dB]", stroke="#00897b", width=2))
+        with self.panel:
+            self.curve = self.handle.gui.add_uplot(
+                (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, padding=PADDING, order=-1
+            )
+
+    def on(self, register: Callable[[Callable[[Any], None]], object], work: Callable[[], object]) -> None:
+        """Has something done when a part of the panel is used; where that fails, the client is disconnected."""
+        register(lambda _: self.viewer.serve_client(self, work))
+
+    def _resize(self, longest: int) -> None:
+        self.longest = longest
+        self.change()
+
+    def _ask_screenshot(self) -> None:
+        self.wants_screenshot = True
+        self.change()
+
+    def on_sharp(self, picture: Tensor) -> None:
+        """Takes a sharp picture, uint8 [h, w, 3]."""
+        if self.wants_screenshot:
+            self.wants_screenshot = False
+            data = io.BytesIO()
+            Image.fromarray(picture.numpy()).save(data, format="PNG")
+            name = f"{self.viewer.subject.name}-{self.look.pane}.png"
+            self.handle.send_file_download(name, data.getvalue(), save_immediately=True)
+
+    # --- cells -----------------------------------------------------------------------------------------------------
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        self.viewer.do(lambda: self.viewer.serve_client(self, lambda: self.pick(*event.screen_pos)))
+
+    def pick(self, x: float, y: float) -> None:
+        """Describes the cell that is at a place of the picture, 0..1 from the left and from the top."""
+        subject, errors, camera = self.viewer.subject, self.viewer.errors, self.camera(self.longest)
+        self.picked = cell_at(subject, camera, self.look, x, y)
+        if self.picked is None:
+            self.info.content = NO_CELL
+            return
+        groups = groups_of(subject.diagram, self.look.level)
+        number = groups[self.picked]
+        psnr = errors.psnr(camera, lambda places: groups[cells_of(subject, places)] == number)
+        self.info.content = describe_cell(subject, self.picked, self.look.level, psnr)
+
+    def _hide(self, what: str) -> None:
+        if what == "show all":
+            self.change(hidden=frozenset())
+        elif self.picked is not None:
+            groups = groups_of(self.viewer.subject.diagram, self.look.level)
+            inside = groups == groups[self.picked]
+            chosen = frozenset((inside if what == "hide" else ~inside).nonzero()[:, 0].tolist())
+            self.change(hidden=self.look.hidden | chosen if what == "hide" else chosen)
+
+    def _save(self) -> None:
+        """Writes what is shown as a run, and says where, or why not."""
+        run = self.viewer.subject.run
+        assert run is not None
+        try:
+            self.info.content = f"Saved as `{save_shown(run, self.look).name}`."
+        except (ConfigError, OSError) as error:
+            self.info.content = f"Not saved: {error}."
+
+    # --- what is drawn into the scene ------------------------------------------------------------------------------
+
+    def clear(self, kind: str) -> None:
+        """Takes away what is drawn of one kind."""
+        for node in self.nodes[kind]:
+            node.remove()
+        self.nodes[kind] = []
+
+    def _show_centres(self, show: bool) -> None:
+        self.clear("centres")
+        if show:
+            diagram, contraction = self.viewer.subject.diagram, self.viewer.subject.renderer.contraction
+            centres = diagram.leaf_centres if contraction is None else contraction.inverse(diagram.leaf_centres)
+            bounds = scene_bounds(self.viewer.subject.scene)
+            cloud = self.handle.scene.add_point_cloud(
+                "/centres",
+                centres.cpu().numpy(),
+                palette(diagram.num_cells).numpy(),
+                point_size=0.012 * float((bounds[1] - bounds[0]).norm()),
+                point_shape="circle",
+                precision="float32",
+            )
+            self.nodes["centres"] = [cloud]
+        self.change()
+
+    def _show_cameras(self, show: bool) -> None:
+        self.clear("cameras")
+        if show:
+            train = self.viewer.subject.scene.train
+            apart = float((train.cameras.origins - train.cameras.origins.mean(0)).norm(dim=-1).mean())
+            count = min(len(train), MOST_VIEWS)
+            with self.handle.atomic():
+                for view in (number * len(train) // count for number in range(count)):
+                    self.nodes["cameras"].append(self._frustum(view, 0.06 * max(apart, 1e-3)))
+        self.change()
+
+    def _frustum(self, view: int, scale: float) -> Any:
+        scene = self.viewer.subject.scene
+        cameras = scene.train.cameras
+        picture = None
+        if len(scene.train.images):
+            truth = scene.train.truth(view, scene.background_colour())
+            step = -(-max(truth.shape[:2]) // THUMBNAIL)
+            picture = (truth[::step, ::step] * 255).to(torch.uint8).numpy()
+        pose = cameras.poses[view].double().numpy()
+        width, height = cameras.size(view)
+        fov = 2 * math.atan(height / 2 / float(cameras.intrinsics[view, 1]))
+        node: Any = self.handle.scene.add_camera_frustum(
+            f"/cameras/{view}",
+            fov=fov,
+            aspect=width / height,
+            scale=scale,
+            thickness=1.5,
+            thickness_units="screen",
+            image=picture,
+            wxyz=SO3.from_matrix(pose[:3, :3] @ FLIP).wxyz,
+            position=pose[:3, 3],
+        )
+
+        self.on(node.on_click, lambda: self.stand(cameras, view))
+        return node
+
+    def stand(self, cameras: Cameras, view: int) -> None:
+        """Goes to one of several cameras."""
+        pose = cameras.poses[view].double().numpy()
+        with self.handle.atomic():
+            self.handle.camera.position = pose[:3, 3]
+            self.handle.camera.look_at = look_point(self.viewer.subject.scene, cameras, view).numpy()
+            self.handle.camera.up_direction = pose[:3, 1]
+            self.handle.camera.fov = 2 * math.atan(cameras.size(view)[1] / 2 / float(cameras.intrinsics[view, 1]))

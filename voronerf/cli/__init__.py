@@ -1,5 +1,0 @@
-"""The command line: ``voronerf train | eval | render | export | view | compare | info | preload | demo | process``."""
-
-from voronerf.cli.main import main
-
-__all__ = ["main"]

@@ -1,0 +1,54 @@
+"""The form of a field that can be rendered."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from torch import Tensor, nn
+
+
+class Field(Protocol):
+    """A callable that returns the colour and density of points seen along directions. All renderers take one.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import Field
+        >>> def fog(positions, directions, ray_index):
+        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+        >>> field: Field = fog  # any callable of this form
+    """
+
+    def __call__(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions [n, 3], directions [r, 3] (unit), ray_index int32 [n] -> rgb [n, 3] in 0..1, sigma [n] >= 0."""
+        ...
+
+
+class DirectionPerSample(nn.Module):
+    """A field around a network that takes one direction for each sample.
+
+    Args:
+        network: Called with positions [n, 3], or Gaussians [n, 6], and unit directions [n, 3]; returns a colour [n, 3]
+            in 0..1 and a density [n] or [n, 1] >= 0 per scene unit.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
+        """Evaluates the field; see :class:`Field`.
+
+        Raises:
+            ValueError: When the network returns something else than a colour and a density.
+        """
+        n = len(positions)
+        found = self.network(positions, directions.index_select(0, ray_index))
+        if not (isinstance(found, (tuple, list)) and len(found) == 2):
+            raise ValueError(f"field: forward must return (colour, density), got {type(found).__name__}")
+        colour, density = found
+        if colour.shape != (n, 3) or density.shape not in ((n,), (n, 1)):
+            raise ValueError(
+                f"field: forward must return a colour [{n}, 3] and a density [{n}], "
+                f"got {list(colour.shape)} and {list(density.shape)}"
+            )
+        return colour, density.reshape(n)

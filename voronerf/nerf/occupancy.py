@@ -1,0 +1,339 @@
+"""An occupancy grid: which cells of the box of a scene are empty, so that rays can skip them.
+
+x, y, z cells of the grid along each axis, q cells to update, r rays, s strata of a ray. Densities are per world unit;
+with a contraction, those that a grid remembers are per unit of contracted space, so that a far cell counts as dense as
+a near one that takes as much light.
+Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (cells keep the largest recent density,
+which decays). Learning it from the samples of a batch, and emptying what is hidden, are additions of this project.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.nerf.cameras import Rays
+from voronerf.nerf.contraction import Contraction, Perspective
+from voronerf.nerf.field import Field
+from voronerf.nerf.fields.radiance import activate_density, activate_radiance
+from voronerf.ops._core.checks import check_range
+from voronerf.ops.march_rays import March, march_rays
+from voronerf.ops.observe_occupancy import observe_occupancy
+from voronerf.ops.observe_occupancy.reference import cells_of
+from voronerf.ops.see_rays import Sight, see_rays
+from voronerf.router import VoronoiRouter
+
+CHUNK = 1 << 17  # points that a field evaluates at a time
+HIDDEN = 1e-3  # a sample is hidden if less than this share of the light reaches it
+# An empty cell is a hole if so many of the 27 around and in it are occupied, and so many random points in it are all
+# denser than so many thresholds.
+HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 9, 2, 2.0
+
+
+class OccupancyGrid:
+    """The largest recent density of every cell of a box, and which cells count as occupied.
+
+    A new grid is occupied everywhere. `update` and `observe` empty cells.
+
+    Attributes:
+        box: float32 [2, 3], lowest and highest corner.
+        density: float32 [x, y, z], the remembered density of each cell.
+        occupied: bool [x, y, z], density >= threshold.
+        threshold: per world unit.
+        contraction: of the space that the box is in, or None.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import OccupancyGrid
+        >>> def ball(positions, directions, ray_index):  # of radius 0.5
+        ...     return torch.ones_like(positions), torch.where(positions.norm(dim=-1) < 0.5, 10.0, 0.0)
+        >>> grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 16, threshold=1.0)
+        >>> grid.share
+        1.0
+        >>> grid.update(ball)
+        >>> grid.share < 0.1
+        True
+    """
+
+    def __init__(
+        self,
+        box: Tensor,
+        resolution: int | Sequence[int] = 64,
+        *,
+        threshold: float,
+        remembered: float = 2.0,
+        contraction: Contraction | Perspective | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        """Makes a grid that is occupied everywhere.
+
+        Args:
+            box: [2, 3], the second corner above the first.
+            resolution: cells along each axis, one number for all or three.
+            threshold: density from which a cell is occupied, per world unit, > 0 and finite.
+            remembered: density of a new cell, in thresholds, >= 1. The larger it is, the more often a cell has to be
+                found empty before it counts as empty.
+            contraction: of the space that the box and the positions are in. Rays stay those of the world.
+            device: of the grid; default that of the box.
+
+        Raises:
+            ValueError: an invalid box, resolution or threshold, or `remembered` below 1.
+        """
+        shape = (resolution,) * 3 if isinstance(resolution, int) else tuple(resolution)
+        if tuple(box.shape) != (2, 3) or not bool((box[1] > box[0]).all()) or not bool(box.isfinite().all()):
+            raise ValueError(f"OccupancyGrid: box must be finite corners [2, 3], low and high, got {box.tolist()}")
+        if len(shape) != 3 or min(shape) < 1:
+            raise ValueError(f"OccupancyGrid: resolution must be one or three numbers >= 1, got {resolution}")
+        if not 0 < threshold < float("inf"):
+            raise ValueError(f"OccupancyGrid: threshold must be positive and finite, got {threshold}")
+        if not 1 <= remembered < float("inf"):
+            raise ValueError(f"OccupancyGrid: remembered must be at least 1 and finite, got {remembered}")
+        self.box = box.detach().to(device=device, dtype=torch.float32).clone()
+        self.threshold = float(threshold)
+        self.contraction = contraction
+        self._numbers = None if contraction is None else contraction.numbers.to(self.box)
+        self.density = torch.full(shape, remembered * self.threshold, device=self.box.device)
+        self.occupied = torch.ones(shape, dtype=torch.bool, device=self.box.device)
+
+    @property
+    def share(self) -> float:
+        """Share of the cells that are occupied, 0..1. Waits for the device."""
+        return float(self.occupied.float().mean())
+
+    def points(self, cells: Tensor, uniforms: Tensor | None = None) -> Tensor:
+        """Points in cells.
+
+        Args:
+            cells: int [q], flat numbers of cells.
+            uniforms: [q, 3] in 0..1, where in the cell; None for the middle.
+
+        Returns:
+            float32 [q, 3], world.
+        """
+        shape = torch.tensor(self.occupied.shape, device=self.box.device)
+        _, y, z = self.occupied.shape
+        place = torch.stack((cells // (y * z), cells // z % y, cells % z), dim=-1).float()
+        place = place + (0.5 if uniforms is None else uniforms)
+        return torch.lerp(self.box[0], self.box[1], place / shape)
+
+    @torch.no_grad()
+    def update(
+        self,
+        field: Field,
+        cells: Tensor | None = None,
+        *,
+        decay: float = 0.0,
+        generator: torch.Generator | None = None,
+        backend: str = "auto",
+    ) -> None:
+        """Evaluates a field at a random point of each cell, and keeps the larger of the new density and the decayed old
+        one.
+
+        Args:
+            field: called without gradients.
+            cells: int32 or int64 [q], flat numbers of the cells to update; None for all.
+            decay: factor on the old densities of these cells, 0..1; 0 forgets them.
+            generator: of the points, on any device.
+            backend: of the op.
+
+        Raises:
+            ValueError: a decay out of range; on the CPU cells out of range.
+        """
+        if not 0 <= decay <= 1:
+            raise ValueError(f"OccupancyGrid.update: decay must lie in 0..1, got {decay}")
+        device = self.box.device
+        if cells is None:
+            cells = torch.arange(self.occupied.numel(), device=device)
+        check_range("OccupancyGrid.update", "cells", cells, self.occupied.numel())
+        drawn_on = device if generator is None else generator.device
+        # All points before the first is entered: `decay` is of the densities from before.
+        points = [
+            self.points(part, torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device))
+            for part in cells.split(CHUNK)
+        ]
+        found = [density_of(field, part) for part in points]
+        if found:
+            positions, density = torch.cat(points), torch.cat(found)
+            seen = torch.ones_like(density)
+            self._enter(positions, density, seen, seen, decay=decay, hidden=0.0, backend=backend)
+
+    @torch.no_grad()
+    def observe(
+        self,
+        positions: Tensor,
+        density: Tensor,
+        deltas: Tensor,
+        weights: Tensor,
+        *,
+        decay: float,
+        backend: str = "auto",
+    ) -> None:
+        """Updates cells, in place, from samples that were rendered anyway.
+
+        A sample that receives less than the share `HIDDEN` of the light counts as density 0. So the inside of an opaque
+        object becomes empty like the space around it, which changes no picture. A surface that only few of the rays
+        through its cell see fades too, until `update` evaluates it again.
+
+        Args:
+            positions: float32 [m, 3] in the box; a position outside counts for the nearest cell at the border.
+            density: [m], at the positions; NaN counts as infinite.
+            deltas: [m], lengths of the strata of the samples.
+            weights: [m], contributions of the samples to their rays, from `composite`.
+            decay: factor on the old densities of the cells of these samples, 0..1.
+            backend: "auto", "reference", "native" or "warp".
+
+        Raises:
+            ValueError: a decay out of range.
+        """
+        if not 0 <= decay <= 1:
+            raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
+        self._enter(positions, density, deltas, weights, decay=decay, hidden=HIDDEN, backend=backend)
+
+    @torch.no_grad()
+    def fill_holes(self, field: Field, *, generator: torch.Generator | None = None) -> None:
+        """Occupies empty cells among occupied ones in which a field is dense: holes in surfaces that few rays meet.
+
+        For a field that learns no more: before, each of these cells would cost samples in every step. Where no ray asks
+        a field any more, it can be dense by chance. Cells that stand alone, or are thin in places, stay empty for that.
+
+        Args:
+            field: called without gradients.
+            generator: of the points, on any device.
+        """
+        beside = torch.nn.functional.avg_pool3d(self.occupied[None].float(), 3, 1, 1, divisor_override=1)[0]
+        holes = ((beside >= HOLE_NEIGHBOURS) & ~self.occupied).view(-1).nonzero()[:, 0]
+        least, device = HOLE_DENSITY * self.threshold, self.box.device
+        drawn_on = device if generator is None else generator.device
+        for _ in range(HOLE_POINTS):
+            dense = [holes[:0]]
+            for part in holes.split(CHUNK):
+                points = self.points(part, torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device))
+                density = density_of(field, points)
+                if self.contraction is not None:
+                    density = density * self.contraction.stretch(points)
+                dense.append(part[density >= least])
+            holes = torch.cat(dense)
+        self.density.view(-1)[holes] = least
+        self.occupied.view(-1)[holes] = True
+
+    def _enter(self, positions: Tensor, density: Tensor, deltas: Tensor, weights: Tensor, **rule: Any) -> None:
+        """Samples, in the units of the world, on their way into the grid; ``rule`` as for `observe_occupancy`."""
+        if self.contraction is not None:
+            stretch = self.contraction.stretch(positions)
+            density, deltas = density * stretch, deltas / stretch
+        samples = positions, density.float(), deltas.float(), weights.float()
+        observe_occupancy(self.density, self.occupied, self.box, *samples, threshold=self.threshold, **rule)
+
+    def cells(self, points: Tensor) -> Tensor:
+        """Flat numbers int32 [n] of the cells that points [n, 3] lie in; outside the box the nearest at its border."""
+        return cells_of(points, self.box, self.occupied.shape)
+
+    def march(
+        self,
+        rays: Rays,
+        near: Tensor,
+        far: Tensor,
+        samples: int,
+        *,
+        seed: Tensor | None = None,
+        spacing: str = "linear",
+        start: Tensor | None = None,
+        most: int | None = None,
+        capacity: int | None = None,
+        backend: str = "auto",
+    ) -> March:
+        """The samples of rays that lie in occupied cells; see `voronerf.ops.march_rays`."""
+        return march_rays(
+            rays.origins,
+            rays.directions,
+            near,
+            far,
+            self.occupied,
+            self.box,
+            samples,
+            seed=seed,
+            spacing=spacing,
+            start=start,
+            most=most,
+            capacity=capacity,
+            contraction=self._numbers,
+            backend=backend,
+        )
+
+    def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> Sight:
+        """What rays see of networks in occupied cells; see `voronerf.ops.see_rays`, which has the other arguments."""
+        given = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
+        return see_rays(*given, contraction=self._numbers, **rule)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The tensors from which `from_state` makes the same grid, bit for bit."""
+        return {
+            "box": self.box.clone(),
+            "density": self.density.clone(),
+            "occupied": self.occupied.clone(),
+            "threshold": torch.tensor(self.threshold, dtype=torch.float64),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Takes the box, the densities and the threshold of another grid's `state_dict`.
+
+        Raises:
+            ValueError: an entry is missing or has a wrong shape.
+        """
+        other = OccupancyGrid.from_state(state, contraction=self.contraction, device=self.box.device)
+        self.box, self.threshold = other.box, other.threshold
+        self.density, self.occupied = other.density, other.occupied
+
+    @staticmethod
+    def from_state(
+        state: Mapping[str, Tensor],
+        *,
+        contraction: Contraction | Perspective | None = None,
+        device: torch.device | str = "cpu",
+    ) -> OccupancyGrid:
+        """A grid from its `state_dict`, and its contraction, which is not part of it.
+
+        Raises:
+            ValueError: an entry is missing or has a wrong shape.
+        """
+        missing = [name for name in ("box", "density", "occupied", "threshold") if name not in state]
+        if missing:
+            raise ValueError(
+                f"OccupancyGrid: state must hold {', '.join(missing)}, got {', '.join(state) or 'nothing'}"
+            )
+        density, occupied = state["density"], state["occupied"]
+        if density.dim() != 3 or density.shape != occupied.shape:
+            raise ValueError(
+                "OccupancyGrid: state must hold density and occupied of one shape [x, y, z], got "
+                f"{list(density.shape)} and {list(occupied.shape)}"
+            )
+        threshold = float(state["threshold"])
+        grid = OccupancyGrid(state["box"], density.shape, threshold=threshold, contraction=contraction, device=device)
+        grid.density.copy_(density)
+        grid.occupied.copy_(occupied)
+        return grid
+
+
+def draw_seed(device: torch.device, generator: torch.Generator | None) -> Tensor:
+    """A seed of jitter for ``march_rays``, int32 [1]; the device is that of the rays."""
+    drawn_on = device if generator is None else generator.device
+    return torch.randint(-(2**31), 2**31, (1,), device=drawn_on, dtype=torch.int32, generator=generator).to(device)
+
+
+def density_of(field: Field, points: Tensor) -> Tensor:
+    """Density [n] of a field at points [n, 3], float32, seen along the z axis; NaN becomes infinity."""
+    sigma = _density_alone(field, points) if isinstance(field, VoronoiRouter) else None
+    if sigma is None:
+        direction = points.new_tensor(((0.0, 0.0, 1.0),))
+        _, sigma = field(points, direction, torch.zeros(len(points), dtype=torch.int32, device=points.device))
+    return sigma.detach().float().nan_to_num(nan=float("inf"), posinf=float("inf"))
+
+
+def _density_alone(field: VoronoiRouter, points: Tensor) -> Tensor | None:
+    """The density without the networks' colour, where they give it as the last of their outputs; else None."""
+    radiance = getattr(type(field.module), "activate", None) is activate_radiance
+    raw = field.last_output(points) if radiance and field.by_table and field.blend == 0 else None
+    return None if raw is None else activate_density(field.module, raw[:, 0].float())

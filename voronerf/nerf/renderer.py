@@ -1,0 +1,329 @@
+"""Renders rays and pictures of a scene.
+
+r rays, h x w pixels. Units as in `voronerf.nerf.volume`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.nerf.cameras import Cameras, Rays
+from voronerf.nerf.contraction import Contraction, Perspective
+from voronerf.nerf.field import Field
+from voronerf.nerf.marching import Seen, render_until_opaque
+from voronerf.nerf.occupancy import OccupancyGrid
+from voronerf.nerf.rays import intersect_box
+from voronerf.nerf.samplers import Occupancy, Stratified
+from voronerf.nerf.volume import Rendered, Samples, per_ray, render_samples
+from voronerf.ops.pixel_rays import pixel_rays
+from voronerf.town.parts import Parts
+
+if TYPE_CHECKING:
+    from voronerf.app.scenes import Scene
+
+
+class RenderedImage(NamedTuple):
+    """What `Renderer.image` returns.
+
+    Attributes:
+        colour: [h, w, 3], the background included.
+        opacity: [h, w].
+        depth: [h, w], as in `Rendered`.
+        heaviest: [h, w, 3], position of the heaviest sample of each ray; its cell is the one that the pixel shows. A
+            ray without samples (opacity 0) has its far end.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import Renderer, Stratified, orbit_cameras
+        >>> def fog(positions, directions, ray_index):
+        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+        >>> cameras = orbit_cameras(1, radius=2.0, elevation=0.0, width=4, height=3, focal=4.0)
+        >>> image = Renderer({"field": fog}, Stratified(8)).image(cameras, 0, near=1.0, far=3.0)
+        >>> image.colour.shape, image.depth.shape
+        (torch.Size([3, 4, 3]), torch.Size([3, 4]))
+    """
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    heaviest: Tensor
+
+
+#: Shows what rays of a picture see: rays, near [r], far [r], background, and whether to find the heaviest samples.
+Look = Callable[[Rays, Tensor, Tensor, Tensor | None, bool], Seen]
+
+#: Pictures that ask the networks of more parts than these are rendered in so many squares along their longer side: a
+#: square meets few of them, which fit into a bound on memory. It does not depend on a bound, so pictures do not.
+FEW_PARTS, TILES = 4, 8
+
+
+class Renderer:
+    """Renders the rays of a scene: fields, asked where a sampler says.
+
+    Attributes:
+        fields: By name.
+        sampler: Can be set at any time.
+        look: How pictures are made; None for this process alone, without randomness. Ranks have a way of their own.
+
+    Args:
+        fields: By the names of the sampler's networks; "field" has the colours.
+        sampler: Where along a ray they are asked.
+        backend: Of the ops.
+
+    Raises:
+        ValueError: Fields of other names.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF
+        >>> from voronerf.nerf import Hierarchical, Rays, Renderer
+        >>> networks = {"coarse": NeRF(width=16, depth=2), "field": NeRF(width=16, depth=2)}
+        >>> renderer = Renderer(networks, Hierarchical(8, 8))
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> first, second = renderer.render(rays, 1.0, 3.0)
+        >>> first.weights.shape, second.weights.shape  # the second pass asks at the points of both
+        (torch.Size([40]), torch.Size([80]))
+    """
+
+    def __init__(self, fields: Mapping[str, Field], sampler: Stratified, *, backend: str = "auto") -> None:
+        wanted = sampler.networks(sampler.space.cones)
+        if set(fields) != set(wanted):
+            raise ValueError(f"Renderer: fields must be {' and '.join(wanted)}, got {sorted(fields)}")
+        self.fields, self.sampler, self.backend = dict(fields), sampler, backend
+        self.look: Look | None = None
+
+    @property
+    def field(self) -> Field:
+        """The field whose colours count."""
+        return self.fields["field"]
+
+    @property
+    def occupancy(self) -> OccupancyGrid | None:
+        """Which space the sampler skips."""
+        return self.sampler.grid if isinstance(self.sampler, Occupancy) else None
+
+    @property
+    def cones(self) -> bool:
+        """Whether fields are asked about Gaussians."""
+        return self.sampler.space.cones
+
+    @property
+    def contraction(self) -> Contraction | Perspective | None:
+        """Of the space that the fields work in."""
+        return self.sampler.space.contraction
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the field's parameters; the CPU for a field without parameters."""
+        parameters = self.field.parameters() if isinstance(self.field, nn.Module) else iter(())
+        first = next(parameters, None)
+        return torch.device("cpu") if first is None else first.device
+
+    def train(self, mode: bool = True) -> Renderer:
+        """Puts the fields into training mode, or into evaluation mode."""
+        for field in self.fields.values():
+            if isinstance(field, nn.Module):
+                field.train(mode)
+        return self
+
+    def render(
+        self,
+        rays: Rays,
+        near: Tensor | float,
+        far: Tensor | float,
+        *,
+        background: Tensor | None = None,
+        jitter: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Rendered, ...]:
+        """Renders rays, with one result for each pass; the last has the colours. Differentiable.
+
+        Args:
+            rays: r rays, with radii for cones.
+            near: [r] or one for all, where the rays begin.
+            far: [r] or one for all, where the rays end.
+            background: [3] or [r, 3]; None is black.
+            jitter: random samples, for training.
+            generator: of the jitter.
+        """
+        near, far = per_ray(near, rays), per_ray(far, rays)
+
+        def look(name: str, samples: Samples) -> Rendered:
+            given = self.fields[name], rays, far, samples, self.sampler.space
+            return render_samples(*given, background=background, backend=self.backend)
+
+        samples, before = self.sampler.draw(look, rays, near, far, jitter=jitter, generator=generator)
+        return (*before, look("field", samples))
+
+    def see(
+        self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None = None, heaviest: bool = True
+    ) -> Seen:
+        """What rays of a picture see, without randomness.
+
+        Args:
+            rays: r rays.
+            near: [r].
+            far: [r].
+            background: [3] or [r, 3]; None is black.
+            heaviest: whether to find the heaviest samples; without it that part of the result means nothing.
+        """
+        if self.look is not None:
+            return self.look(rays, near, far, background, heaviest)
+        if isinstance(self.sampler, Occupancy):
+            given = self.field, rays, near, far, self.sampler
+            return render_until_opaque(*given, background=background, heaviest=heaviest)
+        last = self.render(rays, near, far, background=background)[-1]
+        places = rays.origins
+        if heaviest:
+            positions, weights = (last.samples.by_ray(values) for values in (last.samples.positions, last.weights))
+            places = positions[torch.arange(len(rays), device=places.device), weights.argmax(-1)]
+        return Seen(last.colour, last.opacity, last.depth, places)
+
+    def _tiles(self, hit: Tensor, size: tuple[int, int], chunk: int) -> Iterator[Tensor | slice]:
+        """The rays of a picture that are to be rendered, int64, in pieces: rows, which is faster, or squares."""
+        field = self.field
+        if not isinstance(field, Parts) or len(field) - len(field.far) <= FEW_PARTS:
+            whole = len(hit) <= chunk and bool(hit.all())
+            yield from (slice(None),) if whole else hit.nonzero()[:, 0].split(chunk)
+            return
+        width, height = size
+        side = max(-(-max(size) // TILES), 1)
+        numbers = torch.arange(width * height, device=hit.device).reshape(height, width)
+        for top, left in itertools.product(range(0, height, side), range(0, width, side)):
+            rows = numbers[top : top + side, left : left + side].reshape(-1)
+            yield from (piece for piece in rows[hit[rows]].split(chunk) if len(piece))
+
+    def _rays(self, cameras: Cameras, index: int) -> Rays:
+        """Through all pixels of one camera: by the op that makes those of a training, as it undoes lenses faster."""
+        chosen = cameras[[index]]
+        known = chosen.models is None or chosen.distortion is not None
+        if self.cones or self.backend == "warp" or cameras.poses.dtype != torch.float32 or not known:
+            return cameras.image_rays(index, cones=self.cones)
+        width, height = cameras.size(index)
+        blank = torch.zeros(1, height, width, 3, dtype=torch.uint8, device=cameras.poses.device)
+        pixels = torch.arange(width * height, device=blank.device)
+        found = pixel_rays(
+            chosen.poses,
+            chosen.intrinsics,
+            blank,
+            pixels,
+            near=0.0,
+            far=1.0,
+            distortion=chosen.distortion,
+            models=chosen.models,
+            backend=self.backend,
+        )
+        return Rays(found.origins, found.directions)
+
+    @torch.no_grad()
+    def image(
+        self,
+        cameras: Cameras,
+        index: int,
+        *,
+        near: float,
+        far: float,
+        box: Tensor | None = None,
+        background: Tensor | None = None,
+        heaviest: bool = True,
+        chunk: int | None = None,
+    ) -> RenderedImage:
+        """The whole image of one camera, without gradients and without randomness.
+
+        Args:
+            cameras: on the fields' device.
+            index: the camera.
+            near: nearest distance of interest.
+            far: farthest.
+            box: [2, 3] outside of which nothing is; rays that miss it show the background without asking the field.
+            background: [3], None is black.
+            heaviest: whether to look for each ray's heaviest sample; without it that part of the result means nothing.
+            chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples
+                of a ray, 131,072; over ranks 16,384.
+        """
+        if chunk is None:
+            chunk = 16_384 if self.look is not None else 4096 if self.occupancy is None else 131_072
+        if chunk < 1:
+            raise ValueError(f"Renderer.image: chunk must be >= 1, got {chunk}")
+        rays = self._rays(cameras, index)
+        first, last, hit = intersect_box(rays.origins, rays.directions, box, near, far)
+        colour = torch.zeros_like(rays.origins)
+        colour = colour if background is None else background.to(colour).repeat(len(rays), 1)
+        opacity, depth = torch.zeros_like(first), torch.full_like(first, far)
+        places = rays.origins
+        if heaviest:
+            places = rays.origins + far * rays.directions
+            places = places if self.contraction is None else self.contraction.points(places)
+        field, eye = self.field, cameras.origins[index]
+        pixel = 1 / float(cameras.intrinsics[index, :2].max())
+        with field.seen_from(eye, pixel) if isinstance(field, Parts) and field.detail else nullcontext():
+            for rows in self._tiles(hit, cameras.size(index), chunk):
+                seen = self.see(rays[rows], first[rows], last[rows], background, heaviest)
+                for whole, part in zip((colour, opacity, depth), seen):
+                    whole[rows] = part.to(whole.dtype)
+                if heaviest:
+                    places[rows] = seen.heaviest
+        size = cameras.size(index)[::-1]
+        return RenderedImage(
+            colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), places.reshape(*size, 3)
+        )
+
+
+def render_camera(
+    renderer: Renderer, scene: Scene, cameras: Cameras, index: int, *, heaviest: bool = True
+) -> RenderedImage:
+    """What one of several cameras sees of a scene, on its background, without randomness; on the renderer's device."""
+    device = renderer.device
+    return renderer.train(False).image(
+        cameras.to(device),
+        index,
+        near=scene.near,
+        far=scene.far,
+        box=None if scene.box is None else scene.box.to(device),
+        background=scene.background_colour(device),
+        heaviest=heaviest,
+    )
+
+
+def render_rays(
+    field: Field,
+    rays: Rays,
+    near: Tensor | float,
+    far: Tensor | float,
+    *,
+    samples: int | Stratified,
+    background: Tensor | None = None,
+    jitter: bool = False,
+    generator: torch.Generator | None = None,
+) -> Rendered:
+    """Colours of rays by quadrature of the volume rendering integral (Mildenhall et al. 2020, NeRF, eq. 3).
+
+    Args:
+        field: called once, on all samples; the samples of a ray are consecutive.
+        rays: r rays.
+        near: start of the integral, [r] or one for all.
+        far: end, [r] or one for all. A ray with far == near gets the background.
+        samples: s, one in each of s strata; or another sampler, such as `Occupancy`.
+        background: [3] or [r, 3], the colour behind the scene; None is black.
+        jitter: random samples in the strata, else their middles.
+        generator: of the jitter.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import Rays, render_rays
+        >>> def fog(positions, directions, ray_index):
+        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+        >>> rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
+        >>> result = render_rays(fog, rays, 0.0, 2.0, samples=64)
+        >>> result.opacity.round(decimals=4)  # 1 - exp(-0.5 * 2)
+        tensor([0.6321])
+    """
+    sampler = Stratified(samples) if isinstance(samples, int) else samples
+    renderer = Renderer({"field": field}, sampler, backend=sampler.backend)
+    return renderer.render(rays, near, far, background=background, jitter=jitter, generator=generator)[-1]

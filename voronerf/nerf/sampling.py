@@ -1,0 +1,186 @@
+"""Where the samples of a ray lie, and what they should have seen. r rays, s samples a ray; distances in world units."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from voronerf.ops.resample import resample
+
+SPACINGS = ("linear", "disparity")
+#: Added to the weights of all intervals before drawing from them (mip-NeRF, equation 18).
+PADDING = 0.01
+
+
+def stratified_depths(
+    near: Tensor,
+    far: Tensor,
+    samples: int,
+    *,
+    jitter: bool,
+    spacing: str = "linear",
+    generator: torch.Generator | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One sample in each of s strata of [near, far] (Mildenhall et al. 2020, NeRF, eq. 2).
+
+    Args:
+        near: [r]; positive if spacing is "disparity". This is not checked, because the host would have to wait for the
+            device. A ray with near == 0 then gets finite depths, all 0 except for the far end.
+        far: [r], >= near.
+        samples: s, >= 1.
+        jitter: uniformly random inside each stratum, else in its middle (for "disparity", the middle in disparity).
+        spacing: "linear": strata of equal length; "disparity": equal steps of 1 / distance, dense near the camera, for
+            scenes with a far background.
+        generator: of the jitter, on any device; its numbers are moved to the device of the rays.
+
+    Returns:
+        (depths [r, s] ascending, deltas [r, s], edges [r, s + 1]). A sample stands for its whole stratum: deltas are
+        the widths of the strata, and sum to far - near.
+
+    Raises:
+        ValueError: shapes, an unknown spacing, no samples.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import stratified_depths
+        >>> depths, deltas, edges = stratified_depths(torch.tensor([1.0]), torch.tensor([3.0]), 4, jitter=False)
+        >>> depths, edges
+        (tensor([[1.2500, 1.7500, 2.2500, 2.7500]]), tensor([[1.0000, 1.5000, 2.0000, 2.5000, 3.0000]]))
+    """
+    if near.dim() != 1 or near.shape != far.shape:
+        raise ValueError(
+            "stratified_depths: near and far must have the same shape [r], "
+            f"got {list(near.shape)} and {list(far.shape)}"
+        )
+    if samples < 1:
+        raise ValueError(f"stratified_depths: samples must be >= 1, got {samples}")
+    if spacing not in SPACINGS:
+        raise ValueError(f"stratified_depths: spacing must be one of {', '.join(SPACINGS)}, got {spacing!r}")
+
+    steps = torch.arange(samples + 1, device=near.device, dtype=near.dtype) / samples
+    edges = _spaced(near[:, None], far[:, None], steps[None, :], spacing)
+    if jitter:
+        device = near.device if generator is None else generator.device
+        inside = torch.rand(len(near), samples, device=device, dtype=near.dtype, generator=generator).to(near.device)
+    else:
+        inside = torch.full((1, samples), 0.5, device=near.device, dtype=near.dtype)
+    fractions = (torch.arange(samples, device=near.device, dtype=near.dtype) + inside) / samples
+    depths = _spaced(near[:, None], far[:, None], fractions, spacing)
+    # rounding may put a sample a last bit outside its stratum
+    depths = torch.minimum(torch.maximum(depths, edges[:, :-1]), edges[:, 1:])
+    return depths, edges.diff(dim=-1), edges
+
+
+def stratified_edges(
+    near: Tensor,
+    far: Tensor,
+    samples: int,
+    *,
+    jitter: bool,
+    spacing: str = "linear",
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Ends of s intervals that cover [near, far], for cones.
+
+    Args:
+        near: [r], as for `stratified_depths`.
+        far: [r].
+        samples: s, >= 1.
+        jitter: every inner edge uniformly random between the middles of its strata, else evenly spaced.
+        spacing: "linear" or "disparity".
+        generator: of the jitter, on any device.
+
+    Returns:
+        [r, s + 1] ascending, the first near and the last far.
+    """
+    edges = stratified_depths(near, far, samples, jitter=False, spacing=spacing)[2]
+    if not jitter:
+        return edges
+    device = near.device if generator is None else generator.device
+    shift = torch.rand(len(near), samples - 1, device=device, dtype=near.dtype, generator=generator).to(near.device)
+    steps = (torch.arange(1, samples, device=near.device, dtype=near.dtype) - 0.5 + shift) / samples
+    inner = _spaced(near[:, None], far[:, None], steps, spacing)
+    return torch.cat((edges[:, :1], inner, edges[:, -1:]), dim=1)
+
+
+def strata_uniforms(
+    rays: int, count: int, like: Tensor, jitter: bool, generator: torch.Generator | None
+) -> Tensor | None:
+    """Random numbers [r, count] in 0..1, one in each of `count` strata; None without jitter, which means the middles.
+
+    They are spread more evenly than independent numbers, with the same distribution.
+    """
+    if not jitter:
+        return None
+    device = like.device if generator is None else generator.device
+    drawn = torch.rand(rays, count, device=device, dtype=like.dtype, generator=generator).to(like.device)
+    return (torch.arange(count, device=like.device, dtype=like.dtype) + drawn) / count
+
+
+def blurred_weights(weights: Tensor) -> Tensor:
+    """The weights [r, s] for drawing: maximum of two neighbours, blurred, plus a constant (mip-NeRF, equation 18).
+
+    The result is an upper bound of the weights, with room on both sides, so a second pass also samples beside a
+    surface.
+    """
+    wide = torch.nn.functional.pad(weights[:, None, :], (1, 1), mode="replicate")[:, 0]
+    largest = torch.maximum(wide[:, :-1], wide[:, 1:])
+    return (largest[:, :-1] + largest[:, 1:]) / 2 + PADDING
+
+
+def union_depths(
+    depths: Tensor, edges: Tensor, weights: Tensor, count: int, *, uniforms: Tensor | None = None, backend: str = "auto"
+) -> tuple[Tensor, Tensor]:
+    """The samples of a first pass together with new ones where it found something (NeRF, section 5.2).
+
+    Args:
+        depths: [r, s], of the first pass.
+        edges: [r, s + 1], of its strata.
+        weights: [r, s].
+        count: f, the number of new samples.
+        uniforms: [r, f], of `strata_uniforms`; None takes the middles of strata of equal weight.
+        backend: of the op.
+
+    Returns:
+        (depths [r, s + f] ascending, edges [r, s + f + 1]). A sample stands for the part of the ray up to halfway to
+        its neighbours.
+    """
+    found = resample(weights, edges, count, uniforms=uniforms, backend=backend)
+    every = torch.cat((depths, found), dim=1).sort(dim=1).values
+    return every, torch.cat((edges[:, :1], (every[:, 1:] + every[:, :-1]) / 2, edges[:, -1:]), dim=1)
+
+
+def colour_loss(colour: Tensor, target: Tensor) -> Tensor:
+    """The mean squared error of colours [r, 3] (NeRF, equation 6)."""
+    return (colour - target).square().mean()
+
+
+def interlevel_loss(edges: Tensor, weights: Tensor, found: Tensor, bounds: Tensor) -> Tensor:
+    """The loss of a proposal (Barron et al. 2022, "Mip-NeRF 360", equation 13), the mean over rays.
+
+    It penalises weights of the field that exceed the sum of the proposal's weights over all intervals that overlap
+    them: such weights cannot come from the same density as the proposal.
+
+    Args:
+        edges: [r, s + 1], of the intervals of the field; no gradient.
+        weights: [r, s], of the field; no gradient.
+        found: [r, t + 1], edges of the intervals of the proposal.
+        bounds: [r, t], weights of the proposal.
+    """
+    edges, weights = edges.detach(), weights.detach()
+    total = torch.nn.functional.pad(bounds.cumsum(dim=1), (1, 0))
+    t = bounds.shape[1]
+    first = torch.searchsorted(found, edges[:, :-1].contiguous(), right=True).sub(1).clamp(0, t)
+    last = torch.searchsorted(found, edges[:, 1:].contiguous()).clamp(0, t)
+    bound = total.gather(1, torch.maximum(first, last)) - total.gather(1, first)
+    missed = (weights - bound).clamp_min(0)
+    return (missed.square() / (weights + 1e-7)).sum(dim=1).mean()
+
+
+def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:
+    """Distance at a fraction of the way, exact at both ends."""
+    if spacing == "linear":
+        return torch.lerp(near, far, fraction)
+    # 1 / lerp(1 / near, 1 / far), without the two roundings of the reciprocals, and without 0 / 0 where near is 0
+    disparity = far * (1 - fraction) + near * fraction
+    return torch.where(fraction < 1, near * far / disparity.clamp_min(torch.finfo(near.dtype).tiny), far)

@@ -1,0 +1,232 @@
+"""Volume rendering: samples of rays to colours through a field.
+
+r rays, m samples of all rays (packed), s samples a ray where all have as many. Colours are in 0..1, distances in world
+units along unit directions, densities per unit length.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.nerf.cameras import Rays
+from voronerf.nerf.cones import frustum_gaussians
+from voronerf.nerf.contraction import Contraction, Perspective
+from voronerf.nerf.field import Field
+from voronerf.ops.composite import composite
+
+
+class Samples(NamedTuple):
+    """Samples of rays, ray after ray and near to far: what every sampler gives, and what a field is asked about.
+
+    Attributes:
+        inputs: [m, 3] points, or [m, 6] Gaussians, in the space of the field.
+        ray_index: int32 [m], the ray of each sample.
+        ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
+        depths: [m], their distances.
+        deltas: [m], the lengths of the parts of the ray that they stand for.
+        edges: [r, s + 1], the ends of these parts, where all rays have s samples; else None.
+        rows: int32 [1], how many of the samples belong to rays, where no host has read it; None for all.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import Rays, Stratified
+        >>> rays = Rays(torch.zeros(2, 3), torch.tensor([[0.0, 0, 1]]).expand(2, 3))
+        >>> samples = Stratified(4).sample(rays, torch.zeros(2), torch.ones(2))
+        >>> samples.depths.shape, samples.by_ray(samples.depths).shape
+        (torch.Size([8]), torch.Size([2, 4]))
+    """
+
+    inputs: Tensor
+    ray_index: Tensor
+    ray_offsets: Tensor
+    depths: Tensor
+    deltas: Tensor
+    edges: Tensor | None = None
+    rows: Tensor | None = None
+
+    @property
+    def positions(self) -> Tensor:
+        """[m, 3], the points or the means of the Gaussians."""
+        return self.inputs if self.inputs.shape[1] == 3 else self.inputs[:, :3]
+
+    def counted(self) -> Samples:
+        """Without the rows that belong to no ray; the host waits for their number."""
+        if self.rows is None:
+            return self
+        known = int(self.rows)
+        parts = (values[:known] for values in (self.inputs, self.ray_index, self.depths, self.deltas))
+        inputs, index, depths, deltas = parts
+        return Samples(inputs, index, self.ray_offsets, depths, deltas)
+
+    def of_rays(self, rays: Tensor) -> Samples:
+        """The samples of some rays, int64 [q] in ascending order, which become rays 0 to q - 1."""
+        counts = self.ray_offsets.diff()
+        kept = torch.zeros_like(counts, dtype=torch.bool).index_fill(0, rays, True)
+        rows = kept.index_select(0, self.ray_index).nonzero()[:, 0]
+        number = kept.cumsum(0, dtype=torch.int32) - 1
+        offsets = torch.nn.functional.pad(counts[rays].cumsum(0, dtype=torch.int32), (1, 0))
+        packed = (values.index_select(0, rows) for values in (self.inputs, self.ray_index, self.depths, self.deltas))
+        inputs, index, depths, deltas = packed
+        edges = None if self.edges is None else self.edges[rays]
+        return Samples(inputs, number.index_select(0, index), offsets, depths, deltas, edges)
+
+    def part(self, rows: Tensor) -> Samples:
+        """Some of the samples, bool [m]; all rays stay."""
+        kept = torch.nn.functional.pad(rows.cumsum(0, dtype=torch.int32), (1, 0))
+        chosen = rows.nonzero()[:, 0]
+        packed = (values.index_select(0, chosen) for values in (self.inputs, self.ray_index, self.depths, self.deltas))
+        inputs, index, depths, deltas = packed
+        return Samples(inputs, index, kept.index_select(0, self.ray_offsets), depths, deltas)
+
+    def by_ray(self, values: Tensor) -> Tensor:
+        """Values [m, ...] as [r, s, ...], where all rays have as many samples; else as they are."""
+        if self.edges is None:
+            return values
+        r, ends = self.edges.shape
+        return values.reshape(r, ends - 1, *values.shape[1:])
+
+
+@dataclass(frozen=True)
+class Space:
+    """How a scene is sampled and how a field sees it.
+
+    Args:
+        contraction: Of the space that the field works in; None for that of the world.
+        spacing: Of the strata of a ray, "linear" or "disparity".
+        cones: Whether the field is asked about Gaussians [m, 6], the frustums of cones, in place of points [m, 3].
+        full_gradient: Distance from which the gradients of samples are whole, see `gradient_shares`; None for any.
+
+    Examples:
+        >>> from voronerf.nerf import Space, Stratified
+        >>> sampler = Stratified(64, space=Space(spacing="disparity"))
+    """
+
+    contraction: Contraction | Perspective | None = None
+    spacing: str = "linear"
+    cones: bool = False
+    full_gradient: float | None = None
+
+    def samples(self, rays: Rays, depths: Tensor, edges: Tensor) -> Samples:
+        """The samples of rays at depths [r, s], which stand for the parts between edges [r, s + 1]."""
+        r, s = depths.shape
+        if self.cones:
+            inputs = frustum_gaussians(rays, edges, self.contraction)
+        else:
+            inputs = torch.addcmul(rays.origins[:, None, :], depths[:, :, None], rays.directions[:, None, :])
+            inputs = inputs if self.contraction is None else self.contraction.points(inputs)
+        # A copy of an expanded view: repeat_interleave would gather.
+        index = torch.arange(r, device=depths.device, dtype=torch.int32)[:, None].expand(-1, s).reshape(-1)
+        offsets = torch.arange(0, r * s + 1, s, device=depths.device, dtype=torch.int32)
+        inputs, deltas = inputs.reshape(r * s, inputs.shape[-1]), edges.diff(dim=-1).reshape(-1)
+        return Samples(inputs, index, offsets, depths.reshape(-1), deltas, edges)
+
+
+class Rendered(NamedTuple):
+    """Rays seen through a field.
+
+    Attributes:
+        colour: [r, 3], the background included.
+        opacity: [r], 0..1: the sum of the weights.
+        depth: [r], expected distance, normalised by the opacity; the far end for a ray with opacity 0.
+        weights: [m], the contribution of each sample.
+        rgb: [m, 3], the colour of each sample.
+        density: [m].
+        samples: Where the field was asked.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import Rays, render_rays
+        >>> def wall(positions, directions, ray_index):  # from z = 1 on
+        ...     return torch.ones_like(positions), torch.where(positions[:, 2] > 1, 1e9, 0.0)
+        >>> rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
+        >>> result = render_rays(wall, rays, 0.0, 2.0, samples=8)
+        >>> result.depth, result.weights.shape
+        (tensor([1.1250]), torch.Size([8]))
+    """
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    weights: Tensor
+    rgb: Tensor
+    density: Tensor
+    samples: Samples
+
+
+def ask(field: Field, rays: Rays, samples: Samples, space: Space) -> tuple[Tensor, Tensor]:
+    """Colours [m, 3] and densities [m] of samples, in the dtype of their depths: a field under autocast gives others.
+
+    Their gradients shrink near the camera as `Space` says.
+    """
+    found = field(samples.inputs, rays.directions, samples.ray_index)
+    rgb, density = (values.to(samples.depths.dtype) for values in found)
+    share = gradient_shares(space.full_gradient, samples.depths)
+    if share is not None:
+        for values, scale in ((rgb, share[:, None]), (density, share)):
+            if values.requires_grad:
+                values.register_hook(functools.partial(torch.mul, scale))
+    return rgb, density
+
+
+def render_samples(
+    field: Field,
+    rays: Rays,
+    far: Tensor,
+    samples: Samples,
+    space: Space,
+    *,
+    background: Tensor | None = None,
+    backend: str = "auto",
+) -> Rendered:
+    """Colours of rays from samples of a sampler (Mildenhall et al. 2020, NeRF, eq. 3).
+
+    Args:
+        field: Called once, on all samples, possibly none.
+        rays: r rays.
+        far: [r], their ends.
+        samples: Of the rays.
+        space: Of the sampler.
+        background: [3] or [r, 3]; None is black.
+        backend: Of the composite op.
+    """
+    rgb, density = ask(field, rays, samples, space)
+    along = (samples.by_ray(values) for values in (density, rgb, samples.depths, samples.deltas))
+    offsets = samples.ray_offsets if samples.edges is None else None
+    found = composite(*along, ray_offsets=offsets, background=background, backend=backend)
+    depth = normalised(found.depth, found.opacity, far)
+    return Rendered(found.colour, found.opacity, depth, found.weights.reshape(-1), rgb, density, samples)
+
+
+def normalised(depth: Tensor, opacity: Tensor, far: Tensor) -> Tensor:
+    """Sums of weight times depth [r] divided by opacities [r]; the far end [r] where these are 0."""
+    seen = opacity > 0
+    return torch.where(seen, depth / torch.where(seen, opacity, 1), far)
+
+
+def gradient_shares(full: float | None, depths: Tensor) -> Tensor | None:
+    """Factors on the gradients of what a field says of samples: the square of the distance, up to 1.
+
+    A camera sees the space before it with more rays, and more samples, than others do: without this, fog that only one
+    view shows is learnt there first. Source: Philip and Deschaintre 2023, "Floaters No More: Radiance Field Gradient
+    Scaling for Improved Near-Camera Training".
+
+    Args:
+        full: The distance from which gradients are whole; None for any.
+        depths: [m], of the samples.
+
+    Returns:
+        [m]; None if all are whole.
+    """
+    return None if full is None else (depths / full).square().clamp(max=1)
+
+
+def per_ray(distance: Tensor | float, rays: Rays) -> Tensor:
+    """One distance for each ray, given as one for all or as a tensor."""
+    if isinstance(distance, Tensor):
+        return distance.expand(len(rays))
+    return torch.full_like(rays.origins[:, 0], distance)

@@ -1,0 +1,165 @@
+"""What the autograd of several ops shares. An op's own is in ``voronerf/ops/<op>/autograd.py``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.ops._core.custom_op import Op
+
+
+def asked_for(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
+    """For each tensor that an op took (None where an optional one is absent): will its gradient be used?
+
+    ``ctx.needs_input_grad`` says which inputs require a gradient, not which the caller has asked for: in
+    ``torch.autograd.grad(y, x, create_graph=True)`` the gradients of the weights would be computed and dropped, half of
+    the products of an eikonal loss. torch's own layers ask the engine, and so does this.
+    """
+    edges = iter(ctx.next_functions)
+    return [tensor is not None and _runs(next(edges)[0]) for tensor in inputs]
+
+
+def _runs(node: Any) -> bool:
+    # torch has no public name for this question; without the answer every gradient is computed.
+    ask = getattr(torch._C, "_will_engine_execute_node", None)
+    if node is None or ask is None:
+        return node is not None
+    # For leaves that torch.autograd.grad was asked for the engine refuses to answer, which takes 30 us: too long to ask
+    # unless a whole graph is being made.
+    if type(node).__name__ == "AccumulateGrad" and not torch.is_grad_enabled():
+        return True
+    try:
+        return bool(ask(node))
+    except RuntimeError:
+        return True
+
+
+def aliases(tensors: Sequence[Tensor | None]) -> tuple[list[Tensor | None], bool]:
+    """Tensors to differentiate by within the derivative of a backward op, and whether that is differentiated again.
+
+    Where it is, they stay parts of the caller's graph, as aliases: where one of them was computed from another, that
+    path is the caller's. To be called before gradients are switched on.
+    """
+    graph = torch.is_grad_enabled()
+    found = [
+        None if t is None else t.view_as(t) if graph and t.requires_grad else t.detach().requires_grad_()
+        for t in tensors
+    ]
+    return found, graph
+
+
+def second_derivatives(
+    outputs: Sequence[tuple[Tensor, Tensor | None]],
+    firsts: Sequence[tuple[Tensor, Tensor]],
+    tensors: Sequence[Tensor | None],
+    graph: bool,
+) -> list[Tensor | None]:
+    """The derivative of gradients.
+
+    Args:
+        outputs: results of a formula, each with the gradient that arrives at it.
+        firsts: tensors that the formula read, each with the cotangent of the gradient that it has got.
+        tensors: the inputs to differentiate by, None for an absent one.
+        graph: whether the results are differentiated again.
+
+    Returns:
+        For each of the tensors its derivative, None where there is none.
+    """
+    if not firsts:
+        return [None] * len(tensors)
+    parts, arriving = zip(*outputs, strict=True)
+    sources, cotangents = zip(*firsts, strict=True)
+    gradients = torch.autograd.grad(
+        parts, sources, arriving, create_graph=True, allow_unused=True, materialize_grads=True
+    )
+    total = parts[0].new_zeros(())
+    for gradient, cotangent in zip(gradients, cotangents, strict=True):
+        total = total + (gradient * cotangent).sum()
+    if not total.requires_grad:
+        return [None] * len(tensors)
+    present = [tensor for tensor in tensors if tensor is not None]
+    seconds = iter(torch.autograd.grad(total, present, create_graph=graph, allow_unused=True))
+    return [None if tensor is None else next(seconds) for tensor in tensors]
+
+
+class OfOne(NamedTuple):
+    """The gradient that arrives at an op with one result."""
+
+    result: Tensor | None
+
+
+def register_derivatives(
+    forward: Op, backward: Op, formula: Callable[..., Tensor | Sequence[Tensor]], smooth: Sequence[str]
+) -> None:
+    """Registers the derivatives of an op whose gradients are another op, and whose further ones are those of a formula.
+
+    Args:
+        forward: ``forward(given)``, of a named tuple.
+        backward: ``backward(arriving, given, wanted)`` gives the gradients to the smooth parts of ``given``, in a list:
+            of what has arrived at the results, a named tuple with None for zero, and a bool for each smooth part. What
+            is not wanted or not there may be anything.
+        formula: takes the parts of ``given``, and gives what ``forward`` does.
+        smooth: the fields of ``given`` that have gradients.
+    """
+    kind: Any = forward.structs.kinds[0]
+    arrived: Any = backward.structs.kinds[0]
+    count, places = len(arrived._fields), [kind._fields.index(name) for name in smooth]
+
+    def placed(values: Sequence[Tensor | None]) -> Any:
+        """The values in the places of the smooth parts."""
+        found: list[Tensor | None] = [None] * len(kind._fields)
+        for place, value in zip(places, values):
+            found[place] = value
+        return kind._make(found)
+
+    def first(ctx: Any, *arriving: Tensor | None) -> tuple[Any, ...]:
+        given = kind._make(_kept(ctx, forward))
+        wanted = [ctx.needs_input_grad[place] for place in places]
+        found: list[Tensor | None] = []
+        if any(gradient is not None for gradient in arriving):
+            parts = backward(arrived._make(arriving), given, wanted)
+            found = [part if want else None for part, want in zip(parts, wanted)]
+        return (placed(found),)
+
+    def second(ctx: Any, cotangents: Sequence[Tensor | None]) -> tuple[Any, ...]:
+        arriving, given, wanted = backward.structs.packed(_kept(ctx, backward))
+        leaves, graph = aliases([*arriving, *(given[place] for place in places)])
+        inputs = leaves[count:]
+        with torch.enable_grad():
+            results = formula(*given._replace(**dict(zip(smooth, inputs))))
+            outputs = zip((results,) if isinstance(results, Tensor) else results, leaves)
+            pairs = [
+                (leaf, cotangent)
+                for leaf, cotangent, want in zip(inputs, cotangents, wanted)
+                if want and leaf is not None and cotangent is not None
+            ]
+            used = [(part, gradient) for part, gradient in outputs if gradient is not None]
+            found = second_derivatives(used, pairs, leaves, graph)
+        return arrived._make(found[:count]), placed(found[count:]), None
+
+    forward.register_autograd(first, setup_context=_keeping(forward))
+    backward.register_autograd(second, setup_context=_keeping(backward))
+
+
+def _keeping(op: Op) -> Callable[..., None]:
+    """Saves the arguments of an op, of its custom op one by one."""
+
+    def keep(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        flat = list(op.structs.flat(inputs))
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*[flat[place] for place in op.structs.tensors])
+        for place in op.structs.tensors:
+            flat[place] = None
+        ctx.rest = flat
+
+    return keep
+
+
+def _kept(ctx: Any, op: Op) -> list[Any]:
+    flat = list(ctx.rest)
+    for place, tensor in zip(op.structs.tensors, ctx.saved_tensors):
+        flat[place] = tensor
+    return flat

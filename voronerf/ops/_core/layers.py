@@ -1,0 +1,227 @@
+"""The layer table of a per-cell network, which ``grouped_mlp`` runs.
+
+A network is a list of linear layers with elementwise activations. Each layer names the sources of its inputs, so that
+skip connections and a branch that sees the view direction are entries of a table rather than code, and one kernel runs
+them all. The original NeRF (Mildenhall et al. 2020, figure 7) and the networks of KiloNeRF are both such tables.
+
+Letters: d features of a raw position (3) or direction (3), L octaves of the frequency encoding, i inputs and o outputs
+of a layer, k cells.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from dataclasses import dataclass, field, replace
+
+from voronerf.ops._core.grids import HashGrid
+
+ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
+POSITION_ENCODINGS = ("frequency", "integrated", "hash")
+DIRECTION_ENCODINGS = ("frequency", "spherical")
+POSITIONS = "positions"
+DIRECTIONS = "directions"
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One linear layer and its activation.
+
+    Attributes:
+        inputs: sources concatenated in this order: "positions", "directions", or the index of an earlier layer.
+        width: output features.
+        activation: one of ``ACTIVATIONS``, applied to the sum of product and bias.
+
+    Examples:
+        >>> from voronerf import Layer
+        >>> Layer(("positions",), 64, "relu")  # reads the (encoded) position
+        Layer(inputs=('positions',), width=64, activation='relu')
+        >>> Layer((0, "directions"), 32, "relu").width  # reads layer 0 and the view direction
+        32
+    """
+
+    inputs: tuple[int | str, ...]
+    width: int
+    activation: str = "none"
+
+
+@dataclass(frozen=True)
+class MLP:
+    """A network as a table of layers.
+
+    Attributes:
+        layers: in order of evaluation.
+        outputs: indices of the layers whose results are concatenated into the network's output.
+        position_octaves: octaves of the encoding of the positions; None takes the positions as they come.
+        direction_octaves: octaves of the frequency encoding of the view directions, or None.
+        position_encoding: "frequency", ``frequency_encode`` with the input included (d -> d + 2dL); or "integrated",
+            ``integrated_encode`` of Gaussians: positions are [n, 6], the mean and then the diagonal variance (6 -> 6L);
+            or "hash", ``hash_encode`` (3 -> levels * features), whose table of features is an argument of its own.
+        grid: the levels of the "hash" encoding, else None.
+        direction_encoding: "frequency", or "spherical", ``spherical_harmonics`` of unit vectors (3 -> degree^2).
+        direction_degree: of the spherical harmonics, 1 to 4, else None.
+        text: the whole table as JSON, the form in which it passes through a ``torch.library`` operator; see ``parse``.
+
+    Raises:
+        ValueError: a table that cannot be evaluated: no layers or outputs, a source that is not an earlier layer, a
+            width below 1, an unknown activation or encoding, negative octaves, the integrated encoding without octaves,
+            the hash encoding without a grid or with octaves, spherical harmonics without a degree or with octaves, a
+            degree without them.
+
+    Examples:
+        >>> from voronerf import MLP, Layer
+        >>> table = MLP((Layer(("positions",), 64, "relu"), Layer((0,), 4)), outputs=(1,), position_octaves=10)
+        >>> table.weight_shapes(3)  # [o, i] of each layer, for positions of three features
+        [(64, 63), (4, 64)]
+        >>> table.out_features
+        4
+    """
+
+    layers: tuple[Layer, ...]
+    outputs: tuple[int, ...]
+    position_octaves: int | None = None
+    direction_octaves: int | None = None
+    position_encoding: str = "frequency"
+    grid: HashGrid | None = None
+    direction_encoding: str = "frequency"
+    direction_degree: int | None = None
+    text: str = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if not self.layers:
+            raise ValueError("MLP: layers must hold at least one layer, got none")
+        for index, layer in enumerate(self.layers):
+            _check_layer(index, layer)
+        if not self.outputs:
+            raise ValueError("MLP: outputs must name at least one layer, got none")
+        for output in self.outputs:
+            if not isinstance(output, int) or not 0 <= output < len(self.layers):
+                raise ValueError(f"MLP: outputs must be layer indices 0 to {len(self.layers) - 1}, got {output!r}")
+        for name, octaves in (
+            ("position_octaves", self.position_octaves),
+            ("direction_octaves", self.direction_octaves),
+        ):
+            if octaves is not None and octaves < 0:
+                raise ValueError(f"MLP: {name} must be None or at least 0, got {octaves}")
+        for name, encoding, known in (
+            ("position_encoding", self.position_encoding, POSITION_ENCODINGS),
+            ("direction_encoding", self.direction_encoding, DIRECTION_ENCODINGS),
+        ):
+            if encoding not in known:
+                raise ValueError(f"MLP: {name} must be one of {', '.join(known)}, got {encoding!r}")
+        if self.integrated and not self.position_octaves:
+            raise ValueError(
+                f"MLP: position_octaves must be at least 1 with the integrated encoding, got {self.position_octaves}"
+            )
+        hashed = self.position_encoding == "hash"
+        if hashed != (self.grid is not None) or (hashed and self.position_octaves is not None):
+            raise ValueError(
+                "MLP: grid must come with the hash encoding, and without position_octaves, got "
+                f"{self.position_encoding} with {self.position_octaves} octaves and the grid {self.grid}"
+            )
+        self._check_degree()
+        rows = [[list(layer.inputs), layer.width, layer.activation] for layer in self.layers]
+        table = [rows, list(self.outputs), self.position_octaves, self.direction_octaves]
+        # Tables from before there was a choice have four entries; nor are later choices written that are not made.
+        choices: list[object] = [self.position_encoding, self.grid and self.grid.text]
+        choices += [self.direction_encoding, self.direction_degree]
+        while choices and choices[-1] in (None, "frequency"):
+            choices.pop()
+        table += choices
+        object.__setattr__(self, "text", json.dumps(table))
+
+    def _check_degree(self) -> None:
+        degree, octaves = self.direction_degree, self.direction_octaves
+        if self.direction_encoding != "spherical":
+            if degree is not None:
+                raise ValueError(f"MLP: direction_degree must be None without spherical harmonics, got {degree}")
+        elif degree not in (1, 2, 3, 4):
+            raise ValueError(f"MLP: direction_degree must be 1 to 4 with spherical harmonics, got {degree}")
+        elif octaves is not None:
+            raise ValueError(f"MLP: direction_octaves must be None with spherical harmonics, got {octaves}")
+
+    @staticmethod
+    @functools.lru_cache(maxsize=256)
+    def parse(text: str) -> MLP:
+        """The table whose ``text`` this is."""
+        rows, outputs, *encodings = json.loads(text)
+        if len(encodings) > 3 and encodings[3] is not None:
+            encodings[3] = HashGrid.parse(encodings[3])
+        layers = tuple(Layer(tuple(inputs), width, activation) for inputs, width, activation in rows)
+        return MLP(layers, tuple(outputs), *encodings)
+
+    @property
+    def integrated(self) -> bool:
+        """Whether positions are Gaussians, [n, 6], for the integrated encoding."""
+        return self.position_encoding == "integrated"
+
+    @property
+    def out_features(self) -> int:
+        """Features of the network's output."""
+        return sum(self.layers[index].width for index in self.outputs)
+
+    @property
+    def uses_directions(self) -> bool:
+        """Whether any layer reads the view directions."""
+        return any(DIRECTIONS in layer.inputs for layer in self.layers)
+
+    def source_width(self, source: int | str, positions_d: int, directions_d: int = 0) -> int:
+        """Features that a source contributes to a layer's input, after encoding."""
+        if source == POSITIONS:
+            if self.grid is not None:
+                return self.grid.out_features
+            if self.integrated:
+                assert self.position_octaves is not None
+                return positions_d * self.position_octaves
+            return encoded_width(positions_d, self.position_octaves)
+        if source == DIRECTIONS:
+            if self.direction_degree is not None:
+                return self.direction_degree**2
+            return encoded_width(directions_d, self.direction_octaves)
+        assert isinstance(source, int)
+        return self.layers[source].width
+
+    def input_width(self, layer: int, positions_d: int, directions_d: int = 0) -> int:
+        """Input features i of layer number ``layer``, for raw positions and directions of the given widths."""
+        return sum(self.source_width(source, positions_d, directions_d) for source in self.layers[layer].inputs)
+
+    def weight_shapes(self, positions_d: int, directions_d: int = 0) -> list[tuple[int, int]]:
+        """Shape [o, i] of every layer's weight (without the leading k cells)."""
+        return [
+            (layer.width, self.input_width(index, positions_d, directions_d)) for index, layer in enumerate(self.layers)
+        ]
+
+
+@functools.lru_cache(maxsize=64)
+def for_last_output(table: MLP) -> tuple[MLP, tuple[int, ...]]:
+    """A table whose only output is the last of another's, and which layers of that it has."""
+    needed = {table.outputs[-1]}
+    for index in range(len(table.layers) - 1, -1, -1):
+        needed.update(s for s in table.layers[index].inputs if isinstance(s, int) and index in needed)
+    kept = tuple(sorted(needed))
+    numbers: dict[int | str, int] = {old: new for new, old in enumerate(kept)}
+    layers = [table.layers[index] for index in kept]
+    layers = [replace(layer, inputs=tuple(numbers.get(s, s) for s in layer.inputs)) for layer in layers]
+    return replace(table, layers=tuple(layers), outputs=(numbers[table.outputs[-1]],)), kept
+
+
+def encoded_width(features: int, octaves: int | None) -> int:
+    """Width of ``features`` raw values after frequency encoding with the input included."""
+    return features if octaves is None else features * (1 + 2 * octaves)
+
+
+def _check_layer(index: int, layer: Layer) -> None:
+    if not layer.inputs:
+        raise ValueError(f"MLP: layer {index} must have at least one input, got none")
+    for source in layer.inputs:
+        earlier = isinstance(source, int) and not isinstance(source, bool) and 0 <= source < index
+        if not earlier and source not in (POSITIONS, DIRECTIONS):
+            raise ValueError(
+                f"MLP: layer {index} must read 'positions', 'directions' or an earlier layer, got {source!r}"
+            )
+    if layer.width < 1:
+        raise ValueError(f"MLP: layer {index} must have a width of at least 1, got {layer.width}")
+    if layer.activation not in ACTIVATIONS:
+        raise ValueError(
+            f"MLP: layer {index} must have an activation of {', '.join(ACTIVATIONS)}, got {layer.activation!r}"
+        )

@@ -1,0 +1,261 @@
+"""The compiled module: finds torch's OpenMP for it, loads it, chooses an instruction set, and says how it was built.
+
+Importing this package raises ``BackendUnavailable`` where the
+extension is missing or was built for other sources than these.
+
+OpenMP: the extension is linked without libgomp, and its undefined symbols are bound to the OpenMP runtime that torch
+has loaded. Linking it would not do: torch's wheels bring a libgomp of their own, named ``libgomp.so.1`` (CPU wheels;
+the loader would share it) or with a hash, such as ``libgomp-a34b3233.so.1`` (the loader would add the system's, a
+second pool of threads that competes with torch's, or fail where the system has none).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import sys
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.ops._core import backends
+from voronerf.ops._core.backends import BackendUnavailable
+
+_REMEDY = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
+
+
+def _bind_openmp() -> None:
+    """Make the symbols of torch's OpenMP runtime visible to libraries loaded from now on."""
+    if not sys.platform.startswith("linux"):
+        return
+    with open("/proc/self/maps") as maps:
+        mapped = [line.split(maxsplit=5)[5].strip() for line in maps if line.count("/") > 0]
+    names = ("libgomp", "libiomp5", "libomp")
+    loaded = [path for path in dict.fromkeys(mapped) if os.path.basename(path).startswith(names)]
+    # torch comes first: another package's runtime may be there too.
+    loaded.sort(key=lambda path: "torch" not in path.split(os.sep))
+    ctypes.CDLL(loaded[0] if loaded else "libgomp.so.1", mode=ctypes.RTLD_GLOBAL)
+
+
+def _interface() -> int | None:
+    """Checksum of the stub, which lists every bound signature; the module has that of the stub it was built with."""
+    stub = Path(__file__).resolve().parent.parent / "_C.pyi"
+    return zlib.crc32(stub.read_text().encode()) if stub.exists() else None
+
+
+try:
+    _bind_openmp()
+    from voronerf.ops._core import _C as compiled
+except (ImportError, OSError) as error:
+    raise BackendUnavailable(
+        f"the compiled extension voronerf.ops._core._C cannot be loaded ({error}); {_REMEDY}"
+    ) from error
+if getattr(compiled, "interface", "none") != _interface():
+    _reason = "the compiled module is of another version of voronerf; build it again with `pip install -e .`"
+    backends.warn_once(f"{_reason}. Until then plain PyTorch runs in its place, many times slower.")
+    raise BackendUnavailable(_reason)
+
+DTYPES = {
+    "float32": torch.float32,
+    "float64": torch.float64,
+    "int32": torch.int32,
+    "int64": torch.int64,
+    "uint8": torch.uint8,
+    "bool": torch.bool,
+}
+"""By the names that the compiled module has for them."""
+compiled.name_dtypes(DTYPES)
+
+ISAS = compiled.Isa
+SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
+# Results of at least this many bytes are put on huge pages; for smaller ones the allocator usually has warm memory.
+_LARGE = 1 << 22
+LEAST_GAIN = 1.25
+"""Of bfloat16 products over float32 ones, for networks to use them: rounding and pairing operands costs some."""
+_bfloat16_gain = compiled.bfloat16_gain()
+
+
+def _choose_isa() -> str:
+    """Best instruction set of this processor, or the one of VORONERF_ISA.
+
+    One whose bfloat16 products are slower than float32 ones is not the best. The gain is far from `LEAST_GAIN` on all
+    known processors, so that every process on a machine chooses the same.
+    """
+    best = [isa for isa in SUPPORTED_ISAS if isa != "avx512_bf16" or _bfloat16_gain >= LEAST_GAIN]
+    wanted = os.environ.get("VORONERF_ISA") or best[-1]
+    if wanted not in SUPPORTED_ISAS:
+        here = ", ".join(SUPPORTED_ISAS)
+        # Not BackendUnavailable, which backend="auto" would skip silently.
+        raise ValueError(f"VORONERF_ISA must be one this processor supports ({here}), got {wanted!r}")
+    return wanted
+
+
+_isa = _choose_isa()
+
+
+@contextmanager
+def using_isa(isa: str) -> Iterator[None]:
+    """Ops run with this instruction set, one of ``SUPPORTED_ISAS``, while the context lasts."""
+    global _isa
+    if isa not in SUPPORTED_ISAS:
+        raise ValueError(f"using_isa: isa must be one of {', '.join(SUPPORTED_ISAS)}, got {isa!r}")
+    before, _isa = _isa, isa
+    try:
+        yield
+    finally:
+        _isa = before
+
+
+def on_cuda(tensor: Tensor) -> bool:
+    """Whether the CUDA half of the module is to work on a tensor."""
+    return tensor.is_cuda
+
+
+def stream(tensor: Tensor) -> tuple[int, int]:
+    """Device and current stream of a CUDA tensor."""
+    index = tensor.device.index
+    return index, torch.cuda.current_stream(index).cuda_stream
+
+
+def cpu() -> compiled.Cpu:
+    """The processor as compiled functions take it: instruction set and threads."""
+    return _cpu(_isa, backends.threads())
+
+
+def machine(tensor: Tensor) -> compiled.Cpu | compiled.Cuda:
+    """Where the compiled function for a tensor runs."""
+    return compiled.Cuda(*stream(tensor)) if on_cuda(tensor) else cpu()
+
+
+def aligned(tensor: Tensor) -> Tensor:
+    """A tensor whose memory begins at a multiple of 16 bytes, as CUDA kernels want what they read in pieces."""
+    return tensor.clone() if on_cuda(tensor) and tensor.data_ptr() % 16 else tensor
+
+
+def on_huge_pages(result: Tensor) -> None:
+    """Asks for huge pages for a result that has just been allocated, where it is large and the system gives them."""
+    if result.nbytes >= _LARGE and result.device.type == "cpu":
+        compiled.advise_huge_pages(result, result.nbytes)
+
+
+def refuse_where_deterministic(op: str, tensor: Tensor) -> None:
+    """Says that atomic operations on CUDA add up the gradient of a table in any order, if deterministic algorithms are
+    asked for (``torch.use_deterministic_algorithms``).
+
+    Args:
+        op: Name of the op, for the message.
+        tensor: Of the op; on the CPU nothing is refused.
+
+    Raises:
+        RuntimeError: Deterministic algorithms are asked for, and not only with a warning.
+    """
+    if not (on_cuda(tensor) and torch.are_deterministic_algorithms_enabled()):
+        return
+    said = (
+        f"{op}: the gradient of a hash grid's table has no deterministic CUDA kernel, got "
+        "torch.use_deterministic_algorithms(True); use backend='reference' or warn_only=True"
+    )
+    if not torch.is_deterministic_algorithms_warn_only_enabled():
+        raise RuntimeError(said)
+    warnings.warn(said, stacklevel=2)
+
+
+@functools.lru_cache(maxsize=64)
+def _cpu(isa: str, threads: int) -> compiled.Cpu:
+    return compiled.Cpu(isa, threads)
+
+
+def missing(device: torch.device) -> str | None:
+    """Reason, with the remedy, why this build cannot run on a device; None if it can. CUDA: a device is present."""
+    if device.type != "cuda":
+        return None
+    if not compiled.cuda:
+        return f"{compiled.cuda_outcome}; install the CUDA toolkit and rebuild with VORONERF_CUDA=1 `pip install -e .`"
+    driver = _driver_major()
+    if driver < compiled.cuda_major:
+        return (
+            f"built with CUDA {compiled.cuda_major}, the driver has CUDA {driver}; update the driver, "
+            f"or rebuild with a toolkit of CUDA {driver}"
+        )
+    major, minor = torch.cuda.get_device_capability(device)
+    if _runs_on(compiled.cuda_architectures.split(";"), 10 * major + minor):
+        return None
+    return (
+        f"built with CUDA for {compiled.cuda_architectures}, the device is {major}{minor}; "
+        f"rebuild with VORONERF_CUDA_ARCHITECTURES={major}{minor} `pip install -e .`"
+    )
+
+
+@functools.cache
+def _driver_major() -> int:
+    """Major version of CUDA that the driver has; its minor version may be older than that of the toolkit."""
+    version = ctypes.c_int()
+    library = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    status = library.cuDriverGetVersion(ctypes.byref(version))
+    if status != 0:
+        raise RuntimeError(f"cuDriverGetVersion failed with error {status}")
+    return version.value // 1000
+
+
+def _runs_on(architectures: list[str], capability: int) -> bool:
+    """Whether code for these architectures, and PTX of the last, runs on a device (86 for compute capability 8.6).
+
+    Machine code runs on later minor versions of its major one, PTX on everything from its version on; those of an
+    architecture-specific target such as 90a on that version alone.
+    """
+    for position, architecture in enumerate(architectures):
+        number = int(architecture.rstrip("af"))
+        if number == capability:
+            return True
+        portable = architecture.isdigit() and capability > number
+        if portable and (capability // 10 == number // 10 or position == len(architectures) - 1):
+            return True
+    return False
+
+
+def describe() -> dict[str, Any]:
+    """How the module was built and what it uses."""
+    return {
+        "instruction set": _isa,
+        "bfloat16 products": _bfloat16_products(),
+        "compiler": compiled.compiler,
+        "openmp": compiled.openmp,
+        "cuda": compiled.cuda_outcome,
+        "cuda architectures": compiled.cuda_architectures.split(";") if compiled.cuda else [],
+    }
+
+
+def _bfloat16_products() -> str:
+    """What bfloat16 is multiplied in on the CPU, and why."""
+    if _bfloat16_gain == 0:
+        return "in float32: this processor, or this build, has none"
+    used = "in bfloat16" if _isa == "avx512_bf16" else "in float32"
+    return f"{used}: bfloat16 makes {_bfloat16_gain:.2g} x the operations of float32"
+
+
+def measure_peak(kind: str, *, isa: str | None = None, threads: int | None = None) -> float:
+    """What the machine can do at best, as the yardstick of benchmarks; takes 0.1 to 0.2 s.
+
+    Args:
+        kind: "float32" (multiply-adds) or "bfloat16" (dot products), in floating-point operations a second, operands
+            in registers; or "copy", in bytes a second, read and written, of memory that fits no cache.
+        isa: one of ``ISAS``; by default the one in use.
+        threads: by default torch's number.
+
+    Raises:
+        ValueError: an unknown kind or instruction set, one that this processor or build does not have, or no threads.
+    """
+    if kind not in compiled.Peak:
+        raise ValueError(f"measure_peak: kind must be one of {', '.join(compiled.Peak)}, got {kind!r}")
+    if isa is not None and isa not in ISAS:
+        raise ValueError(f"measure_peak: isa must be one of {', '.join(ISAS)}, got {isa!r}")
+    if threads is not None and threads < 1:
+        raise ValueError(f"measure_peak: threads must be at least 1, got {threads}")
+    return compiled.measure_peak(kind, compiled.Cpu(isa or _isa, threads or torch.get_num_threads()))

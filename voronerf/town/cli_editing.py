@@ -1,0 +1,179 @@
+"""``voronerf join | cut | place``: runs made of runs, in new files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from voronerf.app.cli.commands import say
+from voronerf.app.files import read_json
+from voronerf.app.run import Run, open_run
+from voronerf.app.scenes.record import read_scene
+from voronerf.app.train.config import ConfigError
+from voronerf.town.editing import align as find_frame
+from voronerf.town.editing import check_out
+from voronerf.town.parts import Similarity, Solid
+
+#: Numbers of a transform on the command line.
+MOVE = "tx ty tz rx ry rz s"
+
+
+def opened(run: Path) -> Run:
+    """A run with its cameras, without its images."""
+    record = run / "scene.json"
+    if not record.is_file():
+        raise ConfigError(f"{run}: must hold a run with the record of its scene, scene.json")
+    return open_run(run, scene=read_scene(record))
+
+
+def size_of(run: Path) -> int:
+    """Bytes of the networks of a run and of what its last checkpoint has beside them."""
+    files = [run / "checkpoints" / "last.safetensors", *(run / "checkpoints").glob("networks-*.safetensors")]
+    return sum(file.stat().st_size for file in files)
+
+
+def tell(made: Run) -> int:
+    """Says what was written."""
+    counts = {"cell": made.router.num_cells, "part": len(getattr(made.router, "parts", (0,)))}
+    cells, parts = (f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items())
+    say(f"wrote {made.path}: {cells} in {parts}, {size_of(made.path) / 2**20:.1f} MiB")
+    return 0
+
+
+def join(
+    runs: tuple[Path, ...],
+    /,
+    out: Path,
+    move: tyro.conf.UseAppendAction[tuple[tuple[str, str], ...]] = (),
+    transforms: Path | None = None,
+    align: bool = False,
+    blend: float | None = None,
+) -> int:
+    """Make one run of several. Where they overlap the nearest centre decides; the runs stay as they are.
+
+    Args:
+        runs: Two run directories or more; the first gives data, background and settings.
+        out: The new run directory.
+        move: N "tx ty tz rx ry rz s", once for each run that moves: the run with this number, the first being 1, is
+            scaled by s, turned by angles in degrees about x, y, z and moved.
+        transforms: JSON file with such transforms: {"2": {"translation": [..], "degrees": [..], "scale": 1}}, or a
+            matrix of 4 x 4 in the place of an object.
+        align: Find the transforms of all runs but the first, from the cameras of images with names that both have.
+        blend: Margin in scene units within which neighbours are blended, which hides the seam; default as in the first.
+    """
+    check_out(out)
+    if len(runs) < 2:
+        raise ConfigError(f"join needs two runs or more, got {len(runs)}")
+    frames = given_frames(len(runs), move, transforms)
+    if align and frames:
+        raise ConfigError("give --align, or --move and --transforms, not both")
+    sources = [opened(run) for run in runs]
+    if align:
+        for number, run in enumerate(sources[1:], 1):
+            frame, error, count = find_frame(sources[0].scene, run.scene, str(runs[number]))
+            say(
+                f"{runs[number]}: scale {frame.scale:.6g}, {count} images in common, "
+                f"their cameras {error:.3g} scene units apart"
+            )
+            frames[number] = frame
+    every = [frames.get(number, Similarity()) for number in range(len(runs))]
+    return tell(Run.join(sources, out, frames=every, blend=blend))
+
+
+def given_frames(runs: int, move: Sequence[tuple[str, str]], transforms: Path | None) -> dict[int, Similarity]:
+    """The transforms of the command line and of a JSON file, by the number of their run from 0."""
+    found: dict[int, Similarity] = {}
+    stored: Any = {} if transforms is None else read_json(transforms)
+    if not isinstance(stored, dict):
+        raise ConfigError(f"{transforms}: must be an object with a transform for each run, got {stored!r:.60}")
+    named = [(f"--move {n}", n, text) for n, text in move]
+    for where, number, value in [*named, *((f"{transforms}: {n}", n, value) for n, value in stored.items())]:
+        if not number.isdecimal() or not 1 <= int(number) <= runs:
+            raise ConfigError(f"{where}: must be the number of a run, 1 to {runs}")
+        if int(number) - 1 in found:
+            raise ConfigError(f"{where}: must be given once")
+        try:
+            found[int(number) - 1] = frame_of(value)
+        except (ValueError, TypeError, KeyError) as error:
+            raise ConfigError(f"{where}: {error}") from None
+    return found
+
+
+def frame_of(value: Any) -> Similarity:
+    """A transform as seven numbers in a text, as an object, or as a matrix.
+
+    Raises:
+        ValueError: For anything else, scale 0 and mirror images among it.
+        TypeError: For what is no number.
+    """
+    if isinstance(value, str):
+        numbers = [float(word) for word in value.replace(",", " ").split()]
+        if len(numbers) != 7:
+            raise ValueError(f"must be {MOVE}, seven numbers, got {len(numbers)}")
+        return Similarity.of(numbers[:3], numbers[3:6], numbers[6])
+    if isinstance(value, list):
+        return Similarity.of_matrix(value)
+    if not isinstance(value, dict) or (odd := sorted(value.keys() - {"translation", "degrees", "scale"})):
+        raise ValueError(f"must have translation, degrees and scale, got {odd if isinstance(value, dict) else value}")
+    return Similarity.of(value.get("translation", (0, 0, 0)), value.get("degrees", (0, 0, 0)), value.get("scale", 1.0))
+
+
+def cut(
+    run: Path,
+    /,
+    out: Path,
+    box: tuple[float, float, float, float, float, float] | None = None,
+    sphere: tuple[float, float, float, float] | None = None,
+    cells: tuple[int, ...] | None = None,
+    outside: bool = False,
+) -> int:
+    """Make a run of a region of another, or of all but the region; the run stays as it is.
+
+    Args:
+        run: The run directory.
+        out: The new run directory.
+        box: x y z of the lowest and of the highest corner.
+        sphere: x y z of the centre, and the radius.
+        cells: Numbers of cells, as the viewer shows them.
+        outside: Keep what lies outside.
+    """
+    check_out(out)
+    given = [name for name, value in (("box", box), ("sphere", sphere), ("cells", cells)) if value is not None]
+    if len(given) != 1:
+        came = " and ".join(f"--{name}" for name in given) or "none"
+        raise ConfigError(f"cut needs one of --box, --sphere and --cells, got {came}")
+    try:
+        solid = Solid.box(box[:3], box[3:]) if box is not None else None if sphere is None else Solid(ball=sphere)
+    except ValueError as error:
+        raise ConfigError(f"--{given[0]}: {error}") from None
+    return tell(opened(run).cut(list(cells or ()) if solid is None else solid, out, outside=outside))
+
+
+def place(
+    run: Path,
+    thing: Path,
+    /,
+    out: Path,
+    at: tuple[float, float, float],
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    scale: float = 1.0,
+) -> int:
+    """Make a run of a scene with an object in it; its density comes on top of the scene's. Both stay as they are.
+
+    Args:
+        run: The run directory of the scene.
+        thing: That of the object, cut out with voronerf cut, or trained on white.
+        out: The new run directory.
+        at: x y z, where the middle of the bottom of the object's box shall be.
+        turn: Degrees about the axes x, y, z, in this order.
+        scale: Of the object's size.
+    """
+    check_out(out)
+    try:
+        Similarity.of(at, turn, scale)
+    except ValueError as error:
+        raise ConfigError(f"--scale, --turn, --at: {error}") from None
+    return tell(opened(run).place(opened(thing), at, out, degrees=turn, scale=scale))

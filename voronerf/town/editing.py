@@ -1,0 +1,536 @@
+"""Runs made of runs: joined, cut, and placed in each other. What is made is a run of several parts, in new files.
+
+Positions are in units of the scene that is made. A source is never written to.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from voronerf.app.files import write_text
+from voronerf.app.scenes import Scene
+from voronerf.app.scenes.record import write_scene
+from voronerf.app.scenes.scene import Split
+from voronerf.app.train.checkpoint import Checkpoint, checkpoint_path, checkpoint_paths, save_checkpoint
+from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.progress import Stage
+from voronerf.app.train.renderers import LEAST_OPACITY, PICTURE_POINTS, PICTURE_RESOLUTION, make_picture_grid
+from voronerf.app.train.state import Stored
+from voronerf.nerf.cameras import Cameras
+from voronerf.nerf.contraction import Contraction, Perspective
+from voronerf.nerf.occupancy import OccupancyGrid
+from voronerf.nerf.renderer import Renderer
+from voronerf.router import VoronoiRouter
+from voronerf.town.coarse import Coarse, make_coarse
+from voronerf.town.parts import Part, Parts, Similarity, Solid
+from voronerf.town.run_parts import describe_parts, parts_states
+
+#: The most voxels of the grid of a run that was made of others; it has larger ones where it would have more.
+MOST_VOXELS = 1 << 22
+
+#: The learning rate of runs that are trained together after they were joined, of that of the first: on two halves
+#: of a city all of it lost 0.1 to 0.3 dB against a quarter.
+AGAIN = 0.25
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is taken of a run.
+
+    Attributes:
+        name: For the names of its views.
+        config: Its settings.
+        scene: Its cameras and its bounds.
+        parts: Its networks.
+        grid: What is empty, in its scene; None for a run that reaches to infinity.
+    """
+
+    name: str
+    config: TrainConfig
+    scene: Scene
+    parts: Parts
+    grid: OccupancyGrid | None
+
+    @classmethod
+    def of(
+        cls, name: str, config: TrainConfig, scene: Scene, field: VoronoiRouter | Parts, renderer: Renderer
+    ) -> Source:
+        """The source that a run is. A field alone is taken: networks that only say where to sample are left.
+
+        Raises:
+            ConfigError: For a field of cones, or one in normalised device coordinates.
+        """
+        if config.field_type.cones:
+            raise ConfigError(f"{name}: --field {config.field} cannot be joined or cut: its cones cross borders")
+        contraction = renderer.contraction
+        if isinstance(contraction, Perspective):
+            raise ConfigError(f"{name}: --contraction ndc cannot be joined or cut: it belongs to one camera")
+        grid = renderer.occupancy
+        if isinstance(field, Parts):
+            return cls(name, config, scene, field, grid)
+        if contraction is not None:
+            return cls(name, config, scene, Parts([Part([field], contraction=contraction)]), None)
+        region = []
+        if scene.box is not None:
+            low, high = scene.box.tolist()
+            region = [Solid.box(low, high)]
+            grid = grid or make_picture_grid(replace(config, sampling="stratified"), scene, renderer)
+        return cls(name, config, scene, Parts([Part([field], region=region)]), grid)
+
+
+# Joining --------------------------------------------------------------------------------------------------------------
+
+
+def join(sources: Sequence[Source], frames: Sequence[Similarity], *, on_top: Sequence[bool] = ()) -> Source:
+    """One source of several.
+
+    Args:
+        sources: At least one. The first gives the settings, the background, and the data.
+        frames: From each into the new scene.
+        on_top: Which are in layers above what came before; default none.
+
+    Raises:
+        ConfigError: For runs without bounds beside others, or other backgrounds.
+    """
+    first = sources[0]
+    for index, source in enumerate(sources):
+        if source.scene.box is None and (index or (len(sources) > 1 and not all(on_top[1:] or [False]))):
+            raise ConfigError(
+                f"{source.name}: must have bounds to be joined, which a run of unbounded space has after "
+                "voronerf cut --box or --sphere"
+            )
+        if source.scene.background != first.scene.background:
+            ours, theirs = (s.scene.background or "none" for s in (first, source))
+            if not (on_top and on_top[index]):
+                raise ConfigError(f"{source.name}: must have the background of {first.name}, {ours}, got {theirs}")
+    parts: list[Part] = []
+    for index, (source, frame) in enumerate(zip(sources, frames, strict=True)):
+        above = max((part.layer for part in parts), default=-1) + 1 if on_top and on_top[index] else 0
+        parts += [part.changed(frame=frame @ part.frame, layer=part.layer + above) for part in source.parts]
+    every = Parts(parts, backend=first.parts.backend)
+    scene, grid = _join_scenes(sources, frames), _join_grids(sources, frames)
+    return Source(first.name, _settings(sources, frames, scene), scene, every, grid)
+
+
+def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Scene) -> TrainConfig:
+    """The settings of a run of parts: those of the first, without splits, with strata as short as in any source."""
+    first = sources[0].config
+    samples, rate, hold = int(first.samples or 64), first.lr, first.lr_hold
+    if len(sources) > 1 and rate is not None:  # to be trained further, with fresh moments: not from the beginning
+        rate, hold = rate * AGAIN, 0.0
+    if scene.box is not None:
+        diagonal = float((scene.box[1] - scene.box[0]).norm())
+        for source, frame in zip(sources, frames, strict=True):
+            assert source.scene.box is not None
+            own = float((source.scene.box[1] - source.scene.box[0]).norm()) * frame.scale
+            samples = max(samples, math.ceil(int(source.config.samples or 64) * diagonal / own - 1e-6))
+    return replace(
+        first,
+        cells=(),
+        split_at=None,
+        split_at_steps=None,
+        max_cells=None,
+        split="all",
+        sampling="stratified",
+        lr=rate,
+        lr_hold=hold,
+        samples=min(samples, 32_000),
+        occupancy=scene.box is not None,
+        contraction="none" if scene.box is not None else first.contraction,
+        sightings=0.0,
+        assignment="nearest",
+        parameters=None,
+        resume=False,
+        out=None,
+        cuda_graph=False,
+    )
+
+
+def _join_scenes(sources: Sequence[Source], frames: Sequence[Similarity]) -> Scene:
+    """The views of all sources, those of one scene in one place once, and the box around all of them."""
+    first, box, views = sources[0].scene, sources[0].scene.box, []
+    seen: set[tuple[str, str]] = set()
+    if box is not None:
+        corners = torch.cat([frame.points(_corners(s.scene.box)) for s, frame in zip(sources, frames, strict=True)])
+        boxes = [(s.scene.box, frame) for s, frame in zip(sources, frames, strict=True)]
+        same = all(frame.is_identity and own is not None and torch.equal(own, box) for own, frame in boxes)
+        box = box if same else torch.stack((corners.amin(0), corners.amax(0)))
+    for source, frame in zip(sources, frames, strict=True):
+        key = (source.config.data, str(frame.to_values()))
+        if key not in seen:
+            seen.add(key)
+            views.append((source.name, source.scene, frame))
+    near = min(scene.near * frame.scale for _, scene, frame in views)
+    far = max(scene.far * frame.scale for _, scene, frame in views)
+    train, test = (
+        _join_views([(name, getattr(scene, part), f) for name, scene, f in views]) for part in ("train", "test")
+    )
+    if box is not None:
+        away = (torch.cat((train.cameras.origins, test.cameras.origins))[:, None] - _corners(box)).norm(dim=-1)
+        far = max(far, 1.01 * float(away.max()))
+    moved = None if len(views) > 1 or not frames[0].is_identity else first.transform
+    return replace(first, train=train, test=test, near=near, far=far, box=box, transform=moved)
+
+
+def _corners(box: Tensor | None) -> Tensor:
+    assert box is not None
+    return torch.tensor([[box[i][0], box[j][1], box[k][2]] for i, j, k in itertools.product((0, 1), repeat=3)])
+
+
+def _join_views(views: Sequence[tuple[str, Split, Similarity]]) -> Split:
+    """The cameras of several splits, without images; names that come twice get those of their runs before them."""
+    cameras = [moved_cameras(split.cameras, frame) for _, split, frame in views]
+    names = [name for _, split, _ in views for name in split.names]
+    if len(set(names)) < len(names):
+        names = [f"{i}-{name}" for i, (_, split, _) in enumerate(views) for name in split.names]
+    none = torch.empty(0, 1, 1, 3, dtype=torch.uint8)
+    if len(cameras) == 1:
+        return Split(cameras[0], none, tuple(names))
+    return Split(Cameras.joined(cameras), none, tuple(names))
+
+
+def moved_cameras(cameras: Cameras, frame: Similarity) -> Cameras:
+    """Cameras after a similarity."""
+    if frame.is_identity:
+        return cameras
+    poses = cameras.poses.clone()
+    poses[:, :3, :3] = frame.rotation.to(poses) @ poses[:, :3, :3]
+    poses[:, :3, 3] = frame.points(cameras.origins)
+    return replace(cameras, poses=poses)
+
+
+def _join_grids(sources: Sequence[Source], frames: Sequence[Similarity]) -> OccupancyGrid | None:
+    """What is empty in all sources; voxels as small as the smallest of theirs, as far as `MOST_VOXELS` allows."""
+    grids = [source.grid for source in sources]
+    if any(source.scene.box is None for source in sources) or any(grid is None for grid in grids):
+        return None
+    pairs = [(grid, frame) for grid, frame in zip(grids, frames, strict=True) if grid is not None]
+    first = pairs[0][0]
+    alike = all(
+        frame.is_identity and torch.equal(g.box, first.box) and g.density.shape == first.density.shape
+        for g, frame in pairs
+    )
+    threshold = min(grid.threshold / frame.scale for grid, frame in pairs)
+    if alike:
+        grid = _grid_like(first.box, first.density.shape, threshold)
+        for other, _ in pairs:
+            grid.density = torch.maximum(grid.density, other.density)
+            grid.occupied |= other.occupied
+        return grid
+    corners = torch.cat([frame.points(_corners(grid.box)) for grid, frame in pairs])
+    low, high = corners.amin(0), corners.amax(0)
+    side = min(
+        float(((grid.box[1] - grid.box[0]) / torch.tensor(grid.density.shape)).min()) * frame.scale
+        for grid, frame in pairs
+    )
+    extent = (high - low).double()
+    side = max(side, float((extent.prod() / MOST_VOXELS) ** (1 / 3)))
+    shape = (extent / side).round().clamp(min=1).long().tolist()
+    grid = _grid_like(torch.stack((low, high)), shape, threshold)
+    for source, frame in pairs:
+        density, marked = torch.zeros(grid.density.numel()), torch.zeros(grid.density.numel(), dtype=torch.bool)
+        full = source.occupied.view(-1).nonzero()[:, 0]
+        size = float(((source.box[1] - source.box[0]) / torch.tensor(source.density.shape)).max()) * frame.scale
+        steps = math.ceil(size / side) + 1  # places along each axis of a voxel, so that none between is jumped over
+        places = torch.linspace(1e-3, 1 - 1e-3, steps)
+        for offset in itertools.product(places.tolist(), repeat=3):
+            inside = torch.tensor([offset]).expand(len(full), 3)
+            voxels = grid.cells(frame.points(source.points(full, inside))).long()
+            marked[voxels] = True
+            density.scatter_reduce_(0, voxels, source.density.view(-1)[full] / frame.scale, "amax")
+        found, values = marked.view(grid.density.shape), density.view(grid.density.shape)
+        turned = frame.rotation.abs()
+        if bool(((turned > 1e-6) & (turned < 1 - 1e-6)).any()):  # corners of turned voxels lie between the places
+            around = torch.nn.functional.max_pool3d(found.float()[None, None], 3, 1, 1)[0, 0] > 0
+            values = torch.where(around & ~found, threshold, values)
+            found = around
+        grid.occupied |= found
+        grid.density = torch.maximum(grid.density, values)
+    return grid
+
+
+def _grid_like(box: Tensor, shape: Sequence[int], threshold: float) -> OccupancyGrid:
+    """A grid that is empty."""
+    grid = OccupancyGrid(box, list(shape), threshold=threshold)
+    grid.density.zero_()
+    grid.occupied.zero_()
+    return grid
+
+
+# Cutting --------------------------------------------------------------------------------------------------------------
+
+
+def cut(source: Source, kept: Solid | Tensor) -> Source:
+    """What lies in a solid, or in some cells; networks of cells that show nothing of it are dropped.
+
+    Space inside of the sphere of a contraction is as it was, so that what is cut out of it needs none.
+
+    Args:
+        source: Of any kind.
+        kept: A solid in the scene, or bool [k], the cells.
+
+    Raises:
+        ConfigError: When nothing is left, or the solid reaches out of the sphere of a contraction.
+    """
+    parts, box = source.parts, source.scene.box
+    if isinstance(kept, Tensor):
+        parts = keep_cells(parts, kept)
+    else:
+        changed = []
+        for part in parts:
+            solid = kept.moved(part.frame.inverse)
+            seen = part.contraction
+            if seen is not None and not kept.outside:
+                if not _inside_ball(solid, seen):
+                    where = [round(x, 3) for x in part.frame.points(seen.centre).tolist()]
+                    rule = (
+                        f"must lie within {seen.radius * part.frame.scale:g} of {where}, where space is not contracted"
+                    )
+                    raise ConfigError(f"{source.name}: --box or --sphere {rule}")
+                seen = None
+            changed.append(part.changed(region=(*part.region, solid), contraction=seen))
+        parts = Parts(changed, backend=parts.backend)
+        if not kept.outside:
+            around = kept.bounds()
+            box = around if box is None else torch.stack((box[0].maximum(around[0]), box[1].minimum(around[1])))
+            if not bool((box[0] < box[1]).all()):
+                raise ConfigError(f"{source.name}: nothing is left, the cut is outside of the scene's box")
+    if box is None:
+        return replace(source, parts=parts)
+    grid = source.grid
+    if grid is None:
+        grid = _found_grid(source, parts, box)
+    full = grid.occupied.view(-1).nonzero()[:, 0]
+    size = (grid.box[1] - grid.box[0]) / torch.tensor(grid.occupied.shape)
+    places = grid.points(full)
+    near = ((places > box[0] - size) & (places < box[1] + size)).all(-1)
+    grid = _trimmed(grid, parts, full[near])
+    if grid is None:
+        raise ConfigError(f"{source.name}: nothing is left of it")
+    if not isinstance(kept, Tensor):
+        full, shown = grid.occupied.view(-1).nonzero()[:, 0], torch.zeros(parts.num_cells, dtype=torch.bool)
+        for offset in _LATTICE:
+            if not bool(shown.all()):
+                shown |= parts.shown(grid.points(full, offset.expand(len(full), 3)))
+        if not bool(shown.all()):
+            parts = keep_cells(parts, shown)
+    config, scene = source.config, replace(source.scene, box=grid.box)
+    before = source.scene.box
+    if before is not None:  # strata stay as long as they were
+        share = float((grid.box[1] - grid.box[0]).norm() / (before[1] - before[0]).norm())
+        config = replace(config, samples=max(16, math.ceil(int(config.samples or 64) * share - 1e-6)))
+    config = _settings([replace(source, config=config, scene=scene)], [Similarity()], scene)
+    return Source(source.name, config, scene, parts, grid)
+
+
+def keep_cells(parts: Parts, kept: Tensor) -> Parts:
+    """Parts with some of the cells alone, bool [k].
+
+    Raises:
+        ConfigError: When there are none left of layer 0.
+    """
+    pieces = kept.split([part.num_cells for part in parts])
+    left = [part.keep(own.nonzero()[:, 0]) for part, own in zip(parts, pieces, strict=True)]
+    found = [part for part in left if part is not None]
+    if not found:
+        raise ConfigError("nothing is left: all cells are cut away")
+    lowest = min(part.layer for part in found)
+    if lowest:
+        found = [part.changed(layer=part.layer - lowest) for part in found]
+    return Parts(found, backend=parts.backend)
+
+
+def _inside_ball(solid: Solid, contraction: Contraction) -> bool:
+    """Whether a solid lies where a contraction leaves space as it is."""
+    if solid.ball is not None:
+        away = float((torch.tensor(solid.ball[:3]) - contraction.centre).norm()) + solid.ball[3]
+    else:
+        away = float((_corners(solid.bounds()) - contraction.centre).norm(dim=-1).max())
+    return away <= contraction.radius * (1 + 1e-4)
+
+
+#: Places in a voxel that say whether a part speaks for some of it.
+_LATTICE = torch.tensor([*itertools.product((0.5, 1e-3, 1 - 1e-3), repeat=3)])
+
+
+def _trimmed(grid: OccupancyGrid, parts: Parts, full: Tensor) -> OccupancyGrid | None:
+    """A grid of those of some voxels, int64 [q], in which a part speaks; of the block around them. None for none."""
+    speaks = torch.zeros(len(full), dtype=torch.bool)
+    for offset in _LATTICE:
+        left = (~speaks).nonzero()[:, 0]
+        speaks[left] = parts.assign(grid.points(full[left], offset.expand(len(left), 3))) >= 0
+    if not bool(speaks.any()):
+        return None
+    occupied = torch.zeros_like(grid.occupied)
+    occupied.view(-1)[full[speaks]] = True
+    there = occupied.nonzero()
+    first, last = there.amin(0), there.amax(0) + 1
+    shape = torch.tensor(occupied.shape)
+    box = torch.stack([torch.lerp(grid.box[0], grid.box[1], edge / shape) for edge in (first, last)])
+    block = tuple(slice(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True))
+    trimmed = _grid_like(box, (last - first).tolist(), grid.threshold)
+    trimmed.occupied = occupied[block].contiguous()
+    trimmed.density = torch.where(trimmed.occupied, grid.density[block], 0).contiguous()
+    return trimmed
+
+
+def _found_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
+    """What is empty in a box of a run that has no grid, by asking the field in every voxel."""
+    threshold = -math.log1p(-LEAST_OPACITY) * int(source.config.samples or 64) / float((box[1] - box[0]).norm())
+    grid = OccupancyGrid(box, PICTURE_RESOLUTION, threshold=threshold)
+    generator = torch.Generator().manual_seed(0)
+    for points in range(PICTURE_POINTS):
+        grid.update(parts.eval(), decay=float(points > 0), generator=generator)
+    return grid
+
+
+# Finding where runs belong --------------------------------------------------------------------------------------------
+
+
+def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, int]:
+    """The similarity that moves cameras of a scene to where another has the images of the same names.
+
+    Source: Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns".
+
+    Args:
+        fixed: The scene that stays.
+        moving: The scene that moves.
+        name: Of its run, for errors.
+
+    Returns:
+        The similarity, the root of the mean squared distance of camera centres after it, and how many these are.
+
+    Raises:
+        ConfigError: For fewer than three names in common, or centres on a line, which leave a rotation open.
+    """
+    ours, theirs = (
+        {n: place for split in (s.train, s.test) for n, place in zip(split.names, split.cameras.origins, strict=True)}
+        for s in (fixed, moving)
+    )
+    shared = sorted(ours.keys() & theirs.keys())
+    if len(shared) < 3:
+        raise ConfigError(f"{name}: --align needs at least 3 images of the same names in both runs, got {len(shared)}")
+    to, at = (torch.stack([of[n] for n in shared]).double() for of in (ours, theirs))
+    to_mean, at_mean = to.mean(0), at.mean(0)
+    u, spread, v = torch.linalg.svd((to - to_mean).T @ (at - at_mean) / len(shared))
+    if float(spread[1]) < 1e-9 * max(float(spread[0]), 1e-30):
+        raise ConfigError(f"{name}: --align needs cameras that are not on one line, those of {len(shared)} images are")
+    sign = torch.ones(3, dtype=torch.float64)
+    sign[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(v))
+    rotation = u @ torch.diag(sign) @ v
+    scale = float((spread * sign).sum() / (at - at_mean).square().sum(1).mean())
+    found = Similarity(scale, rotation, to_mean - scale * rotation @ at_mean)
+    return found, float((found.points(at) - to).square().sum(1).mean().sqrt()), len(shared)
+
+
+# Placing --------------------------------------------------------------------------------------------------------------
+
+
+def standing(thing: Source, at: Sequence[float], degrees: Sequence[float], scale: float) -> Similarity:
+    """Where an object is to be: the middle of the bottom of its box at a place, turned about it, and scaled.
+
+    Raises:
+        ConfigError: For an object without a box.
+    """
+    box = thing.scene.box
+    if box is None:
+        raise ConfigError(f"{thing.name}: an object must have bounds, which voronerf cut --box or --sphere gives it")
+    foot = torch.cat(((box[0] + box[1])[:2] / 2, box[0, 2:]))
+    return Similarity.of(at, degrees, scale) @ Similarity(translation=-foot.double())
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def check_out(out: Path) -> None:
+    """Refuses to write into a folder with something in it.
+
+    Raises:
+        ConfigError: Names it.
+    """
+    if checkpoint_paths(out):
+        raise ConfigError(f"--out must not hold a run already, got {out}")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"--out must be a new or an empty folder, got {out}")
+
+
+def _coarse_levels(source: Source) -> dict[int, Coarse]:
+    """What the parts show from far away, by their numbers, in voxels as long as half a step along a ray."""
+    box, grid, found = source.scene.box, source.grid, dict[int, Coarse]()
+    if len(source.parts) == 1 or box is None:
+        return found
+    side = float((box[1] - box[0]).norm()) / int(source.config.samples or 64) / 2
+    occupied = None if grid is None else lambda points: grid.occupied.view(-1)[grid.cells(points).long()]
+    for index, part in enumerate(source.parts.eval()):
+        level = make_coarse(part, side, occupied, source.parts.backend)
+        if level is not None:
+            found[index] = level
+    return found
+
+
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """A folder to write a run into, which becomes ``out`` when all of it is there; else nothing is left.
+
+    Raises:
+        ConfigError: When there is something in ``out``.
+        OSError: When it cannot be written; names ``out``.
+    """
+    check_out(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.parent / f".{out.name[:100]}.{os.getpid()}.partial"
+    try:
+        partial.mkdir()
+        yield partial
+        os.replace(partial, out)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(out)) from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def write(source: Source, out: Path) -> None:
+    """Writes a run of parts, whole or not at all; with several parts also their coarse levels.
+
+    Raises:
+        ConfigError: When there is something in the folder.
+        OSError: When it cannot be written; nothing is left then.
+    """
+    with new_folder(out) as partial:
+        config = replace(source.config, out=out)
+        stored = Stored(
+            config=config.to_values(),
+            step=0,
+            seconds=0.0,
+            rays=config.rays,
+            rays_done=0,
+            stages=(vars(Stage(source.parts.num_cells, 0.0, 0, None, None, 0)),),
+            evaluated=0,
+            skipped=0,
+            rate_factor=1.0,
+            threads=torch.get_num_threads(),
+        )
+        groups: dict[str, dict[str, Tensor]] = dict(parts_states(source.parts))
+        if source.grid is not None:
+            groups["occupancy"] = source.grid.state_dict()
+        groups |= {f"part-{i}.coarse": vars(level) for i, level in _coarse_levels(source).items()}
+        tensors = {
+            # What stands in two places is one tensor, which a file does not take twice.
+            f"{prefix}.{name}": tensor.detach().cpu().contiguous() if "router-" in name else tensor.cpu().clone()
+            for prefix, group in groups.items()
+            for name, tensor in group.items()
+        }
+        values = {**vars(stored), "stages": list(stored.stages), "parts": describe_parts(source.parts)}
+        save_checkpoint(checkpoint_path(partial), Checkpoint(tensors, values))
+        write_text(partial / "config.json", config.to_json())
+        write_scene(partial / "scene.json", source.scene)
