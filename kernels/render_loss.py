@@ -18,7 +18,7 @@ from voronerf.kernels.composite import _OPAQUE, _absorbed, _density
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops.composite.reference import check_ray_offsets
 from voronerf.ops.render_loss.autograd import Results, register, results
-from voronerf.ops.render_loss.reference import Rendered
+from voronerf.ops.render_loss.reference import RenderLossInputs
 
 wp.set_module_options({"enable_backward": False})
 
@@ -117,14 +117,14 @@ def _density_kernel(raw: wp.array2d(dtype=wp.float32), scale: wp.float32, densit
     density[i] = _softplus(raw[i, 3]) * scale
 
 
-def render_loss(given: Rendered) -> list[Tensor]:
+def render_loss(given: RenderLossInputs) -> list[Tensor]:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
     *parts, _ = _render_loss(given._replace(raw=given.raw.float()))
     return parts
 
 
 @custom_op("render_loss_warp")
-def _render_loss(given: Rendered) -> Iterator[Results]:
+def _render_loss(given: RenderLossInputs) -> Iterator[Results]:
     loss, colour, weights, density, error, gradient = results(given)
     yield loss, colour, weights, density, error, gradient
     raw, target, m, r = given.raw, given.target, given.raw.shape[0], given.target.shape[0]

@@ -1,4 +1,4 @@
-// How far away occupied cells are, so that rays leap over empty ones; for march_rays and see_rays on the CPU.
+// How far away occupied cells are, so that rays leap over empty ones; for march_rays and render_opaque on the CPU.
 #pragma once
 
 #include "rays/march_rays.h"

@@ -37,7 +37,7 @@ RUNS = [
     for backend in backends.implemented(op)
     for device in ("cpu", "cuda")
 ]
-NETWORKS = ("grouped_mlp", "grouped_program", "learn_outputs", "routed_mlp", "adam")
+NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "adam")
 """Ops that check their tensors in ways of their own."""
 
 

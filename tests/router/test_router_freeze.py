@@ -11,7 +11,7 @@ from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Rays, Renderer, Step
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.average import update_averages
 from voronerf.nerf.fields import HashGridField
-from voronerf.ops import learn_outputs
+from voronerf.ops import forward_with_tape
 
 FROZEN, LEARNING = [1, 3], [0, 2]
 OPTIMIZERS = {
@@ -144,18 +144,18 @@ def gradients_of_table(router, points, count):
 
 
 @pytest.mark.parametrize("backend", ["native", "reference"])
-def test_learn_outputs_leaves_frozen_cells_out(backend):
+def test_forward_with_tape_leaves_frozen_cells_out(backend):
     router, points = make("table"), torch.rand(100, 3)
     router.freeze(FROZEN)
     network = router.table_arguments(points, torch.ones(100, 3), None)
-    outputs = learn_outputs(network, backend=backend)
+    outputs = forward_with_tape(network, backend=backend)
     outputs.learn(outputs.raw.square().sum(), 2 * outputs.raw, backward=True)
     for p in router.parameters():
         assert not p.grad[FROZEN].any() and p.grad[LEARNING].any()
     with pytest.raises(ValueError, match=r"frozen must have shape \[k\] with k = 4, got \[3\]"):
-        learn_outputs({**network, "frozen": torch.zeros(3, dtype=torch.bool)})
+        forward_with_tape({**network, "frozen": torch.zeros(3, dtype=torch.bool)})
     with pytest.raises(TypeError, match="frozen must have dtype bool, got float32"):
-        learn_outputs({**network, "frozen": torch.zeros(4)})
+        forward_with_tape({**network, "frozen": torch.zeros(4)})
 
 
 def test_a_step_leaves_out_rays_that_teach_nothing():

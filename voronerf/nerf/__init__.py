@@ -4,9 +4,9 @@ from voronerf.nerf.cameras import Cameras, Rays, focus_point, orbit_cameras, tur
 from voronerf.nerf.cells import Cells, SplitRule
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
-from voronerf.nerf.marching import Seen, render_until_opaque
+from voronerf.nerf.marching import RayColours, render_until_opaque
 from voronerf.nerf.occupancy import OccupancyGrid
-from voronerf.nerf.ray_loss import Batch, Found, RayLoss
+from voronerf.nerf.ray_loss import Batch, RayLoss, RenderOutput
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import RenderedImage, Renderer, render_rays
 from voronerf.nerf.samplers import SAMPLERS, Hierarchical, Occupancy, Proposal, Stratified
@@ -22,20 +22,20 @@ __all__ = [
     "Cells",
     "Contraction",
     "Field",
-    "Found",
     "Hierarchical",
     "Occupancy",
     "OccupancyGrid",
     "Perspective",
     "PlannedSplit",
     "Proposal",
+    "RayColours",
     "RayLoss",
     "Rays",
+    "RenderOutput",
     "Rendered",
     "RenderedImage",
     "Renderer",
     "Samples",
-    "Seen",
     "Space",
     "SplitRule",
     "Step",

@@ -17,7 +17,7 @@ from voronerf.diagram.reservoir import SampleReservoir, select_heaviest
 from voronerf.diagram.subdivision import Split, split_diagram
 from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.occupancy import OccupancyGrid
-from voronerf.nerf.ray_loss import Found
+from voronerf.nerf.ray_loss import RenderOutput
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.schedule import PlannedSplit
@@ -186,7 +186,7 @@ class Cells:
             self.grid.density.view(-1)[voxels] = 0
             self.grid.occupied.view(-1)[voxels] = False
 
-    def heaviest(self, found: Found) -> Tensor:
+    def heaviest(self, found: RenderOutput) -> Tensor:
         """The samples [n, 4] that may be kept, with their importance; none after the last split."""
         if self.planned is None:
             return found.weights.new_empty(0, 4)
@@ -195,7 +195,7 @@ class Cells:
         kept[: len(points), :3], kept[: len(points), 3] = points, importance
         return kept
 
-    def observe(self, found: Found) -> None:
+    def observe(self, found: RenderOutput) -> None:
         """Teaches the occupancy grid what the samples of a step found."""
         if self.grid is not None and not self.sampler.settling:
             observed = found.samples.positions, found.density, found.samples.deltas, found.weights

@@ -16,8 +16,8 @@ from voronerf.nerf.fields.radiance import activate_radiance
 from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.volume import normalised
 from voronerf.ops.composite import composite
-from voronerf.ops.see_rays import NETWORK
-from voronerf.ops.see_rays.reference import Wave, walk
+from voronerf.ops.render_opaque import NETWORK
+from voronerf.ops.render_opaque.reference import Wave, walk
 from voronerf.router import VoronoiRouter
 
 OPAQUE = 0.02  # a ray ends when it lets less than this through: what is behind counts as of the colour before it
@@ -29,7 +29,7 @@ WAVE, CONTRACTED_WAVE = 12, 8
 FINE_OPAQUE, FINE_WAVE = 0.015, 4
 
 
-class Seen(NamedTuple):
+class RayColours(NamedTuple):
     """What the rays of a picture see.
 
     Attributes:
@@ -65,7 +65,7 @@ def render_until_opaque(
     *,
     background: Tensor | None = None,
     heaviest: bool = True,
-) -> Seen:
+) -> RayColours:
     """`render_rays` for pictures, without gradients: rays are walked in waves, and end when they are opaque.
 
     A wave is a few samples of every ray that is not opaque yet. So the field evaluates little more than the samples in
@@ -122,11 +122,11 @@ def render_until_opaque(
     if heaviest:
         places = rays.origins + at[:, None] * rays.directions
         places = places if contraction is None else contraction.points(places)
-    return Seen(colour, opacity, depth, places)
+    return RayColours(colour, opacity, depth, places)
 
 
 def _network(field: Field, rays: Rays, sampler: Occupancy) -> dict[str, Any] | None:
-    """What ``see_rays`` asks in the place of a field; None if it is more than networks, for Warp and CUDA."""
+    """What ``render_opaque`` asks in the place of a field; None if it is more than networks, for Warp and CUDA."""
     if not isinstance(field, VoronoiRouter) or field.blend > 0 or not rays.origins.is_cpu:
         return None
     if "warp" in (sampler.backend, field.backend):

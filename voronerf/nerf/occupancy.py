@@ -23,7 +23,7 @@ from voronerf.ops._core.checks import check_range
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.observe_occupancy.reference import cells_of
-from voronerf.ops.see_rays import Sight, see_rays
+from voronerf.ops.render_opaque import RaySums, render_opaque
 from voronerf.router import VoronoiRouter
 
 CHUNK = 1 << 17  # points that a field evaluates at a time
@@ -263,10 +263,10 @@ class OccupancyGrid:
             backend=backend,
         )
 
-    def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> Sight:
-        """What rays see of networks in occupied cells; see `voronerf.ops.see_rays`, which has the other arguments."""
+    def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaySums:
+        """What rays see of networks in occupied cells; see `voronerf.ops.render_opaque`, which has the other arguments."""
         given = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
-        return see_rays(*given, contraction=self._numbers, **rule)
+        return render_opaque(*given, contraction=self._numbers, **rule)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The tensors from which `from_state` makes the same grid, bit for bit."""

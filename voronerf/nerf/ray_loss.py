@@ -1,7 +1,7 @@
 """The loss of a batch of rays, with gradients: one contract, and the ways to it in one process.
 
 r rays, m samples of all rays. A way takes a :class:`Batch`, samples its rays, asks the field and gives a
-:class:`Found`; ``why_not`` says what keeps a renderer from it. :mod:`voronerf.town.ray_runs` has the way through
+:class:`RenderOutput`; ``why_not`` says what keeps a renderer from it. :mod:`voronerf.town.ray_runs` has the way through
 several territories.
 """
 
@@ -22,7 +22,7 @@ from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.sampling import colour_loss
 from voronerf.nerf.volume import Samples, gradient_shares
-from voronerf.ops.learn_outputs import Outputs, learn_outputs
+from voronerf.ops.forward_with_tape import Outputs, forward_with_tape
 from voronerf.ops.render_loss import RenderLoss, render_loss_gradient
 from voronerf.ops.sighting_gradient import sighting_gradient
 from voronerf.ops.sighting_gradient.reference import seen_there, sighting_loss
@@ -63,7 +63,7 @@ class Batch:
     view: Tensor | None = None
 
 
-class Found(NamedTuple):
+class RenderOutput(NamedTuple):
     """What a step finds. Only the loss has gradients.
 
     Where cells of the field are frozen, a faster way may leave out rays that meet none of the others; the entries of
@@ -112,7 +112,7 @@ class RayLoss(Protocol):
         'networks, colours and loss are separate operations'
     """
 
-    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
+    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> RenderOutput:
         """The loss of rays at random samples; ``loss.backward()`` gives the gradients of all parameters.
 
         Args:
@@ -192,7 +192,7 @@ class Networks:
         tables = [each.router.table_arguments(each.points, each.directions, each.ray_index) for each in self.asked]
         if self.alone:
             tables = [{**cast(Any, tables[0]), "rows": self.samples.rows}]
-        self.outputs = [learn_outputs(cast(Any, table), backend=backend) for table in tables]
+        self.outputs = [forward_with_tape(cast(Any, table), backend=backend) for table in tables]
         if self.alone:
             return self.outputs[0].raw
         raw = self.deltas.new_full((len(self.deltas), 4), EMPTY)
@@ -220,7 +220,7 @@ class Fused:
     def __init__(self, renderer: Renderer, sightings: float = 0.0) -> None:
         self.renderer, self.sightings = renderer, sightings
 
-    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
+    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> RenderOutput:
         """See :class:`RayLoss`."""
         renderer, directions, target, background = self.renderer, batch.rays.directions, batch.target, batch.background
         field = cast(VoronoiRouter | Parts, renderer.field)
@@ -266,7 +266,7 @@ class Fused:
         if asked:
             assert inputs.grad is not None and directions.grad is not None
             self._learn_rays(batch.rays, samples, inputs.grad, directions.grad)
-        return Found(loss, found.error, found.weights, networks.density(found), samples, found.colour)
+        return RenderOutput(loss, found.error, found.weights, networks.density(found), samples, found.colour)
 
     def _learn_rays(self, rays: Rays, samples: Samples, of_inputs: Tensor, of_directions: Tensor) -> None:
         """Gives rays the gradients to their origins and directions: samples move with them.
@@ -344,7 +344,7 @@ class Composed:
     def __init__(self, renderer: Renderer, sightings: float) -> None:
         self.renderer, self.sightings = renderer, sightings
 
-    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> Found:
+    def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> RenderOutput:
         """See :class:`RayLoss`."""
         given: dict[str, Any] = {"background": batch.background, "jitter": True, "generator": generator}
         *before, last = self.renderer.render(batch.rays, batch.near, batch.far, **given)
@@ -363,7 +363,7 @@ class Composed:
         if backward:
             loss.backward()
             loss = loss.detach()
-        return Found(loss, error, last.weights.detach(), last.density.detach(), samples, last.colour.detach())
+        return RenderOutput(loss, error, last.weights.detach(), last.density.detach(), samples, last.colour.detach())
 
     def explain(self) -> str:
         """See :class:`RayLoss`."""

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from voronerf.nerf.cameras import Cameras, Rays
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
-from voronerf.nerf.marching import Seen, render_until_opaque
+from voronerf.nerf.marching import RayColours, render_until_opaque
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.samplers import Occupancy, Stratified
@@ -56,7 +56,7 @@ class RenderedImage(NamedTuple):
 
 
 #: Shows what rays of a picture see: rays, near [r], far [r], background, and whether to find the heaviest samples.
-Look = Callable[[Rays, Tensor, Tensor, Tensor | None, bool], Seen]
+Look = Callable[[Rays, Tensor, Tensor, Tensor | None, bool], RayColours]
 
 #: Pictures that ask the networks of more parts than these are rendered in so many squares along their longer side: a
 #: square meets few of them, which fit into a bound on memory. It does not depend on a bound, so pictures do not.
@@ -163,7 +163,7 @@ class Renderer:
 
     def see(
         self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None = None, heaviest: bool = True
-    ) -> Seen:
+    ) -> RayColours:
         """What rays of a picture see, without randomness.
 
         Args:
@@ -183,7 +183,7 @@ class Renderer:
         if heaviest:
             positions, weights = (last.samples.by_ray(values) for values in (last.samples.positions, last.weights))
             places = positions[torch.arange(len(rays), device=places.device), weights.argmax(-1)]
-        return Seen(last.colour, last.opacity, last.depth, places)
+        return RayColours(last.colour, last.opacity, last.depth, places)
 
     def _tiles(self, hit: Tensor, size: tuple[int, int], chunk: int) -> Iterator[Tensor | slice]:
         """The rays of a picture that are to be rendered, int64, in pieces: rows, which is faster, or squares."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from voronerf.nerf.ray_loss import Batch, Composed, Found, Fused, RayLoss, why_not_fused
+from voronerf.nerf.ray_loss import Batch, Composed, Fused, RayLoss, RenderOutput, why_not_fused
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy
 from voronerf.ops._core import backends
@@ -43,7 +43,7 @@ class Step:
             return Fused(self.renderer, self.sightings)
         return Composed(self.renderer, self.sightings)
 
-    def run(self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False) -> Found:
+    def run(self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False) -> RenderOutput:
         """The loss of a batch, with gradients, and what its samples have found.
 
         Args:
@@ -71,10 +71,12 @@ class Step:
         obstacle = why_not_fused(renderer, self.sightings)
         if obstacle is None:
             device, dtype = renderer.device, torch.float32
-            chosen = backends.chosen("learn_outputs", device, dtype, backend=renderer.backend)
+            chosen = backends.chosen("forward_with_tape", device, dtype, backend=renderer.backend)
             lines[-1] += f", on the {chosen} backend"
             if chosen != "native":
-                obstacle = backends.why_not("learn_outputs", "native", device, dtype) or f"--backend {renderer.backend}"
+                obstacle = (
+                    backends.why_not("forward_with_tape", "native", device, dtype) or f"--backend {renderer.backend}"
+                )
         if obstacle is not None:
             lines.append(f"not faster: {obstacle}")
         for name, field in renderer.fields.items():

@@ -18,13 +18,13 @@ from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_pixels import draw_pixels
 from voronerf.ops.draw_pixels.reference import Runs
 from voronerf.ops.first_solid import Solids, first_solid
+from voronerf.ops.forward_with_tape import Outputs, forward_with_tape
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
 from voronerf.ops.grouped_mlp import grouped_mlp
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.hash_encode import hash_encode
 from voronerf.ops.integrated_encode import integrated_encode
-from voronerf.ops.learn_outputs import Outputs, learn_outputs
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
@@ -33,9 +33,9 @@ from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
 from voronerf.ops.ray_runs.reference import OwnSamples
 from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradient
+from voronerf.ops.render_opaque import RaySums, render_opaque
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
-from voronerf.ops.see_rays import Sight, see_rays
 from voronerf.ops.sighting_gradient import sighting_gradient
 from voronerf.ops.spherical_harmonics import spherical_harmonics
 
@@ -50,10 +50,10 @@ __all__ = [
     "Outputs",
     "OwnSamples",
     "PixelRays",
+    "RaySums",
     "RenderLoss",
     "Rule",
     "Runs",
-    "Sight",
     "Solids",
     "adam",
     "balance_centres",
@@ -63,13 +63,13 @@ __all__ = [
     "composite",
     "draw_pixels",
     "first_solid",
+    "forward_with_tape",
     "frequency_encode",
     "grouped_linear",
     "grouped_mlp",
     "grouped_program",
     "hash_encode",
     "integrated_encode",
-    "learn_outputs",
     "locate_cell",
     "march_rays",
     "nearest_centre",
@@ -78,11 +78,11 @@ __all__ = [
     "pixel_rays",
     "render_loss",
     "render_loss_gradient",
+    "render_opaque",
     "resample",
     "routed_mlp",
     "run_gradients",
     "run_sums",
-    "see_rays",
     "sighting_gradient",
     "spherical_harmonics",
 ]

@@ -56,7 +56,7 @@ from voronerf.app.train.run_directory import read_metrics
 from voronerf.app.train.trainer import FIGURES, Trainer
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.cameras import Rays
-from voronerf.nerf.marching import Seen
+from voronerf.nerf.marching import RayColours
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.renderer import Renderer
 from voronerf.ops._core import backends
@@ -262,7 +262,7 @@ class JointTrainer:
     def train_step(self) -> None:
         """One step of all territories."""
         self.joint.survey(self.step)
-        natively = all(trainer.any_threads for trainer in self.trainers.values())
+        natively = all(trainer.thread_deterministic for trainer in self.trainers.values())
         first = next(iter(self.trainers.values()))
         with backends.torch_on_one_thread() if natively else nullcontext():
             batches = {}
@@ -402,7 +402,7 @@ class JointTrainer:
     def _due(self) -> int:
         return int(self.fraction * self.config.evaluations + 1e-9)
 
-    def _look(self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None, heaviest: bool) -> Seen:
+    def _look(self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None, heaviest: bool) -> RayColours:
         """For the renderer: one rank more that is not done."""
         self.group.total(torch.ones(1, device=self.group.device))
         return see_together(self.joint, rays, near, far, background)

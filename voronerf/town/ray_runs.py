@@ -18,17 +18,17 @@ import torch
 from torch import Tensor
 
 from voronerf.nerf.cameras import Rays
-from voronerf.nerf.marching import Seen
+from voronerf.nerf.marching import RayColours
 from voronerf.nerf.occupancy import HIDDEN
-from voronerf.nerf.ray_loss import Batch, Found, density_scale, why_not_fused
+from voronerf.nerf.ray_loss import Batch, RenderOutput, density_scale, why_not_fused
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.sampling import colour_loss
 from voronerf.nerf.volume import Samples, ask, gradient_shares, normalised
 from voronerf.ops.composite import composite
-from voronerf.ops.learn_outputs import learn_outputs
-from voronerf.ops.learn_outputs.reference import with_gradients
+from voronerf.ops.forward_with_tape import forward_with_tape
+from voronerf.ops.forward_with_tape.reference import with_gradients
 from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
 from voronerf.ops.ray_runs.reference import OwnSamples, along_rays, answer, compose, sum_runs
 from voronerf.ops.ray_runs.reference import own_samples as keep_own
@@ -184,7 +184,7 @@ class JointLoss:
         self.map = Map(record[:, :6].reshape(-1, 2, 3).float(), links, bright, shares)
         self._chart()
 
-    def run(self, batches: Mapping[int, Batch], *, backward: bool = False) -> dict[int, Found]:
+    def run(self, batches: Mapping[int, Batch], *, backward: bool = False) -> dict[int, RenderOutput]:
         """The loss and what was found, for each own territory.
 
         Args:
@@ -369,7 +369,7 @@ class _Pass:
         self.sums = self.near.new_empty(0, self.width)
         self.answers, self.loss = self.sums, self.near.new_zeros(())
         self.total: Tensor | None = None
-        self.found: Found | None = None
+        self.found: RenderOutput | None = None
         self._going: Iterator[None] = iter(())
 
     @torch.enable_grad()
@@ -403,7 +403,7 @@ class _Pass:
         shares, scale = gradient_shares(renderer.sampler.space.full_gradient, own.depths), density_scale(field)
         network = field.table_arguments(own.positions, self.rays.directions, own.ray_index)
         assert network is not None
-        outputs = learn_outputs(network, backend=backend)
+        outputs = forward_with_tape(network, backend=backend)
         sums, density = run_sums(outputs.raw, own, density_scale=scale, backend=backend)
         self._told(sums, own)
         yield
@@ -453,7 +453,7 @@ class _Pass:
         error = weights.new_zeros(len(self.ids))
         ray = own.ray_index[own.run_offsets[:-1].long()].long()
         error.index_copy_(0, ray, self.answers[:, -1].to(error.dtype))
-        self.found = Found(self.loss, error, weights, density, _samples(own))
+        self.found = RenderOutput(self.loss, error, weights, density, _samples(own))
 
     @property
     def samples(self) -> int:
@@ -470,7 +470,7 @@ class _Pass:
         return dict(zip(sizes, sums.split(each.tolist()), strict=True))
 
 
-def _together(home: _Pass | None, guest: _Pass | None) -> Found:
+def _together(home: _Pass | None, guest: _Pass | None) -> RenderOutput:
     """What a territory has found on its own rays and on those of others."""
     passes = [each for each in (home, guest) if each is not None]
     found = [each.found for each in passes if each.found is not None]
@@ -484,14 +484,14 @@ def _together(home: _Pass | None, guest: _Pass | None) -> Found:
         none = passes[0].near.new_empty(0)
         index = none.to(torch.int32)
         samples = Samples(none.new_empty(0, 3), index, index.new_zeros(1), none, none)
-        return Found(loss, none, none, none, samples)
+        return RenderOutput(loss, none, none, none, samples)
     first, second = found
     index = torch.cat((first.samples.ray_index, second.samples.ray_index + len(first.error)))
     offsets = torch.cat((first.samples.ray_offsets, second.samples.ray_offsets[1:] + len(first.weights)))
     values = (torch.cat((getattr(first.samples, n), getattr(second.samples, n))) for n in ("depths", "deltas"))
     samples = Samples(torch.cat((first.samples.inputs, second.samples.inputs)), index, offsets, *values)
     rest = {n: torch.cat((getattr(first, n), getattr(second, n))) for n in ("error", "weights", "density")}
-    return Found(loss, **rest, samples=samples)
+    return RenderOutput(loss, **rest, samples=samples)
 
 
 def _samples(own: OwnSamples) -> Samples:
@@ -539,7 +539,7 @@ def _put_together(sums: Tensor, batch: Batch, sightings: float) -> tuple[Tensor,
     return answer(order, whole, blocked, slopes[ray], error[ray]), loss.detach()
 
 
-def see_together(joint: JointLoss, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None) -> Seen:
+def see_together(joint: JointLoss, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None) -> RayColours:
     """What rays of a picture see; all ranks call it at the same time, each with rays of its own or none.
 
     Rays go to all territories that they may meet, and do not end at the first surface.
@@ -575,7 +575,7 @@ def see_together(joint: JointLoss, rays: Rays, near: Tensor, far: Tensor, backgr
     if background is not None:
         seen = seen + made.through[:, None] * background.to(seen)
     depth = torch.zeros_like(near).index_add(0, ray, made.front * whole[:, 6])
-    return Seen(seen, opacity, normalised(depth, opacity, far), rays.origins)
+    return RayColours(seen, opacity, normalised(depth, opacity, far), rays.origins)
 
 
 @torch.no_grad()

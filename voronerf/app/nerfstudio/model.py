@@ -20,7 +20,7 @@ from voronerf.app.nerfstudio.scene import scene_of, seen_from_inside
 from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.networks import make_routers, parameter_groups, resolve_config
 from voronerf.app.train.renderers import make_grid, make_renderer
-from voronerf.nerf import Batch, Cells, Found, Rays, Step, intersect_box
+from voronerf.nerf import Batch, Cells, Rays, RenderOutput, Step, intersect_box
 
 
 @dataclasses.dataclass
@@ -109,7 +109,7 @@ class VoronerfModel(Model):
             self.settings.split_rule,
             generator=torch.Generator().manual_seed(self.settings.seed),
         )
-        self._found: Found | None = None
+        self._found: RenderOutput | None = None
 
     @property
     def num_cells(self) -> int:
@@ -215,14 +215,14 @@ class VoronerfModel(Model):
             return {"rgb_loss": (outputs["rgb"] - self._truth(batch, self.background)).square().mean()}
         return {"rgb_loss": self._learn(outputs, batch).loss}
 
-    def _learn(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> Found:
+    def _learn(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> RenderOutput:
         """What a training step finds, once for the outputs of a batch: losses and metrics ask for it."""
         if "found" not in outputs:
             rays, near, far = outputs["rays"]
             background = self.background if batch["image"].shape[-1] == 3 else torch.rand_like(rays.origins)
             target = self._truth(batch, background)
             outputs["found"] = self._found = self.learner.run(Batch(rays, near, far, target, background))
-        found: Found = outputs["found"]
+        found: RenderOutput = outputs["found"]
         return found
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -215,7 +215,9 @@ def check_backend(config: TrainConfig, device: torch.device) -> None:
     Raises:
         BackendUnavailable: names the op.
     """
-    marching = ("march_rays", "observe_occupancy", "learn_outputs", "render_loss_gradient") if config.occupancy else ()
+    marching = (
+        ("march_rays", "observe_occupancy", "forward_with_tape", "render_loss_gradient") if config.occupancy else ()
+    )
     drawing = () if SAMPLERS[config.sampling].passes == 1 else ("resample",)
     ops = ("pixel_rays", "nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", "adam")
     seeing = ("sighting_gradient",) if config.sightings and config.occupancy else ()

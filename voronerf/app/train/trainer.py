@@ -52,7 +52,7 @@ from voronerf.app.train.refinement import EVERY, START, Refinement
 from voronerf.app.train.renderers import make_grid, make_renderer
 from voronerf.app.train.run_directory import read_metrics
 from voronerf.diagram import VoronoiDiagram
-from voronerf.nerf import Batch, Cells, Found, Step
+from voronerf.nerf import Batch, Cells, RenderOutput, Step
 from voronerf.nerf.average import averages_in_place, drop_averages, update_averages
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.ray_loss import why_not_fused
@@ -131,7 +131,7 @@ class Trainer:
         for router in self.routers.values():
             router.generator = self.draws
         #: Whether native ops compute the networks: then steps are the same bit for bit on any number of threads.
-        self.any_threads = computes_natively(self.routers, config)
+        self.thread_deterministic = computes_natively(self.routers, config)
         self.optimizer = make_optimizer(self.routers, config, views=len(scene.train))
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=config.precision == "fp16")
         grid = make_grid(config, scene, self.device) if config.occupancy else None
@@ -380,7 +380,7 @@ class Trainer:
 
     def train_step(self) -> Tensor:
         """One step of :meth:`advance` without its count and clock; returns the loss, which may not be computed yet."""
-        with backends.torch_on_one_thread() if self.any_threads else nullcontext():
+        with backends.torch_on_one_thread() if self.thread_deterministic else nullcontext():
             self.prepare()
             loss, kept = self._compute()
             self.finish(kept)
@@ -418,7 +418,7 @@ class Trainer:
         half = HALVES.get(self.config.precision)
         return nullcontext() if half is None else torch.autocast(self.device.type, half, cache_enabled=False)
 
-    def learn(self, found: Found) -> tuple[Tensor, Tensor]:
+    def learn(self, found: RenderOutput) -> tuple[Tensor, Tensor]:
         """Updates the parameters after gradients were dropped and a step has found these, or a loss that has them.
 
         Returns:
@@ -458,7 +458,7 @@ class Trainer:
 
     def split(self) -> None:
         """Splits the cells by the kept samples; cells that hold too few of them stay as they are."""
-        with backends.torch_on_one_thread() if self.any_threads else nullcontext():
+        with backends.torch_on_one_thread() if self.thread_deterministic else nullcontext():
             if self._split():  # else the reservoir goes on collecting samples
                 self.cells.empty_reservoir()
                 self._begin_stage()
@@ -664,7 +664,7 @@ class Trainer:
         except (ValueError, KeyError, TypeError, RuntimeError) as error:
             raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
         threads = torch.get_num_threads()
-        if stored.threads != threads and self.device.type == "cpu" and not self.any_threads:
+        if stored.threads != threads and self.device.type == "cpu" and not self.thread_deterministic:
             self.say(
                 f"not bit for bit: {checkpoint.source} was written on {stored.threads} threads, now there are {threads}"
                 ", and torch computes these networks"

@@ -608,6 +608,9 @@ def render_loss(_0: RenderLossInputs, _1: RenderLossOutputs, _2: Cpu) -> None: .
 @overload
 def render_loss(_0: RenderLossInputs, _1: RenderLossOutputs, _2: Cuda) -> None: ...
 
+# MlpTable, MlpInputs, MarchInputs, SeeCells, SeeRule, SeeOutputs, Cpu
+def render_opaque(_0: MlpTable, _1: MlpInputs, _2: MarchInputs, _3: SeeCells, _4: SeeRule, _5: SeeOutputs, _6: Cpu) -> bool: ...
+
 # const float32*, const float32*, const float32*, float32*, int64, int64, int64, Cpu
 @overload
 def resample(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: int, _5: int, _6: int, _7: Cpu) -> None: ...
@@ -620,9 +623,6 @@ def run_gradients(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3
 
 # RenderLossInputs, const float32*, const int32*, float32*, float32*, Cpu
 def run_sums(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
-
-# MlpTable, MlpInputs, MarchInputs, SeeCells, SeeRule, SeeOutputs, Cpu
-def see_rays(_0: MlpTable, _1: MlpInputs, _2: MarchInputs, _3: SeeCells, _4: SeeRule, _5: SeeOutputs, _6: Cpu) -> bool: ...
 
 # Sightings, float32*, float32*, float32*, Cpu
 def sighting_gradient(_0: Sightings, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Cpu) -> None: ...

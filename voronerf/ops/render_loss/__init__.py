@@ -8,7 +8,7 @@ from torch import Tensor
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops._core.checks import FLOATING, INDEX, Checked, check_count, check_number, check_positive, detached
-from voronerf.ops.render_loss.reference import Rendered, RenderLoss
+from voronerf.ops.render_loss.reference import RenderLoss, RenderLossInputs
 
 _OP = backends.declare(
     "render_loss", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
@@ -85,7 +85,7 @@ def render_loss_gradient(
     hidden: float = 0.0,
     backend: str = "auto",
 ) -> tuple[RenderLoss, Tensor]:
-    """`render_loss` and the gradient of its loss to ``raw``, for `learn_outputs`; nothing is differentiable.
+    """`render_loss` and the gradient of its loss to ``raw``, for `forward_with_tape`; nothing is differentiable.
 
     Args:
         raw: [m, 4], float32 or float64.
@@ -125,7 +125,7 @@ def _checked(
     background: Tensor | None,
     density_scale: float,
     hidden: float,
-) -> Rendered:
+) -> RenderLossInputs:
     """The arguments, of which the outputs of the networks alone are part of a graph."""
     tensors = Checked(op)
     tensors.tensor("raw", raw, FLOATING, "m", 4)
@@ -141,4 +141,4 @@ def _checked(
     if not 0 <= hidden < 1:
         raise ValueError(f"{op}: hidden must lie in [0, 1), got {hidden}")
     constant = detached(deltas), ray_offsets, detached(target), detached(background)
-    return Rendered(raw, *constant, float(density_scale), float(hidden))
+    return RenderLossInputs(raw, *constant, float(density_scale), float(hidden))

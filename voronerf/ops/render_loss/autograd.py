@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.custom_op import Op
-from voronerf.ops.render_loss.reference import Rendered, render_loss
+from voronerf.ops.render_loss.reference import RenderLossInputs, render_loss
 
 Results = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
-def results(given: Rendered) -> Results:
+def results(given: RenderLossInputs) -> Results:
     """Memory for loss, colour, weights, density, error, and the gradient of the loss to ``raw``."""
     raw, r, m = given.raw, given.target.shape[0], given.raw.shape[0]
     loss, colour, error = raw.new_empty(()), raw.new_empty(r, 3), raw.new_empty(r)
@@ -25,7 +25,7 @@ def register(forward: Op) -> None:
     forward.register_autograd(_backward, setup_context=_setup)
 
 
-def _setup(ctx: Any, inputs: tuple[Rendered], output: Results) -> None:
+def _setup(ctx: Any, inputs: tuple[RenderLossInputs], output: Results) -> None:
     *tensors, ctx.density_scale, ctx.hidden = inputs[0]
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(*output[1:])
@@ -37,8 +37,8 @@ def _backward(ctx: Any, of_loss: Tensor | None, *_: Tensor | None) -> tuple[Any]
     *tensors, gradient = ctx.saved_tensors
     found = None
     if of_loss is not None and torch.is_grad_enabled():
-        given = Rendered._make([*tensors, ctx.density_scale, ctx.hidden])
+        given = RenderLossInputs._make([*tensors, ctx.density_scale, ctx.hidden])
         (found,) = torch.autograd.grad(render_loss(given).loss, given.raw, of_loss, create_graph=True)
     elif of_loss is not None:
         found = of_loss * gradient
-    return (Rendered._make([found, *[None] * 6]),)
+    return (RenderLossInputs._make([found, *[None] * 6]),)

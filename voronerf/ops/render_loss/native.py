@@ -12,23 +12,23 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops.render_loss.autograd import Results, register, results
-from voronerf.ops.render_loss.reference import Rendered
+from voronerf.ops.render_loss.reference import RenderLossInputs
 
 
-def render_loss(given: Rendered) -> list[Tensor]:
+def render_loss(given: RenderLossInputs) -> list[Tensor]:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
     *parts, _ = forward(given._replace(raw=given.raw.float()))
     return parts
 
 
-def render_loss_gradient(given: Rendered) -> Results:
+def render_loss_gradient(given: RenderLossInputs) -> Results:
     """What ``forward`` gives; see ``voronerf.ops.render_loss_gradient``."""
     found: Results = forward.inside(given)
     return found
 
 
 @custom_op("render_loss_native")
-def forward(given: Rendered) -> Iterator[Results]:
+def forward(given: RenderLossInputs) -> Iterator[Results]:
     """Loss, colour, weights, density, error, and the gradient of the loss to ``raw``."""
     loss, colour, weights, density, error, gradient = found = results(given)
     yield found

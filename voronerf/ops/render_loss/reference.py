@@ -37,7 +37,7 @@ class RenderLoss(NamedTuple):
     error: Tensor
 
 
-class Rendered(NamedTuple):
+class RenderLossInputs(NamedTuple):
     """What ``render_loss`` takes; ``voronerf.ops.render_loss`` says what each is."""
 
     raw: Tensor
@@ -49,7 +49,7 @@ class Rendered(NamedTuple):
     hidden: float
 
 
-def render_loss(given: Rendered) -> RenderLoss:
+def render_loss(given: RenderLossInputs) -> RenderLoss:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
     raw, deltas, ray_offsets, target, background, density_scale, hidden = given
     raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
@@ -66,7 +66,7 @@ def render_loss(given: Rendered) -> RenderLoss:
 
 
 @torch.enable_grad()
-def render_loss_gradient(given: Rendered) -> tuple[Tensor, ...]:
+def render_loss_gradient(given: RenderLossInputs) -> tuple[Tensor, ...]:
     """The result of `render_loss`, and the gradient of its loss to ``raw``."""
     given = given._replace(raw=given.raw.detach().requires_grad_())
     found = render_loss(given)

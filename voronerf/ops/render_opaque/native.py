@@ -1,4 +1,4 @@
-"""``see_rays`` of the compiled module: a wave of a few thousand samples goes from the grid to the colours in the cache.
+"""``render_opaque`` of the compiled module: a wave of a few thousand samples goes from the grid to the colours in the cache.
 
 No custom op: nothing that is traced or differentiated renders pictures.
 """
@@ -18,21 +18,21 @@ from voronerf.ops.grouped_mlp.layer_table import Given, in_float32, table_of
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import inputs_of, march_rays
 from voronerf.ops.march_rays.reference import March, Rays
+from voronerf.ops.render_opaque import reference
+from voronerf.ops.render_opaque.reference import Operations, RaySums, Rule
 from voronerf.ops.routed_mlp.native import routed_mlp
-from voronerf.ops.see_rays import reference
-from voronerf.ops.see_rays.reference import Operations, Rule, Sight
 
 _APART = Operations(march_rays=lambda *given: March(*march_rays(*given)), routed_mlp=routed_mlp, composite=composite)
 
 
 @torch.no_grad()
-def see_rays(rays: Rays, network: Mapping[str, Any], rule: Rule) -> Sight:
-    """Every ray up to the first surface, in float32; see ``voronerf.ops.see_rays``."""
+def render_opaque(rays: Rays, network: Mapping[str, Any], rule: Rule) -> RaySums:
+    """Every ray up to the first surface, in float32; see ``voronerf.ops.render_opaque``."""
     weights, biases, centres = network["weights"], network["biases"], network["centres"]
     floats = (*weights, *biases, centres, network["features"], network["directions"])
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in floats)
     if not plain or torch.is_autocast_enabled("cpu"):
-        return reference.see_rays(rays, network, rule, _APART)
+        return reference.render_opaque(rays, network, rule, _APART)
     features, (r,) = network["features"], rays.near.shape
     if features is not None and features.dim() == 3 and weights[0].shape[0] == 1:
         features = features[0]
@@ -42,12 +42,12 @@ def see_rays(rays: Rays, network: Mapping[str, Any], rule: Rule) -> Sight:
     if weights[0].shape[0] == 1:
         centres = child_offsets = child = None
     if child_offsets is not None:
-        check_tree(child_offsets, child, len(centres), "see_rays")
+        check_tree(child_offsets, child, len(centres), "render_opaque")
     near = rays.near
     colour, opacity, depths, light = near.new_empty(r, 3), near.new_empty(r), near.new_empty(r), near.new_empty(r)
     heaviest = near.new_empty(r) if rule.heaviest else rays.far
     compiled = native.compiled
-    sound = compiled.see_rays(
+    sound = compiled.render_opaque(
         table_of(*grouped_mlp.key_of(taken)),
         grouped_mlp.inputs_of(taken, _no_offsets(weights[0]), None, near.new_empty(0)),
         inputs_of(rays),
@@ -65,8 +65,8 @@ def see_rays(rays: Rays, network: Mapping[str, Any], rule: Rule) -> Sight:
         native.cpu(),
     )
     if not sound:
-        raise too_shallow(depth, "see_rays")
-    return Sight(colour, opacity, depths, light, heaviest)
+        raise too_shallow(depth, "render_opaque")
+    return RaySums(colour, opacity, depths, light, heaviest)
 
 
 def _no_offsets(weight: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 // time: through the grid, to their cells, through the networks, and to the colours. A ray that has ended makes room for
 // the next one of the picture, so that the waves are as large to the end. What a ray sees does not depend on which rays
 // are beside it, nor on the number of threads.
-#include "rays/see_rays.h"
+#include "rays/render_opaque.h"
 
 #include <algorithm>
 #include <atomic>
@@ -18,7 +18,7 @@
 #include "network/cpu/row_tasks.h"
 #include "rays/march_rays_isa.h"
 #include "rays/march_rooms.h"
-#include "rays/see_rays_isa.h"
+#include "rays/render_opaque_isa.h"
 
 namespace voronerf {
 
@@ -208,7 +208,7 @@ class Pool {
 
 }  // namespace
 
-bool see_rays_cpu(const MlpTable& table, const MlpInputs& network, const MarchInputs& march, const SeeCells& cells,
+bool render_opaque_cpu(const MlpTable& table, const MlpInputs& network, const MarchInputs& march, const SeeCells& cells,
                   const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads) {
   if (march.r == 0) return true;
   std::unique_ptr<uint8_t[]> memory;

@@ -1,5 +1,5 @@
 // What rays of a picture see, from the walk through the occupancy grid to the colour: r rays, k cells, m centres of all
-// diagrams together. What it computes is said in voronerf/ops/see_rays.
+// diagrams together. What it computes is said in voronerf/ops/render_opaque.
 #pragma once
 
 #include <cstdint>
@@ -33,7 +33,7 @@ struct SeeOutputs {
 
 // The march has no uniforms, seed or start. The network has positions [r,3], which are not read, and directions [r,q]
 // or none. False if a place is not at a leaf after `depth` levels.
-bool see_rays_cpu(const MlpTable& table, const MlpInputs& network, const MarchInputs& march, const SeeCells& cells,
+bool render_opaque_cpu(const MlpTable& table, const MlpInputs& network, const MarchInputs& march, const SeeCells& cells,
                   const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads);
 
 }  // namespace voronerf

@@ -24,16 +24,16 @@ from voronerf.ops._core.checks import (
 )
 from voronerf.ops.composite import composite
 from voronerf.ops.march_rays.reference import March, Rays
+from voronerf.ops.render_opaque.reference import Operations, RaySums, Rule
 from voronerf.ops.routed_mlp import check_routed, routed_mlp
-from voronerf.ops.see_rays.reference import Operations, Rule, Sight
 
-_OP = backends.declare("see_rays", native=Implementation(("cpu",), (torch.float32,)))
+_OP = backends.declare("render_opaque", native=Implementation(("cpu",), (torch.float32,)))
 #: Names of the arguments of `routed_mlp` that a network has; the others are of the samples, or of the backward pass.
 NETWORK = ("weights", "biases", "layers", "features", "centres", "child_offsets", "child", "depth")
 _MOST_WAVE = 1024
 
 
-def see_rays(
+def render_opaque(
     origins: Tensor,
     directions: Tensor,
     near: Tensor,
@@ -50,7 +50,7 @@ def see_rays(
     contraction: Tensor | None = None,
     heaviest: bool = True,
     backend: str = "auto",
-) -> Sight:
+) -> RaySums:
     """Renders rays without gradients and without randomness: each is walked until it is opaque.
 
     Equivalent to ``march_rays``, ``routed_mlp``, the activations of ``render_loss`` and ``composite`` for a few samples
@@ -77,17 +77,17 @@ def see_rays(
         backend: "auto", "reference" or "native".
 
     Returns:
-        Sight(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]), sums without a background.
+        RaySums(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]), sums without a background.
 
     Examples:
         >>> import torch
         >>> from voronerf import MLP, Layer
-        >>> from voronerf.ops import see_rays
+        >>> from voronerf.ops import render_opaque
         >>> weights, biases = [torch.zeros(1, 4, 3)], [torch.tensor([[0.0, 0, 0, 20]])]  # grey, and 20 dense
         >>> network = {"weights": weights, "biases": biases, "layers": MLP((Layer(("positions",), 4),), outputs=(0,))}
         >>> ray = torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]), torch.zeros(1), torch.full((1,), 4.0)
         >>> box, occupied = torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), torch.ones(1, 1, 1, dtype=torch.bool)
-        >>> seen = see_rays(*ray, occupied, box, 64, network, density_scale=1.0)
+        >>> seen = render_opaque(*ray, occupied, box, 64, network, density_scale=1.0)
         >>> seen.colour.round(decimals=2), (seen.depth / seen.opacity).round(decimals=2), float(seen.light) < 0.02
         (tensor([[0.5000, 0.5000, 0.5000]]), tensor([1.0600]), True)
     """
@@ -142,7 +142,7 @@ def see_rays(
         most=samples,
     )
     found = run(rays, table, Rule(density_scale, opaque, wave, heaviest))
-    return Sight(*found)
+    return RaySums(*found)
 
 
 def _operations(device: torch.device, dtype: torch.dtype) -> Operations:

@@ -1,4 +1,4 @@
-#include "rays/see_rays.h"
+#include "rays/render_opaque.h"
 
 #include "bindings/bind.h"
 #include "bindings/grouped_mlp.h"
@@ -11,7 +11,7 @@ VN_STRUCT(SeeRule, density_scale, opaque, wave);
 VN_STRUCT(SeeOutputs, colour, opacity, depth, light, heaviest);
 
 VN_BINDINGS(module) {
-  module.cpu("see_rays", VN_CPU(see_rays_cpu));
+  module.cpu("render_opaque", VN_CPU(render_opaque_cpu));
 }
 
 }  // namespace voronerf

@@ -1,6 +1,6 @@
-// The kernel of see_rays, once for each instruction set: the samples of a wave are weighed as in render_loss, and added
+// The kernel of render_opaque, once for each instruction set: the samples of a wave are weighed as in render_loss, and added
 // to their rays.
-#include "rays/see_rays_isa.h"
+#include "rays/render_opaque_isa.h"
 
 #include "rays/render_tile.h"
 

@@ -14,7 +14,7 @@ from voronerf.ops.march_rays.reference import Rays, march_rays
 from voronerf.ops.routed_mlp.reference import routed_mlp
 
 
-class Sight(NamedTuple):
+class RaySums(NamedTuple):
     """What rays see.
 
     Attributes:
@@ -25,8 +25,8 @@ class Sight(NamedTuple):
         heaviest: [r], the depth of the heaviest sample; the far end for a ray without any.
 
     Examples:
-        >>> from voronerf.ops import Sight
-        >>> Sight._fields
+        >>> from voronerf.ops import RaySums
+        >>> RaySums._fields
         ('colour', 'opacity', 'depth', 'light', 'heaviest')
     """
 
@@ -38,7 +38,7 @@ class Sight(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """How rays are walked; ``voronerf.ops.see_rays`` says what each is."""
+    """How rays are walked; ``voronerf.ops.render_opaque`` says what each is."""
 
     density_scale: float
     opaque: float
@@ -77,8 +77,8 @@ REFERENCE = Operations()
 
 
 @torch.no_grad()
-def see_rays(rays: Rays, network: Mapping[str, Any], rule: Rule, operations: Operations = REFERENCE) -> Sight:
-    """Every ray up to the first surface; see ``voronerf.ops.see_rays``."""
+def render_opaque(rays: Rays, network: Mapping[str, Any], rule: Rule, operations: Operations = REFERENCE) -> RaySums:
+    """Every ray up to the first surface; see ``voronerf.ops.render_opaque``."""
     centres, directions = network.get("centres"), network.get("directions")
     of_samples = ("positions", "coords", "directions", "direction_index")
     given = {name: value for name, value in network.items() if name not in of_samples}
@@ -103,7 +103,7 @@ def see_rays(rays: Rays, network: Mapping[str, Any], rule: Rule, operations: Ope
 @torch.no_grad()
 def walk(
     look: Callable[[Tensor, Tensor | None], Wave], far: Tensor, samples: int, wave: int, opaque: float, heaviest: bool
-) -> Sight:
+) -> RaySums:
     """Rays in waves, and what they add up to.
 
     Args:
@@ -132,7 +132,7 @@ def walk(
         through[live] = light
         more = ((found.stop < samples) & (light > opaque)).nonzero()[:, 0]
         live, start = live[more], found.stop[more]
-    return Sight(colour, opacity, depth, through, at)
+    return RaySums(colour, opacity, depth, through, at)
 
 
 def _heaviest(wave: Wave, most: int) -> tuple[Tensor, Tensor]:

@@ -8,11 +8,11 @@ from helpers import on_any_number_of_threads
 from op_cases import refused
 
 from voronerf import MLP, Layer
-from voronerf.ops import see_rays
+from voronerf.ops import render_opaque
 from voronerf.ops._core.cases import Draw
-from voronerf.ops.see_rays.case import CASE
+from voronerf.ops.render_opaque.case import CASE
 
-pytestmark = pytest.mark.op("see_rays")
+pytestmark = pytest.mark.op("render_opaque")
 MOVED = ("origins", "directions", "near", "far")
 CHOICES = [*itertools.product((0, 1, 33, 700), ("hashed", "as they are"), (1, 3), ("linear", "disparity"))]
 
@@ -21,7 +21,7 @@ CHOICES = [*itertools.product((0, 1, 33, 700), ("hashed", "as they are"), (1, 3)
 @pytest.mark.parametrize(("n", "positions", "cells", "spacing"), CHOICES)
 def test_native_sees_what_the_reference_sees(n, positions, cells, spacing):
     given = CASE.make(Draw(n, positions=positions, cells=cells, spacing=spacing), n)
-    found, expected = (see_rays(**given, backend=backend) for backend in ("native", "reference"))
+    found, expected = (render_opaque(**given, backend=backend) for backend in ("native", "reference"))
     for name, part, other in zip(found._fields, found, expected, strict=True):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5, msg=name)
     assert n < 33 or 0.1 < float(found.opacity.mean()) < 1.1
@@ -38,9 +38,9 @@ def test_networks_of_other_dtypes_are_seen(dtype):
             network[name] = [None if tensor is None else tensor.to(dtype) for tensor in network[name]]
         network["features"] = network["features"].to(dtype)
     with torch.autocast("cpu", torch.bfloat16, enabled=dtype == "autocast"):
-        found = see_rays(**{**given, "network": network}, backend="native")
+        found = render_opaque(**{**given, "network": network}, backend="native")
     allowed = 1e-4 if dtype == torch.float64 else 0.03
-    for part, other in zip(found[:4], see_rays(**given, backend="reference")[:4], strict=True):
+    for part, other in zip(found[:4], render_opaque(**given, backend="reference")[:4], strict=True):
         assert part.dtype == torch.float32
         torch.testing.assert_close(part, other, rtol=allowed, atol=allowed)
 
@@ -50,10 +50,10 @@ def test_networks_of_other_dtypes_are_seen(dtype):
 def test_a_ray_sees_the_same_bits_beside_any_others(kind):
     """On any number of threads, and in any order: which rays share a wave depends on both."""
     given = CASE.make(Draw(7, **kind), 5000)
-    found = on_any_number_of_threads(lambda: see_rays(**given, backend="native"))
+    found = on_any_number_of_threads(lambda: render_opaque(**given, backend="native"))
     order = torch.randperm(5000, generator=torch.Generator().manual_seed(0))
     moved = {name: given[name][order] for name in MOVED}
-    for part, other in zip(found, see_rays(**{**given, **moved}, backend="native"), strict=True):
+    for part, other in zip(found, render_opaque(**{**given, **moved}, backend="native"), strict=True):
         assert torch.equal(part[order], other)
 
 
@@ -64,7 +64,7 @@ def test_leaps_over_empty_cells_find_the_same():
     given["occupied"][5:7, 4:8, 3:9] = True
     few, many = ({**given, **{name: given[name].repeat_interleave(copies, 0) for name in MOVED}} for copies in (1, 8))
     assert len(few["near"]) * 130 < 4 * 12**3 <= len(many["near"]) * 130
-    for part, other in zip(see_rays(**few), see_rays(**many), strict=True):
+    for part, other in zip(render_opaque(**few), render_opaque(**many), strict=True):
         assert torch.equal(part, other[::8])
 
 
@@ -80,17 +80,17 @@ def test_a_tree_of_diagrams_tells_the_cells():
     ray = origins, torch.tensor([[0.0, 0, 1]]).expand(3, 3), torch.zeros(3), torch.full((3,), 4.0)
     box, occupied = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.ones(2, 2, 2, dtype=torch.bool)
     for backend in ("auto", "reference"):
-        seen = see_rays(*ray, occupied, box, 64, network, density_scale=1.0, backend=backend)
+        seen = render_opaque(*ray, occupied, box, 64, network, density_scale=1.0, backend=backend)
         assert torch.equal(seen.colour.round(decimals=1), torch.eye(3)), backend
-    with refused(ValueError, "see_rays: depth must be the number of levels of the tree, got 1, which is too few"):
-        see_rays(*ray, occupied, box, 64, {**network, "depth": 1}, density_scale=1.0, backend="native")
+    with refused(ValueError, "render_opaque: depth must be the number of levels of the tree, got 1, which is too few"):
+        render_opaque(*ray, occupied, box, 64, {**network, "depth": 1}, density_scale=1.0, backend="native")
 
 
 def test_what_is_of_the_samples_is_refused():
     given = CASE.make(Draw(0), 3)
-    with refused(TypeError, "see_rays: network must hold ... alone, got cells"):
-        see_rays(**{**given, "network": {**given["network"], "cells": torch.zeros(3, dtype=torch.int32)}})
+    with refused(TypeError, "render_opaque: network must hold ... alone, got cells"):
+        render_opaque(**{**given, "network": {**given["network"], "cells": torch.zeros(3, dtype=torch.int32)}})
     layers = MLP((Layer(("positions",), 3),), outputs=(0,))
     network = {"weights": [torch.zeros(1, 3, 3)], "biases": [None], "layers": layers}
-    with refused(ValueError, "see_rays: layers must put out 4 numbers, colour and density, got 3"):
-        see_rays(**{**given, "network": network})
+    with refused(ValueError, "render_opaque: layers must put out 4 numbers, colour and density, got 3"):
+        render_opaque(**{**given, "network": network})

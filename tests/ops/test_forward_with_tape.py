@@ -7,9 +7,9 @@ import torch
 from op_cases import refused
 
 from voronerf import MLP, HashGrid, Layer
-from voronerf.ops import learn_outputs, routed_mlp
+from voronerf.ops import forward_with_tape, routed_mlp
 
-pytestmark = pytest.mark.op("learn_outputs")
+pytestmark = pytest.mark.op("forward_with_tape")
 
 GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
 TABLE = MLP(
@@ -53,7 +53,7 @@ def squares(out):
 
 def learn(given, *, backward=False, backend="auto"):
     """The loss, with gradients."""
-    outputs = learn_outputs(given, backend=backend)
+    outputs = forward_with_tape(given, backend=backend)
     assert not outputs.raw.requires_grad
     return outputs.learn(*squares(outputs.raw), backward=backward)
 
@@ -150,20 +150,20 @@ def test_is_once_differentiable(device, backend):
 
 def test_refuses_what_makes_no_sense(device, backend):
     given = network(device)
-    with refused(ValueError, "learn_outputs: network must hold positions, weights, biases and layers, got ..."):
-        learn_outputs({"positions": given["positions"]})
-    with refused(TypeError, "learn_outputs: unknown arguments other"):
-        learn_outputs({**given, "other": 1})
-    with refused(ValueError, "learn_outputs: weights[1] must have shape ..."):
-        learn_outputs({**given, "weights": [given["weights"][0], given["weights"][1][:, :2]]})
-    outputs = learn_outputs(given, backend=backend)
+    with refused(ValueError, "forward_with_tape: network must hold positions, weights, biases and layers, got ..."):
+        forward_with_tape({"positions": given["positions"]})
+    with refused(TypeError, "forward_with_tape: unknown arguments other"):
+        forward_with_tape({**given, "other": 1})
+    with refused(ValueError, "forward_with_tape: weights[1] must have shape ..."):
+        forward_with_tape({**given, "weights": [given["weights"][0], given["weights"][1][:, :2]]})
+    outputs = forward_with_tape(given, backend=backend)
     loss, gradient = squares(outputs.raw)
-    with refused(ValueError, "learn_outputs: loss must have shape [], got [40, 3]"):
+    with refused(ValueError, "forward_with_tape: loss must have shape [], got [40, 3]"):
         outputs.learn(gradient, gradient)
-    with refused(ValueError, "learn_outputs: gradient must have shape [40, 3], got [3]"):
+    with refused(ValueError, "forward_with_tape: gradient must have shape [40, 3], got [3]"):
         outputs.learn(loss, gradient[0])
-    with refused(TypeError, "learn_outputs: loss must be a tensor, got float"):
+    with refused(TypeError, "forward_with_tape: loss must be a tensor, got float"):
         outputs.learn(0.0, gradient)
-    with refused(TypeError, "learn_outputs: backward must be True or False, got int"):
+    with refused(TypeError, "forward_with_tape: backward must be True or False, got int"):
         outputs.learn(loss, gradient, backward=1)
     assert all(parameter.grad is None for parameter in parameters_of(given))

@@ -1,4 +1,4 @@
-"""``learn_outputs`` of the compiled module, in float32.
+"""``forward_with_tape`` of the compiled module, in float32.
 
 Checks and nodes of ``routed_mlp``, a loss and their backward passes take a tenth of a step of a few thousand samples.
 Here the gradients of the parameters are computed as soon as that of the outputs is known, and given to the parameters
@@ -15,19 +15,19 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
+from voronerf.ops.forward_with_tape import reference
+from voronerf.ops.forward_with_tape.reference import Tape, learnt, with_gradients
 from voronerf.ops.grouped_mlp import native as grouped_mlp
-from voronerf.ops.learn_outputs import reference
-from voronerf.ops.learn_outputs.reference import Tape, learnt, with_gradients
 from voronerf.ops.routed_mlp import native as routed_mlp
 from voronerf.ops.routed_mlp import of_samples
 
 
-def learn_outputs(network: Mapping[str, Any]) -> tuple[Tensor, Tape]:
-    """The outputs and their tape, once differentiable; see ``voronerf.ops.learn_outputs``."""
+def forward_with_tape(network: Mapping[str, Any]) -> tuple[Tensor, Tape]:
+    """The outputs and their tape, once differentiable; see ``voronerf.ops.forward_with_tape``."""
     floats = (network["positions"], *network["weights"], *network["biases"], network.get("features"))
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in floats)
     if not plain or torch.is_autocast_enabled(network["positions"].device.type) or not torch.is_grad_enabled():
-        return reference.learn_outputs(network, routed_mlp.routed_mlp)
+        return reference.forward_with_tape(network, routed_mlp.routed_mlp)
     names = routed_mlp.Where._fields
     where = routed_mlp.Where(**{name: network[name] for name in names if name in network})
     rest = {name: value for name, value in network.items() if name not in (*names, "frozen")}

@@ -1,4 +1,4 @@
-// The kernel of see_rays, once for each instruction set.
+// The kernel of render_opaque, once for each instruction set.
 #pragma once
 
 #include <cstdint>
@@ -15,7 +15,7 @@ struct SeenWave {
   float density_scale;
   double* front;                   // [r], the optical depth so far
   float* most;                     // [r], the largest weight so far, or null
-  float* colour;                   // of the picture's rays, as in see_rays.h
+  float* colour;                   // of the picture's rays, as in render_opaque.h
   float *opacity, *depth, *light;  // light: what is left behind the wave
   float* heaviest;
 };

@@ -11,10 +11,10 @@ from torch import Tensor
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops._core.checks import check_flag, check_shape, detached
-from voronerf.ops.learn_outputs.reference import Tape
+from voronerf.ops.forward_with_tape.reference import Tape
 from voronerf.ops.routed_mlp import check_routed, routed_mlp
 
-_OP = backends.declare("learn_outputs", native=Implementation(EVERYWHERE, FLOATS))
+_OP = backends.declare("forward_with_tape", native=Implementation(EVERYWHERE, FLOATS))
 
 
 class Outputs(NamedTuple):
@@ -27,11 +27,11 @@ class Outputs(NamedTuple):
     Examples:
         >>> import torch
         >>> from voronerf import MLP, Layer
-        >>> from voronerf.ops import learn_outputs
+        >>> from voronerf.ops import forward_with_tape
         >>> weight = torch.tensor([[[2.0]]], requires_grad=True)
         >>> table = MLP((Layer(("positions",), 1),), outputs=(0,))
         >>> network = {"positions": torch.ones(4, 1), "weights": [weight], "biases": [None], "layers": table}
-        >>> outputs = learn_outputs(network)
+        >>> outputs = forward_with_tape(network)
         >>> loss = outputs.learn(outputs.raw.square().mean(), outputs.raw * (2 / 4), backward=True)
         >>> float(loss), float(weight.grad)
         (4.0, 4.0)
@@ -61,7 +61,7 @@ class Outputs(NamedTuple):
         return self.tape.learn(detached(loss), detached(gradient), backward)
 
 
-def learn_outputs(network: Mapping[str, Any], *, backend: str = "auto") -> Outputs:
+def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> Outputs:
     """Evaluates networks that learn from the gradient of a loss to their outputs.
 
     ``outputs.learn(loss, gradient)`` is equivalent to the backward pass of a loss of ``routed_mlp(**network)[0]``, for
@@ -80,10 +80,10 @@ def learn_outputs(network: Mapping[str, Any], *, backend: str = "auto") -> Outpu
     Examples:
         >>> import torch
         >>> from voronerf import MLP, Layer
-        >>> from voronerf.ops import learn_outputs
+        >>> from voronerf.ops import forward_with_tape
         >>> table = MLP((Layer(("positions",), 1),), outputs=(0,))
         >>> weights = [torch.tensor([[[2.0]]])]
-        >>> learn_outputs({"positions": torch.ones(1, 1), "weights": weights, "biases": [None], "layers": table}).raw
+        >>> forward_with_tape({"positions": torch.ones(1, 1), "weights": weights, "biases": [None], "layers": table}).raw
         tensor([[2.]])
     """
     if not isinstance(network, Mapping) or not {"positions", "weights", "biases", "layers"} <= network.keys():

@@ -1,4 +1,4 @@
-"""The case of ``learn_outputs``."""
+"""The case of ``forward_with_tape``."""
 
 from __future__ import annotations
 

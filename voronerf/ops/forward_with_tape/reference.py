@@ -17,14 +17,14 @@ class Tape(Protocol):
     """What outputs were computed from, for their backward pass."""
 
     def learn(self, loss: Tensor, gradient: Tensor, backward: bool) -> Tensor:
-        """The loss with gradients; see `voronerf.ops.learn_outputs.Outputs.learn`."""
+        """The loss with gradients; see `voronerf.ops.forward_with_tape.Outputs.learn`."""
         ...
 
 
-def learn_outputs(
+def forward_with_tape(
     network: Mapping[str, Any], evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp
 ) -> tuple[Tensor, Tape]:
-    """The outputs and their tape; see ``voronerf.ops.learn_outputs``."""
+    """The outputs and their tape; see ``voronerf.ops.forward_with_tape``."""
     network = dict(network)
     frozen = network.pop("frozen", None)
     out, cells = evaluate(**network)
@@ -68,7 +68,7 @@ class _Known(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, of_loss: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():  # what the gradients follow from is not known here
-            raise RuntimeError("learn_outputs: gradients are differentiable no further, got create_graph=True")
+            raise RuntimeError("forward_with_tape: gradients are differentiable no further, got create_graph=True")
         found, ctx.gradients = ctx.gradients, None  # to be taken as they are, not copied
         if not of_loss.is_cpu or float(of_loss) != 1:  # nothing is read of a device
             found = [gradient * of_loss for gradient in found]

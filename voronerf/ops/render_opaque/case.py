@@ -1,4 +1,4 @@
-"""The case of ``see_rays``."""
+"""The case of ``render_opaque``."""
 
 from __future__ import annotations
 
