@@ -26,7 +26,6 @@ import torch
 from harness import metadata
 
 from voronerf import Run, open_run
-from voronerf.app.evaluate import seam
 from voronerf.app.evaluate.panels import contact_sheet, picture_of_colour, save_picture
 from voronerf.app.scenes import Scene, city_scene
 from voronerf.app.scenes.record import read_scene
@@ -38,7 +37,7 @@ from voronerf.town.parts import Similarity, Solid
 
 RESULT = Path(__file__).parent / "results" / "editing.json"
 PICTURES = Path(__file__).parent.parent / "docs" / "images"
-BLOCKS, SIZE, BLEND = 2, 64, 0.03
+BLOCKS, SIZE = 2, 64
 OVERLAP = 0.1  # of a half, on each side of the border
 TOGETHER = 0.2  # share of the time in which joined halves are trained together
 
@@ -120,23 +119,12 @@ def city(out: Path, seconds: float, seeds: list[int]) -> None:
         for way, run in runs.items():
             row = {"way": way, "seed": seed, "cells": run.router.num_cells}
             row["psnr"] = run.evaluate(lpips="off")["psnr"]
-
-            def picture(view: int, run: Run = run):
-                return run.render(view)
-
-            row["seam"] = seam(run.router, scene, picture, views=8, margin=BLEND)
-            if hasattr(run.router, "parts"):
-                run.router.blend = BLEND
-                row["psnr blended"] = run.evaluate(lpips="off")["psnr"]
-                if seed == seeds[0] and way == "views by position":
-                    blended = picture_of_colour(run.render(4).colour)
-                run.router.blend = 0.0
             rows.append(row)
             print(row)
         if seed == seeds[0]:
             pictures = {way: picture_of_colour(run.render(4).colour) for way, run in runs.items()}
             truth = picture_of_colour(scene.test.truth(4, scene.background_colour()))
-            save_picture(PICTURES / "editing-join.png", contact_sheet({"truth": truth, **pictures, "blended": blended}))
+            save_picture(PICTURES / "editing-join.png", contact_sheet({"truth": truth, **pictures}))
     keep(
         "city",
         rows,
@@ -144,7 +132,6 @@ def city(out: Path, seconds: float, seeds: list[int]) -> None:
             "blocks": BLOCKS,
             "size": SIZE,
             "seconds of a half": seconds,
-            "margin": BLEND,
             "seeds": seeds,
             "together": TOGETHER,
         },

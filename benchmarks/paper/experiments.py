@@ -246,7 +246,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "seams": Experiment(
         "figure",
-        "Samples go to the nearest cell, or while training to one drawn from the distances: seams over time.",
+        "Samples go to the nearest cell, or while training to one drawn from the distances.",
         _changed((NEAREST, {}), (STOCHASTIC, {"assignment": "stochastic"})),
     ),
     "title": Experiment(

@@ -149,23 +149,6 @@ def counts(path: Path, rows: Sequence[Row]) -> Path:
     return save(figure, path)
 
 
-def seams(path: Path, rows: Sequence[Row]) -> Path:
-    """The seam measure over training seconds."""
-    table = Rows(rows)
-    figure, axes = panes(len(table.scenes))
-    for pane, scene in zip(axes, table.scenes):
-        for number, variant in enumerate(table.variants):
-            found = [
-                [(e["seconds"], e["seam"]) for e in row["looks"] if e.get("seam") is not None]
-                for row in table.of(variant, scene)
-            ]
-            banded(pane, variant, found, number)
-        pane.set(xlabel="training time [s]", ylabel="difference across cell borders", title=scene)
-        if pane.lines:
-            pane.legend(fontsize=8)
-    return save(figure, path)
-
-
 def balance(path: Path, rows: Sequence[Row]) -> Path:
     """std(W / max W) before and after, a box each."""
     figure, axes = panes(1)
@@ -258,7 +241,7 @@ PLOTS: dict[str, Callable[[Path, Sequence[Row]], Path]] = {
     "split-kinds": curves,
     "early-late": curves,
     "cell-count": counts,
-    "seams": seams,
+    "seams": curves,
     "nested-2d": curves,
     "balance": balance,
 }

@@ -1,4 +1,4 @@
-"""Snapshots of a training: a held-out view, a slice through its density, its cells, its seams.
+"""Snapshots of a training: a held-out view, a slice through its density, its cells.
 
 A look is a file of a run directory, looks/NAME.npz; NAME says when: "before" and "after" the first split, at quarters
 of the run, "end".
@@ -17,7 +17,6 @@ import torch
 from paper.slices import slice_density, slice_points
 from voronerf.app.evaluate.metrics import psnr
 from voronerf.app.evaluate.scores import render_view
-from voronerf.app.evaluate.seams import seam
 from voronerf.app.files import write_bytes
 from voronerf.app.scenes import Scene
 from voronerf.app.train.trainer import Trainer
@@ -27,7 +26,6 @@ VERSION = 1  # of what a look holds; those of another version are not used
 AFTER = 0.04
 QUARTERS = (0.25, 0.5, 0.75)
 SLICE = 96  # points on each side of a slice
-SEAM_VIEWS = 2  # test views whose seams are measured
 
 
 def stops(trainer: Trainer) -> list[tuple[str, float]]:
@@ -83,20 +81,7 @@ def picture(trainer: Trainer) -> dict[str, Any]:
     return {name: value.cpu().numpy() for name, value in found.items()} | {
         "num_cells": router.num_cells,
         "psnr": float(score),
-        **seams(trainer),
     }
-
-
-def seams(trainer: Trainer) -> dict[str, float]:
-    """The step in colour across the borders of cells, {} where none is visible.
-
-    Only for trainings with one field of points.
-    """
-    if len(trainer.routers) > 1 or trainer.renderer.sampler.passes > 1 or trainer.renderer.cones:
-        return {}
-    scene, renderer = trainer.scene, trainer.renderer
-    found = seam(trainer.router, scene, lambda view: render_view(renderer, scene, view), views=SEAM_VIEWS)
-    return {} if math.isnan(found) else {"seam": found}
 
 
 def load(folder: Path, name: str) -> dict[str, Any] | None:

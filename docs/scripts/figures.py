@@ -12,7 +12,7 @@ import torch
 from matplotlib.patches import Rectangle
 from torch import Tensor
 
-from voronerf import VoronoiDiagram, VoronoiRouter, balance, cell_sort, split_diagram
+from voronerf import VoronoiDiagram, balance, cell_sort, split_diagram
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -29,7 +29,6 @@ def main() -> None:
     draw_balance(points, importance)
     draw_nested(points, importance)
     draw_sort()
-    draw_blend()
 
 
 def samples() -> tuple[Tensor, Tensor]:
@@ -127,25 +126,6 @@ def draw_sort() -> None:
     axis.set_ylim(0, 3)
     axis.axis("off")
     figure.savefig(OUT / "sort.png", dpi=110)
-    plt.close(figure)
-
-
-def draw_blend() -> None:
-    """What a router answers along a line through two cells, without and with blending."""
-    router = VoronoiRouter(torch.nn.Linear(3, 1), torch.tensor([[-0.5, 0, 0], [0.5, 0, 0]]), coords="first3").eval()
-    with torch.no_grad():
-        for parameter, values in zip(router.parameters(), ((0.0, 0.0), (0.2, 0.8))):
-            parameter.copy_(torch.tensor(values).reshape(2, *[1] * (parameter.dim() - 1)).expand_as(parameter))
-        x = torch.linspace(-0.3, 0.3, 601)
-        points = torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], 1)
-        figure, axis = plt.subplots(figsize=(8, 2.4), constrained_layout=True)
-        for margin in (0.0, 0.1):
-            router.blend = margin
-            axis.plot(x, router(points)[:, 0], label=f"blend={margin}")
-    axis.set_xlabel("position; the border between the two cells is at 0")
-    axis.set_ylabel("output")
-    axis.legend()
-    figure.savefig(OUT / "blend.png", dpi=110)
     plt.close(figure)
 
 

@@ -98,8 +98,8 @@ def test_networks_stay_in_their_file(scene, tmp_path) -> None:
 
 def test_how_a_run_is_rendered_may_differ(trained, scene) -> None:
     folder = trained[0].out
-    other = open_run(folder, scene=scene, samples=5, blend=0.2, occupancy=True, backend="reference")
-    assert (other.renderer.sampler.samples, other.router.blend) == (5, 0.2)
+    other = open_run(folder, scene=scene, samples=5, occupancy=True, backend="reference")
+    assert other.renderer.sampler.samples == 5
     assert {other.renderer.backend, other.router.backend} == {"reference"}
     assert other.renderer.occupancy is not None and open_run(folder, scene=scene).renderer.occupancy is None
     smaller = open_run(folder, data="builtin", downscale=10)
@@ -109,8 +109,6 @@ def test_how_a_run_is_rendered_may_differ(trained, scene) -> None:
 def test_what_cannot_be_opened(trained, scene, tmp_path) -> None:
     folder = trained[0].out
     refuses("last.safetensors: there is no checkpoint", open_run, tmp_path, scene=scene, error=CheckpointError)
-    with pytest.raises(ConfigError, match="--blend must be a distance of 0 or more, got -1"):
-        open_run(folder, scene=scene, blend=-1)
     refuses("--device must be cpu or cuda, got 'meta'", open_run, folder, scene=scene, device="meta", error=ConfigError)
     with pytest.raises(ConfigError, match="--occupancy needs a scene with a box or --contraction"):
         open_run(folder, scene=replace(scene, box=None), occupancy=True)

@@ -21,7 +21,6 @@ import torch
 from torch import Tensor, nn
 
 from voronerf import VoronoiDiagram, VoronoiRouter
-from voronerf.diagram.blending import blend_cells
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 K = 5
@@ -214,23 +213,6 @@ def loop(case: Case, modules: list[nn.Module], cells: Tensor, args: Any, kwargs:
         else:
             result[key] = first
     return result
-
-
-def blended(case: Case, modules: list[nn.Module], router: VoronoiRouter, args: Any, kwargs: Any) -> dict[str, Tensor]:
-    """Outputs by path: numbers are the weighted sums of what a sample's cells say, everything else its own cell's."""
-    positions = case.positions(*args, **kwargs).detach().reshape(-1, 3)
-    own, blend = router.diagram.locate(positions).long(), blend_cells(router.diagram, positions, router.blend)
-    assert blend.rows.numel(), "no sample lies near a border"
-    weights = torch.nn.functional.one_hot(own, len(modules)).to(blend.weights)
-    weights[blend.rows] = 0
-    weights[blend.rows, blend.cells.long()] = blend.weights
-    expected = loop(case, modules, own, args, kwargs)
-    every = [loop(case, modules, torch.full_like(own, cell), args, kwargs) for cell in range(len(modules))]
-    for key, value in expected.items():
-        if isinstance(value, Tensor) and value.is_floating_point():
-            parts = torch.stack([outputs[key].flatten(0, len(case.lead) - 1) for outputs in every], 1)  # [n, k, ...]
-            expected[key] = torch.einsum("nk,nk...->n...", weights.to(parts), parts).view_as(value)
-    return expected
 
 
 def routed(case: Case, modules: list[nn.Module], centres: Tensor | VoronoiDiagram, **options: Any) -> VoronoiRouter:

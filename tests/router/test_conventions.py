@@ -20,7 +20,6 @@ from convention_harness import (
     Case,
     Counter,
     K,
-    blended,
     close,
     gradients,
     loop,
@@ -106,17 +105,6 @@ def test_identical_cells_give_the_fields_own_output(
         counts = nearest(case, centres, args, kwargs).unique(return_counts=True)[1].tolist()
         # Where another batch may do without the loop, that is looked at on a few samples.
         assert sorted(counter.rows[-len(counts) :]) == sorted(counts)
-
-
-@every_module
-def test_blended_cells_equal_a_weighted_sum_over_cells(case: Case) -> None:
-    modules = [module.eval() for module in case.modules(torch.float64)]
-    diagram = VoronoiDiagram(torch.rand(3, 3) * 2 - 1).refine({1: torch.rand(3, 3) * 2 - 1})[0]
-    router = routed(case, modules, diagram, blend=0.3).eval()
-    args, kwargs, _ = prepared(case, torch.float64)
-    for _ in range(2):
-        found = tensors(case.call(router, args, kwargs))
-        close(found, blended(case, modules, router, args, kwargs), rtol=1e-5, atol=1e-5)
 
 
 @every_case

@@ -98,9 +98,9 @@ def test_runs_of_different_fields_are_joined(opened, runs, tmp_path) -> None:
 
 def test_a_joined_run_is_the_same_when_opened_again(opened, tmp_path, scene) -> None:
     frames = [Similarity(), Similarity.of((0.5, 0, 0), (0, 0, 45), 0.8)]
-    first = Run.join(opened, tmp_path / "joined", frames=frames, blend=0.05)
+    first = Run.join(opened, tmp_path / "joined", frames=frames)
     again = open_run(tmp_path / "joined", scene=scene)
-    assert again.router.blend == 0.05 and torch.equal(first.render(0).colour, again.render(0).colour)
+    assert torch.equal(first.render(0).colour, again.render(0).colour)
     assert torch.equal(first.scene.box, again.scene.box) and again.scene.box[1, 0] > scene.box[1, 0]
     assert again.config.samples > 16
 
@@ -425,7 +425,6 @@ def test_the_commands(runs, tmp_path, capsys) -> None:
     for command, said in {
         f"join {one} {two} --out {joined}": "--out must not hold a run already",
         f"join {one} --out X": "join needs two runs or more, got 1",
-        f"join {one} {two} --out X --blend -1": "--blend must be a distance of 0 or more, got -1.0",
         f"join {one} {tmp_path / 'none'} --out X": "none: must hold a run",
         f"cut {one} --out X": "cut needs one of --box, --sphere and --cells, got none",
         f"cut {one} --out X --box 1 1 1 0 0 0": "--box: Solid: a box must have its second corner above the first",

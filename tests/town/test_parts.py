@@ -194,36 +194,6 @@ def test_a_contracted_part_is_asked_in_its_own_space(torch_seed) -> None:
     assert close(parts(points, directions, index)[1], router(contraction.points(points), directions, index)[1])
 
 
-def test_blending_leaves_no_step_between_parts(torch_seed) -> None:
-    left, right = (Part([plain(1)], VoronoiDiagram(torch.tensor([[x, 0, 0]]))) for x in (0.0, 1.0))
-    with torch.no_grad():  # one colour and density each
-        for parameter in (*left.parameters(), *right.parameters()):
-            parameter.mul_(parameter.dim() < 3)
-    parts = Parts([left, right]).eval()
-    line = torch.stack((torch.linspace(0.3, 0.7, 401), torch.zeros(401), torch.zeros(401)), 1)
-    ask = line, torch.tensor([[0.0, 0, 1]]), torch.zeros(401, dtype=torch.int32)
-
-    def step() -> float:
-        return float(parts(*ask)[0].diff(dim=0).abs().max())
-
-    hard, far = step(), parts(*ask)[0][[0, -1]]
-    parts.blend = 0.1
-    assert step() < hard / 5
-    assert close(parts(*ask)[0][[0, -1]], far)
-    middle = (left[0](*ask)[1][200] + right[0](*ask)[1][200]) / 2
-    assert close(parts(*ask)[1][200], middle)
-    refuses("blend must be finite", lambda: setattr(parts, "blend", -1.0))
-
-
-def test_blending_changes_nothing_far_from_other_parts(torch_seed) -> None:
-    near, far = plain(5), plain(2, 50.0)
-    parts, asked = Parts([Part([near]), Part([far])]).eval(), queries(width=1.0)
-    parts.blend = 0.05
-    blended = near(*asked)  # whose own margin is the same
-    assert not close(blended[1], plain(5)(*asked)[1])
-    assert all(close(a, b) for a, b in zip(parts(*asked), blended, strict=True))
-
-
 def test_gradients_reach_all_parts(torch_seed) -> None:
     one, two = hashed(3), plain(2, 1.0)
     parts = Parts([Part([one]), Part([two], frame=Similarity.of(scale=1.1))])

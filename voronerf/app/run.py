@@ -123,7 +123,6 @@ class Run:
         out: Path | str,
         *,
         frames: Sequence[Similarity] | None = None,
-        blend: float | None = None,
     ) -> Run:
         """One run of several: where they overlap the nearest centre decides.
 
@@ -131,7 +130,6 @@ class Run:
             runs: At least two; the first gives data, background and settings.
             out: A new directory; the runs stay as they are.
             frames: From the scene of each run into that of the new one; None for where they are.
-            blend: Margin in scene units within which neighbours are blended; None for that of the first.
 
         Raises:
             ConfigError: For runs that cannot be joined; see the guide.
@@ -142,10 +140,7 @@ class Run:
             raise ConfigError(
                 f"join needs two runs or more, and a frame for each: got {len(runs)} runs, {count} frames"
             )
-        _check_blend(blend)
-        return cls._made(
-            runs[0], out, editing.join([run.source for run in runs], frames or [Similarity()] * len(runs)), blend
-        )
+        return cls._made(runs[0], out, editing.join([run.source for run in runs], frames or [Similarity()] * len(runs)))
 
     def cut(self, kept: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Run:
         """A run of what lies in a solid or in some cells, in new files; networks that show nothing of it are dropped.
@@ -255,10 +250,8 @@ class Run:
         return open_run(out, scene=new, backend=self.renderer.backend)
 
     @classmethod
-    def _made(cls, first: Run, out: Path | str, source: editing.Source, blend: float | None = None) -> Run:
+    def _made(cls, first: Run, out: Path | str, source: editing.Source) -> Run:
         """Writes what was made and opens it."""
-        if blend is not None:
-            source = replace(source, config=replace(source.config, blend=blend))
         editing.write(source, Path(out))
         images = len(first.scene.test.images) > 0
         scene = first.scene if images else read_scene(Path(out) / "scene.json")
@@ -337,7 +330,6 @@ def open_run(
     samples: int | None = None,
     fine_samples: int | None = None,
     occupancy: bool = False,
-    blend: float | None = None,
     device: str = "cpu",
     backend: str = "auto",
     memory: str | int | None = None,
@@ -361,7 +353,6 @@ def open_run(
         fine_samples: Samples per ray in the second pass; None for those of the training.
         occupancy: Skip empty space, found by evaluating the field once. A run trained with occupancy always uses its
             own grid, because its field has learnt nothing about empty space.
-        blend: Margin in scene units within which neighbouring cells are blended; None for that of the training.
         device: Torch device.
         backend: Backend of the operations.
         memory: Bound on the memory of this process and on what the files of networks take of the system's, such as
@@ -400,7 +391,6 @@ def open_run(
     path = Path(path)
     folders = [str(data)] if isinstance(data, (str, Path)) else [str(folder) for folder in data or ()]
     check_device(device)
-    _check_blend(blend)
     check_folders(path)
     if not 0 <= detail < math.inf:
         raise ConfigError(f"--detail must be a number of pixels, 0 or more, got {detail}")
@@ -426,7 +416,6 @@ def open_run(
     load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)
     for router in routers.values():
         router.backend = backend
-        router.blend = config.blend if blend is None else blend
         router.eval()
     config = replace(
         config,
@@ -478,8 +467,3 @@ def _joined_scene(scenes: Sequence[Scene], run: Path) -> Scene:
             f"{run}: several scenes must be those of the runs that it was joined of, in order, got {names}"
         )
     return found
-
-
-def _check_blend(blend: float | None) -> None:
-    if blend is not None and not 0 <= blend < math.inf:
-        raise ConfigError(f"--blend must be a distance of 0 or more, got {blend}")

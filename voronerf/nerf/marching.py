@@ -127,7 +127,7 @@ def render_until_opaque(
 
 def _network(field: Field, rays: Rays, sampler: Occupancy) -> dict[str, Any] | None:
     """What ``render_opaque`` asks in the place of a field; None if it is more than networks, for Warp and CUDA."""
-    if not isinstance(field, VoronoiRouter) or field.blend > 0 or not rays.origins.is_cpu:
+    if not isinstance(field, VoronoiRouter) or not rays.origins.is_cpu:
         return None
     if "warp" in (sampler.backend, field.backend):
         return None

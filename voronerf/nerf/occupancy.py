@@ -335,5 +335,5 @@ def density_of(field: Field, points: Tensor) -> Tensor:
 def _density_alone(field: VoronoiRouter, points: Tensor) -> Tensor | None:
     """The density without the networks' colour, where they give it as the last of their outputs; else None."""
     radiance = getattr(type(field.module), "activate", None) is activate_radiance
-    raw = field.last_output(points) if radiance and field.by_table and field.blend == 0 else None
+    raw = field.last_output(points) if radiance and field.by_table else None
     return None if raw is None else activate_density(field.module, raw[:, 0].float())

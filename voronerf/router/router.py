@@ -15,7 +15,6 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.diagram import VoronoiDiagram
-from voronerf.diagram.blending import Mixture
 from voronerf.diagram.subdivision import finer_diagram
 from voronerf.ops._core.backends import BACKENDS
 from voronerf.ops._core.compiler import not_compiled
@@ -43,8 +42,8 @@ from voronerf.router.ways import Choices, Wish, evaluate
 _MANY = 256
 _NO_GRAPH = (
     "VoronoiRouter: a graph without breaks takes a router with fuse=True that has made such a call before, of tensors, "
-    "numbers and strings, without blend, frozen cells and autocast; its results are tensors, or tuples, lists and "
-    "dicts of them"
+    "numbers and strings, without frozen cells and autocast; its results are tensors, or tuples, lists and dicts of "
+    "them"
 )
 Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
@@ -102,15 +101,11 @@ class VoronoiRouter(nn.Module):
             while training (:meth:`VoronoiDiagram.sample_cell`), and is "nearest" in eval mode.
         temperature: Of the stochastic assignment, in scene units.
         backend: Of every operation, see ``voronerf info``.
-        blend: Margin in scene units; also an attribute. In eval mode, samples closer to a border are evaluated in the
-            cells beyond it too, in at most four cells, and the results are averaged by distance, so that no step shows
-            at borders (:mod:`voronerf.diagram`). Other samples do not change. Not in a full graph of
-            ``torch.compile``.
 
     Raises:
         TypeError: For a module that mixes samples, or that cannot be one network for each cell.
-        ValueError: For bad centres, coords, methods or layout, an unknown assignment, a temperature that is not
-            positive, or a negative margin.
+        ValueError: For bad centres, coords, methods or layout, an unknown assignment, or a temperature that is not
+            positive.
 
     Examples:
         >>> import torch
@@ -145,13 +140,12 @@ class VoronoiRouter(nn.Module):
         assignment: Assignment = "nearest",
         temperature: float = 0.05,
         backend: str = "auto",
-        blend: float = 0.0,
     ) -> None:
         module = getattr(module, "_orig_mod", module)  # of torch.compile, which would not see the parameters of cells
         check_module(module)
         options = {"coords": coords, "assignment": assignment, "temperature": temperature, "layout": layout, "way": way}
         lists = {"per_ray": per_ray, "shared": shared, "methods": methods, "share": share}
-        _check_options(module, lists, **options, backend=backend, blend=blend)
+        _check_options(module, lists, **options, backend=backend)
         super().__init__()
         own = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
         first = next(module.parameters(), None)
@@ -162,7 +156,7 @@ class VoronoiRouter(nn.Module):
         self.recipe: dict[str, Any] | None = None
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
         self._watch: Any = None  # of optimisers that hold the state of other cells
-        self.assignment, self.temperature, self.blend = assignment, temperature, blend
+        self.assignment, self.temperature = assignment, temperature
         self.backend, self.coords, self.fuse, self.way, self.layout = backend, coords, fuse, way, layout
         self.assume = dict(assume or {})
         self.per_ray = None if per_ray is None else tuple(per_ray)
@@ -520,7 +514,7 @@ class VoronoiRouter(nn.Module):
         return self._by_table
 
     def raw(self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> Tensor:
-        """What the networks of a field with a layer table give before its ``activate``: [n, out], never blended.
+        """What the networks of a field with a layer table give before its ``activate``: [n, out].
 
         Arguments are those of ``forward``.
         """
@@ -547,23 +541,10 @@ class VoronoiRouter(nn.Module):
             raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
         if not table.uses_directions:
             directions = ray_index = None
-        mixture = None if raw else self._mixture(positions[:, :3] if coords is None else coords)
-
-        def run(positions: Tensor, directions: Any, ray_index: Any, where: dict[str, Any]) -> Any:
-            given: dict[str, Any] = {"directions": directions, "direction_index": ray_index, **where}
-            given.update(frozen=self.frozen_cells, backend=self.backend)
-            outputs = routed_mlp(positions, **parameters_of_table(field, self.num_cells), **given)[0]
-            return outputs if raw else field.activate(outputs)
-
-        own = run(positions, directions, ray_index, self._where(positions, coords))
-        if mixture is None:
-            return own
-        if ray_index is not None:
-            ray_index = ray_index[mixture.rows]
-        elif directions is not None:
-            directions = directions[mixture.rows]
-        others = run(positions[mixture.rows], directions, ray_index, {"cells": mixture.cells})
-        return mixture.mix(own[0], others[0]), mixture.mix(own[1], others[1])
+        given: dict[str, Any] = {"directions": directions, "direction_index": ray_index}
+        given.update(self._where(positions, coords), frozen=self.frozen_cells, backend=self.backend)
+        outputs = routed_mlp(positions, **parameters_of_table(field, self.num_cells), **given)[0]
+        return outputs if raw else field.activate(outputs)
 
     def table_arguments(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any] | None:
         """The arguments with which ``routed_mlp`` gives what :meth:`raw` does; None where that is not all it does.
@@ -628,8 +609,12 @@ class VoronoiRouter(nn.Module):
 
     def _route(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         """One call of a method of the module; in a graph one operation where it is fused, else a break of the graph."""
-        held = self.blend > 0 or self.frozen_cells is not None
-        if torch.compiler.is_compiling() and self.fuse and not held and not torch.is_autocast_enabled("cpu"):
+        if (
+            torch.compiler.is_compiling()
+            and self.fuse
+            and self.frozen_cells is None
+            and not torch.is_autocast_enabled("cpu")
+        ):
             rule = coords if coords is not None else self.coords
             spec = spec_of(args, kwargs)
             structure = None if spec is None else structure_of(self._known.number, method, spec)
@@ -673,14 +658,9 @@ class VoronoiRouter(nn.Module):
             self.layout == "flat",
         )
         call = Call(module, method, layout, [*names, *kwargs], args, kwargs)
-        mixture, grouping = self._mixture(positions), self._group(method, positions)
+        grouping = self._group(method, positions)
         wish = Wish(self.fuse, self.way, bool(self.methods), self.assume)
-        return evaluate(call, grouping, mixture, self._choices, wish, self.frozen_cells)
-
-    def _mixture(self, positions: Tensor) -> Mixture | None:
-        """The other cells that samples near borders are evaluated in too."""
-        blends = self.blend > 0 and not self.training and self.num_cells > 1
-        return Mixture.of(self.diagram, positions, self.blend, self.backend) if blends else None
+        return evaluate(call, grouping, self._choices, wish, self.frozen_cells)
 
     def _group(self, method: str, positions: Tensor) -> Grouping:
         """The samples in their cells; other methods that are called with the same positions share it."""
@@ -747,7 +727,6 @@ def _check_options(module: nn.Module, lists: dict[str, Any], **options: Any) -> 
     rules = {
         "assignment": (options["assignment"] in ("nearest", "stochastic"), "'nearest' or 'stochastic'"),
         "temperature": (options["temperature"] > 0, "positive"),
-        "blend": (0 <= options["blend"] < float("inf"), "finite and at least 0"),
         "layout": (options["layout"] in ("rays", "flat"), "'rays' or 'flat'"),
         "way": (options["way"] in ("fastest", "fused", "grouped", "loop"), "'fastest', 'fused', 'grouped' or 'loop'"),
         "backend": (options["backend"] in ("auto", *BACKENDS), f"auto, {', '.join(BACKENDS)}"),

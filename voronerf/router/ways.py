@@ -23,7 +23,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf.diagram.blending import Mixture
 from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.ops._core.tolerances import agree, agree_gradients
 from voronerf.router import rules  # noqa: F401  registers the rules
@@ -32,7 +31,7 @@ from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters
-from voronerf.router.layout import RAY, Call, Results, map_tensors, rebuild, tensors_of
+from voronerf.router.layout import RAY, Call, Results, map_tensors, tensors_of
 from voronerf.router.trace import Unfusable, rows_for
 
 _OP = "VoronoiRouter"
@@ -142,10 +141,8 @@ def kind_of(call: Call, device: torch.device, fused: bool) -> Any:
 # Carrying out ---------------------------------------------------------------------------------------------------------
 
 
-def evaluate(
-    call: Call, grouping: Grouping, mixture: Mixture | None, choices: Choices, wish: Wish, frozen: Tensor | None
-) -> Any:
-    """What a method returns for the samples of all cells (or two placeholders), some mixed with those of others.
+def evaluate(call: Call, grouping: Grouping, choices: Choices, wish: Wish, frozen: Tensor | None) -> Any:
+    """What a method returns for the samples of all cells (or two placeholders).
 
     Samples in ``frozen`` cells, bool [k], are evaluated apart, without gradients.
     """
@@ -155,13 +152,7 @@ def evaluate(
     way, why = choose(kind, call, grouping, choices, wish)
     given = way, why, kind, call, grouping, choices
     frozen = frozen if torch.is_grad_enabled() and call.layout.n else None
-    own = (carry_out(*given) if frozen is None else carry_out_apart(*given, frozen)).restored(call.layout)
-    if mixture is None:
-        return own
-    entries, tensors = grouping.of_entries(mixture.rows, mixture.cells), tensors_of(own)
-    for i, tensor in enumerate(carry_out(way, why, kind, call, entries, choices).unsorted):
-        tensors[i] = mixture.mix(tensors[i], tensor.reshape(entries.n, -1))
-    return rebuild(own, tensors)
+    return (carry_out(*given) if frozen is None else carry_out_apart(*given, frozen)).restored(call.layout)
 
 
 def find_out(call: Call, grouping: Grouping, choices: Choices, wish: Wish) -> Kind:

@@ -50,7 +50,6 @@ def join(
     move: tyro.conf.UseAppendAction[tuple[tuple[str, str], ...]] = (),
     transforms: Path | None = None,
     align: bool = False,
-    blend: float | None = None,
 ) -> int:
     """Make one run of several. Where they overlap the nearest centre decides; the runs stay as they are.
 
@@ -62,7 +61,6 @@ def join(
         transforms: JSON file with such transforms: {"2": {"translation": [..], "degrees": [..], "scale": 1}}, or a
             matrix of 4 x 4 in the place of an object.
         align: Find the transforms of all runs but the first, from the cameras of images with names that both have.
-        blend: Margin in scene units within which neighbours are blended, which hides the seam; default as in the first.
     """
     check_out(out)
     if len(runs) < 2:
@@ -80,7 +78,7 @@ def join(
             )
             frames[number] = frame
     every = [frames.get(number, Similarity()) for number in range(len(runs))]
-    return tell(Run.join(sources, out, frames=every, blend=blend))
+    return tell(Run.join(sources, out, frames=every))
 
 
 def given_frames(runs: int, move: Sequence[tuple[str, str]], transforms: Path | None) -> dict[int, Similarity]:

@@ -25,7 +25,6 @@ from torch import Tensor, nn
 
 from voronerf import ops
 from voronerf.diagram import VoronoiDiagram
-from voronerf.diagram.blending import blend_cells
 from voronerf.router.router import VoronoiRouter
 from voronerf.town.coarse import Coarse, is_far
 
@@ -499,8 +498,6 @@ class Parts(nn.Module):
     Args:
         parts: At least one.
         backend: Of the operations.
-        blend: Margin in scene units within which the cells of a part, and neighbouring parts of a layer, are blended in
-            eval mode; also an attribute.
 
     Raises:
         ValueError: No part, or none in layer 0.
@@ -523,7 +520,7 @@ class Parts(nn.Module):
 
     hidden: Tensor | None
 
-    def __init__(self, parts: Sequence[Part], *, backend: str = "auto", blend: float = 0.0) -> None:
+    def __init__(self, parts: Sequence[Part], *, backend: str = "auto") -> None:
         super().__init__()
         if not parts or all(part.layer for part in parts):
             raise ValueError("Parts: parts must hold at least one in layer 0")
@@ -541,7 +538,7 @@ class Parts(nn.Module):
             owners = torch.arange(len(of), dtype=torch.int32).repeat_interleave(counts)
             self.register_buffer(f"_part_of_{level}", owners.to(self.diagram.centres.device), persistent=False)
         self.register_buffer("hidden", None, persistent=False)
-        self.backend, self.blend = backend, blend
+        self.backend = backend
         self.detail = 0.0
         self.far: frozenset[int] = frozenset()
 
@@ -577,20 +574,6 @@ class Parts(nn.Module):
         self._backend = backend
         for router in self.routers:
             router.backend = backend
-
-    @property
-    def blend(self) -> float:
-        """Margin in scene units within which neighbours are blended."""
-        return self._blend
-
-    @blend.setter
-    def blend(self, margin: float) -> None:
-        if not 0 <= margin < math.inf:
-            raise ValueError(f"Parts: blend must be finite and at least 0, got {margin}")
-        self._blend = margin
-        for part in self:
-            for router in part:
-                router.blend = margin / part.frame.scale
 
     def without(self, hidden: Tensor) -> Parts:
         """The same parts without what some cells show, bool [k]; the networks are not copied."""
@@ -629,7 +612,7 @@ class Parts(nn.Module):
         """The cell that shows each position: [n, 3] -> int32 [n], of the uppermost layer that has one; -1 for none."""
         found = torch.full((len(positions),), -1, dtype=torch.int32, device=positions.device)
         for level in range(len(self.layers)):
-            for index, rows, _, leaf, _ in self._claims(level, positions):
+            for index, rows, _, leaf in self._claims(level, positions):
                 cells = self[index].number[leaf] + self.starts[index]
                 found[rows] = cells.int()
         return found
@@ -638,52 +621,29 @@ class Parts(nn.Module):
         """Which cells show something at positions [n, 3], in any layer: bool [k]."""
         found = torch.zeros(self.num_cells, dtype=torch.bool, device=positions.device)
         for level in range(len(self.layers)):
-            for index, _, _, leaf, _ in self._claims(level, positions):
+            for index, _, _, leaf in self._claims(level, positions):
                 found[self[index].number[leaf].long() + self.starts[index]] = True
         return found
 
-    def _claims(
-        self, level: int, positions: Tensor, blend: float = 0.0
-    ) -> list[tuple[int, Tensor, Tensor, Tensor, Tensor | None]]:
-        """Which parts of a layer speak for which positions: (part, rows, own points, leaves, weights) each."""
+    def _claims(self, level: int, positions: Tensor) -> list[tuple[int, Tensor, Tensor, Tensor]]:
+        """Which parts of a layer speak for which positions: (part, rows, own points, leaves) each."""
         of, n, device = self.layers[level], len(positions), positions.device
         everything = torch.arange(n, device=device)
         if len(of) == 1:
-            return [claim for claim in [self._claim(of[0], positions, everything, None)] if len(claim[1])]
+            return [claim for claim in [self._claim(of[0], positions, everything)] if len(claim[1])]
         owners, joint = getattr(self, f"_part_of_{level}"), cast(VoronoiDiagram, self.joint[level])
-        who, rows = owners[joint.locate(positions, backend=self.backend).long()], everything
-        weights: Tensor | None = None
-        if blend > 0:
-            found = blend_cells(joint, positions, blend)
-            alone = torch.ones(n, dtype=torch.bool, device=device)
-            alone[found.rows] = False
-            # The leaves of one part count together.
-            keys, entry = (found.rows * len(of) + owners[found.cells.long()]).unique(return_inverse=True)
-            shares = torch.zeros(len(keys), dtype=positions.dtype, device=device).index_add(
-                0, entry, found.weights.to(positions.dtype)
-            )
-            rows = torch.cat((everything[alone], keys // len(of)))
-            who = torch.cat((who[alone], (keys % len(of)).int()))
-            weights = torch.cat((positions.new_ones(int(alone.sum())), shares))
+        who = owners[joint.locate(positions, backend=self.backend).long()]
         order, offsets = ops.cell_sort(who, len(of), backend=self.backend)
         claims, first = [], 0
         for index, last in zip(of, offsets[1:].tolist(), strict=True):
             if last > first:
-                entries = order[first:last].long()
-                share = None if weights is None else weights[entries]
-                claims.append(self._claim(index, positions, rows[entries], share))
+                claims.append(self._claim(index, positions, order[first:last].long()))
             first = last
         # What the part of the nearest centre says nothing about goes to the nearest of the others that do.
         left = torch.ones(n, dtype=torch.bool, device=device)
         for _, taken, *_ in claims:
             left[taken] = False
-        claims += self._claims_of_others(of, positions, left.nonzero()[:, 0], weights is not None)
-        if weights is not None:
-            total = positions.new_zeros(n)
-            for _, taken, _, _, share in claims:
-                total.index_add_(0, taken, cast(Tensor, share))
-            claims = [(i, rows, own, leaf, cast(Tensor, w) / total[rows]) for i, rows, own, leaf, w in claims]
-            return sorted((claim for claim in claims if len(claim[1])), key=lambda claim: claim[0])
+        claims += self._claims_of_others(of, positions, left.nonzero()[:, 0])
         merged = []
         for index in sorted({claim[0] for claim in claims}):
             same = [claim[1:4] for claim in claims if claim[0] == index and len(claim[1])]
@@ -692,23 +652,21 @@ class Parts(nn.Module):
                 if len(same) > 1 and len(rows) == n:  # all of them are taken to be in their order
                     order = rows.argsort()
                     rows, own, leaf = rows[order], own[order], leaf[order]
-                merged.append((index, rows, own, leaf, None))
-        return cast(Any, merged)
+                merged.append((index, rows, own, leaf))
+        return merged
 
-    def _claim(
-        self, index: int, positions: Tensor, rows: Tensor, weights: Tensor | None
-    ) -> tuple[int, Tensor, Tensor, Tensor, Tensor | None]:
+    def _claim(self, index: int, positions: Tensor, rows: Tensor) -> tuple[int, Tensor, Tensor, Tensor]:
         """The rows that a part speaks for, of those it is asked about."""
         part = self[index]
-        own = part.own_points(positions if len(rows) == len(positions) and weights is None else positions[rows])
+        own = part.own_points(positions if len(rows) == len(positions) else positions[rows])
         leaf, speaks = part.find(own, self.backend, self._hidden_of(index))
         if bool(speaks.all()):
-            return index, rows, own, leaf, weights
-        return index, rows[speaks], own[speaks], leaf[speaks], None if weights is None else weights[speaks]
+            return index, rows, own, leaf
+        return index, rows[speaks], own[speaks], leaf[speaks]
 
     def _claims_of_others(
-        self, of: list[int], positions: Tensor, rows: Tensor, weighted: bool
-    ) -> list[tuple[int, Tensor, Tensor, Tensor, Tensor | None]]:
+        self, of: list[int], positions: Tensor, rows: Tensor
+    ) -> list[tuple[int, Tensor, Tensor, Tensor]]:
         """For each of some rows the nearest part that speaks for it."""
         if not len(rows):
             return []
@@ -718,12 +676,12 @@ class Parts(nn.Module):
         places = positions[rows][:, None]
         inside = ((places >= boxes[:, 0]) & (places <= boxes[:, 1])).all(-1)
         found = []
-        if not weighted and not bool((inside.sum(1) > 1).any()):  # nothing to compare
+        if not bool((inside.sum(1) > 1).any()):  # nothing to compare
             columns = inside.any(0).nonzero()[:, 0].tolist()
-            return [self._claim(of[column], positions, rows[inside[:, column]], None) for column in columns]
+            return [self._claim(of[column], positions, rows[inside[:, column]]) for column in columns]
         for column in inside.any(0).nonzero()[:, 0].tolist():
             index, near = of[column], rows[inside[:, column]]
-            claim = self._claim(index, positions, near, None)
+            claim = self._claim(index, positions, near)
             taken, centres = claim[1], self[index].kept_centres
             places = positions[taken]
             nearest = ops.nearest_centre(places, centres.to(places), backend=self.backend).long()
@@ -731,11 +689,10 @@ class Parts(nn.Module):
             found.append((claim, away))
             least[taken] = torch.minimum(least[taken], away)
         claims = []
-        for (index, taken, own, leaf, _), away in found:
+        for (index, taken, own, leaf), away in found:
             first = away == least[taken]
             least[taken[first]] = -1.0  # a tie goes to the first
-            taken, own, leaf = taken[first], own[first], leaf[first]
-            claims.append((index, taken, own, leaf, positions.new_ones(len(taken)) if weighted else None))
+            claims.append((index, taken[first], own[first], leaf[first]))
         return claims
 
     def forward(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
@@ -772,34 +729,28 @@ class Parts(nn.Module):
             whole = part.whole and not part.region and self.hidden is None and len(part.routers) == 1
             if whole:
                 return None, *part.evaluate(part.own_points(positions), None, directions, ray_index)
-        claims = self._claims(level, positions, 0.0 if self.training else self.blend)
+        claims = self._claims(level, positions)
         if not claims:
             return positions.new_empty(0).long(), positions.new_empty(0, 3), positions.new_empty(0)
         pieces = []
-        for index, rows, own, leaf, weights in claims:
-            rays = ray_index if len(rows) == n and weights is None else ray_index[rows]
+        for index, rows, own, leaf in claims:
+            rays = ray_index if len(rows) == n else ray_index[rows]
             coarse = self[index].coarse
             if coarse is not None and index in self.far:
                 colour, density = coarse(own)
                 density = density / self[index].frame.scale
             else:
                 colour, density = self[index].evaluate(own, leaf, directions, rays, self.backend)
-            if weights is not None:
-                colour, density = colour * weights[:, None], density * weights
             pieces.append((rows, colour, density))
         rows, colour, density = (torch.cat(tensors) for tensors in zip(*pieces, strict=True))
-        if len(claims) == 1 and len(rows) == n and claims[0][4] is None:
+        if len(claims) == 1 and len(rows) == n:
             return None, colour, density
-        if claims[0][4] is not None:  # blended: rows come in any order, and more than once
-            both = torch.cat((colour, density[:, None]), 1)
-            both = both.new_zeros(n, 4).index_add(0, rows, both)
-            return None, both[:, :3], both[:, 3]
         return rows, colour, density
 
     def asked(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> list[Asked]:
         """Which routers are asked about positions of a scene of one layer. Arguments are those of :meth:`forward`."""
         found = list[Asked]()
-        for index, rows, own, leaf, _ in self._claims(0, positions):
+        for index, rows, own, leaf in self._claims(0, positions):
             whole = len(rows) == len(positions)  # claims of several parts are in any order, that of one in theirs
             for each in self[index].asked(own, leaf, directions, ray_index if whole else ray_index[rows], self.backend):
                 mine = each.rows if whole else rows if each.rows is None else rows[each.rows]

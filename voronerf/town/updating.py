@@ -290,7 +290,7 @@ def divide(source: Source, changes: Changes, generator: torch.Generator) -> tupl
         part, of = part.divide(children)
         made.append(part)
         parents.append(of + first)
-    divided, of = Parts(made, backend=parts.backend, blend=parts.blend), torch.cat(parents)
+    divided, of = Parts(made, backend=parts.backend), torch.cat(parents)
     owner = divided.assign(moved).long()
     changed = owner[owner >= 0].bincount(minlength=len(of)) > 0
     return divided, changes.worse[of] | (changes.rebuilt[of] & changed)
@@ -317,7 +317,7 @@ def split_off(parts: Parts, cells: Tensor) -> tuple[Parts, list[VoronoiRouter]]:
             else:
                 learners.append(part[len(part.routers) - 1])
         made.append(part)
-    return Parts(made, backend=parts.backend, blend=parts.blend), learners
+    return Parts(made, backend=parts.backend), learners
 
 
 def opened(grid: OccupancyGrid, rows: Tensor) -> OccupancyGrid:

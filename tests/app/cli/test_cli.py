@@ -60,7 +60,7 @@ def test_eval_scores_every_view(run, capsys, fails):
     fails("nowhere: there is no such file or folder", "eval", run, "--lpips nowhere")
 
 
-@pytest.mark.parametrize("options", ["--samples 4", "--occupancy", "--blend 0.3"])
+@pytest.mark.parametrize("options", ["--samples 4", "--occupancy"])
 def test_pictures_and_videos(run, tmp_path, options):
     scores = []
     for given in ("", options):
@@ -214,7 +214,6 @@ def test_bad_input_is_one_line(run, tmp_path, fails):
     fails("--views must be at least 1, got 0", "eval", run, "--views 0")
     fails("--samples must be at least 1, got 0", "eval", run, "--samples 0")
     fails("--panels must not be negative", "eval", run, "--panels -1")
-    fails("--blend must be a distance of 0 or more, got -1.0", "eval", run, "--blend -1")
     fails("--device must name a device that is present, got 'cuda:99'", "preload --device cuda:99")
     fails(
         "a checkpoint of another configuration: --lr ", "train --data builtin --out", run, "--resume", TINY, "--lr 0.1"

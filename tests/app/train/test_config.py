@@ -59,7 +59,6 @@ def test_json_of_something_else(text):
         ({"max_cells": 9, "split": "worst", "cells": (2, 2, 2)}, "--max-cells must come with one or two numbers of"),
         ({"max_cells": 9, "split": "worst", "cells": (2,), "split_at": (0.1,)}, "--split-at must have two fractions, "),
         ({"parameters": 0}, "--parameters must be at least 1, got 0"),
-        ({"blend": -1.0}, "--blend must be a distance of 0 or more, got -1.0"),
         ({"fine_samples": 0}, "--fine-samples must be at least 1, got 0"),
         ({"field": "mip-nerf"}, "--field must be nerf, mipnerf, kilonerf or hashgrid, got 'mip-nerf'"),
         ({"sampling": "hierachical"}, "--sampling must be stratified, hierarchical or proposal, got 'hierachical'"),

@@ -14,7 +14,7 @@ from helpers import read_json, refuses
 from tiny_runs import small, stopping
 
 from voronerf import open_run
-from voronerf.app.evaluate.scores import evaluate, mean_scores, render_view
+from voronerf.app.evaluate.scores import evaluate, render_view
 from voronerf.app.files import read_json_lines
 from voronerf.app.train.batches import RayBatches
 from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
@@ -138,17 +138,6 @@ def test_a_run_directory_has_one_run(tmp_path, scene, monkeypatch):
     with held(other), held(Path("runs/empty")):
         pass
     assert other.is_dir() and not Path("runs/empty").exists()
-
-
-def test_the_final_scores_are_blended_as_the_pictures_are(tmp_path, scene):
-    plain = Trainer(small(tmp_path / "plain"), scene).run()
-    trainer = Trainer(small(tmp_path / "blended", blend=0.3), scene)
-    blended = trainer.run()
-    assert plain["steps"] == blended["steps"] and plain["psnr"] != blended["psnr"]
-    with trainer.averaged():
-        assert blended["psnr"] == mean_scores(evaluate(trainer.renderer, scene, views=2))["psnr"]
-    assert open_run(tmp_path / "blended", scene=scene).config.blend == 0.3
-    assert open_run(tmp_path / "blended", scene=scene, blend=0.0).evaluate(views=2)["psnr"] == plain["psnr"]
 
 
 def after_the_split(folder, scene, **settings):

@@ -185,17 +185,6 @@ def test_the_command_line(tmp_path, capsys):
     assert "no occupancy grid" not in capsys.readouterr().out  # the run in --out says --no-occupancy by now
 
 
-@pytest.mark.parametrize("field", [{}, CONES])
-def test_pictures_may_blend_cells(tmp_path, scene, field):
-    trainer = Trainer(small(tmp_path, **HIERARCHICAL, **field), scene)
-    trainer.advance()
-    plain = render_view(trainer.renderer, scene, 0).colour
-    for router in trainer.routers.values():
-        router.blend = 0.3
-    blended = render_view(trainer.renderer, scene, 0).colour
-    assert not torch.equal(plain, blended) and float((plain - blended).abs().max()) < 0.5
-
-
 def test_a_worst_cell_without_samples_is_split_when_it_has_them(tmp_path, scene):
     """Few samples a step, 5 of them, and splits planned sooner than enough are kept."""
     kept = {"samples": 10, "reservoir": 200, "reservoir_batches": 40, "min_cell_samples": 20}

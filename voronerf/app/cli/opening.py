@@ -35,8 +35,6 @@ class Opening:
     """Samples per ray in the second pass; default as in training."""
     occupancy: bool = False
     """Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses its own grid."""
-    blend: float | None = None
-    """Margin in scene units within which neighbouring cells are blended; default as in training, 0 is off."""
     device: str = "cpu"
     """Torch device."""
     backend: str = "auto"

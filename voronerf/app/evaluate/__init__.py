@@ -1,4 +1,4 @@
-"""Scores and pictures of a trained scene: PSNR, SSIM, LPIPS, panels, videos, seams, curves.
+"""Scores and pictures of a trained scene: PSNR, SSIM, LPIPS, panels, videos, curves.
 
 Pictures are in ``panels``, ``plots`` and ``video``, which import matplotlib, Pillow or ffmpeg.
 """
@@ -6,7 +6,6 @@ Pictures are in ``panels``, ``plots`` and ``video``, which import matplotlib, Pi
 from voronerf.app.evaluate.lpips import Lpips, LpipsError, find_lpips
 from voronerf.app.evaluate.metrics import psnr, ssim
 from voronerf.app.evaluate.scores import ViewScore, evaluate, mean_scores, score_views
-from voronerf.app.evaluate.seams import seam
 
 __all__ = [
     "Lpips",
@@ -17,6 +16,5 @@ __all__ = [
     "mean_scores",
     "psnr",
     "score_views",
-    "seam",
     "ssim",
 ]

@@ -118,9 +118,6 @@ class TrainConfig:
     """A sample goes to the nearest cell, or, while training, to one drawn by its distances to the centres."""
     temperature: float = 0.05
     """Temperature of the stochastic assignment, in scene units."""
-    blend: float = 0.0
-    """Margin in scene units within which neighbouring cells are blended in the final scores and pictures; 0 is off.
-    Training does not blend."""
     reservoir: int = 10_000
     """Samples kept for the next split."""
     reservoir_batches: int = 500
@@ -334,7 +331,7 @@ RESUMABLE = frozenset(
         "eval_views",
         "final_views",
     }
-    | {"checkpoint_every", "keep_checkpoints", "panels", "tensorboard", "blend", "lpips"}
+    | {"checkpoint_every", "keep_checkpoints", "panels", "tensorboard", "lpips"}
 )
 
 

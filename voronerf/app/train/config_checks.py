@@ -98,7 +98,6 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     need(config.width is None or config.width >= 2, "width", "be at least 2")
     need(config.depth is None or 1 <= config.depth <= 1000, "depth", "be at least 1 and at most 1000")
     need(config.parameters is None or config.parameters >= 1, "parameters", "be at least 1")
-    need(0 <= config.blend < float("inf"), "blend", "be a distance of 0 or more")
     for name in ("panels", "min_cell_samples"):
         need((getattr(config, name) or 0) >= 0, name, "not be negative")
     need(config.eval_views >= 1, "eval_views", "be at least 1")
@@ -186,10 +185,6 @@ def check_joint(config: TrainConfig, ranks: int) -> None:
         "contraction": (
             config.contraction != "ndc",
             "be none or sphere with several territories: parts have no normalised device coordinates",
-        ),
-        "blend": (
-            config.blend == 0,
-            "be 0 with several territories, which train apart; `voronerf eval RUN --blend` blends the finished run",
         ),
         "appearance": (
             not config.appearance,

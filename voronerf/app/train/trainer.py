@@ -265,8 +265,6 @@ class Trainer:
             left = len(self.plan) - self.level
             if left:
                 self.say(f"Run ended before {left} of {len(self.plan)} planned splits.")
-            for router in self.routers.values():
-                router.blend = self.config.blend
             self._evaluate(self.config.final_views, self.lpips, last=True)
         return self._summarise()
 
