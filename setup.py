@@ -215,7 +215,7 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     # named, and NaN and infinity are distinguished from numbers. A root that may set errno is a call, which keeps its
     # loop from becoming vectors.
     extra = [*shlex.split(os.environ.get("CXXFLAGS", "")), "-fno-fast-math", "-ffp-contract=off", "-fno-math-errno"]
-    # libgomp is left out of the link: voronerf/ops/_core/native/__init__.py binds the module to the copy that torch has loaded.
+    # libgomp is left out of the link: voronerf/ops/_core/native/__init__.py binds the module to torch's copy.
     if cuda.nvcc is not None:
         # nvcc knows where its static runtime is. With that, the module loads on a machine without CUDA.
         linker = [str(cuda.nvcc), "-shared", "-cudart=static", *host_compiler(), "-Xlinker", "--exclude-libs,ALL"]

@@ -216,8 +216,8 @@ class Others:
 class Peaks:
     """The machine's limits, measured at every query, because the clock of the processor changes.
 
-    On the CPU by ``voronerf.ops._core.native.measure_peak``; on CUDA by torch's product of large matrices and a large copy,
-    which are what a user can reach rather than the limit itself.
+    On the CPU by ``voronerf.ops._core.native.measure_peak``; on CUDA by torch's product of large matrices and a large
+    copy, which are what a user can reach rather than the limit itself.
     """
 
     def __init__(self, device: torch.device) -> None:

@@ -11,8 +11,8 @@ if _command := bool(sys.argv) and sys.argv[0].endswith(("/voronerf", "\\voronerf
     # OpenMP's threads spin for milliseconds by default while they wait for each other, on cores that others may need:
     # beside ten busy processes a step of training takes twenty times as long. Read when torch loads its runtime.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    # Garbage is collected again in voronerf.app.cli.main: while torch is loaded there is none, and to look for it takes a
-    # tenth of the time.
+    # Garbage is collected again in voronerf.app.cli.main: while torch is loaded there is none, and to look for it takes
+    # a tenth of the time.
     gc.disable()
 
 try:

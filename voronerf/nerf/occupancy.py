@@ -264,7 +264,7 @@ class OccupancyGrid:
         )
 
     def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaySums:
-        """What rays see of networks in occupied cells; see `voronerf.ops.render_opaque`, which has the other arguments."""
+        """What rays see of networks in occupied voxels; other arguments are those of `voronerf.ops.render_opaque`."""
         given = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return render_opaque(*given, contraction=self._numbers, **rule)
 

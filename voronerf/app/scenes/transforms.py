@@ -77,8 +77,8 @@ def _read(path: Path) -> Any:
 def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, Any], list[Frame]]:
     """Reads a transforms file and finds its images.
 
-    Images that are listed but missing are left out, with one line in the log (logger `voronerf.app.scenes.transforms`, level
-    WARNING) that says how many.
+    Images that are listed but missing are left out, with one line in the log (logger `voronerf.app.scenes.transforms`,
+    level WARNING) that says how many.
 
     Args:
         path: the JSON file.

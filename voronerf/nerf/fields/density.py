@@ -1,4 +1,4 @@
-"""A small network for the density only, which proposes where to sample a ray. Units as in `voronerf.nerf.fields.nerf`."""
+"""A small network for the density only, which proposes where to sample a ray. Units as in `fields.nerf`."""
 
 from __future__ import annotations
 

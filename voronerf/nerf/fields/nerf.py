@@ -30,8 +30,8 @@ class NeRF(RadianceField):
     such that the untrained density is ``INITIAL_DENSITY``. Surfaces need densities near 100 per scene unit;
     ``density_scale`` lets network outputs of order one reach them sooner.
 
-    ``layers`` (a table, see :class:`voronerf.ops._core.layers.MLP`) and :meth:`linears`, in the order of the table, describe the
-    network. :class:`voronerf.VoronoiRouter` uses them to evaluate the copies of all cells in one pass.
+    ``layers`` (a table, see :class:`voronerf.ops._core.layers.MLP`) and :meth:`linears`, in its order, describe
+    the network. :class:`voronerf.VoronoiRouter` uses them to evaluate the copies of all cells in one pass.
 
     Args:
         width: Channels of the hidden layers, at least 2.

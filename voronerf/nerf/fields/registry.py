@@ -151,8 +151,8 @@ def register_field(name: str) -> Callable[[Network], Network]:
         >>> FIELDS["tiny"].options
         {'width': 16}
 
-        Now ``TrainConfig(field="tiny", width=32)`` trains it. So does ``voronerf.app.cli.main`` with ``--field tiny``, in a
-        program that has run these lines.
+        Now ``TrainConfig(field="tiny", width=32)`` trains it. So does ``voronerf.app.cli.main`` with ``--field tiny``,
+        in a program that has run these lines.
 
         >>> del FIELDS["tiny"]
 

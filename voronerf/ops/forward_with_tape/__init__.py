@@ -83,7 +83,8 @@ def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> O
         >>> from voronerf.ops import forward_with_tape
         >>> table = MLP((Layer(("positions",), 1),), outputs=(0,))
         >>> weights = [torch.tensor([[[2.0]]])]
-        >>> forward_with_tape({"positions": torch.ones(1, 1), "weights": weights, "biases": [None], "layers": table}).raw
+        >>> network = {"positions": torch.ones(1, 1), "weights": weights, "biases": [None], "layers": table}
+        >>> forward_with_tape(network).raw
         tensor([[2.]])
     """
     if not isinstance(network, Mapping) or not {"positions", "weights", "biases", "layers"} <= network.keys():

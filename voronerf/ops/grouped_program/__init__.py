@@ -38,8 +38,8 @@ def grouped_program(
     """Runs a program on the rows of each cell, with the cell's parameters.
 
     A program is a list of steps: layers, activations, sums, products, columns that are moved
-    (:mod:`voronerf.ops._core.program`). All values of a tile of rows stay in cache. Gradients of every order to inputs and
-    parameters; the gradient of a program is a program itself.
+    (:mod:`voronerf.ops._core.program`). All values of a tile of rows stay in cache. Gradients of every order to inputs
+    and parameters; the gradient of a program is a program itself.
 
     Args:
         inputs: [n, w] floating point for each input of the program, sorted by cell, n < 2**31; at least one.

@@ -1,4 +1,4 @@
-"""``render_opaque`` of the compiled module: a wave of a few thousand samples goes from the grid to the colours in the cache.
+"""``render_opaque`` of the compiled module: a wave of some thousand samples goes from grid to colours in the cache.
 
 No custom op: nothing that is traced or differentiated renders pictures.
 """
