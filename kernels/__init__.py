@@ -3,18 +3,15 @@
 On the CPU Warp runs on one thread, so there it serves as a check. Importing this package raises
 ``BackendUnavailable`` where Warp is missing or too old; ``import voronerf`` never imports it.
 
-Kernels are compiled when they are first used, a file at a time, or all at once by `preload` (`voronerf preload`).
-Compiled kernels stay in Warp's cache, in the folder WARP_CACHE_PATH or Warp's default.
+Kernels are compiled when they are first used, a file at a time. Compiled kernels stay in Warp's cache, in the folder
+WARP_CACHE_PATH or Warp's default.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
-import pkgutil
 import tempfile
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -71,25 +68,6 @@ def missing(device: torch.device) -> str | None:
     if device.type == "cuda" and not wp.is_cuda_available():
         return "this build of NVIDIA Warp sees no CUDA driver; install warp-lang from PyPI and check the driver"
     return None
-
-
-def preload(device: torch.device) -> dict[str, float]:
-    """Compiles every kernel for a device, or finds it in the cache; returns the seconds that each file took.
-
-    Raises:
-        BackendUnavailable: Warp cannot run on the device.
-    """
-    reason = missing(device)
-    if reason is not None:
-        raise BackendUnavailable(f"preload: {reason}")
-    seconds = {}
-    target = wp.device_from_torch(device)
-    for name in sorted(info.name for info in pkgutil.iter_modules(__path__) if not info.name.startswith("_")):
-        module = importlib.import_module(f"{__name__}.{name}")
-        started = time.perf_counter()
-        wp.load_module(module, device=target)
-        seconds[name] = time.perf_counter() - started
-    return seconds
 
 
 def describe() -> dict[str, Any]:

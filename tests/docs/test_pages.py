@@ -59,7 +59,7 @@ def test_every_option_of_every_command_is_on_the_page(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("name", [name for name in PAGES if "changelog" not in name])
 def test_options_on_a_page_exist(name: str) -> None:
-    from voronerf.app.cli.commands import train
+    from voronerf.app.cli.train import train
     from voronerf.app.train.config import TrainConfig
 
     fields = dataclasses.fields(TrainConfig)

@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from voronerf.app.cli.commands import say
+from voronerf.app.cli.display import say
 from voronerf.app.files import read_json
 from voronerf.app.run import Run, open_run
 from voronerf.app.scenes.record import read_scene

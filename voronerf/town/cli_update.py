@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from voronerf.app.cli.commands import say
+from voronerf.app.cli.display import say
 from voronerf.app.cli.opening import check_counts
 from voronerf.app.run import open_run
 from voronerf.app.scenes import load_scene

@@ -14,10 +14,10 @@ from types import SimpleNamespace
 import imageio_ffmpeg
 import pytest
 from cli_commands import TINY, words
-from helpers import python, read_json
+from helpers import read_json
 from PIL import Image
 
-from voronerf.app.cli import commands, main
+from voronerf.app.cli import main
 from voronerf.app.cli.main import COMMANDS
 from voronerf.app.render.paths import CameraPath, write_camera_path
 from voronerf.app.scenes import builtin_scene
@@ -125,19 +125,6 @@ def test_info_names_every_backend(capsys):
         assert word in output
 
 
-@pytest.mark.warp
-def test_preload_compiles_into_the_cache_of_ones_choice(tmp_path):
-    # In a process of its own, since Warp reads the place once; one file of kernels, since all take a while.
-    code = (
-        "import pkgutil, sys; every = pkgutil.iter_modules; "
-        "pkgutil.iter_modules = lambda path: [m for m in every(path) if m.name in ('observe_occupancy', '_launch')]; "
-        "from voronerf.app.cli import main; sys.exit(main(['preload']))"
-    )
-    said = python("-c", code, env={**os.environ, "WARP_CACHE_PATH": str(tmp_path / "cache")})
-    assert "observe_occupancy" in said and "1 files in" in said and str(tmp_path) in said
-    assert any("observe_occupancy" in str(path) for path in (tmp_path / "cache").rglob("*"))
-
-
 def test_resume_needs_no_setting_again(run, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
@@ -214,7 +201,6 @@ def test_bad_input_is_one_line(run, tmp_path, fails):
     fails("--views must be at least 1, got 0", "eval", run, "--views 0")
     fails("--samples must be at least 1, got 0", "eval", run, "--samples 0")
     fails("--panels must not be negative", "eval", run, "--panels -1")
-    fails("--device must name a device that is present, got 'cuda:99'", "preload --device cuda:99")
     fails(
         "a checkpoint of another configuration: --lr ", "train --data builtin --out", run, "--resume", TINY, "--lr 0.1"
     )
@@ -299,10 +285,10 @@ def test_image_names_that_are_too_long_for_panels(tmp_path, monkeypatch, fails):
         whole = builtin_scene(16, test_views=1)
         return lambda *_, **__: replace(whole, test=replace(whole.test, names=(name,)))
 
-    monkeypatch.setattr(commands, "load_scene", scene("x" * 252))
+    monkeypatch.setattr("voronerf.app.cli.train.load_scene", scene("x" * 252))
     fails("--panels must be 0 with image names of more than 251 bytes, got xxx", "train --out", tmp_path / "a", TINY)
     assert not (tmp_path / "a").exists()
-    monkeypatch.setattr(commands, "load_scene", scene("x" * 251))
+    monkeypatch.setattr("voronerf.app.cli.train.load_scene", scene("x" * 251))
     succeeds("train --out", tmp_path / "a", TINY)
     assert (tmp_path / "a" / "images" / f"{'x' * 251}.png").is_file()
 

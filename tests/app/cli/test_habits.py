@@ -9,64 +9,39 @@ from types import SimpleNamespace
 
 import pytest
 from cli_commands import TINY, words
-from PIL import Image
 
-from voronerf.app.cli import commands, info, main
+from voronerf.app.cli import info, main, train
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def make_run(folder, psnr, cells, *, ended=True, views=("r_0", "r_1")):
+def make_run(folder, psnr, cells, *, ended=True):
     """A run as far as its files tell; a line of metrics for one that has not ended."""
-    (folder / "images").mkdir(parents=True)
-    for view in views:
-        Image.new("RGB", (8, 4), "red").save(folder / "images" / f"{view}.png")
+    folder.mkdir()
     (folder / "config.json").write_text(json.dumps({"cells": cells, "width": 32, "out": str(folder)}))
-    scores = {
-        "psnr": psnr,
-        "ssim": 0.9,
-        "lpips": None,
-        "steps": 1200,
-        "seconds": 60.0,
-        "stages": [{}, {"started_at_second": 9}],
-    }
+    scores = {"psnr": psnr, "ssim": 0.9, "lpips": None, "steps": 1200, "seconds": 60.0}
     if ended:
         (folder / "summary.json").write_text(json.dumps(scores))
-    lines = ({"step": step, "seconds": step / 20, "psnr": psnr - 1 / step} for step in (600, 1200))
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (folder / "metrics.jsonl").write_text(json.dumps({"step": 1200, "seconds": 60, "psnr": psnr}) + "\n")
     return folder
 
 
-def test_runs_are_compared_on_one_page(tmp_path, capsys):
-    first = make_run(tmp_path / "a<b>", 30.125, [16])
-    second = make_run(tmp_path / "wide", 31.5, [4, 4], views=("r_1", "r_2"))
-    third = make_run(tmp_path / "other" / "wide", 29.0, [], ended=False, views=())
-    out = tmp_path / "pages" / "all.html"
-    assert main(words("compare", first, second, third, "--out", out)) == 0
-    page = out.read_text()
-    assert "a&lt;b&gt;" in page and "a<b>" not in page
-    assert "<b>31.50</b>" in page and "<td>30.12</td>" in page and "1,200" in page
-    assert "--cells" in page and "<td>4 4</td>" in page and "--width" not in page and "--out" not in page
-    assert f"<th>{second}</th>" in page and f"<td>{third}</td>" in page  # two of one name are told by their folders
-    # The curve, and the one view that two of them have: nothing is loaded from elsewhere.
-    assert page.count("src='data:image/png;base64,") == page.count("src=") == 3 and "http" not in page
-    assert "<h3>r_1</h3>" in page and "<h3>r_0</h3>" not in page
-    assert "31.50" in capsys.readouterr().out
+def test_runs_are_compared(tmp_path, capsys):
+    runs = make_run(tmp_path / "a[b]", 30.125, [16]), make_run(tmp_path / "wide", 31.5, [4, 4], ended=False)
+    assert main(words("compare", *runs)) == 0
+    rows = [line.split() for line in capsys.readouterr().out.replace("│", " ").splitlines()]
+    assert (
+        ["PSNR", "[dB]", "30.12", "31.50"] in rows and ["SSIM", "0.9000", "-"] in rows and ["LPIPS", "-", "-"] in rows
+    )
+    assert not any(row[0] in ("width", "out") for row in rows if row) and any(row[:1] == ["cells"] for row in rows)
 
 
 def test_what_is_not_compared(tmp_path, fails):
-    run = make_run(tmp_path / "run", 30.0, [16])
-    broken = make_run(tmp_path / "broken", 30.0, [16])
-    out = tmp_path / "page.html"
+    run, broken = make_run(tmp_path / "run", 30.0, [16]), make_run(tmp_path / "broken", 30.0, [16])
     fails("compare needs at least two runs, got 1", "compare", run)
-    fails("--out must end in .html, got page", "compare", run, run, "--out page")
-    fails("--views must not be negative, got -1", "compare", run, run, "--views -1")
     fails(f"{tmp_path}: there is no run, it has no config.json", "compare", run, tmp_path)
-    (broken / "images" / "r_0.png").write_bytes(b"no picture")
-    fails("r_0.png: is not a PNG", "compare", run, broken, "--out", out)
     (broken / "summary.json").write_text("[1]")
-    fails("summary.json: must be an object, got [1]", "compare", run, broken, "--out", out)
-    assert not out.exists()
+    fails("summary.json: must be an object, got [1]", "compare", run, broken)
 
 
 def scalars(folder):
@@ -94,8 +69,8 @@ def test_tensorboard(tmp_path, fails, monkeypatch):
 
 def test_a_training_without_options_says_what_to_try(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(commands, "load_scene", lambda *args, **options: SimpleNamespace(name="x"))
-    monkeypatch.setattr(commands, "run_training", lambda *args, **options: {"complete": True})
+    monkeypatch.setattr(train, "load_scene", lambda *args, **options: SimpleNamespace(name="x"))
+    monkeypatch.setattr(train, "run_training", lambda *args, **options: {"complete": True})
     assert main(["train"]) == 0
     said = capsys.readouterr().out
     assert "trains the built-in scene for 480 s" in said and "voronerf train --data DIR" in said

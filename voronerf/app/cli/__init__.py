@@ -1,4 +1,4 @@
-"""The command line: ``voronerf train | eval | render | export | view | compare | info | preload | demo | process``."""
+"""The command line, ``voronerf train | eval | ...``: a file for each command, and their table in ``main``."""
 
 from voronerf.app.cli.main import main
 

@@ -11,7 +11,8 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
-from voronerf.app.cli.commands import console, run_training, say
+from voronerf.app.cli.display import console, say
+from voronerf.app.cli.train import run_training
 from voronerf.app.evaluate.panels import contact_sheet, picture_of_colour, save_picture
 from voronerf.app.render.video import check_video, write_video
 from voronerf.app.run import Run, open_run

@@ -1,26 +1,38 @@
-"""What a running training shows: a live line on a terminal, plain lines elsewhere."""
+"""What commands print: plain lines, and bars of their progress on a terminal."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
     Progress,
-    ProgressColumn,
-    Task,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
+    track,
 )
-from rich.text import Text
 
 from voronerf.app.train.progress import Progress as TrainingProgress
 
 LONGEST_LINE = 900
+
+console = Console(soft_wrap=True)
+
+
+def say(line: str) -> None:
+    """Prints a line as plain text, with control characters escaped."""
+    console.print(printable(line), highlight=False, markup=False, emoji=False)
+
+
+def tracked(parts: Sequence[Any], name: str) -> Iterable[Any]:
+    """Yields the parts of a task, with a progress bar on a terminal."""
+    return track(parts, description=name, console=console, disable=not console.is_terminal)
 
 
 def printable(text: str) -> str:
@@ -33,13 +45,6 @@ def one_line(text: str) -> str:
     line = printable(" ".join(text.split()))
     head, tail = 2 * LONGEST_LINE // 3, LONGEST_LINE // 3 - 5
     return line if len(line) <= LONGEST_LINE else f"{line[:head]} ... {line[-tail:]}"
-
-
-class _Rate(ProgressColumn):
-    """Rays per second, in thousands."""
-
-    def render(self, task: Task) -> Text:
-        return Text(f"{task.fields['speed'] / 1000:6.1f} k rays/s")
 
 
 class TrainingDisplay:
@@ -61,7 +66,7 @@ class TrainingDisplay:
             TextColumn("{task.percentage:3.0f} %"),
             TextColumn("step {task.fields[step]}"),
             TextColumn("{task.fields[stage]}"),
-            _Rate(),
+            TextColumn("{task.fields[speed]} k rays/s"),
             TextColumn("loss {task.fields[loss]:.5f}"),
             TextColumn("{task.fields[psnr]}"),
             TimeRemainingColumn(),
@@ -70,7 +75,7 @@ class TrainingDisplay:
             refresh_per_second=4,
         )
         self.task = self.progress.add_task(
-            escape(printable(label)), total=1.0, step=0, stage="", speed=0.0, loss=0.0, psnr=""
+            escape(printable(label)), total=1.0, step=0, stage="", speed="", loss=0.0, psnr=""
         )
         self.loss = math.nan  # until the first is read
 
@@ -82,7 +87,7 @@ class TrainingDisplay:
             completed=now.fraction,
             step=now.step,
             stage="coarse" if now.cells == 1 else f"{now.cells} cells",
-            speed=now.rays_per_second,
+            speed=f"{now.rays_per_second / 1000:6.1f}",
             loss=self.loss,
             psnr="" if now.psnr is None else f"psnr {now.psnr:.2f} dB",
         )

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from voronerf.app.cli.commands import given_path, say, tracked
+from voronerf.app.cli.display import say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
+from voronerf.app.cli.render import given_path
 from voronerf.app.export import cameras as camera_files
 from voronerf.app.export import cells as cell_files
 from voronerf.app.export import mesh as mesh_files

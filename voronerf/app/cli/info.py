@@ -12,7 +12,7 @@ import torch
 from rich.markup import escape
 from rich.table import Table
 
-from voronerf.app.cli.commands import console, say
+from voronerf.app.cli.display import console, say
 from voronerf.app.run import open_run
 from voronerf.nerf import Step
 from voronerf.ops._core import backends

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 from pathlib import Path
+from types import ModuleType
 
-from voronerf.app.cli.commands import import_viewer, say, serve_runs
+from voronerf.app.cli.display import say
 from voronerf.app.cli.opening import AS_IN_TRAINING, Opening
-from voronerf.app.scenes.record import read_scene
 
 
 def view(run: Path, /, host: str = "127.0.0.1", port: int = 8080, opening: Opening = AS_IN_TRAINING) -> int:
@@ -21,11 +22,17 @@ def view(run: Path, /, host: str = "127.0.0.1", port: int = 8080, opening: Openi
     """
     viewers = import_viewer()
     viewers.check_address(host, port)
-    record = run / "scene.json"
-    scene = read_scene(record) if record.is_file() else None
-    opened = opening.open(run, scene=scene, pictures=True)
-    viewer = viewers.view_run(opened, host=host, port=port)
+    viewer = viewers.view_run(opening.open_without_images(run, pictures=True), host=host, port=port)
     say(f"{viewer.audience}; Ctrl-C ends")
-    with contextlib.closing(viewer):
-        serve_runs(viewer, opening)
+    with contextlib.closing(viewer), contextlib.suppress(KeyboardInterrupt):
+        viewer.warm_up()
+        viewer.serve()
     return 0
+
+
+def import_viewer() -> ModuleType:
+    """The viewer, which needs viser."""
+    try:
+        return importlib.import_module("voronerf.app.viewer")
+    except ImportError as error:
+        raise ImportError(f"the viewer needs viser: pip install 'voronerf[viewer]' ({error})") from None

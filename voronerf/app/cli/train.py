@@ -1,51 +1,48 @@
-"""The commands behind ``voronerf train | eval | render | info | preload | process``. Each returns the exit status."""
+"""``voronerf train``: a training with its display, its signals and its pictures."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib
+import functools
+import inspect
+import itertools
 import os
 import shlex
 import signal
-import threading
-from collections.abc import Callable, Iterable, Sequence
+import sys
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from types import FrameType, ModuleType
-from typing import Annotated, Any, Literal
+from types import FrameType
+from typing import Annotated, Any
 
 import torch
 import tyro
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import track
-from rich.table import Table
 
 from voronerf.app.cli.board import Board
-from voronerf.app.cli.display import StageDisplay, TrainingDisplay, printable
-from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
+from voronerf.app.cli.display import TrainingDisplay, console, say
+from voronerf.app.cli.view import import_viewer
 from voronerf.app.evaluate.panels import write_panels
-from voronerf.app.export.video import export_video
-from voronerf.app.files import json_text, write_text
-from voronerf.app.render.paths import CameraPath, read_camera_path
-from voronerf.app.render.video import check_video
-from voronerf.app.run import Run, open_run
+from voronerf.app.run import open_run
 from voronerf.app.scenes import BUILTIN, Scene, SceneError, load_scene
-from voronerf.app.scenes.process import process as make_scene
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.config_checks import check_device, check_joint, why_no_occupancy
 from voronerf.app.train.networks import resolve_config
 from voronerf.app.train.progress import Progress
-from voronerf.app.train.run_directory import check_stored_paths, choose_directory, held, is_outside, write_curve
+from voronerf.app.train.run_directory import (
+    check_stored_paths,
+    choose_directory,
+    held,
+    is_outside,
+    read_config,
+    stored_config,
+    write_curve,
+)
 from voronerf.app.train.trainer import Trainer
-from voronerf.ops._core import backends
 from voronerf.town.distributed.group import Group, joined, local_rank, restarts, world_size
 from voronerf.town.distributed.same import check_same, check_same_scene
 from voronerf.town.joint import JointTrainer
-
-console = Console(soft_wrap=True)
 
 #: Makes a `voronerf.app.viewer.Training`, which shows a trainer.
 Watch = Callable[[Trainer], Any]
@@ -55,10 +52,13 @@ LONGEST_NAME = 255 - len(".png")
 #: What ends a training with a checkpoint: Ctrl-C, kill, a closed terminal, and the warning that Slurm can send.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
 
-
-def say(line: str) -> None:
-    """Prints a line as plain text, with control characters escaped."""
-    console.print(printable(line), highlight=False, markup=False, emoji=False)
+#: Printed before a training without any options.
+WHAT_TO_TRY = """This trains the built-in scene for 480 s, into runs/. Ctrl-C stops it. Other things to try:
+  voronerf train --budget 60                the same for a minute
+  voronerf train --data DIR --downscale 4   your scene: Blender, transforms.json, COLMAP or LLFF
+  voronerf train --view                     watch it in a browser
+  voronerf demo                             one network against 64 cells, in a built-in city
+  voronerf train --help                     every option"""
 
 
 def train(
@@ -119,7 +119,8 @@ def train(
             if summary["complete"]:
                 say(f"{viewer.address} shows the run until Ctrl-C")
                 viewer.show(import_viewer().Subject.of(open_run(chosen.out, scene=scene, backend=config.backend)))
-                serve_runs(viewer)
+                with contextlib.suppress(KeyboardInterrupt):
+                    viewer.serve()
     return 0 if summary["complete"] else 130
 
 
@@ -277,209 +278,48 @@ def _train(trainer: Trainer | JointTrainer) -> dict[str, Any]:
         restore()
 
 
-def evaluate_run(
-    run: Path,
-    /,
-    opening: Opening = AS_IN_TRAINING,
-    views: int | None = None,
-    panels: int = 4,
-    lpips: Path | None = None,
-) -> int:
-    """Score a trained run on its test views and draw panels: truth, render, error, depth, cells.
+def command_of(args: list[str]) -> Callable[..., int]:
+    """Returns :func:`train`, whose defaults are the settings of --config, or for --resume those of the run in --out."""
+    if args == ["train"]:
+        for line in WHAT_TO_TRY.splitlines():
+            say(line)
+    file, out = _given_path(args, "--config"), _given_path(args, "--out")
+    if "train" not in args[:1] or (file is None and "--resume" not in args):
+        return train
+    if file is not None and "--resume" in args:
+        raise ConfigError("--config must be left out with --resume, which goes on with the settings of the run")
+    if file is not None and not file.is_file():
+        raise ConfigError(f"--config {file}: there is no such file")
+    stored = read_config(file) if file is not None else None if out is None else stored_config(out)
+    folder = out if file is None else file.parent
+    if folder is None or stored is None:
+        return train
 
-    Args:
-        run: The run directory.
-        opening: How the run is opened.
-        views: Number of test views, evenly spread; default all.
-        panels: Number of views drawn.
-        lpips: LPIPS weights, a file or folder, or "off"; default as in training, else VORONERF_LPIPS, the folder lpips
-            of VORONERF_DATA or beside the scene, the installed lpips package.
-    """
-    if panels < 0:
-        raise ConfigError(f"--panels must not be negative, got {panels}")
-    check_counts(views=views)
-    opened = opening.open(run)
-    perceived, source = opened.find_lpips(lpips)
-    if perceived is None:
-        say(source)
-    result = opened.evaluate(views=views, lpips=perceived or "off")
-    table = Table("view", "psnr [dB]", "ssim", "lpips")
-    for view in result["views"]:
-        table.add_row(escape(printable(view["name"])), *_figures(view))
-    table.add_section()
-    table.add_row("mean", *_figures(result))
-    console.print(table)
-    say(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB")
-    write_text(run / "eval.json", json_text(result, indent=2) + "\n")
-    if panels:
-        write_panels(opened.renderer, opened.diagram, opened.scene, run / "images", views=panels)
-    say(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""))
-    return 0
+    def given(name: str) -> bool:
+        return any(word == f"--{name}" or word.startswith(f"--{name}=") for word in args)
 
+    check_stored_paths(
+        folder, data=None if given("data") else stored.data, lpips=None if given("lpips") else stored.lpips
+    )
+    # A given --steps replaces a stored budget and the other way round; the number that is set here is replaced in turn.
+    length = {name for name in ("budget", "steps") if given(name)}
+    if length == {"steps"} and stored.budget is not None:
+        stored = replace(stored, budget=None, steps=sys.maxsize)
+    elif length == {"budget"} and stored.steps is not None:
+        stored = replace(stored, budget=sys.float_info.max, steps=None)
 
-def render(
-    run: Path,
-    /,
-    out: Path | None = None,
-    path: Path | None = None,
-    spiral: bool = False,
-    frames: int = 60,
-    fps: float | None = None,
-    crop: Crop = None,
-    opening: Opening = AS_IN_TRAINING,
-) -> int:
-    """Render a video of a trained run: a turntable, a spiral, or a camera path.
+    @functools.wraps(train)
+    def train_on(config: TrainConfig = stored, **others: Any) -> int:
+        return train(config, **others)
 
-    Args:
-        run: The run directory.
-        out: The video file, .mp4; default turntable.mp4, spiral.mp4 or the name of the path in the run directory.
-        path: Camera path in nerfstudio's format, such as the viewer saves; it has the frames and their size.
-        spiral: Go where the training cameras are: up and down around an object, or a small spiral before a scene that
-            was taken from one side, for which it is the default.
-        frames: Frames of a turntable or a spiral.
-        fps: Frames per second; default 24, or those of the path.
-        crop: Show a box only, x y z of its lowest and of its highest corner, or "saved" for the viewer's.
-        opening: How the run is opened.
-    """
-    check_counts(frames=frames)
-    if fps is not None and not 0.01 <= fps <= 1000:
-        raise ConfigError(f"--fps must be 0.01 to 1000, got {fps:g}")
-    given = given_path(path, spiral)
-    opened = opening.open_without_images(run, pictures=True)
-    spiral = spiral or opened.scene.kind == "forward"
-    name = path.stem if path is not None else "spiral" if spiral else "turntable"
-    out = out or run / f"{name}.mp4"
-    check_video(out)
-    if given is not None:
-        given = replace(given, frames=given.frames.downscaled(opening.downscale or 1))
-    box = crop_box(opened, crop)
-    export_video(opened, out, flight=given, spiral=spiral, frames=frames, fps=fps, box=box, track=tracked)
-    say(f"wrote {out}")
-    return 0
+    first, *others = inspect.signature(train).parameters.values()
+    signature = inspect.Signature([first.replace(default=stored), *others])
+    train_on.__signature__ = signature  # type: ignore[attr-defined]
+    return train_on
 
 
-def given_path(path: Path | None, spiral: bool) -> CameraPath | None:
-    """Reads the camera path of --path, if there is one."""
-    if path is not None and spiral:
-        raise ConfigError("--spiral must be off with --path, which has the frames")
-    return None if path is None else read_camera_path(path)
-
-
-def tracked(parts: Sequence[Any], name: str) -> Iterable[Any]:
-    """The parts of a work, with a bar of its progress on a terminal."""
-    return track(parts, description=name, console=console, disable=not console.is_terminal)
-
-
-def import_viewer() -> ModuleType:
-    """The viewer, which needs the extra."""
-    try:
-        return importlib.import_module("voronerf.app.viewer")
-    except ImportError as error:
-        raise ImportError(f"the viewer needs viser: pip install 'voronerf[viewer]' ({error})") from None
-
-
-def serve_runs(viewer: Any, opening: Opening = AS_IN_TRAINING) -> None:
-    """Serves a viewer of runs until Ctrl-C; its pages can open other runs, and train.
-
-    Args:
-        viewer: A `voronerf.app.viewer.Viewer`.
-        opening: How runs are opened.
-    """
-
-    def read_images(run: Run) -> None:
-        try:
-            if opening.data is None:
-                check_stored_paths(run.path, data=run.config.data)
-            whole = load_scene(run.config.data, allow_outside=opening.allow_outside, **run.config.reading)
-        except (ConfigError, ValueError, OSError) as error:
-            say(f"without the images of the scene: {error}")
-        else:
-            viewer.do(lambda: viewer.subject.run is run and viewer.take_images(whole))
-
-    def open_one(path: Path) -> Run:
-        run = opening.open_without_images(path, pictures=True)
-        if not len(run.scene.train.images) and opening.memory is None:
-            threading.Thread(target=read_images, args=(run,), daemon=True).start()
-        return run
-
-    def train_one(config: TrainConfig, scene: Scene) -> None:
-        run_training(config, scene, watch=partial(import_viewer().Training, viewer))
-
-    viewer.open, viewer.train = open_one, train_one
-    with contextlib.suppress(KeyboardInterrupt):
-        viewer.warm_up()
-        shown = viewer.subject.run
-        if not len(shown.scene.train.images) and opening.memory is None:
-            threading.Thread(target=read_images, args=(shown,), daemon=True).start()
-        viewer.serve()
-
-
-def preload(device: str = "cpu") -> int:
-    """Compile the Warp kernels now rather than at their first use; WARP_CACHE_PATH says where they are kept.
-
-    Args:
-        device: Torch device to compile for.
-    """
-    check_device(device)
-    target = torch.device(device)
-    reason = backends.missing("warp", target)
-    if reason is not None:
-        raise backends.BackendUnavailable(f"preload: {reason}")
-    # By name and here, since importing it needs Warp.
-    kernels = importlib.import_module("voronerf.kernels")
-    seconds = kernels.preload(target)
-    table = Table("kernels", "seconds")
-    for name, took in seconds.items():
-        table.add_row(name, f"{took:.2f}")
-    console.print(table)
-    cache = kernels.describe()["cache"]
-    say(f"{len(seconds)} files in {sum(seconds.values()):.1f} s, kept in {cache}")
-    return 0
-
-
-def process(
-    source: Path,
-    out: Path,
-    /,
-    frames: int = 150,
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto",
-    camera_model: str = "SIMPLE_RADIAL",
-    mapper: Literal["auto", "global", "incremental"] = "auto",
-    max_features: int = 4096,
-    verbose: bool = False,
-) -> int:
-    """Make a scene of a video or of images: COLMAP finds the cameras. A stopped one goes on with the same command.
-
-    Args:
-        source: A video, or a folder of PNG or JPEG images.
-        out: The folder to make; it gets images, sparse/0, transforms.json and colmap, which keeps every stage.
-        frames: Frames taken of a video, evenly spread.
-        matching: Which images are compared: all with all, each with those next to it by name, or those that share
-            their largest features (auto).
-        camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.
-        mapper: How cameras are found; auto is global, and incremental too if that model has faults.
-        max_features: Of an image.
-        verbose: Show what COLMAP says.
-    """
-    check_counts(frames=frames, max_features=max_features)
-    display = StageDisplay(console)
-    with display.progress:
-        make_scene(
-            source,
-            out,
-            frames=frames,
-            matching=matching,
-            camera_model=camera_model,
-            mapper=mapper,
-            max_features=max_features,
-            verbose=verbose,
-            say=display.say,
-            progress=display.show,
-        )
-    return 0
-
-
-def _figures(score: dict[str, Any]) -> list[str]:
-    """What a table shows of a score; a dash for what was not computed."""
-    places = {"psnr": 2, "ssim": 4, "lpips": 4}
-    return ["-" if score[name] is None else f"{score[name]:.{digits}f}" for name, digits in places.items()]
+def _given_path(args: list[str], option: str) -> Path | None:
+    """The value of an option that is a path, or None."""
+    found = next((after for word, after in itertools.pairwise(args) if word == option), None)
+    found = next((word.removeprefix(f"{option}=") for word in args if word.startswith(f"{option}=")), found)
+    return None if found is None else Path(found)

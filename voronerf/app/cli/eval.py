@@ -1,0 +1,61 @@
+"""``voronerf eval``: the scores of a trained run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from voronerf.app.cli.display import console, printable, say
+from voronerf.app.cli.opening import AS_IN_TRAINING, Opening, check_counts
+from voronerf.app.evaluate.panels import write_panels
+from voronerf.app.files import json_text, write_text
+from voronerf.app.train.config import ConfigError
+
+
+def evaluate_run(
+    run: Path,
+    /,
+    opening: Opening = AS_IN_TRAINING,
+    views: int | None = None,
+    panels: int = 4,
+    lpips: Path | None = None,
+) -> int:
+    """Score a trained run on its test views and draw panels: truth, render, error, depth, cells.
+
+    Args:
+        run: The run directory.
+        opening: How the run is opened.
+        views: Number of test views, evenly spread; default all.
+        panels: Number of views drawn.
+        lpips: LPIPS weights, a file or folder, or "off"; default as in training, else VORONERF_LPIPS, the folder lpips
+            of VORONERF_DATA or beside the scene, the installed lpips package.
+    """
+    if panels < 0:
+        raise ConfigError(f"--panels must not be negative, got {panels}")
+    check_counts(views=views)
+    opened = opening.open(run)
+    perceived, source = opened.find_lpips(lpips)
+    if perceived is None:
+        say(source)
+    result = opened.evaluate(views=views, lpips=perceived or "off")
+    table = Table("view", "psnr [dB]", "ssim", "lpips")
+    for view in result["views"]:
+        table.add_row(escape(printable(view["name"])), *_figures(view))
+    table.add_section()
+    table.add_row("mean", *_figures(result))
+    console.print(table)
+    say(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB")
+    write_text(run / "eval.json", json_text(result, indent=2) + "\n")
+    if panels:
+        write_panels(opened.renderer, opened.diagram, opened.scene, run / "images", views=panels)
+    say(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""))
+    return 0
+
+
+def _figures(score: dict[str, Any]) -> list[str]:
+    """What a table shows of a score; a dash for what was not computed."""
+    places = {"psnr": 2, "ssim": 4, "lpips": 4}
+    return ["-" if score[name] is None else f"{score[name]:.{digits}f}" for name, digits in places.items()]

@@ -1,0 +1,52 @@
+"""``voronerf process``: a scene of a video or of photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from voronerf.app.cli.display import StageDisplay, console
+from voronerf.app.cli.opening import check_counts
+from voronerf.app.scenes.process import process as make_scene
+
+
+def process(
+    source: Path,
+    out: Path,
+    /,
+    frames: int = 150,
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto",
+    camera_model: str = "SIMPLE_RADIAL",
+    mapper: Literal["auto", "global", "incremental"] = "auto",
+    max_features: int = 4096,
+    verbose: bool = False,
+) -> int:
+    """Make a scene of a video or of images: COLMAP finds the cameras. A stopped one goes on with the same command.
+
+    Args:
+        source: A video, or a folder of PNG or JPEG images.
+        out: The folder to make; it gets images, sparse/0, transforms.json and colmap, which keeps every stage.
+        frames: Frames taken of a video, evenly spread.
+        matching: Which images are compared: all with all, each with those next to it by name, or those that share
+            their largest features (auto).
+        camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.
+        mapper: How cameras are found; auto is global, and incremental too if that model has faults.
+        max_features: Of an image.
+        verbose: Show what COLMAP says.
+    """
+    check_counts(frames=frames, max_features=max_features)
+    display = StageDisplay(console)
+    with display.progress:
+        make_scene(
+            source,
+            out,
+            frames=frames,
+            matching=matching,
+            camera_model=camera_model,
+            mapper=mapper,
+            max_features=max_features,
+            verbose=verbose,
+            say=display.say,
+            progress=display.show,
+        )
+    return 0
