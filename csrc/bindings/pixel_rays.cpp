@@ -4,8 +4,8 @@
 
 namespace voronerf {
 
-VN_STRUCT(PixelRaysInputs, poses, intrinsics, distortion, models, images, pixels, box, background, background_per_ray,
-          c, h, w, channels, b, near, far);
+VN_STRUCT(PixelRaysInputs, poses, intrinsics, lens, tables, images, pixels, box, background, background_per_ray, c, h,
+          w, channels, b, l, near, far);
 VN_STRUCT(PixelRaysOutputs, origins, directions, near, far, colour);
 
 VN_BINDINGS(module) {

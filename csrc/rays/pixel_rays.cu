@@ -1,4 +1,4 @@
-// Rays through pixels on CUDA, one thread a ray: the arithmetic of the CPU. float64 is for lenses that bend alone.
+// Rays through pixels on CUDA, one thread a ray: the arithmetic of the CPU.
 #include "common/cuda_wrappers.h"
 #include "rays/pixel_rays_math.h"
 

@@ -9,14 +9,14 @@ namespace voronerf {
 struct PixelRaysInputs {
   const float* poses;       // [c,4,4], camera to world
   const float* intrinsics;  // [c,4]: fx, fy, cx, cy
-  const float* distortion;  // [c,8], voronerf/ops/pixel_rays/lens.py; or null
-  const int32_t* models;    // [c], camera models, voronerf/ops/pixel_rays/lens.py; or null
+  const int32_t* lens;      // [c], the table of each camera, none of [0, l) for no distortion; null with tables
+  const float* tables;      // [l,h,w,2], directions (x, y, z) of pixels in the camera as (x, -y) / (1 - z); or null
   const uint8_t* images;    // [c,h,w,channels]
   const int64_t* pixels;    // [b], numbered through all images
   const float* box;         // [2,3], or null for all of space
   const float* background;  // [b,3], or [3], or null
   bool background_per_ray;
-  int64_t c, h, w, channels, b;
+  int64_t c, h, w, channels, b, l;
   float near, far;
 };
 

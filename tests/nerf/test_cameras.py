@@ -6,16 +6,9 @@ import pytest
 import torch
 from helpers import refuses
 
-from voronerf.nerf.cameras import (
-    Cameras,
-    Rays,
-    distort,
-    focus_point,
-    look_at,
-    orbit_cameras,
-    turntable_cameras,
-    undistort,
-)
+from voronerf.nerf import lenses
+from voronerf.nerf.cameras import Cameras, Rays, focus_point, look_at, orbit_cameras, turntable_cameras
+from voronerf.nerf.lenses import distort, undistort
 
 FOX = (0.0578421, -0.0805099, -0.000980296, 0.00015575, 0, 0, 0, 0)
 STRONG = (-0.28, 0.09, 0.001, -0.002, 0, 0, 0, 0)
@@ -94,6 +87,41 @@ def test_distort_follows_opencv():
     )
     found = distort(torch.tensor(x), torch.tensor(y), torch.tensor((k1, k2, p1, p2, 0, 0, 0, 0)))
     assert [float(value) for value in found] == pytest.approx(expected, abs=1e-6)
+
+
+def mixed():
+    """A fisheye, an FOV lens, one without distortion, the fisheye again and a perspective lens."""
+    models = torch.tensor([1, 2, 0, 1, 0], dtype=torch.int32)
+    bent = torch.tensor([FOX, (0.9, *7 * (0.0,)), 8 * (0.0,), FOX, STRONG])
+    base = cameras(5)
+    return Cameras(base.poses, base.intrinsics, 30, 20, bent, models)
+
+
+def test_tables_of_lenses_have_the_rays_of_pixels():
+    some = mixed()
+    lens, tables = some.lenses
+    assert lens[2] == -1 and lens[0] == lens[3] and tables.on(lens.device).shape == (3, 20, 30, 2)
+    y, x = torch.meshgrid(torch.arange(20), torch.arange(30), indexing="ij")
+    for index in range(5):
+        expected = some.rays(index, x.reshape(-1), y.reshape(-1)).directions
+        torch.testing.assert_close(some.image_rays(index).directions, expected, atol=2e-7, rtol=0)
+
+
+def test_cameras_that_come_of_others_share_their_tables():
+    some = mixed()
+    tables = some.lenses[1]
+    for other in (some[1:3], some.to("cpu"), some.moved(2 * torch.eye(4)), some[[4]]):
+        assert other.lenses[1] is tables
+    assert some[[4, 1]].lenses[0].tolist() == some.lenses[0][[4, 1]].tolist()
+    assert some.downscaled(2).lenses[1] is not tables
+
+
+def test_tables_are_bounded(monkeypatch):
+    monkeypatch.setattr(lenses, "MOST_BYTES", 3 * 30 * 20 * 8 - 1)
+    message = (
+        "the ray tables of 3 lenses of 30 x 20 pixels take 0.0 GiB, at most 0 GiB; reduce"
+    )
+    refuses(message, getattr, mixed(), "lenses")
 
 
 def test_downscaled_keeps_directions():

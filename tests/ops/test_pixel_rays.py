@@ -22,7 +22,8 @@ def scene(channels, lens):
     models = None
     if lens == "mixed":
         models = torch.arange(4, dtype=torch.int32) % 3
-        bent[2::3, 0] = 0.9  # of FOV
+        bent[2, 0] = 0.9  # of FOV
+        bent[3] = 0  # no lens
     images = torch.randint(0, 256, (4, HEIGHT, WIDTH, channels), dtype=torch.uint8)
     return Cameras(poses, intrinsics, WIDTH, HEIGHT, bent, models), images
 
@@ -38,19 +39,8 @@ def test_is_what_cameras_boxes_and_colours_give_one_by_one(device, backend, chan
     behind = {None: None, "one": torch.rand(3), "per ray": torch.rand(b, 3)}[background]
     box = BOX if boxed else None
     on = lambda tensor: None if tensor is None else tensor.to(device)  # noqa: E731
-    found = pixel_rays(
-        on(cameras.poses),
-        on(cameras.intrinsics),
-        on(images),
-        on(index),
-        near=2.5,
-        far=4.0,
-        box=on(box),
-        distortion=on(cameras.distortion),
-        models=on(cameras.models),
-        background=on(behind),
-        backend=backend,
-    )
+    options = {"near": 2.5, "far": 4.0, "box": on(box), "background": on(behind), "backend": backend}
+    found = cameras.to(device).pixel_rays(on(images), on(index), **options)
     pixel = index % (HEIGHT * WIDTH)
     rays = cameras.rays(index // (HEIGHT * WIDTH), pixel % WIDTH, pixel // WIDTH)
     near, far, hit = intersect_box(rays.origins, rays.directions, box, 2.5, 4.0)
@@ -86,6 +76,6 @@ def test_refuses_what_makes_no_sense():
                 pixel_rays(**{**good, "index": torch.tensor([0, bad, 5])}, near=0.0, far=1.0, backend=backend)
     refuses = refusals(pixel_rays, **good, near=0.0, far=1.0)
     refuses("images must have 3 or 4 channels, got 2", images=images[..., :2])
-    refuses("distortion must be given with models, got None", models=torch.arange(4, dtype=torch.int32) % 3)
-    refuses("models must lie in 0 to 2, got values from 0 to 3", models=torch.arange(4, dtype=torch.int32))
+    refuses("lens and tables must be given together, got one", lens=torch.zeros(4, dtype=torch.int32))
+    refuses("tables must have shape [l, h, w, 2] with h = 12, w = 17, got [1, 12, 16, 2]", tables=torch.zeros(1, 12, 16, 2))
     refuses("near and far must satisfy 0 <= near < far, got 1.0 and 1.0", near=1.0)

@@ -4,9 +4,8 @@ c cameras, r rays, b chosen pixels, n points.
 
 Frames. A pose maps camera to world coordinates; camera axes are OpenGL's: x right, y up, the camera looks along -z. The
 world is z up. Pixels: x to the right, y down, the image covers [0, width] x [0, height], the centre of the first pixel
-is at (0.5, 0.5). Distortion acts on image-plane coordinates u = (x - cx) / fx, v = (y - cy) / fy. It is OpenCV's
-rational model with (k1, k2, p1, p2, k3, k4, k5, k6), for fisheyes COLMAP's THIN_PRISM_FISHEYE with (k1, k2, p1, p2, k3,
-k4, s1, s2), or COLMAP's FOV with (omega, 0, ...); see `distort`.
+is at (0.5, 0.5). Distortion acts on image-plane coordinates u = (x - cx) / fx, v = (y - cy) / fy. See
+`voronerf.nerf.lenses.distort` for its models.
 """
 
 from __future__ import annotations
@@ -14,14 +13,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from voronerf.ops.pixel_rays.lens import FISHEYE, PERSPECTIVE, camera_rays, distort, undistort
+from voronerf.nerf.lenses import FISHEYE, PERSPECTIVE, LensTables, distort, unproject
+from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 
-__all__ = ["Cameras", "Rays", "distort", "focus_point", "look_at", "orbit_cameras", "turntable_cameras", "undistort"]
+__all__ = ["Cameras", "Rays", "focus_point", "look_at", "orbit_cameras", "turntable_cameras"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ class Cameras:
         intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
         width: of every image, in pixels; of the widest where they differ.
         height: of every image, in pixels; of the highest where they differ.
-        distortion: float32 [c, 8], coefficients of the lenses, or None for none.
+        distortion: float32 [c, 8], coefficients of the lenses, see `voronerf.nerf.lenses.distort`, or None for none.
         models: int32 [c], the camera model of each: 0 perspective, 1 fisheye, 2 FOV. It needs coefficients. None is
             perspective for all.
         sizes: int64 [c, 2], (width, height) of each image, or None if they are of one size. See `size`.
@@ -119,7 +120,7 @@ class Cameras:
         scale = torch.linalg.det(move[:3, :3]).abs() ** (1 / 3)
         poses = (move @ self.poses.to(move)).clone()
         poses[:, :3, :3] /= scale
-        return replace(self, poses=poses.to(self.poses))
+        return replace(self, poses=poses.to(self.poses))._with_lenses(*self.lenses)
 
     @classmethod
     def of_images(
@@ -195,10 +196,35 @@ class Cameras:
         return self._each(lambda tensor: tensor.to(device))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Cameras:
-        """With another tensor for each."""
+        """With another tensor for each; the tables of the lenses are shared."""
         given = ((field.name, getattr(self, field.name)) for field in fields(self))
         changed: dict[str, Any] = {name: change(value) for name, value in given if isinstance(value, Tensor)}
-        return replace(self, **changed)
+        return replace(self, **changed)._with_lenses(change(self.lenses[0]), self.lenses[1])
+
+    def _with_lenses(self, lens: Tensor, tables: LensTables | None) -> Cameras:
+        self.__dict__["lenses"] = lens, tables
+        return self
+
+    @cached_property
+    def lenses(self) -> tuple[Tensor, LensTables | None]:
+        """The lens of each camera, int32 [c], -1 for one without distortion; and the tables of the distinct ones.
+
+        Cameras that are indexed, moved or sent to a device share the tables.
+
+        Raises:
+            ValueError: The tables would take too much memory.
+        """
+        lens = torch.full((len(self),), -1, dtype=torch.int32, device=self.poses.device)
+        if self.distortion is None:
+            return lens, None
+        models = torch.zeros_like(lens) if self.models is None else self.models
+        bent = (self.distortion != 0).any(1) | (models == FISHEYE)
+        if not bool(bent.any()):
+            return lens, None
+        every = torch.cat((self.intrinsics, self.distortion, models[:, None].to(self.intrinsics)), dim=1)
+        distinct, of = every[bent].unique(dim=0, return_inverse=True)
+        lens[bent] = of.to(torch.int32)
+        return lens, LensTables(distinct, self.width, self.height)
 
     def downscaled(self, factor: int) -> Cameras:
         """Cameras of the images averaged over blocks of `factor` x `factor` pixels.
@@ -232,36 +258,44 @@ class Cameras:
                 its axis is that of the pixel (Barron et al. 2021, section 3.1). A pixel away from the optical axis is
                 farther away and so appears narrower. Lens distortion of the size of a pixel is ignored.
         """
-        if isinstance(image_index, int):
-            chosen, camera = self[[image_index]], None
-        else:
-            chosen, camera = self, image_index.to(torch.int32)
-        origins, directions = camera_rays(
-            chosen.poses,
-            chosen.intrinsics,
-            _position(x).to(self.poses.dtype),
-            _position(y).to(self.poses.dtype),
-            camera=camera,
-            distortion=chosen.distortion,
-            models=chosen.models,
-        )
-        if not cones:
-            return Rays(origins, directions)
-        return Rays(origins, directions, chosen.radii(directions, camera))
+        x, y = _position(x).to(self.poses.dtype), _position(y).to(self.poses.dtype)
+        camera = torch.full_like(x, image_index, dtype=torch.int64) if isinstance(image_index, int) else image_index
+        fx, fy, cx, cy = self.intrinsics[camera].unbind(-1)
+        local = torch.stack(((x - cx) / fx, -(y - cy) / fy, -torch.ones_like(x)), dim=-1)
+        if self.distortion is not None:
+            for index in camera.unique().tolist():
+                own = camera == index
+                lens = self.intrinsics[index], self.distortion[index], self._model(index)
+                local[own] = unproject(x[own], y[own], *lens)[0].to(local)
+        pose = self.poses[camera]
+        directions = torch.nn.functional.normalize((pose[:, :3, :3] * local[:, None, :]).sum(-1), dim=-1)
+        return Rays(pose[:, :3, 3], directions, self.radii(directions, camera) if cones else None)
 
-    def radii(self, directions: Tensor, camera: Tensor | None) -> Tensor:
-        """The radii [b] of cones along `directions` [b, 3] of the cameras int [b]; None for the first camera."""
-        widths, axes = self.intrinsics[:, :2].prod(-1).rsqrt() * (2 / math.sqrt(12)), self.forward
-        if camera is not None:
-            widths, axes = widths[camera], axes[camera]
-        return widths * (directions * axes).sum(-1)
+    def _model(self, index: int) -> int:
+        return PERSPECTIVE if self.models is None else int(self.models[index])
+
+    def radii(self, directions: Tensor, camera: Tensor) -> Tensor:
+        """The radii [b] of cones along `directions` [b, 3] of the cameras int [b]."""
+        widths = self.intrinsics[:, :2].prod(-1).rsqrt() * (2 / math.sqrt(12))
+        return widths[camera] * (directions * self.forward[camera]).sum(-1)
 
     def image_rays(self, index: int, *, cones: bool = False) -> Rays:
         """Rays through all pixel centres of one camera, row by row: [height * width], of its own image."""
         device = self.poses.device
         width, height = self.size(index)
-        y, x = torch.meshgrid(torch.arange(height, device=device), torch.arange(width, device=device), indexing="ij")
-        return self.rays(index, x.reshape(-1), y.reshape(-1), cones=cones)
+        pixels = torch.arange(height, device=device)[:, None] * self.width + torch.arange(width, device=device)
+        blank = torch.zeros(1, self.height, self.width, 3, dtype=torch.uint8, device=device)
+        one = self[[index]]
+        rays = one.pixel_rays(blank, pixels.reshape(-1), near=0.0, far=1.0)
+        radii = one.radii(rays.directions, torch.zeros_like(pixels.reshape(-1))) if cones else None
+        return Rays(rays.origins, rays.directions, radii)
+
+    def pixel_rays(self, images: Tensor, index: Tensor, **options: Any) -> PixelRays:
+        """`voronerf.ops.pixel_rays` of these cameras and their images, uint8 [c, height, width, 3 or 4]."""
+        lens, tables = self.lenses
+        if tables is not None:
+            options |= {"lens": lens, "tables": tables.on(self.poses.device)}
+        return pixel_rays(self.poses, self.intrinsics, images, index, **options)
 
     def project(self, points: Tensor, index: int) -> tuple[Tensor, Tensor]:
         """Projects points into the image of one camera.
@@ -277,7 +311,7 @@ class Cameras:
         pose = self.poses[index]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         depth = -local[:, 2]
-        model = PERSPECTIVE if self.models is None else int(self.models[index])
+        model = self._model(index)
         if model == FISHEYE:
             across = local[:, :2].norm(dim=-1)
             share = torch.atan2(across, depth) / across.clamp_min(1e-12)

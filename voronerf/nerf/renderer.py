@@ -21,7 +21,6 @@ from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.samplers import Occupancy, Stratified
 from voronerf.nerf.volume import Rendered, Samples, per_ray, render_samples
-from voronerf.ops.pixel_rays import pixel_rays
 from voronerf.town.parts import Parts
 
 if TYPE_CHECKING:
@@ -199,28 +198,6 @@ class Renderer:
             rows = numbers[top : top + side, left : left + side].reshape(-1)
             yield from (piece for piece in rows[hit[rows]].split(chunk) if len(piece))
 
-    def _rays(self, cameras: Cameras, index: int) -> Rays:
-        """Through all pixels of one camera: by the op that makes those of a training, as it undoes lenses faster."""
-        chosen = cameras[[index]]
-        known = chosen.models is None or chosen.distortion is not None
-        if self.cones or self.backend == "warp" or cameras.poses.dtype != torch.float32 or not known:
-            return cameras.image_rays(index, cones=self.cones)
-        width, height = cameras.size(index)
-        blank = torch.zeros(1, height, width, 3, dtype=torch.uint8, device=cameras.poses.device)
-        pixels = torch.arange(width * height, device=blank.device)
-        found = pixel_rays(
-            chosen.poses,
-            chosen.intrinsics,
-            blank,
-            pixels,
-            near=0.0,
-            far=1.0,
-            distortion=chosen.distortion,
-            models=chosen.models,
-            backend=self.backend,
-        )
-        return Rays(found.origins, found.directions)
-
     @torch.no_grad()
     def image(
         self,
@@ -251,7 +228,7 @@ class Renderer:
             chunk = 16_384 if self.look is not None else 4096 if self.occupancy is None else 131_072
         if chunk < 1:
             raise ValueError(f"Renderer.image: chunk must be >= 1, got {chunk}")
-        rays = self._rays(cameras, index)
+        rays = cameras.image_rays(index, cones=self.cones)
         first, last, hit = intersect_box(rays.origins, rays.directions, box, near, far)
         colour = torch.zeros_like(rays.origins)
         colour = colour if background is None else background.to(colour).repeat(len(rays), 1)

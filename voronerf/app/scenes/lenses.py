@@ -5,7 +5,6 @@ Source: COLMAP, "Camera Models", and `src/colmap/sensor/models.h`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from voronerf.nerf.cameras import Cameras
-from voronerf.ops.pixel_rays.lens import FISHEYE, FOV, PERSPECTIVE, distort, undistort
+from voronerf.nerf.lenses import FISHEYE, FOV, PERSPECTIVE, unproject
 
 
 class Lens(NamedTuple):
@@ -88,11 +87,5 @@ def pixels_with_rays(cameras: Cameras, index: int) -> Tensor:
 def _has_ray(cameras: Cameras, index: int, x: Tensor, y: Tensor) -> Tensor:
     if cameras.distortion is None:
         return torch.ones_like(x, dtype=torch.bool)
-    fx, fy, cx, cy = cameras.intrinsics[index].double()
-    coefficients = cameras.distortion[index].double()
-    u, v = (x.double() - cx) / fx, (y.double() - cy) / fy
     model = PERSPECTIVE if cameras.models is None else int(cameras.models[index])
-    a, b = undistort(u, v, coefficients, model)
-    again, and_again = distort(a, b, coefficients, model)
-    found = torch.maximum((again - u).abs() * fx, (and_again - v).abs() * fy) < 1e-3
-    return found & (torch.hypot(a, b) < math.pi) if model == FISHEYE else found
+    return unproject(x, y, cameras.intrinsics[index], cameras.distortion[index], model)[1]

@@ -150,6 +150,10 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
     cameras = _cameras(frame.poses(poses), views, sizes, found.source)
     contraction = _contraction(kind, frame, cameras)
     cameras = cameras.downscaled(found.factor)
+    try:
+        _ = cameras.lenses
+    except ValueError as error:
+        raise SceneError(f"{found.source}: {error}") from None
     masks = _without_dark_corners(cameras, masks, found.source, views)
     near, far, box = frame.near, frame.far, None
     if kind == "object":

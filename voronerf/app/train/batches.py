@@ -20,7 +20,6 @@ from voronerf.nerf.cameras import Rays
 from voronerf.nerf.occupancy import draw_seed
 from voronerf.nerf.rays import intersect_box
 from voronerf.ops.draw_pixels import Runs, draw_pixels
-from voronerf.ops.pixel_rays import pixel_rays
 
 #: Share of the rays that are drawn from the sightings of points, where these are learnt from.
 SEEN = 0.25
@@ -123,16 +122,12 @@ class RayBatches:
             self.pages.fetch(index)
         background = uniforms if random_background and self.images.shape[-1] == 4 else self.background
         cameras = self.cameras
-        found = pixel_rays(
-            cameras.poses,
-            cameras.intrinsics,
+        found = cameras.pixel_rays(
             self.images,
             index,
             near=float(self.scene.near),
             far=float(self.scene.far),
             box=self.box,
-            distortion=cameras.distortion,
-            models=cameras.models,
             background=background,
             backend=self.backend,
         )

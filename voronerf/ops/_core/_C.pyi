@@ -273,8 +273,8 @@ Peak: tuple[str, ...]  # float32 bfloat16 copy
 class PixelRaysInputs(NamedTuple):
     poses: Tensor | None  # const float32*
     intrinsics: Tensor | None  # const float32*
-    distortion: Tensor | None  # const float32*
-    models: Tensor | None  # const int32*
+    lens: Tensor | None  # const int32*
+    tables: Tensor | None  # const float32*
     images: Tensor | None  # const uint8*
     pixels: Tensor | None  # const int64*
     box: Tensor | None  # const float32*
@@ -285,6 +285,7 @@ class PixelRaysInputs(NamedTuple):
     w: int  # int64
     channels: int  # int64
     b: int  # int64
+    l: int  # int64
     near: float  # float32
     far: float  # float32
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, Implementation
-from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_number, check_range, detached
+from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_number, detached
 from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
 
 _OP = backends.declare("pixel_rays", native=Implementation(EVERYWHERE, (torch.float32,)))
@@ -22,15 +22,14 @@ def pixel_rays(
     near: float,
     far: float,
     box: Tensor | None = None,
-    distortion: Tensor | None = None,
-    models: Tensor | None = None,
+    lens: Tensor | None = None,
+    tables: Tensor | None = None,
     background: Tensor | None = None,
     backend: str = "auto",
 ) -> PixelRays:
     """The rays of a training step: through the centres of pixels, cut to a box, with the colours of the pixels.
 
-    Lens distortion is undone by Newton's method in float64; the box is met by the slab method (Kay and Kajiya 1986).
-    Not differentiable.
+    The box is met by the slab method (Kay and Kajiya 1986). Not differentiable.
 
     Args:
         poses: float32 [c, 4, 4], camera to world, OpenGL axes.
@@ -41,11 +40,10 @@ def pixel_rays(
         near: nearest distance of interest, >= 0.
         far: farthest.
         box: float32 [2, 3], lowest and highest corner, or None for all of space.
-        distortion: float32 [c, 8], (k1, k2, p1, p2, k3, k4, k5, k6) of OpenCV's rational model, or None for none.
-        models: int32 [c], the model of each lens, which comes with distortion; None is 0 for all. 0 is perspective. 1
-            is a fisheye, and distortion is (k1, k2, p1, p2, k3, k4, s1, s2) of COLMAP's THIN_PRISM_FISHEYE, whose k1 to
-            k4 are those of OpenCV's fisheye model. 2 is COLMAP's FOV, and distortion is (omega, 0, ...). Others are an
-            error on the CPU, and perspective on CUDA.
+        lens: int32 [c], the table of each camera; a number that no table has, such as -1, is a camera without
+            distortion. It comes with tables.
+        tables: float32 [l, h, w, 2], for each lens the directions (x, y, z) of its pixels in the camera's axes as
+            stereographic projections (x, -y) / (1 - z), see `voronerf.nerf.lenses.LensTables`; None for no distortion.
         background: float32 [3] or [b, 3], the colour behind images with an alpha channel; None leaves their
             colours as they are.
         backend: "auto", "reference" or "native".
@@ -74,12 +72,10 @@ def pixel_rays(
     given.tensor("images", images, (torch.uint8,), "c", "h", "w", "channels")
     given.tensor("index", index, (torch.int64,), "b")
     given.optional("box", box, LIKE_FIRST, 2, 3)
-    given.optional("distortion", distortion, LIKE_FIRST, "c", 8)
-    given.optional("models", models, INDEX, "c")
-    if models is not None:
-        check_range(_OP, "models", models, 3)
-        if distortion is None:
-            raise ValueError(f"{_OP}: distortion must be given with models, got None")
+    given.optional("lens", lens, INDEX, "c")
+    given.optional("tables", tables, LIKE_FIRST, "l", "h", "w", 2)
+    if (lens is None) != (tables is None):
+        raise ValueError(f"{_OP}: lens and tables must be given together, got one")
     given.each_or_all("background", background, LIKE_FIRST, "b", 3)
     if given.sizes["channels"] not in (3, 4):
         raise ValueError(f"{_OP}: images must have 3 or 4 channels, got {given.sizes['channels']}")
@@ -90,7 +86,6 @@ def pixel_rays(
     if torch.finfo(torch.float32).max < far < float("inf"):
         raise ValueError(f"{_OP}: far must be at most 3.4e+38 or infinite, got {far}")
     run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
-    constant = (detached(tensor) for tensor in (box, distortion, background))
-    box, distortion, background = constant
+    box, tables, background = (detached(tensor) for tensor in (box, tables, background))
     views = detached(poses), detached(intrinsics), images
-    return PixelRays(*run(Pixels(*views, index, box, distortion, models, background, float(near), float(far))))
+    return PixelRays(*run(Pixels(*views, index, box, lens, tables, background, float(near), float(far))))

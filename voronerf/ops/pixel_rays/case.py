@@ -7,18 +7,14 @@ import torch
 from voronerf.ops._core.cases import Arguments, Case, Draw
 
 
-def cameras(draw: Draw, c: int) -> Arguments:
-    """Poses and lenses of c cameras, of every model."""
-    intrinsics = torch.cat([30 + 10 * draw.uniform(c, 2), 4 * draw.uniform(c, 2)], dim=1)
-    models = draw.integers(0, 3, c) if draw.free else torch.arange(c, dtype=torch.int32) % 3
-    lens = {"distortion": 0.01 * draw.normal(c, 8), "models": draw.among("models", models, None)}
-    return {"poses": torch.eye(4).repeat(c, 1, 1), "intrinsics": intrinsics, **lens}
-
-
 def _make(draw: Draw, n: int) -> Arguments:
     c, h, w = draw.number("cameras", 3, 1, 4), draw.number("height", 5, 1, 9), draw.number("width", 7, 1, 9)
     images = draw.integers(0, 256, c, h, w, draw.among("channels", 4, 3), dtype=torch.uint8)
-    call: Arguments = {**cameras(draw, c), "images": images, "near": 0.2, "far": 3.0, "background": draw.uniform(n, 3)}
+    intrinsics = torch.cat([30 + 10 * draw.uniform(c, 2), 4 * draw.uniform(c, 2)], dim=1)
+    call: Arguments = {"poses": torch.eye(4).repeat(c, 1, 1), "intrinsics": intrinsics, "images": images}
+    if draw.among("bent", True, False):  # camera 0 has no table
+        call |= {"lens": torch.arange(c, dtype=torch.int32) - 1, "tables": 0.1 * draw.normal(c, h, w, 2)}
+    call |= {"near": 0.2, "far": 3.0, "background": draw.uniform(n, 3)}
     call["box"] = draw.among("box", torch.tensor([[-1.0] * 3, [1.0] * 3]), None)
     return {**call, "index": draw.integers(0, c * h * w, n, dtype=torch.int64)}
 
@@ -29,5 +25,5 @@ CASE = Case(
         "far must be a number, got NoneType": {"far": None},
         "far must be at most 3.4e+38 or infinite, got 1e+39": {"far": 1e39},
     },
-    on_devices=({"models": None},),
+    on_devices=({"bent": False},),
 )

@@ -15,7 +15,7 @@ from voronerf.ops.pixel_rays.reference import Pixels
 @custom_op("pixel_rays_native")
 def pixel_rays(pixels: Pixels) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    poses, intrinsics, images, index, box, distortion, models, background, near, far = pixels
+    poses, intrinsics, images, index, box, lens, tables, background, near, far = pixels
     b = index.shape[0]
     origins, directions, colour = poses.new_empty(b, 3), poses.new_empty(b, 3), poses.new_empty(b, 3)
     first, last = poses.new_empty(b), poses.new_empty(b)
@@ -25,8 +25,8 @@ def pixel_rays(pixels: Pixels) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor,
     given = compiled.PixelRaysInputs(
         poses=poses,
         intrinsics=intrinsics,
-        distortion=distortion,
-        models=models,
+        lens=lens,
+        tables=tables,
         images=images,
         pixels=index,
         box=box,
@@ -37,6 +37,7 @@ def pixel_rays(pixels: Pixels) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor,
         w=w,
         channels=channels,
         b=b,
+        l=0 if tables is None else len(tables),
         near=near,
         far=far,
     )

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_range
-from voronerf.ops.pixel_rays.lens import camera_rays
 
 
 class PixelRays(NamedTuple):
@@ -46,8 +45,8 @@ class Pixels(NamedTuple):
     images: Tensor  # uint8 [c, h, w, 3 or 4]
     numbers: Tensor  # int64 [b], of the pixels
     box: Tensor | None  # [2, 3] or None
-    distortion: Tensor | None  # [c, 8] or None
-    models: Tensor | None  # int32 [c] or None
+    lens: Tensor | None  # int32 [c] or None
+    tables: Tensor | None  # [l, h, w, 2] or None
     background: Tensor | None  # [3], [b, 3] or None
     near: float  # nearest distance
     far: float  # farthest
@@ -56,13 +55,23 @@ class Pixels(NamedTuple):
 @torch.no_grad()
 def pixel_rays(pixels: Pixels) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    poses, intrinsics, images, index, box, distortion, models, background, near, far = pixels
+    poses, intrinsics, images, index, box, lens, tables, background, near, far = pixels
     c, h, w, channels = images.shape
     check_range("pixel_rays", "index", index, c * h * w)
     pixel = index % (h * w)
     x, y = ((place + 0.5).to(poses.dtype) for place in (pixel % w, pixel // w))
-    camera = (index // (h * w)).to(torch.int32)
-    origins, directions = camera_rays(poses, intrinsics, x, y, camera=camera, distortion=distortion, models=models)
+    camera = index // (h * w)
+    fx, fy, cx, cy = intrinsics[camera].unbind(-1)
+    u, v, ahead = (x - cx) / fx, (y - cy) / fy, torch.ones_like(x)
+    if lens is not None and tables is not None:
+        table = lens[camera].long()
+        bent = (table >= 0) & (table < len(tables))
+        right, down = tables.reshape(-1, 2)[torch.where(bent, table, 0) * (h * w) + pixel].unbind(-1)
+        square = right * right + down * down
+        u, v, ahead = (torch.where(bent, *pair) for pair in ((2 * right, u), (2 * down, v), (1 - square, ahead)))
+    local = torch.stack((u, -v, -ahead), dim=-1)
+    directions = torch.nn.functional.normalize((poses[camera, :3, :3] * local[:, None, :]).sum(-1), dim=-1)
+    origins = poses[camera, :3, 3]
     if box is None:
         enter, leave = torch.full_like(x, near), torch.full_like(x, far)
     else:
@@ -72,7 +81,7 @@ def pixel_rays(pixels: Pixels) -> PixelRays:
     if channels == 4 and background is not None:
         alpha = values[:, 3:]
         colour = colour * alpha + background * (1 - alpha)
-    return PixelRays(origins.contiguous(), directions, enter, leave, colour.contiguous())
+    return PixelRays(origins, directions, enter, leave, colour.contiguous())
 
 
 def meet_box(origins: Tensor, directions: Tensor, box: Tensor, near: float, far: float) -> tuple[Tensor, Tensor]:
