@@ -77,5 +77,7 @@ def test_refuses_what_makes_no_sense():
     refuses = refusals(pixel_rays, **good, near=0.0, far=1.0)
     refuses("images must have 3 or 4 channels, got 2", images=images[..., :2])
     refuses("lens and tables must be given together, got one", lens=torch.zeros(4, dtype=torch.int32))
-    refuses("tables must have shape [l, h, w, 2] with h = 12, w = 17, got [1, 12, 16, 2]", tables=torch.zeros(1, 12, 16, 2))
+    refuses(
+        "tables must have shape [l, h, w, 2] with h = 12, w = 17, got [1, 12, 16, 2]", tables=torch.zeros(1, 12, 16, 2)
+    )
     refuses("near and far must satisfy 0 <= near < far, got 1.0 and 1.0", near=1.0)

@@ -279,14 +279,14 @@ class Cameras:
         widths = self.intrinsics[:, :2].prod(-1).rsqrt() * (2 / math.sqrt(12))
         return widths[camera] * (directions * self.forward[camera]).sum(-1)
 
-    def image_rays(self, index: int, *, cones: bool = False) -> Rays:
+    def image_rays(self, index: int, *, cones: bool = False, backend: str = "auto") -> Rays:
         """Rays through all pixel centres of one camera, row by row: [height * width], of its own image."""
         device = self.poses.device
         width, height = self.size(index)
         pixels = torch.arange(height, device=device)[:, None] * self.width + torch.arange(width, device=device)
         blank = torch.zeros(1, self.height, self.width, 3, dtype=torch.uint8, device=device)
         one = self[[index]]
-        rays = one.pixel_rays(blank, pixels.reshape(-1), near=0.0, far=1.0)
+        rays = one.pixel_rays(blank, pixels.reshape(-1), near=0.0, far=1.0, backend=backend)
         radii = one.radii(rays.directions, torch.zeros_like(pixels.reshape(-1))) if cones else None
         return Rays(rays.origins, rays.directions, radii)
 

@@ -228,7 +228,7 @@ class Renderer:
             chunk = 16_384 if self.look is not None else 4096 if self.occupancy is None else 131_072
         if chunk < 1:
             raise ValueError(f"Renderer.image: chunk must be >= 1, got {chunk}")
-        rays = cameras.image_rays(index, cones=self.cones)
+        rays = cameras.image_rays(index, cones=self.cones, backend=self.backend)
         first, last, hit = intersect_box(rays.origins, rays.directions, box, near, far)
         colour = torch.zeros_like(rays.origins)
         colour = colour if background is None else background.to(colour).repeat(len(rays), 1)

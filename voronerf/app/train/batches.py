@@ -85,7 +85,7 @@ class RayBatches:
             if masks is not None:
                 chosen &= masks[image, :height, :width].to(self.place)
             if box is not None:
-                rays = cameras.image_rays(image)
+                rays = cameras.image_rays(image, backend=self.backend)
                 _, _, hit = intersect_box(rays.origins, rays.directions, box, self.scene.near, self.scene.far)
                 chosen &= hit.reshape(height, width)
             edges = torch.nn.functional.pad(chosen.to(torch.int8), (1, 1)).diff(dim=1)
