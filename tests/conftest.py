@@ -30,10 +30,6 @@ import torch
 
 from voronerf.ops._core import backends
 
-# Where there is AMX, torch may multiply bfloat16 networks, if a timing says so; what tests say of the kernels would
-# depend on the processor. test_bfloat16_by_torch.py asks for it.
-torch.cpu._is_amx_tile_supported = lambda: False
-
 PARTS = ("native", "cuda", "warp")
 NO_CUDA = backends.missing("reference", torch.device("cuda")) is not None
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from rich.markup import escape
 from rich.table import Table
 
@@ -53,11 +52,6 @@ def info(run: Path | None = None, /) -> int:
         for key, entry in values.items():
             text = ", ".join(map(str, entry)) or "none" if isinstance(entry, list) else str(entry)
             console.print(f"{f'{name} {key}'.strip():26} {text}", highlight=False, markup=False)
-    if backends.missing("native", torch.device("cpu")) is None:
-        by_torch = importlib.import_module("voronerf.ops.grouped_mlp.by_torch")
-        kernels = importlib.import_module("voronerf.ops.grouped_mlp.native")
-        text = by_torch.describe(kernels.fused)
-        console.print(f"{'native bfloat16 by torch':26} {text}", highlight=False, markup=False)
     for name, extra in EXTRAS.items():
         text = f"{extra.adds}: {_state(name, extra.modules)}"
         console.print(f"{f'extra {name}':26} {text}", highlight=False, markup=False)

@@ -3,7 +3,7 @@
 n samples, r rays, k cells, p and q features of a raw position and direction, i inputs and o outputs of a layer. Tensors
 are cast to float32 on the way in and back on the way out, a cell having few weights. With bfloat16 storage, or under
 autocast to it, products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16), and float32
-ones elsewhere, or torch multiplies (``by_torch.py``); sums are float32 always. Gradients that will be differentiated
+ones elsewhere; sums are float32 always. Gradients that will be differentiated
 again are taken layer by layer (``layerwise.py``).
 """
 
@@ -22,7 +22,6 @@ from voronerf.ops._core import native
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import asked_for
 from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer
-from voronerf.ops.grouped_mlp import by_torch
 from voronerf.ops.grouped_mlp.layer_table import (
     Given,
     Key,
@@ -85,12 +84,6 @@ def grouped_mlp(
     Under ``torch.autocast`` to bfloat16, products take bfloat16 operands where the processor has them.
     """
     given = Given(positions, weights, biases, layers, directions, direction_index, features)
-    return (by_torch.run if by_torch.is_faster(given, fused) else fused)(given, offsets)
-
-
-def fused(given: Given, offsets: Tensor) -> Tensor:
-    """The same by the kernels."""
-    features, positions = given.features, given.positions
     own, before = features is not None and features.dim() == 3, hashes_before(given)
     cells = cells_of(offsets, positions) if own and before else None
     taken, dtype = network(given, cells, hashed_before=before)

@@ -19,17 +19,11 @@ from voronerf.ops._core import native
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.cell_sort import native as cell_sort
-from voronerf.ops.grouped_mlp import by_torch
 from voronerf.ops.grouped_mlp import native as grouped_mlp
 from voronerf.ops.grouped_mlp.layer_table import Given, Network, network
 from voronerf.ops.locate_cell import native as locate_cell
 from voronerf.ops.nearest_centre import native as nearest_centre
-from voronerf.ops.routed_mlp.reference import Operations, Where, first_rows
-from voronerf.ops.routed_mlp.reference import routed_mlp as compose
-
-_APART = Operations(
-    nearest_centre.nearest_centre, locate_cell.locate_cell, cell_sort.cell_sort, grouped_mlp.grouped_mlp
-)
+from voronerf.ops.routed_mlp.reference import Where, first_rows
 
 
 def routed_mlp(
@@ -45,9 +39,6 @@ def routed_mlp(
 ) -> tuple[Tensor, Tensor]:
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
     where = Where(**given)
-    if by_torch.is_faster(Given(positions, weights, biases, layers, directions), grouped_mlp.fused):
-        read: dict[str, Any] = {"layers": layers, "directions": directions, "direction_index": direction_index}
-        return compose(positions, weights, biases, **read, **given, operations=_APART)
     call, dtype = prepared(positions, weights, biases, layers, where, directions, direction_index, features)
     out, found, *_ = forward(*call)
     if call.where.cells is not None:
