@@ -39,9 +39,6 @@ ISAS = {
     "aarch64": {"neon": ["-DVN_ISA=3"]},
 }
 """Of an architecture, beside the portable path."""
-ALIGNED = ("geometry/centre_grid_isa.cpp",)
-"""Files of short loops of look-ups, which some processors run a tenth slower where they cross a line of the cache of
-instructions: what is linked before them would decide."""
 WINDOWS = sys.platform == "win32"
 LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
 # One of each major version, which runs on its minor ones. Without 100 and 120 a Blackwell GPU would compile the PTX of
@@ -257,8 +254,7 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
         if source.name.endswith("_isa.cpp"):
             for isa, flags_of_isa in isas().items():
                 objects.append(f"{name}.{isa}.o")
-                flags_of_file = [*flags_of_isa, *(["-falign-loops=64"] if name in ALIGNED else [])]
-                lines += [f"build {objects[-1]}: cxx {quote(str(source))}", f"  flags = {join(flags_of_file)}"]
+                lines += [f"build {objects[-1]}: cxx {quote(str(source))}", f"  flags = {join(flags_of_isa)}"]
         elif source.suffix == ".cpp":
             objects.append(f"{name}.o")
             lines.append(f"build {objects[-1]}: cxx {quote(str(source))}")

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 Row = dict[str, Any]
 
 SHOWN = (
-    r"^nearest_centre/n=262144 k=(16|512|4096 frozen)/float32",
+    r"^nearest_centre/n=262144 k=(16|512)/float32",
     r"^locate_cell/16x16 n=262144/",
     r"^cell_sort/n=262144 k=256/",
     r"^grouped_linear/64-64 .*/float32/",

@@ -32,7 +32,7 @@ def calls(seed):
 
     points, centres, weight = rand(5000, 3), rand(400, 3), rand(2, 7, 3)
     ray, rgb, edges = [rand(100, 50) for _ in range(3)], rand(100, 50, 3), rand(100, 51).sort(dim=1).values
-    grid, cells = v.centre_grid(centres), v.nearest_centre(points, centres)
+    cells = v.nearest_centre(points, centres)
 
     def gradient():
         own = weight.clone().requires_grad_()
@@ -40,8 +40,6 @@ def calls(seed):
 
     return [
         lambda: (v.nearest_centre(points, centres),),
-        lambda: (v.nearest_centre(points, centres, grid=grid),),
-        lambda: tuple(v.centre_grid(centres).tables[1:3]),
         lambda: v.cell_sort(cells, 400),
         lambda: (network(points, weight),),
         lambda: (v.grouped_mlp(points, halves(points), [weight], [None], layers=LAYERS),),

@@ -39,10 +39,8 @@ from voronerf.diagram import (
 from voronerf.nerf import OccupancyGrid
 from voronerf.nerf.fields import HashGridField, NeRF
 from voronerf.ops import (
-    CentreGrid,
     Composite,
     cell_sort,
-    centre_grid,
     composite,
     frequency_encode,
     grouped_linear,
@@ -65,7 +63,6 @@ __all__ = [
     "MLP",
     "BackendUnavailable",
     "Balance",
-    "CentreGrid",
     "Composite",
     "HashGrid",
     "HashGridField",
@@ -79,7 +76,6 @@ __all__ = [
     "VoronoiRouter",
     "balance",
     "cell_sort",
-    "centre_grid",
     "composite",
     "frequency_encode",
     "grouped_linear",

@@ -33,7 +33,6 @@ def cases() -> list[Case]:
         found.append(_nearest(n, k, single, backends=ALL if k == 16 else ("native",), quick=k == 16))
     found += [_nearest(count, 16, single) for count in (1 << 10, 1 << 14, 1 << 20)]
     found.append(_nearest(n, 16, torch.float64))
-    found += [_nearest(n, k, single, frozen=True) for k in (512, 4096)]
     for count, shape, quick in ((n, (16, 16), True), (n, (64, 64), False), (1 << 10, (16, 16), False)):
         name = "x".join(str(k) for k in shape)
         work = functools.partial(_locate_work, count, shape)
@@ -63,22 +62,20 @@ def _nearest(
     k: int,
     dtype: torch.dtype,
     *,
-    frozen: bool = False,
     backends: tuple[str, ...] = ("native",),
     quick: bool = False,
 ) -> Case:
-    name = f"n={n} k={k}" + (" frozen" if frozen else "")
-    work = functools.partial(_nearest_work, n, k, dtype, frozen)
+    name = f"n={n} k={k}"
+    work = functools.partial(_nearest_work, n, k, dtype)
     return Case("nearest_centre", name, dtype, FORWARD, n, k, work, backends, quick)
 
 
-def _nearest_work(n: int, k: int, dtype: torch.dtype, frozen: bool, device: torch.device) -> Work:
+def _nearest_work(n: int, k: int, dtype: torch.dtype, device: torch.device) -> Work:
     points = [uniform_points(n, seed, device, dtype) for seed in range(rotation(12 * n))]
     centres = uniform_points(k, 1000, device, dtype)
 
     def ours(backend: str) -> Contender:
-        grid = {"grid": ops.centre_grid(centres)} if frozen else {}
-        return Contender(lambda call: ops.nearest_centre(points[call % len(points)], centres, backend=backend, **grid))
+        return Contender(lambda call: ops.nearest_centre(points[call % len(points)], centres, backend=backend))
 
     def using(make: Callable[[Tensor], Lookup]) -> Callable[[], Contender]:
         def set_up() -> Contender:
@@ -87,17 +84,13 @@ def _nearest_work(n: int, k: int, dtype: torch.dtype, frozen: bool, device: torc
 
         return set_up
 
-    makers = dict(LOOKUPS)
-    if frozen:
-        # Without a preparation their answer is in the row of the same number of centres.
-        makers = {name: maker for name, maker in makers.items() if name in ("scipy cKDTree", "faiss flat")}
     return Work(
         ours,
-        {name: using(maker) for name, maker in makers.items()},
+        {name: using(maker) for name, maker in LOOKUPS.items()},
         lambda cells: _wrong_cells(points[0], centres, cells),
         tolerance=0.01 * min(n, CHECKED),  # the expanded square misplaces some points
-        amount=(16.0 * n if frozen else float(FLOPS) * n * k),
-        bound="copy" if frozen else "float32" if dtype == torch.float32 else "",
+        amount=float(FLOPS) * n * k,
+        bound="float32" if dtype == torch.float32 else "",
     )
 
 

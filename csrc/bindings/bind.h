@@ -183,7 +183,7 @@ class Module {
     (LoaderOf<A>::declare(declarations_, module_), ...);
     std::string exact, python;
     int number = 0;
-    const auto add = [&](const std::string& exactly, const std::string& type) {
+    [[maybe_unused]] const auto add = [&](const std::string& exactly, const std::string& type) {
       exact += (number == 0 ? "" : ", ") + exactly;
       python += (number == 0 ? "_" : ", _") + std::to_string(number) + ": " + type;
       ++number;

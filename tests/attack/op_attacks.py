@@ -18,7 +18,6 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from voronerf import MLP, HashGrid, Layer, ops
 from voronerf.app.cli.main import NO_MEMORY
-from voronerf.ops import CentreGrid
 from voronerf.ops._core import backends, tolerances
 from voronerf.ops._core.cases import SIZES, Draw, cases
 from voronerf.ops.grouped_mlp.case import layer_table
@@ -137,7 +136,7 @@ def other_argument(rng: random.Random, op: str, name: str, value: Any) -> Any:
         at = rng.randrange(len(value))
         there = value[at] if isinstance(value[at], Tensor) else torch.ones(2)
         return [*value[:at], other_tensor(rng, there), *value[at + 1 :]]
-    if isinstance(value, (MLP, HashGrid, CentreGrid)):
+    if isinstance(value, (MLP, HashGrid)):
         others = (
             None,
             "x",
@@ -147,7 +146,7 @@ def other_argument(rng: random.Random, op: str, name: str, value: Any) -> Any:
             Layer((-1,), 3),
             {},
         )
-        return rng.choice((*others, ops.centre_grid(torch.rand(4, 3))))
+        return rng.choice(others)
     if isinstance(value, str):
         return rng.choice((*TEXTS, None, 3, torch.ones(2)))
     if value is None:

@@ -12,7 +12,6 @@
 #include "encoding/encode.h"
 #include "encoding/spherical_harmonics.h"
 #include "geometry/cell_sort.h"
-#include "geometry/centre_grid.h"
 #include "geometry/locate_cell.h"
 #include "geometry/nearest_centre.h"
 #include "network/grouped_linear.h"
@@ -34,29 +33,12 @@ void search(Isa isa) {
   wild = false;  // centres are finite
   const Array<T> centres = below(2) == 0 ? uniform<T>(3 * k) : lattice<T>(3 * k);
   wild = was_wild;
-  Array<int32_t> found(n, -7), again(n, -7), by_grid(n, -7);
+  Array<int32_t> found(n, -7), again(n, -7);
   voronerf::nearest_centre_cpu(points.data(), centres.data(), found.data(), n, k, isa, 1);
   voronerf::nearest_centre_cpu(points.data(), centres.data(), again.data(), n, k, isa, 3);
   same(found, again, "nearest_centre");
   within(found, k, "nearest_centre");
   like_portable(found, "nearest_centre");
-
-  const Array<double> exact(centres.begin(), centres.end());
-  const auto tables = voronerf::centre_grid_build(exact.data(), k, isa, 1);
-  const auto others = voronerf::centre_grid_build(exact.data(), k, isa, 3);
-  same(tables->entries, others->entries, "centre_grid");
-  same(tables->lists, others->lists, "centre_grid");
-  Array<float> table;
-  for (int64_t i = 0; i < k; ++i) {
-    for (int a = 0; a < 3; ++a) table.push_back(static_cast<float>(centres[3 * i + a]));
-    table.push_back(0.0f);
-  }
-  const voronerf::CentreGrid grid{tables->frame, tables->entries.data(), tables->lists.data(), table.data(),
-                                  tables->bits};
-  for (const int threads : {1, 3}) {
-    voronerf::nearest_centre_grid_cpu(points.data(), centres.data(), grid, by_grid.data(), n, k, isa, threads);
-    if (by_grid != found) fail("nearest_centre_grid: not what all centres give");
-  }
 }
 
 template <typename T>

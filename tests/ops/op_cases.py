@@ -60,7 +60,7 @@ def refusals(call, name=None, /, **good):
     call(**good)
 
     def refuses(message, **changed):
-        of_types = re.search("dtype|must be an integer|must be a tensor|must be a CentreGrid", message)
+        of_types = re.search("dtype|must be an integer|must be a tensor", message)
         with refused(TypeError if of_types else ValueError, f"{name or call.__name__}: {message}"):
             call(**{**good, **changed})
 

@@ -20,12 +20,6 @@ from torch import Tensor, nn
 
 from voronerf import ops
 from voronerf.diagram.drawing import draw_cell
-from voronerf.ops._core import backends
-
-# A grid is faster than a search of all centres from this many centres on. Making it pays after this many points (see
-# ops.centre_grid).
-_GRID_CENTRES = 384
-_GRID_POINTS = 1 << 17
 
 
 class VoronoiDiagram(nn.Module):
@@ -63,8 +57,6 @@ class VoronoiDiagram(nn.Module):
     child: Tensor
     depth: int
     num_cells: int
-    _grid: ops.CentreGrid | None = None
-    _points_located: int = 0
 
     def __init__(self, centres: Tensor) -> None:
         """Makes a flat diagram. A single centre is allowed: one cell, all of space.
@@ -151,9 +143,6 @@ class VoronoiDiagram(nn.Module):
     def locate(self, points: Tensor, *, backend: str = "auto") -> Tensor:
         """The leaf that each point lies in.
 
-        On the CPU, a flat diagram of many centres makes a grid (`ops.centre_grid`) after enough points. It makes the
-        query faster and does not change the result.
-
         Args:
             points: floating [..., 3]; half types are compared in float32, float64 points in float64.
             backend: see `voronerf.ops._core.backends`.
@@ -169,33 +158,11 @@ class VoronoiDiagram(nn.Module):
         dtype = torch.float64 if flat.dtype == torch.float64 else torch.float32
         flat, centres = flat.to(dtype), self.centres.to(dtype)
         if self.depth == 1:
-            grid = self._centre_grid(flat.shape[0], backend)
-            cells = ops.nearest_centre(flat, centres, grid=grid, backend=backend)
+            cells = ops.nearest_centre(flat, centres, backend=backend)
         else:
             tree = self.child_offsets, self.child
             cells = ops.locate_cell(flat, centres, *tree, depth=self.depth, backend=backend)
         return cells.reshape(points.shape[:-1])
-
-    def _centre_grid(self, n: int, backend: str) -> ops.CentreGrid | None:
-        """A grid of the present centres if one pays for n more points, or None."""
-        if self.centres.shape[0] < _GRID_CENTRES or backend not in ("auto", "native") or torch.compiler.is_compiling():
-            return None
-        if backends.why_not("nearest_centre_grid", "native", self.centres.device) is not None:
-            return None
-        # One reading of the attribute, which another thread may set at any time.
-        grid = self._grid
-        # Buffers may be written to from outside, as by DistributedDataParallel.
-        if grid is not None and not grid.belongs_to(self.centres):
-            grid = self._grid = None
-        self._points_located += n
-        if grid is None and self._points_located >= _GRID_POINTS:
-            grid = self._grid = ops.centre_grid(self.centres)
-            self._points_located = 0
-        return grid
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What is copied and pickled: all but the grid, which can be made again."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("_grid", "_points_located")}
 
     def sample_cell(
         self, points: Tensor, *, temperature: float, generator: torch.Generator | None = None, backend: str = "auto"

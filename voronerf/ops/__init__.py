@@ -13,7 +13,6 @@ from voronerf.ops._core.layers import MLP, Layer
 from voronerf.ops.adam import Guard, Rule, adam
 from voronerf.ops.balance_centres import balance_centres
 from voronerf.ops.cell_sort import cell_sort
-from voronerf.ops.centre_grid import CentreGrid, centre_grid
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_pixels import draw_pixels
 from voronerf.ops.draw_pixels.reference import Runs
@@ -41,7 +40,6 @@ from voronerf.ops.spherical_harmonics import spherical_harmonics
 
 __all__ = [
     "MLP",
-    "CentreGrid",
     "Composite",
     "Guard",
     "HashGrid",
@@ -58,7 +56,6 @@ __all__ = [
     "adam",
     "balance_centres",
     "cell_sort",
-    "centre_grid",
     "compose_runs",
     "composite",
     "draw_pixels",

@@ -8,15 +8,13 @@ from torch import Tensor
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
 from voronerf.ops._core.checks import FLOATING, Checked
-from voronerf.ops.centre_grid import CentreGrid
-from voronerf.ops.nearest_centre_grid import nearest_centre_grid
 
 _OP = backends.declare(
     "nearest_centre", native=Implementation(EVERYWHERE, COORDINATES), warp=Implementation(EVERYWHERE, COORDINATES)
 )
 
 
-def nearest_centre(points: Tensor, centres: Tensor, *, grid: CentreGrid | None = None, backend: str = "auto") -> Tensor:
+def nearest_centre(points: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
     """Index of the nearest centre of every point: ``argmin_c |x - v_c|``.
 
     Exact: the direct form of the distance is used, and ties go to the lowest index. A point that is not finite goes to
@@ -25,15 +23,10 @@ def nearest_centre(points: Tensor, centres: Tensor, *, grid: CentreGrid | None =
     Args:
         points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are compared in float32.
         centres: [k, 3] floating point, finite, k >= 1.
-        grid: made by ``centre_grid`` from these centres, or None. The result is the same, and faster for hundreds of
-            centres. With a grid there are "native", on the CPU, and "reference".
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
         cells int32 [n], in 0 to k - 1.
-
-    Raises:
-        ValueError: a grid of other centres.
 
     Examples:
         >>> import torch
@@ -49,8 +42,6 @@ def nearest_centre(points: Tensor, centres: Tensor, *, grid: CentreGrid | None =
     if given.sizes["k"] < 1:
         raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
     points, centres = of_one_dtype(points, centres)
-    if grid is not None:
-        return nearest_centre_grid(points, centres, grid, backend)
     run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
     cells: Tensor = run(points, centres)
     return cells

@@ -18,7 +18,6 @@ CASE = Case(
     refused={
         "points must be a tensor, got list": {"points": [1.0]},
         "centres must have shape [k, 3], got [1]": {"centres": torch.zeros(1)},
-        "grid must be a CentreGrid, got int": {"grid": 3},
     },
     alternatives={"torch cdist": lambda points, centres: torch.cdist(points, centres).argmin(1)},
     on_devices=({"k": 700}, {"points": "lattice"}, {"dtype": torch.float64}),
