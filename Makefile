@@ -13,7 +13,7 @@ THREADS ?= 1
 # Processes that share the tests.
 JOBS ?= auto
 # Every architecture nvcc 13 knows that a user may have; the last also as PTX.
-CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90a 100 120
+CUDA_CHECK_ARCHITECTURES ?= 75 80 86 89 90 100 120
 
 SOURCES := $(shell find csrc -type f) setup.py pyproject.toml
 

@@ -188,13 +188,13 @@ def reporting(check, monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("reported", "status", "outcome"),
     [
-        (["80", "90a"], 0, "held without a warning, 0 spilling."),
-        (["80"], 1, "(sm_90a)."),
+        (["80", "90"], 0, "held without a warning, 0 spilling."),
+        (["80"], 1, "(sm_90)."),
         ([], 1, "failed: no kernel was reported."),
     ],
 )
 def test_cuda_check_fails_where_nothing_was_checked(reporting, reported, status, outcome):
-    found, said = reporting("".join(REPORT.format(arch) for arch in reported), "80", "90a")
+    found, said = reporting("".join(REPORT.format(arch) for arch in reported), "80", "90")
     assert found == status and said.endswith(outcome)
 
 
@@ -220,17 +220,6 @@ def test_cuda_check_leaves_the_toolkits_own_kernels_alone(reporting):
     assert status == 0 and "cub" not in said and "kernels and 1 of the toolkit's compiled for sm_80" in said
 
 
-def test_cuda_check_takes_no_serialized_products(reporting, check, monkeypatch, tmp_path):
-    """ptxas's word for it, which -Werror does not reach."""
-    told = (
-        "ptxas info    : (C7510) Potential Performance Loss: wgmma.mma_async instructions are serialized due to "
-        "insufficient register resources for the wgmma pipeline in the function '_Z6kernelv'\n"
-    )
-    monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
-    status, said = reporting(told + REPORT.format("90a"), "90a")
-    assert status == 1 and "(C7510)" in said and "failed: ptxas serializes wgmma in " in said
-
-
 def test_cuda_check_compares_with_the_table(check, monkeypatch, tmp_path):
     row = {"registers": 40, "spilled_bytes": 8, "shared_bytes": 0, "warps": 48}
     monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
@@ -246,21 +235,21 @@ def test_cuda_check_compares_with_the_table(check, monkeypatch, tmp_path):
     fewer = {"kernel": {"sm_80": {**row, "warps": 47}}}
     assert check.regressions("V13", fewer) == ["kernel (sm_80): warps 47, below 48"]
     assert check.regressions("V14", more) == ["kernel (sm_80): spilled_bytes 12, above 8"]
-    assert [check.warps(registers, "sm_90a") for registers in (8, 32, 33, 255)] == [64, 64, 51, 8]
+    assert [check.warps(registers, "sm_90") for registers in (8, 32, 33, 255)] == [64, 64, 51, 8]
     assert [check.warps(8, architecture) for architecture in ("sm_75", "sm_89")] == [32, 48]
 
 
 def test_cuda_check_notes_the_architectures_it_was_asked_for(check, monkeypatch, reporting, tmp_path):
     monkeypatch.setattr(check, "TABLE", tmp_path / "table.json")
     old = {"registers": 40, "spilled_bytes": 0, "shared_bytes": 0, "warps": 48}
-    _, said = reporting(REPORT.format("90a"), "90a")
+    _, said = reporting(REPORT.format("90"), "90")
     kernel = next(line for line in said.splitlines() if "kernel" in line).split(": registers")[0]
-    known = {kernel: {"sm_100": old, "sm_90a": old}, "gone": {"sm_100": old}}
+    known = {kernel: {"sm_100": old, "sm_90": old}, "gone": {"sm_100": old}}
     check.TABLE.write_text(check.as_text("V12", known))
-    reporting(REPORT.format("90a"), "90a", "--update")
-    assert list(check.json.loads(check.TABLE.read_text())["kernels"][kernel]) == ["sm_90a"]  # of another nvcc
+    reporting(REPORT.format("90"), "90", "--update")
+    assert list(check.json.loads(check.TABLE.read_text())["kernels"][kernel]) == ["sm_90"]  # of another nvcc
     check.TABLE.write_text(check.as_text("", known))
-    reporting(REPORT.format("90a"), "90a", "--update")
+    reporting(REPORT.format("90"), "90", "--update")
     kept = check.json.loads(check.TABLE.read_text())["kernels"]
-    assert list(kept[kernel]) == ["sm_90a", "sm_100"] and "gone" not in kept
-    assert kept[kernel]["sm_100"] == list(old.values()) != kept[kernel]["sm_90a"]
+    assert list(kept[kernel]) == ["sm_90", "sm_100"] and "gone" not in kept
+    assert kept[kernel]["sm_100"] == list(old.values()) != kept[kernel]["sm_90"]

@@ -19,13 +19,6 @@ STEPS: dict[str, tuple[int, str, bool, int]] = {
 the number of cells."""
 
 
-def has_wgmma(device: str) -> bool:
-    """Whether a device multiplies by groups of warps: an H100 or an H200, or the emulated one."""
-    import torch
-
-    return device == "cpu" or torch.cuda.get_device_capability(device) == (9, 0)
-
-
 def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     """Names and checks, which raise."""
     import torch
@@ -220,14 +213,13 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         *(
             (f"grouped_mlp {name} {precision} forward by {way}", functools.partial(forward, layers, precision, way))
             for name, layers, precision, ways in (
-                ("skips", SKIPS, "bfloat16", ("chain", "wgmma")),
-                ("skips", SKIPS, "float16", ("chain", "tiles", "wgmma")),
-                ("nerf64", NeRF(width=64).layers, "bfloat16", ("chain", "wgmma")),
-                ("thick", THICK, "bfloat16", ("chain", "wgmma")),
-                ("narrow", NARROW, "bfloat16", ("chain", "wgmma")),
+                ("skips", SKIPS, "bfloat16", ("chain",)),
+                ("skips", SKIPS, "float16", ("chain", "tiles")),
+                ("nerf64", NeRF(width=64).layers, "bfloat16", ("chain",)),
+                ("thick", THICK, "bfloat16", ("chain",)),
+                ("narrow", NARROW, "bfloat16", ("chain",)),
             )
             for way in ways
-            if way != "wgmma" or has_wgmma(device)
         ),
         ("grouped_mlp dense float32", functools.partial(network, DENSE, [37, 3], 3, "float32")),
         ("grouped_mlp beyond float16", beyond_float16),

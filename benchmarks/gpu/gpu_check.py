@@ -50,8 +50,6 @@ PYTHON = sys.executable
 TAIL = 40
 """Lines of a failure that are printed."""
 SPLIT = "--split-compile=0"
-TARGETS = {"90": "90a"}
-"""What to build for, where that is not the compute capability as it is: with wgmma, to compare it."""
 JUDGED = (
     *("small", "large", "captured", "roofs", "sizes", "step", "profile", "rivals", "training"),
     *("memcheck", "racecheck", "synccheck", "initcheck"),
@@ -130,8 +128,7 @@ def parts(out: Path, data: Path | None) -> dict[str, Part]:
     sanitizer, profiler = shutil.which("compute-sanitizer", path=places), shutil.which("ncu", path=places)
     architecture = capability()
     # nvcc optimises the kernels of a file in parallel, where it can.
-    target = TARGETS.get(architecture or "", architecture or "")
-    built = (("VORONERF_CUDA", "1"), ("VORONERF_CUDA_ARCHITECTURES", target), ("NVCC_APPEND_FLAGS", SPLIT))
+    built = (("VORONERF_CUDA", "1"), ("VORONERF_CUDA_ARCHITECTURES", architecture or ""), ("NVCC_APPEND_FLAGS", SPLIT))
     own = [PYTHON, str(ROOT / "benchmarks" / "gpu" / "gpu_parts.py")]
     # Each allocation for itself, so that what reads or writes beyond one leaves all of them.
     apart = (("PYTORCH_NO_CUDA_MEMORY_CACHING", "1"),)
@@ -253,14 +250,11 @@ def highlights(found: dict[str, Any]) -> list[str]:
 
 def ruled(times: dict[str, float]) -> list[str]:
     """What docs/cuda.md says is to be kept or deleted, by seconds of each row."""
-    chain, tiles, groups = (times.get(f"nerf64 k=16 forward{way}") for way in ("", " by tiles", " by wgmma"))
+    chain, tiles = (times.get(f"nerf64 k=16 forward{way}") for way in ("", " by tiles"))
     lines = []
     if chain and tiles:
         gain = tiles / chain
         lines.append(f"chain is {gain:.2f} x the tiles: {'keep it' if gain >= 1.5 else 'delete it (below 1.5)'}")
-    if chain and groups:
-        gain = chain / groups
-        lines.append(f"wgmma is {gain:.2f} x the chain: {'keep it' if gain >= 1.2 else 'delete it (below 1.2)'}")
     pairs = [
         (times.get(f"cell_sort k={k} by counting"), times.get(f"cell_sort k={k} by radix")) for k in (16, 256, 1022)
     ]

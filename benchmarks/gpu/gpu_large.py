@@ -11,8 +11,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from gpu_cases import has_wgmma
-
 N = 1 << 22
 """Samples, at which every loop of the kernels is walked several times."""
 SUBSET = 1 << 12
@@ -28,7 +26,7 @@ def large_cases(device: str, n: int = N) -> list[tuple[str, Callable[[], str]]]:
         for precision in ALLOWED:
             # Chained networks look up no hash grid, and take 16 bits.
             chained = precision != "float32" and name != "hash32"
-            ways = ("tiles", "layers", *(("chain", *["wgmma"] * has_wgmma(device)) if chained else ()))
+            ways = ("tiles", "layers", *(["chain"] * chained))
             ways = ("tiles",) if name == "hash32" else ways
             run = functools.partial(compare, device, name, precision, ways, n)
             cases.append((f"{name} {precision} by {', '.join(ways)}", run))

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from gpu_cases import has_wgmma
 from gpu_journal import Again, Case, Journal, one_by_one, settling
 
 N = 1 << 22
@@ -163,11 +162,9 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         both_work, both_aim = (price.forward + price.backward) * n, 0.25 if name == "nerf64" else None
         row(f"{name} k={k} forward", forward, "bfloat16", price.forward * n, aims.get(name))
         if name != "nerf256":
-            # Which is the fastest: values in registers, as above, in shared memory, or in registers with products of
-            # four warps, which are to become the way by themselves where this shows that they pay.
-            for way in ("tiles", "wgmma") if has_wgmma(device) else ("tiles",):
-                other = functools.partial(network, name, k, False, way)
-                row(f"{name} k={k} forward by {way}", other, "bfloat16", price.forward * n)
+            # Which is faster: values in registers, as above, or in shared memory.
+            other = functools.partial(network, name, k, False, "tiles")
+            row(f"{name} k={k} forward by tiles", other, "bfloat16", price.forward * n)
         row(f"{name} k={k} forward + backward", both, "bfloat16", both_work, both_aim)
     return rows.measure()
 

@@ -85,10 +85,9 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& inputs, co
 
 // On CUDA: what is multiplied (sums are float32), and the way a call goes: fused with values in registers
 // (grouped_mlp_cuda_chain.h), fused with values in shared memory (grouped_mlp_cuda_plan.h), layer by layer
-// (grouped_mlp_cuda_layers.h). One can be asked for, to compare them. groups: the chain with products of four warps,
-// never by itself.
+// (grouped_mlp_cuda_layers.h). One can be asked for, to compare them.
 enum class MlpPrecision : int { float32 = 0, bfloat16, float16, tf32 };
-enum class MlpCudaWay : int { automatic = 0, chain, tiles, layers, groups };
+enum class MlpCudaWay : int { automatic = 0, chain, tiles, layers };
 
 // How calls of these sizes go on the device that is current: made once, and kept by who makes such calls. parameters:
 // whether their gradients are wanted. Throws std::invalid_argument for a table that breaks a rule of its way.

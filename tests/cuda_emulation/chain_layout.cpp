@@ -54,16 +54,15 @@ void bind_chain_layout(py::module_& module) {
   // The plan of a table, or the rule that it breaks.
   module.def("chain_plan",
              [](voronerf::Argument<voronerf::MlpTable> table, int precision, int64_t n, int64_t k, int capability,
-                int shared_bytes, int multiprocessors, bool groups, bool compiled) -> py::object {
+                int shared_bytes, int multiprocessors) -> py::object {
                voronerf::MlpChainPlan plan;
-               const voronerf::MlpCudaDevice device = {capability, shared_bytes, multiprocessors, 1 << 20, compiled};
+               const voronerf::MlpCudaDevice device = {capability, shared_bytes, multiprocessors, 1 << 20};
                const char* fault =
                    voronerf::mlp_chain_plan(table.get(),
-                                            static_cast<voronerf::MlpPrecision>(precision), n, k, device, groups, plan);
+                                            static_cast<voronerf::MlpPrecision>(precision), n, k, device, plan);
                if (fault != nullptr) return py::str(fault);
                py::dict told;
                told["width"] = plan.width;
-               told["groups"] = plan.groups;
                told["warps"] = plan.warps;
                told["resident"] = plan.resident;
                told["slot"] = plan.slot;

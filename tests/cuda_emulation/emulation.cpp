@@ -55,13 +55,6 @@ struct Fiber {
   State state = State::ready;
   unsigned index = 0;
   std::vector<std::vector<Copy>> copies;
-  GroupThread group;
-};
-
-// What the threads of a group of four warps have done, the first to come setting it down.
-struct GroupStep {
-  const char* operation;
-  uint64_t argument;
 };
 
 struct Warp {
@@ -78,16 +71,13 @@ std::vector<void*> idle_watches;
 struct Block {
   std::vector<Fiber> fibers;
   std::vector<Warp> warps;
-  std::vector<std::vector<GroupStep>> groups;
   unsigned waiting = 0, left = 0, generation = 0;
   char order[2];
   std::map<const void*, void*> shared;
   size_t shared_bytes = 0;
   void* dynamic = nullptr;
-  size_t dynamic_bytes = 0;
 
-  Block(size_t threads, size_t bytes)
-      : fibers(threads), warps(threads / 32), groups(threads / 128), dynamic_bytes(bytes) {
+  Block(size_t threads, size_t bytes) : fibers(threads), warps(threads / 32) {
     for (unsigned i = 0; i < threads; ++i) fibers[i].index = i;
     // A buffer of exactly the size: AddressSanitizer knows its ends.
     if (bytes > 0) dynamic = poisoned(bytes);
@@ -220,12 +210,6 @@ void run_block(Launch& it, Block& block, std::mt19937_64& random) {
                        : "an operation of a warp is not reached by all of its lanes";
     return;
   }
-  for (const Fiber& fiber : block.fibers) {
-    if (!fiber.group.products.empty()) it.error = "products of a group are not waited for";
-    if (fiber.group.steps > 0 && fiber.group.steps != block.groups[fiber.index / 128].size()) {
-      it.error = "an operation of a group is not reached by all of its warps";
-    }
-  }
 }
 
 }  // namespace
@@ -241,37 +225,6 @@ int lane() {
 
 std::vector<std::vector<Copy>>& copies() {
   return launching->current->copies;
-}
-
-const float kUnderWay = std::numeric_limits<float>::signaling_NaN();
-
-GroupThread& group_thread() {
-  return launching->current->group;
-}
-
-size_t dynamic_bytes() {
-  return launching->block->dynamic_bytes;
-}
-
-std::vector<const void*> unpublished() {
-  std::vector<const void*> all;
-  for (const Fiber& fiber : launching->block->fibers) {
-    all.insert(all.end(), fiber.group.unpublished.begin(), fiber.group.unpublished.end());
-  }
-  return all;
-}
-
-void agree(const char* operation, uint64_t argument) {
-  Block& block = *launching->block;
-  Fiber& fiber = *launching->current;
-  if (fiber.index / 128 >= block.groups.size()) fail(std::string(operation) + " in a group of fewer than four warps");
-  auto& steps = block.groups[fiber.index / 128];
-  const size_t step = fiber.group.steps++;
-  if (step == steps.size()) steps.push_back({operation, argument});
-  if (std::strcmp(steps[step].operation, operation) != 0) {
-    fail(std::string("warps of a group come to ") + steps[step].operation + " and to " + operation);
-  }
-  if (steps[step].argument != argument) fail(std::string("warps of a group do not agree on ") + operation);
 }
 
 void fail(const std::string& message) {

@@ -87,7 +87,7 @@ inline cudaError_t cudaMemcpyAsync(void* to, const void* from, size_t size, cuda
 }
 constexpr cudaError_t cudaErrorInvalidValue = 1;
 struct cudaFuncAttributes {
-  int ptxVersion, maxThreadsPerBlock;
+  int ptxVersion;
 };
 
 namespace vn_emulation {
@@ -149,40 +149,6 @@ void require_all(unsigned mask);
 [[noreturn]] void fail(const std::string& message);
 [[noreturn]] void misaligned(const char* operation);
 
-// What a thread has under way of products of its group of four warps (emulation_groups.h).
-struct GroupRegisters {
-  const void* at;
-  std::vector<unsigned char> bytes;
-};
-struct GroupSums {
-  float* at;
-  std::vector<float> values;
-};
-struct GroupProduct {
-  float* d;
-  int tiles;
-  bool bfloat16;
-  int set;
-  uint64_t b;
-  const uint32_t* a;
-  uint32_t kept[4], rows[4][4];  // this thread's part of the left operand, and those of its rows
-};
-struct GroupThread {
-  std::vector<GroupRegisters> settled, fenced;
-  std::vector<GroupSums> sums;
-  std::vector<GroupProduct> products;
-  int sets = 0;
-  size_t steps = 0;
-  std::vector<const void*> unpublished;
-};
-constexpr ptrdiff_t kSharedWindow = 1024;  // address of the dynamic shared memory among those of shared memory
-extern const float kUnderWay;              // no number
-GroupThread& group_thread();
-size_t dynamic_bytes();
-std::vector<const void*> unpublished();
-// Every thread of a group does the same, in the same order; they need not meet.
-void agree(const char* operation, uint64_t argument);
-
 }  // namespace vn_emulation
 
 inline cudaError_t cudaGetDevice(int* device) {
@@ -214,7 +180,6 @@ inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, 
 template <typename Kernel>
 cudaError_t cudaFuncGetAttributes(cudaFuncAttributes* attributes, Kernel) {
   attributes->ptxVersion = vn_emulation::settings().compiled;
-  attributes->maxThreadsPerBlock = 1024;
   return cudaSuccess;
 }
 // An error unless it is all that there is: host threads that set what they need themselves take it from each other.
@@ -363,7 +328,6 @@ inline void emulated_copy_wait(size_t pending) {
       for (int word = 0; word < 4; ++word) {
         static_cast<uint32_t*>(copy.to)[word] = copy.valid ? static_cast<const uint32_t*>(copy.from)[word] : 0;
       }
-      vn_emulation::group_thread().unpublished.push_back(copy.to);
     }
     groups.erase(groups.begin());
   }

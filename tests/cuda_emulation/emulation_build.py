@@ -22,7 +22,7 @@ SANITIZERS = {
     "address": ["-fsanitize=address", "--param", "asan-instrumentation-with-call-threshold=0"],
     "thread": ["-fsanitize=thread"],
 }
-PYTHON = {"module.cpp", "index_maps.cpp", "chain_layout.cpp", "group_bindings.cpp", "plans.cpp"}
+PYTHON = {"module.cpp", "index_maps.cpp", "chain_layout.cpp", "plans.cpp"}
 """Files for Python, which are compiled with the bindings of csrc/."""
 PLAIN = {"emulation.cpp", "emulated_products.cpp", "python.cpp"}
 """Files with nothing to watch."""

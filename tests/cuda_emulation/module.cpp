@@ -14,7 +14,6 @@ namespace py = pybind11;
 namespace vn_emulation {
 int64_t launches();
 }
-void bind_groups(py::module_& module);
 void bind_index_maps(py::module_& module);
 void bind_plans(py::module_& module);
 void bind_chain_layout(py::module_& module);
@@ -22,7 +21,6 @@ void planted(const float* values, float* out, int* counter, int blocks, int thre
 
 PYBIND11_MODULE(voronerf_emulation, module) {
   voronerf::bind_all(module);
-  bind_groups(module);
   bind_index_maps(module);
   bind_plans(module);
   bind_chain_layout(module);
@@ -36,15 +34,13 @@ PYBIND11_MODULE(voronerf_emulation, module) {
       "grouped_mlp_plan",
       [](voronerf::Argument<voronerf::MlpTable> table, int precision, int64_t n, int64_t k, bool backward, int way) {
         voronerf::MlpCudaChoice choice;
-        voronerf::MlpCudaDevice device = voronerf::mlp_cuda_device();
-        device.groups = voronerf::mlp_chain_groups_compiled();
         const char* fault = voronerf::mlp_cuda_choose(table.get(), static_cast<voronerf::MlpPrecision>(precision), n, k,
-                                                      backward, static_cast<voronerf::MlpCudaWay>(way), device, choice);
+                                                      backward, static_cast<voronerf::MlpCudaWay>(way),
+                                                      voronerf::mlp_cuda_device(), choice);
         VN_CHECK(fault == nullptr, fault);
         py::dict plan;
         const bool by_layers = choice.way == voronerf::MlpCudaWay::layers;
         plan["way"] = static_cast<int>(choice.way);
-        plan["groups"] = choice.chain.groups;
         plan["by_layers"] = by_layers;
         plan["precision"] = static_cast<int>(by_layers ? choice.layers.precision : choice.fused.precision);
         plan["task_rows"] = choice.fused.task_rows;

@@ -52,11 +52,11 @@ def way(layers, precision, *, backward=False, **options):
     return WAYS[plan(layers, precision=precision, backward=backward, **options)["way"]]
 
 
-def chain(layers, *, d=None, precision="bfloat16", n=MANY, k=16, groups=False, built=True, **device):
+def chain(layers, *, d=None, precision="bfloat16", n=MANY, k=16, **device):
     """The chained plan, or the rule that the table breaks, on an H200 unless another device is given."""
     known = {"capability": 90, "shared_bytes": 227 * KIB, "multiprocessors": 132} | device
     operands = PRECISIONS.index(precision)
-    return module().chain_plan(table(layers, d), operands, n, k, *known.values(), groups, built)
+    return module().chain_plan(table(layers, d), operands, n, k, *known.values())
 
 
 def assert_covers(found, n, k):

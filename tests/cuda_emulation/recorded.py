@@ -24,11 +24,11 @@ from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops.cell_sort.native import sort as sort_cells
 from voronerf.ops.grouped_mlp.native import using_way
 
-# Values in registers, with weights that stay or pass through; in shared memory, where that is asked for; what fits no
-# fused network: layer by layer; and in registers with products of four warps.
+# Values in registers, with weights that stay or pass through; in shared memory, where that is asked for; and what fits
+# no fused network: layer by layer.
 NETWORKS = (
     *(("float32", 227, "auto"), ("bfloat16", 40, "tiles"), ("bfloat16", 227, "auto"), ("bfloat16", 1, "auto")),
-    *(("bfloat16", 227, "wgmma"), ("float16", 30, "auto"), ("float16", 40, "wgmma")),
+    ("float16", 30, "auto"),
 )
 
 

@@ -181,25 +181,3 @@ def test_what_stays_where():
     assert not chain(nerf(128, 8))["resident"] and chain(nerf(128, 8))["warps"] == 8 and not chain(THICK)["resident"]
     assert chain(plain(64, 4), precision="float32").startswith("products must be of 16 bits")
     assert chain(plain(130, 4)) == "a layer must have at most 128 features"
-
-
-def test_plans_of_four_warps_have_whole_groups():
-    for layers in (plain(64, 4), plain(32, 3), NeRF(width=64).layers, nerf(128, 8), SKIPS):
-        for shared in (227, 99, 64):
-            alone, together = (chain(layers, shared_bytes=shared * KIB, groups=groups) for groups in (False, True))
-            if isinstance(together, str):
-                assert together.startswith("two pieces of weights, and what four warps keep, must fit the shared mem")
-                continue
-            assert together["warps"] % 4 == 0 and together["groups"] and not alone["groups"]
-            # Descriptors count in 16 bytes.
-            assert all(layer["piece"] % 16 == 0 for layer in together["layers"]) and together["slot"] % 16 == 0
-            if alone["warps"] >= 4:
-                assert {**alone, "groups": True} == together
-
-
-def test_four_warps_multiply_only_on_hopper_and_for_those_who_ask():
-    rule = "wgmma must be asked for with compute capability 9.0 and kernels compiled for sm_90a"
-    assert not chain(plain(64, 4))["groups"]
-    for capability in (75, 80, 89, 100, 103, 120):
-        assert chain(plain(64, 4), precision="float16", groups=True, capability=capability) == rule
-    assert chain(plain(64, 4), groups=True, built=False) == rule

@@ -25,7 +25,7 @@ from emulated_networks import (
     run,
 )
 from helpers import refuses, same
-from network_plans import PRECISIONS, WAYS, plain, plan, way
+from network_plans import PRECISIONS, plain, plan, way
 
 import voronerf
 from voronerf.nerf.fields import NeRF
@@ -85,16 +85,12 @@ CHAINED = {
     "gaussians": Case(GAUSSIANS, [20, 33], 6, HALVES[:1]),
     "deep gaussians": Case(DEEP, [20, 33], 6, HALVES[:1]),
     **{f"width {width}": of_width(width) for width in WIDTHS},
-}
-ALONE = {
     "skips, little memory": Case(SKIPS, [37, 290], 3, HALVES, (64,), seeds=(7,)),
     "before Ampere": Case(SKIPS, [70, 5], 3, HALVES[1:], (64,), capability=75),
-}
-TOGETHER = {
     "nerf64": Case(NeRF(width=64).layers, [300, 2], 3, HALVES[:1]),
     "narrow": Case(NARROW, [300, 2], 3, HALVES[:1]),
 }
-"""Outputs of chained networks, by warps alone and by four of them together."""
+"""Outputs of chained networks."""
 
 
 def each(cases: dict[str, Case]) -> list:
@@ -121,37 +117,12 @@ def test_outputs_and_gradients(case: Case, precision: str, shared: int) -> None:
             check(case.layers, case.counts, case.d, precision)
 
 
-@pytest.mark.parametrize(
-    ("case", "precision", "shared", "asked"),
-    [
-        pytest.param(*parameter.values, asked, id=f"{asked}-{parameter.id}")
-        for asked, cases in (("auto", CHAINED | ALONE), ("wgmma", CHAINED | TOGETHER))
-        for parameter in each(cases)
-    ],
-)
-def test_outputs_of_chained_networks(case: Case, precision: str, shared: int, asked: str) -> None:
+@pytest.mark.parametrize(("case", "precision", "shared"), each(CHAINED))
+def test_outputs_of_chained_networks(case: Case, precision: str, shared: int) -> None:
     """Gradients of ReLU differ where a rounding moves a sample across its kink."""
-    options = {"seed": case.seeds[0], "capability": case.capability, "shared_bytes": shared * KIB}
-    with emulated(**options), using_way(asked):
-        found = plan(case.layers, precision=precision, backward=False, d=case.d, asked=asked)
-        assert WAYS[found["way"]] == "chain" and found["groups"] == (asked == "wgmma")
+    with emulated(seed=case.seeds[0], capability=case.capability, shared_bytes=shared * KIB):
+        assert way(case.layers, precision, d=case.d) == "chain"
         check_forward(case.layers, case.counts, case.d, precision)
-
-
-@pytest.mark.parametrize("precision", HALVES)
-def test_gradients_where_four_warps_multiply(precision: str) -> None:
-    """Cells of fewer rows than four warps have, and gradients, which go as without."""
-    with emulated(seed=1), using_way("wgmma"):
-        check(BRANCHED, [129, 0, 1, 70], 3, precision)
-
-
-def test_four_warps_multiply_as_each_alone() -> None:
-    """The same products in the same order: not a bit differs in the emulation."""
-    given, results = case(plain(64, 3), [200, 0, 31], 3, torch.bfloat16), []
-    for asked in ("wgmma", "chain"):
-        with emulated(), using_way(asked):
-            results.append(run(given, plain(64, 3), torch.bfloat16, "native")[0])
-    assert torch.equal(*results)
 
 
 @pytest.mark.parametrize("integrated", [False, True])
@@ -240,14 +211,13 @@ def test_weight_gradients_are_the_same_in_every_order(shared: int, multiprocesso
         assert (part.double() - exact).norm() <= 3e-6 * max(exact.norm().item(), 1e-6)
 
 
-@pytest.mark.parametrize("asked", ["auto", "wgmma"])
-def test_tensors_that_are_not_aligned(asked: str) -> None:
+def test_tensors_that_are_not_aligned() -> None:
     """Rows of four features are read whole where they begin at multiples of 16 bytes."""
     layers = MLP((Layer((POSITIONS,), 8),), (0,))
     weights, offsets = [torch.rand(1, 8, 8).bfloat16()], torch.tensor([0, 40], dtype=torch.int32)
     x, off = torch.rand(40, 8), torch.empty(1 + 40 * 8)
     off[1:] = x.flatten()
-    with emulated(), using_way(asked):
+    with emulated():
         aligned, shifted = (
             voronerf.grouped_mlp(rows, offsets, weights, [None], layers=layers, backend="native")
             for rows in (x, off[1:].view(40, 8))
@@ -255,11 +225,10 @@ def test_tensors_that_are_not_aligned(asked: str) -> None:
     assert off[1:].data_ptr() % 16 and torch.equal(aligned, shifted)
 
 
-@pytest.mark.parametrize("asked", ["auto", "wgmma"])
-def test_numbers_that_are_none_stay_in_their_rows(asked: str) -> None:
+def test_numbers_that_are_none_stay_in_their_rows() -> None:
     given = case(plain(64, 2), [40], 3, torch.bfloat16)
     given["positions"][5, 1], given["positions"][9, 0] = torch.nan, torch.inf
-    with emulated(), using_way(asked):
+    with emulated():
         out = run(given, plain(64, 2), torch.bfloat16, "native")[0]
     assert out.isnan().any(1).nonzero().flatten().tolist() == [5, 9]
 
@@ -303,8 +272,6 @@ def test_a_way_that_is_asked_for_is_taken_or_refused(monkeypatch) -> None:
 
     refuses("grouped_mlp: a layer must have at most 128 features on CUDA", asked, "chain", WIDE, 7)
     refuses("grouped_mlp: spherical harmonics must be computed by tiles or layers on", asked, "chain", HARMONICS, 3)
-    rule = "grouped_mlp: wgmma must be asked for with compute capability 9.0 and kernels compiled for sm_90a on CUDA"
-    refuses(rule, asked, "wgmma", plain(64, 2), 3, capability=100)
     many = MLP((Layer((POSITIONS,), 2), Layer((0,) * 65, 2)), (1,))
     rule = "grouped_mlp: a layer must have at most 64 sources on CUDA; use backend='reference'"
     refuses(rule, asked, "auto", many, 3)
@@ -313,7 +280,7 @@ def test_a_way_that_is_asked_for_is_taken_or_refused(monkeypatch) -> None:
     monkeypatch.setenv("VORONERF_CUDA_MLP", "tiles")
     assert _choose_way() == "tiles"
     monkeypatch.setenv("VORONERF_CUDA_MLP", "fast")
-    rule = "must be one of auto, chain, tiles, layers, wgmma, got 'fast'"
+    rule = "must be one of auto, chain, tiles, layers, got 'fast'"
     refuses(rule, _choose_way)
 
 

@@ -56,12 +56,10 @@ MlpCudaParameters parameters_of(const MlpTable& table, const MlpInputs& in) {
 
 std::unique_ptr<MlpCudaCall> grouped_mlp_call_cuda(const MlpTable& table, int64_t n, int64_t k, bool backward,
                                                    bool parameters, MlpPrecision precision, MlpCudaWay way) {
-  MlpCudaDevice device = mlp_cuda_device();
-  device.groups = way == MlpCudaWay::groups && mlp_chain_groups_compiled();
   auto call = std::make_unique<MlpCudaCall>();
   call->table = table;
   MlpCudaChoice& choice = call->choice;
-  if (const char* fault = mlp_cuda_choose(table, precision, n, k, backward, way, device, choice)) {
+  if (const char* fault = mlp_cuda_choose(table, precision, n, k, backward, way, mlp_cuda_device(), choice)) {
     const char* callers[] = {"grouped_mlp", "grouped_linear", "routed_mlp"};
     throw std::invalid_argument(std::string(callers[static_cast<int>(table.caller)]) + ": " + fault +
                                 " on CUDA; use backend='reference'");

@@ -12,9 +12,6 @@
 // in chunks of 64; a chunk's weights and biases are a piece. A block has all pieces of its cell in shared memory where
 // they fit, or two at a time, one that is read and one that is fetched.
 //
-// On compute capability 9.0 four warps can multiply together (cuda_wgmma.h): the same rows, fragments and weights, but
-// these are read from shared memory by the tensor cores themselves, once for 64 rows.
-//
 // This header is the plan, a pure function of the table, the batch and the device, and the order of weights and of
 // encoded columns, which kernels and tests share.
 #pragma once
@@ -67,8 +64,7 @@ struct MlpChainInput {
 
 struct MlpChainPlan {
   MlpPrecision precision;
-  int width;    // that the kernel is made for: 32, 64, 128
-  bool groups;  // products of four warps
+  int width;  // that the kernel is made for: 32, 64, 128
   int warps;
   bool resident;  // all pieces in shared memory
   int slot;       // bytes of one piece, where they are not
@@ -86,17 +82,12 @@ struct MlpChainPlan {
   int rows() const { return kChainRows * warps; }
 };
 
-// Null where the table fits, else the rule that it breaks. groups: with products of four warps, which are for those who
-// ask for them until a run on a device has shown that they pay.
+// Null where the table fits, else the rule that it breaks.
 const char* mlp_chain_plan(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k,
-                           const MlpCudaDevice& device, bool groups, MlpChainPlan& plan);
+                           const MlpCudaDevice& device, MlpChainPlan& plan);
 
 // Bytes of workspace, in MlpCudaWorkspace's order; there are no partials.
 MlpCudaWorkspace mlp_chain_workspace(const MlpChainPlan& plan, int64_t k);
-
-// The kernel of rows with products of four warps; whether there is code for the current device in it.
-void mlp_chain_groups_cuda(const MlpChainPlan& plan, const MlpCudaData& data, void* stream);
-bool mlp_chain_groups_compiled();
 
 void mlp_chain_cuda(const MlpChainPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
                     unsigned char* workspace, void* stream);

@@ -171,7 +171,7 @@ int shape(const MlpCudaDevice& device, MlpChainPlan& plan) {
   const int64_t weights = plan.resident ? plan.packed_bytes : 2 * int64_t{plan.slot};
   int best = 0;
   for (const int warps : {4, 8, 12, 16, 2, 1}) {
-    if (warps > most || (warps < 4 && (best > 0 || plan.groups))) continue;
+    if (warps > most || (warps < 4 && best > 0)) continue;
     const int64_t bytes = weights + int64_t{warps} * plan.region;
     if (bytes > device.shared_bytes) continue;
     const int64_t blocks =
@@ -189,15 +189,11 @@ int shape(const MlpCudaDevice& device, MlpChainPlan& plan) {
 }  // namespace
 
 const char* mlp_chain_plan(const MlpTable& table, MlpPrecision precision, int64_t n, int64_t k,
-                           const MlpCudaDevice& device, bool groups, MlpChainPlan& plan) {
+                           const MlpCudaDevice& device, MlpChainPlan& plan) {
   plan = {};
   const bool half =
       precision == MlpPrecision::float16 || (precision == MlpPrecision::bfloat16 && device.capability >= 80);
   if (!half) return "products must be of 16 bits, on tensor cores that have them";
-  if (groups && (device.capability != 90 || !device.groups)) {
-    return "wgmma must be asked for with compute capability 9.0 and kernels compiled for sm_90a";
-  }
-  plan.groups = groups;
   plan.precision = precision;
   MlpCudaPlan read{};
   if (const char* fault = mlp_cuda_read_table(table, read)) return fault;
@@ -234,10 +230,7 @@ const char* mlp_chain_plan(const MlpTable& table, MlpPrecision precision, int64_
     chosen = &each;
     if (warps >= kEnough) break;
   }
-  if (chosen == nullptr) {
-    return groups ? "two pieces of weights, and what four warps keep, must fit the shared memory of a block"
-                  : "two pieces of weights must fit the shared memory of a block";
-  }
+  if (chosen == nullptr) return "two pieces of weights must fit the shared memory of a block";
   attempt(*chosen);
   const int64_t wanted = std::max<int64_t>(1, int64_t{kTasks} * device.multiprocessors);
   plan.task_rows = ceil_div(std::max<int64_t>(1, ceil_div(n, wanted)), int64_t{plan.rows()}) * plan.rows();

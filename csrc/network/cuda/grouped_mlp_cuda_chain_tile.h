@@ -45,6 +45,18 @@ __device__ __forceinline__ void chain_multiply(MlpSums<2, kTiles>& sums, const M
   }
 }
 
+// The same for the first `steps` steps, all where kAll says so.
+template <bool kBfloat16, bool kAll, int kTiles, int kSteps>
+__device__ __forceinline__ void chain_multiply_steps(MlpSums<2, kTiles>& sums, const MlpFragment (&held)[kSteps],
+                                                     int steps, const unsigned char* weights) {
+#pragma unroll
+  for (int step = 0; step < kSteps; ++step) {
+    if (kAll || step < steps) {
+      chain_multiply<kBfloat16>(sums, held[step], weights + step * chain_pairs(kTiles) * kChainQuad);
+    }
+  }
+}
+
 // Sums begin with the biases of a piece.
 template <int kTiles>
 __device__ __forceinline__ void chain_begin(MlpSums<2, kTiles>& sums, const float* biases) {

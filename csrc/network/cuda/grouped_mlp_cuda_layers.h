@@ -72,7 +72,7 @@ const char* mlp_layers_plan(const MlpTable& table, MlpPrecision precision, int64
 // Of the ways a call can go the automatic one is the first that takes the table, except where fusing would move more
 // than twice the memory; of one that is asked for nothing else is taken.
 struct MlpCudaChoice {
-  MlpCudaWay way;  // not automatic, nor groups, which is the chain's
+  MlpCudaWay way;  // not automatic
   MlpChainPlan chain;
   MlpCudaPlan fused;
   MlpLayersPlan layers;

@@ -160,14 +160,12 @@ const char* mlp_cuda_choose(const MlpTable& table, MlpPrecision precision, int64
                             MlpCudaWay wanted, const MlpCudaDevice& device, MlpCudaChoice& choice) {
   choice = {};
   // Gradients of what the chain computes are those of the tiles, which compute it again.
-  const char* chain = backward
-                          ? "gradients take tiles or layers"
-                          : mlp_chain_plan(table, precision, n, k, device, wanted == MlpCudaWay::groups, choice.chain);
+  const char* chain =
+      backward ? "gradients take tiles or layers" : mlp_chain_plan(table, precision, n, k, device, choice.chain);
   const char* tiles = mlp_cuda_plan(table, precision, n, k, backward, device, choice.fused);
   const char* layers = mlp_layers_plan(table, precision, n, k, backward, device, choice.layers);
-  const bool chained = wanted == MlpCudaWay::chain || wanted == MlpCudaWay::groups;
-  choice.way = chained ? MlpCudaWay::chain : wanted;
-  if (chained && !backward) return chain;
+  choice.way = wanted;
+  if (wanted == MlpCudaWay::chain && !backward) return chain;
   if (wanted == MlpCudaWay::tiles) return tiles;
   if (wanted == MlpCudaWay::layers) return layers;
   const auto fits = [&](const char* fault, int64_t bytes, int rows) {

@@ -73,7 +73,6 @@ struct MlpCudaDevice {
   int shared_bytes;  // a block may ask for
   int multiprocessors;
   int64_t cache_bytes;  // of the last level
-  bool groups = false;  // kernels have code for products of four warps; known where those are asked for
 };
 
 // Fills in what of a plan the table alone says: layers, their sources and widths, which of them are live, inputs and

@@ -48,15 +48,6 @@ class BalanceInputs(NamedTuple):
 
 CellSortWay: tuple[str, ...]  # automatic counting radix
 
-class CentreGrid(NamedTuple):
-    frame: Tensor | None  # const float32*
-    entries: Tensor | None  # const int32*
-    lists: Tensor | None  # const int32*
-    table: Tensor | None  # const float32*
-    bits: int  # int32
-
-class CentreGridTables: ...
-
 class CompositeGradients(NamedTuple):
     colour: Tensor | None  # const float32*
     opacity: Tensor | None  # const float32*
@@ -196,7 +187,7 @@ MlpCaller: tuple[str, ...]  # grouped_mlp grouped_linear routed_mlp
 
 class MlpCudaCall: ...
 
-MlpCudaWay: tuple[str, ...]  # auto chain tiles layers wgmma
+MlpCudaWay: tuple[str, ...]  # auto chain tiles layers
 
 class MlpEncoding(NamedTuple):
     kind: str  # MlpEncodingKind
@@ -425,18 +416,6 @@ def cell_sort_workspace(_0: int, _1: int) -> int: ...
 @overload
 def cell_sort_workspace(_0: int, _1: int, _2: str, _3: Cuda) -> int: ...
 
-# const float64*, int64, Cpu
-def centre_grid_build(_0: Tensor | None, _1: int, _2: Cpu) -> CentreGridTables: ...
-
-# CentreGridTables, int32, float32*, int32*, int32*
-def centre_grid_copy(_0: CentreGridTables, _1: int, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None) -> bool: ...
-
-# CentreGridTables
-def centre_grid_entries(_0: CentreGridTables) -> int: ...
-
-# CentreGridTables
-def centre_grid_lists(_0: CentreGridTables) -> int: ...
-
 # RunsOfRays, float32*, Cpu
 def compose_runs(_0: RunsOfRays, _1: Tensor | None, _2: Cpu) -> float: ...
 
@@ -580,10 +559,6 @@ def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: 
 @overload
 def nearest_centre(_0: Tensor | None, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: int, _5: int, _6: Cuda) -> None: ...
 # const float64*, const float64*, const int32*, int32*, int64, int64, Cuda
-
-# const float32*, const float32*, CentreGrid, int32*, int64, int64, Cpu
-def nearest_centre_grid(_0: Tensor | None, _1: Tensor | None, _2: CentreGrid, _3: Tensor | None, _4: int, _5: int, _6: Cpu) -> None: ...
-# const float64*, const float64*, CentreGrid, int32*, int64, int64, Cpu
 
 # ObservedSamples, float32*, uint8*, int32*, float32*, Cpu
 @overload
