@@ -36,7 +36,7 @@ def compare(runs: tuple[Path, ...], /) -> int:
     for run in runs:
         table.add_column(escape(printable(str(run))), justify="right", overflow="fold")
     for key, heading, places in FIGURES:
-        table.add_row(heading, *(shown(figures.get(key), places) for figures, _ in found))
+        table.add_row(escape(heading), *(shown(figures.get(key), places) for figures, _ in found))
     table.add_section()
     for name in dict.fromkeys(name for _, settings in found for name in settings if name not in PLACES):
         values = [escape(printable(str(settings.get(name)))) for _, settings in found]

@@ -41,7 +41,7 @@ def evaluate_run(
     if perceived is None:
         say(source)
     result = opened.evaluate(views=views, lpips=perceived or "off")
-    table = Table("view", "psnr [dB]", "ssim", "lpips")
+    table = Table("view", "PSNR, dB", "SSIM", "LPIPS")
     for view in result["views"]:
         table.add_row(escape(printable(view["name"])), *_figures(view))
     table.add_section()
