@@ -36,6 +36,7 @@ from voronerf.app.train.run_directory import (
     held,
     is_outside,
     read_config,
+    read_curve,
     stored_config,
     write_curve,
 )
@@ -118,7 +119,8 @@ def train(
         for viewer in viewers:
             if summary["complete"]:
                 say(f"{viewer.address} shows the run until Ctrl-C")
-                viewer.show(import_viewer().Subject.of(open_run(chosen.out, scene=scene, backend=config.backend)))
+                run = open_run(chosen.out, scene=scene, backend=config.backend)
+                viewer.show(import_viewer().Subject.of(run), read_curve(chosen.out))
                 with contextlib.suppress(KeyboardInterrupt):
                     viewer.serve()
     return 0 if summary["complete"] else 130

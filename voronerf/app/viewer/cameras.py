@@ -1,4 +1,4 @@
-"""Cameras of a browser as cameras of the renderer, and the view of a scene that is nearest to one.
+"""Cameras of a browser as cameras of the renderer.
 
 A browser's camera has OpenCV's axes (x right, y down, z forward), its canvas square pixels, and `fov` is vertical.
 """
@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from viser.transforms import SO3
 
 from voronerf.app.scenes import Scene
 from voronerf.nerf.cameras import Cameras, focus_point
@@ -28,9 +30,9 @@ def make_camera(
     Args:
         rotation: [3, 3], camera to world, in OpenCV's axes.
         position: [3], in scene units.
-        fov: vertical, in radians.
-        aspect: width over height of the canvas.
-        longest: pixels along the longer side.
+        fov: Vertical, in radians.
+        aspect: Width over height of the canvas.
+        longest: Pixels along the longer side.
 
     Examples:
         >>> import numpy as np
@@ -48,6 +50,14 @@ def make_camera(
     across = down * width / (height * aspect)
     intrinsics = torch.tensor([[across, down, width / 2, height / 2]])
     return Cameras(torch.from_numpy(pose).float()[None], intrinsics, width, height)
+
+
+def frustum(cameras: Cameras, number: int) -> dict[str, Any]:
+    """The arguments of viser's ``add_camera_frustum`` for one of several cameras."""
+    pose, (width, height) = cameras.poses[number].double().numpy(), cameras.size(number)
+    fov = 2 * math.atan(height / 2 / float(cameras.intrinsics[number, 1]))
+    wxyz = SO3.from_matrix(pose[:3, :3] @ FLIP).wxyz
+    return {"fov": fov, "aspect": width / height, "wxyz": wxyz, "position": pose[:3, 3]}
 
 
 def crop_camera(camera: Cameras, left: int, top: int, width: int, height: int) -> Cameras:
@@ -81,19 +91,3 @@ def look_point(scene: Scene, cameras: Cameras, index: int) -> Tensor:
     centre = scene_bounds(scene).mean(0) if focus is None else focus
     origin, forward = cameras.origins[index], cameras.forward[index]
     return origin + forward * ((centre - origin) @ forward).clamp_min(0.1)
-
-
-def nearest_view(cameras: Cameras, origin: Tensor, forward: Tensor) -> int:
-    """The number of the camera that is nearest in place and direction.
-
-    Places count in units of the cameras' mean distance from their centre.
-
-    Args:
-        cameras: c of them.
-        origin: [3].
-        forward: unit [3].
-    """
-    centre = cameras.origins.mean(0)
-    unit = (cameras.origins - centre).norm(dim=-1).mean().clamp_min(1e-6)
-    apart = ((cameras.origins - origin) / unit).square().sum(-1) + (cameras.forward - forward).square().sum(-1)
-    return int(apart.argmin())

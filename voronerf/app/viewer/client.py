@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import math
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -14,20 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 import viser
-from PIL import Image
-from torch import Tensor
 from viser.transforms import SO3
 from viser.uplot import Scale, Series
 
 from voronerf.app.evaluate.panels import palette
-from voronerf.app.train.config import ConfigError
-from voronerf.app.viewer.cameras import FLIP, look_point, make_camera, scene_bounds
-from voronerf.app.viewer.cells import describe_cell
+from voronerf.app.viewer.cameras import frustum, look_point, make_camera, scene_bounds
 from voronerf.app.viewer.crop import CropBox
 from voronerf.app.viewer.door import chosen
 from voronerf.app.viewer.path import Keyframes
-from voronerf.app.viewer.pictures import PANES, Look, cell_at, cells_of, groups_of, save_shown
-from voronerf.app.viewer.runs import Exports, Runs
+from voronerf.app.viewer.pictures import PANES, Look, cell_at, describe_cell, groups_of
 from voronerf.nerf.cameras import Cameras
 
 if TYPE_CHECKING:
@@ -38,8 +31,6 @@ SHARP, LARGEST = 512, 2048
 #: Training views that are drawn at most, evenly spread, and the longer side of their pictures.
 MOST_VIEWS, THUMBNAIL = 200, 96
 NO_CELL = "Click on a cell."
-#: Pixels across an upright canvas below which the panel lies over the picture, as on a phone.
-NARROW = 576
 #: Pixels around the curve: above, right, below, left. Without them its labels are cut off.
 PADDING = (14, 14, 0, 0)
 
@@ -48,15 +39,15 @@ class Client:
     """A browser that has connected.
 
     Attributes:
-        camera: its camera, with so many pixels along the longer side.
-        look: what it shows.
-        longest: pixels along the longer side of its sharp picture.
-        version: counts what changes its picture.
-        moved_at: when that was last.
-        wants_coarse: a picture now.
-        wants_sharp: a better one, when the camera rests.
-        drawn_at: when the last sharp picture was done.
-        cost: seconds that it took.
+        camera: Its camera, with so many pixels along the longer side.
+        look: What it shows.
+        longest: Pixels along the longer side of its sharp picture.
+        version: Counts what changes its picture.
+        moved_at: When that was last.
+        wants_coarse: A picture now.
+        wants_sharp: A better one, when the camera rests.
+        drawn_at: When the last sharp picture was done.
+        cost: Seconds that it took.
     """
 
     def __init__(self, handle: viser.ClientHandle, viewer: Viewer) -> None:
@@ -74,14 +65,9 @@ class Client:
     def _start(self) -> None:
         self.look = Look(level=self.viewer.subject.diagram.depth)
         self.picked: int | None = None
-        self.wants_screenshot = False
         self.nodes: dict[str, list[Any]] = {kind: [] for kind in ("centres", "cameras", "crop", "keyframes")}
         self.curve: viser.GuiUplotHandle | None = None
-        width, height = self.handle.camera.image_width, self.handle.camera.image_height
-        phone = 0 < width < min(NARROW, height)
-        self.panel = self.handle.gui.add_folder("Controls", expand_by_default=False) if phone else nullcontext()
-        with self.panel:
-            self._build()
+        self._build()
         self.draw_curve()
 
     def on_subject(self) -> None:
@@ -135,16 +121,19 @@ class Client:
             self._show_centres(True)
         self.change(level=depth, hidden=frozenset())
 
-    def on_images(self) -> None:
-        """Shows what needs the images of the scene, which are there now."""
-        if self.nodes["cameras"]:
-            self._show_cameras(True)
-        self.change()
+    def stand(self, cameras: Cameras, view: int) -> None:
+        """Goes to one of several cameras."""
+        of = frustum(cameras, view)
+        with self.handle.atomic():
+            self.handle.camera.position = of["position"]
+            self.handle.camera.look_at = look_point(self.viewer.subject.scene, cameras, view).numpy()
+            self.handle.camera.up_direction = cameras.poses[view, :3, 1].double().numpy()
+            self.handle.camera.fov = of["fov"]
 
     # --- the panel -------------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
-        gui, depth, run = self.handle.gui, self.viewer.subject.diagram.depth, self.viewer.subject.run
+        gui, depth = self.handle.gui, self.viewer.subject.diagram.depth
         pane = gui.add_dropdown("Show", PANES, initial_value="colour", hint="What each pixel shows.")
         self.on(pane.on_update, lambda: self.change(pane=chosen(pane)))
         size = gui.add_slider("Pixels", 128, LARGEST, 64, SHARP, hint="Along the longer side of a picture at rest.")
@@ -155,25 +144,14 @@ class Client:
             self.info = gui.add_markdown(NO_CELL)
             hide = gui.add_button_group("Cell", ("hide", "only this", "show all"))
             self.on(hide.on_click, lambda: self._hide(hide.value))
-            if run is not None:
-                save = gui.add_button("Save what is shown", hint="As a run of its own, beside this one.")
-                self.on(save.on_click, lambda: self.viewer.do(lambda: self.viewer.serve_client(self, self._save)))
         with gui.add_folder("Scene", expand_by_default=False):
             centres = gui.add_checkbox("Centres", False)
             self.on(centres.on_update, lambda: self._show_centres(centres.value))
             cameras = gui.add_checkbox("Cameras", False, hint="The training views; click on one to stand there.")
             self.on(cameras.on_update, lambda: self._show_cameras(cameras.value))
             self.crop = CropBox(self)
-        with gui.add_folder("Camera", expand_by_default=False):
-            self.keyframes = Keyframes(self, self.viewer.subject.folder)
-            shot = gui.add_button("Screenshot", icon=viser.Icon.CAMERA)
-            self.on(shot.on_click, self._ask_screenshot)
-        if run is not None:
-            with gui.add_folder("Export", expand_by_default=False):
-                Exports(self, run)
-            if self.viewer.open is not None:
-                with gui.add_folder("Runs", expand_by_default=False):
-                    Runs(self, run)
+        with gui.add_folder("Camera path", expand_by_default=False):
+            self.keyframes = Keyframes(self)
 
     def draw_curve(self) -> None:
         """Draws PSNR in dB over training seconds, from the second evaluation on."""
@@ -184,10 +162,9 @@ class Client:
             self.curve.data = (seconds, psnr)
             return
         series = (Series(label="s"), Series(label="PSNR [dB]", stroke="#00897b", width=2))
-        with self.panel:
-            self.curve = self.handle.gui.add_uplot(
-                (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, padding=PADDING, order=-1
-            )
+        self.curve = self.handle.gui.add_uplot(
+            (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, padding=PADDING, order=-1
+        )
 
     def on(self, register: Callable[[Callable[[Any], None]], object], work: Callable[[], object]) -> None:
         """Has something done when a part of the panel is used; where that fails, the client is disconnected."""
@@ -197,19 +174,6 @@ class Client:
         self.longest = longest
         self.change()
 
-    def _ask_screenshot(self) -> None:
-        self.wants_screenshot = True
-        self.change()
-
-    def on_sharp(self, picture: Tensor) -> None:
-        """Takes a sharp picture, uint8 [h, w, 3]."""
-        if self.wants_screenshot:
-            self.wants_screenshot = False
-            data = io.BytesIO()
-            Image.fromarray(picture.numpy()).save(data, format="PNG")
-            name = f"{self.viewer.subject.name}-{self.look.pane}.png"
-            self.handle.send_file_download(name, data.getvalue(), save_immediately=True)
-
     # --- cells -----------------------------------------------------------------------------------------------------
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
@@ -217,15 +181,10 @@ class Client:
 
     def pick(self, x: float, y: float) -> None:
         """Describes the cell that is at a place of the picture, 0..1 from the left and from the top."""
-        subject, errors, camera = self.viewer.subject, self.viewer.errors, self.camera(self.longest)
-        self.picked = cell_at(subject, camera, self.look, x, y)
-        if self.picked is None:
-            self.info.content = NO_CELL
-            return
-        groups = groups_of(subject.diagram, self.look.level)
-        number = groups[self.picked]
-        psnr = errors.psnr(camera, lambda places: groups[cells_of(subject, places)] == number)
-        self.info.content = describe_cell(subject, self.picked, self.look.level, psnr)
+        subject = self.viewer.subject
+        self.picked = cell_at(subject, self.camera(self.longest), self.look, x, y)
+        found = self.picked
+        self.info.content = NO_CELL if found is None else describe_cell(subject.diagram, found, self.look.level)
 
     def _hide(self, what: str) -> None:
         if what == "show all":
@@ -233,17 +192,8 @@ class Client:
         elif self.picked is not None:
             groups = groups_of(self.viewer.subject.diagram, self.look.level)
             inside = groups == groups[self.picked]
-            chosen = frozenset((inside if what == "hide" else ~inside).nonzero()[:, 0].tolist())
-            self.change(hidden=self.look.hidden | chosen if what == "hide" else chosen)
-
-    def _save(self) -> None:
-        """Writes what is shown as a run, and says where, or why not."""
-        run = self.viewer.subject.run
-        assert run is not None
-        try:
-            self.info.content = f"Saved as `{save_shown(run, self.look).name}`."
-        except (ConfigError, OSError) as error:
-            self.info.content = f"Not saved: {error}."
+            cells = frozenset((inside if what == "hide" else ~inside).nonzero()[:, 0].tolist())
+            self.change(hidden=self.look.hidden | cells if what == "hide" else cells)
 
     # --- what is drawn into the scene ------------------------------------------------------------------------------
 
@@ -273,45 +223,24 @@ class Client:
     def _show_cameras(self, show: bool) -> None:
         self.clear("cameras")
         if show:
-            train = self.viewer.subject.scene.train
-            apart = float((train.cameras.origins - train.cameras.origins.mean(0)).norm(dim=-1).mean())
-            count = min(len(train), MOST_VIEWS)
+            scene = self.viewer.subject.scene
+            cameras, count = scene.train.cameras, min(len(scene.train), MOST_VIEWS)
+            apart = float((cameras.origins - cameras.origins.mean(0)).norm(dim=-1).mean())
             with self.handle.atomic():
-                for view in (number * len(train) // count for number in range(count)):
-                    self.nodes["cameras"].append(self._frustum(view, 0.06 * max(apart, 1e-3)))
+                for view in (number * len(scene.train) // count for number in range(count)):
+                    picture = None
+                    if len(scene.train.images):
+                        truth = scene.train.truth(view, scene.background_colour())
+                        step = -(-max(truth.shape[:2]) // THUMBNAIL)
+                        picture = (truth[::step, ::step] * 255).to(torch.uint8).numpy()
+                    node: Any = self.handle.scene.add_camera_frustum(
+                        f"/cameras/{view}",
+                        scale=0.06 * max(apart, 1e-3),
+                        thickness=1.5,
+                        thickness_units="screen",
+                        image=picture,
+                        **frustum(cameras, view),
+                    )
+                    self.on(node.on_click, partial(self.stand, cameras, view))
+                    self.nodes["cameras"].append(node)
         self.change()
-
-    def _frustum(self, view: int, scale: float) -> Any:
-        scene = self.viewer.subject.scene
-        cameras = scene.train.cameras
-        picture = None
-        if len(scene.train.images):
-            truth = scene.train.truth(view, scene.background_colour())
-            step = -(-max(truth.shape[:2]) // THUMBNAIL)
-            picture = (truth[::step, ::step] * 255).to(torch.uint8).numpy()
-        pose = cameras.poses[view].double().numpy()
-        width, height = cameras.size(view)
-        fov = 2 * math.atan(height / 2 / float(cameras.intrinsics[view, 1]))
-        node: Any = self.handle.scene.add_camera_frustum(
-            f"/cameras/{view}",
-            fov=fov,
-            aspect=width / height,
-            scale=scale,
-            thickness=1.5,
-            thickness_units="screen",
-            image=picture,
-            wxyz=SO3.from_matrix(pose[:3, :3] @ FLIP).wxyz,
-            position=pose[:3, 3],
-        )
-
-        self.on(node.on_click, lambda: self.stand(cameras, view))
-        return node
-
-    def stand(self, cameras: Cameras, view: int) -> None:
-        """Goes to one of several cameras."""
-        pose = cameras.poses[view].double().numpy()
-        with self.handle.atomic():
-            self.handle.camera.position = pose[:3, 3]
-            self.handle.camera.look_at = look_point(self.viewer.subject.scene, cameras, view).numpy()
-            self.handle.camera.up_direction = pose[:3, 1]
-            self.handle.camera.fov = 2 * math.atan(cameras.size(view)[1] / 2 / float(cameras.intrinsics[view, 1]))

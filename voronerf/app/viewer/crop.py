@@ -19,11 +19,7 @@ LEAST, ARROWS = 0.01, 0.12
 
 
 class CropBox:
-    """Renders the inside of a box only, and draws the box.
-
-    Args:
-        client: whose picture it is.
-    """
+    """Renders the inside of a box only, and draws the box."""
 
     def __init__(self, client: Client) -> None:
         self.client, subject = client, client.viewer.subject
@@ -66,7 +62,7 @@ class CropBox:
         """Moves the lowest corner, number 0, or the highest.
 
         Raises:
-            ValueError: a page of the viewer cannot have sent the place.
+            ValueError: A page of the viewer cannot have sent the place.
         """
         place = np.asarray(place, dtype=np.float64)
         if place.shape != (3,) or not (np.abs(place) < 1e9).all():

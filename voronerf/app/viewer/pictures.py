@@ -10,29 +10,21 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from voronerf.app.evaluate.panels import (
-    picture_of_cells,
-    picture_of_colour,
-    picture_of_depth,
-)
+from voronerf.app.evaluate.panels import picture_of_cells, picture_of_colour, picture_of_depth
 from voronerf.app.run import Run
 from voronerf.app.scenes import Scene
-from voronerf.app.train.config import ConfigError
 from voronerf.app.viewer.cameras import crop_camera
-from voronerf.app.viewer.errors import ViewErrors
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.field import Field
 from voronerf.nerf.renderer import RenderedImage, Renderer, render_camera
-from voronerf.router import VoronoiRouter
-from voronerf.town import editing
-from voronerf.town.parts import Parts, Solid
 
-PANES = ("colour", "depth", "opacity", "error", "cells")
+PANES = ("colour", "depth", "opacity", "cells")
 
 
 @dataclass(frozen=True)
@@ -40,10 +32,10 @@ class Look:
     """What one browser shows, besides its camera.
 
     Attributes:
-        pane: one of `PANES`.
-        level: of a nested diagram whose cells are shown, 1 is the coarsest.
-        hidden: leaves that are not rendered.
-        crop: lowest and highest corner of the box that is rendered, or None for the scene's.
+        pane: One of `PANES`.
+        level: Of a nested diagram, whose cells are shown; 1 is the coarsest.
+        hidden: Leaves that are not rendered.
+        crop: Lowest and highest corner of the box that is rendered, or None for the scene's.
     """
 
     pane: str = "colour"
@@ -52,57 +44,49 @@ class Look:
     crop: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
-@dataclass
+@dataclass(frozen=True)
 class Subject:
     """What is viewed: a trained run, or one in training.
 
     Attributes:
-        name: for titles.
-        folder: the run directory.
-        scene: images and cameras.
-        router: its diagram has the cells.
-        renderer: how rays become colours.
-        weights: a context in which the networks have the weights to show.
-        run: what can be exported and trained further; None for a run in training.
+        name: For titles.
+        folder: The run directory.
+        scene: Cameras, and images if they are read.
+        router: Has the diagram of the cells, and says which cell a position belongs to.
+        renderer: How rays become colours.
+        weights: A context in which the networks have the weights to show.
     """
 
     name: str
     folder: Path
     scene: Scene
-    router: VoronoiRouter | Parts
+    router: Any
     renderer: Renderer
     weights: Callable[[], AbstractContextManager[None]] = nullcontext
-    run: Run | None = None
 
     @classmethod
-    def of(cls, run: Run, scene: Scene | None = None) -> Subject:
-        """A run; the scene may have the images that the run's own lacks."""
-        return cls(run.path.resolve().name, run.path, scene or run.scene, run.router, run.renderer, run=run)
+    def of(cls, run: Run) -> Subject:
+        """A trained run."""
+        return cls(run.path.resolve().name, run.path, run.scene, run.router, run.renderer)
 
     @property
     def diagram(self) -> VoronoiDiagram:
         """The cells, which a split replaces."""
-        return self.router.diagram
+        diagram: VoronoiDiagram = self.router.diagram
+        return diagram
 
 
 class VisibleCells(nn.Module):
-    """A field without the density of hidden cells.
+    """A field without the density of hidden cells, bool [k]."""
 
-    Args:
-        field: the whole field.
-        diagram: of its cells.
-        hidden: bool [k].
-        backend: of the look-up.
-    """
-
-    def __init__(self, field: Field, diagram: VoronoiDiagram, hidden: Tensor, backend: str) -> None:
+    def __init__(self, field: Field, router: Any, hidden: Tensor) -> None:
         super().__init__()
-        self.field, self.diagram, self.hidden, self.backend = field, diagram, hidden, backend
+        self.field, self.router, self.hidden = field, router, hidden
 
     def forward(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
         """See :class:`voronerf.nerf.Field`."""
         colour, density = self.field(positions, directions, ray_index)
-        cells = self.diagram.locate(positions[:, :3].contiguous(), backend=self.backend)
+        cells = self.router.assign(positions[:, :3].contiguous())
         return colour, density.masked_fill(self.hidden[cells.long()], 0)
 
 
@@ -130,22 +114,14 @@ def render_bands(subject: Subject, camera: Cameras, look: Look, rows: int) -> It
         hidden = torch.zeros(subject.diagram.num_cells, dtype=torch.bool)
         hidden[list(look.hidden)] = True
         hidden = hidden.to(renderer.device)
-        parts = subject.router
-        fields: dict[str, Field] = {
-            name: VisibleCells(field, subject.diagram, hidden, renderer.backend)
-            if not isinstance(parts, Parts)
-            else parts.without(hidden)
-            for name, field in renderer.fields.items()
-        }
         renderer = copy.copy(renderer)
-        renderer.fields = fields
+        renderer.fields = {name: VisibleCells(field, subject.router, hidden) for name, field in renderer.fields.items()}
     if look.crop is not None:
         scene = replace(scene, box=torch.tensor(look.crop))
-    heaviest = look.pane in ("cells", "error")
     for top in range(0, camera.height, rows):
         band = crop_camera(camera, 0, top, camera.width, min(rows, camera.height - top))
         with subject.weights():
-            yield render_camera(renderer, scene, band, 0, heaviest=heaviest)
+            yield render_camera(renderer, scene, band, 0, heaviest=look.pane == "cells")
 
 
 def stack_bands(bands: list[RenderedImage]) -> RenderedImage:
@@ -160,28 +136,17 @@ def render_look(subject: Subject, camera: Cameras, look: Look) -> RenderedImage:
 
 def cells_of(subject: Subject, places: Tensor) -> Tensor:
     """The leaves int64 [...] of places [..., 3], as `RenderedImage.heaviest` has them."""
-    where = places.to(subject.renderer.device)
-    if isinstance(subject.router, Parts):  # where no part speaks there is nothing to see, in the last of the cells
-        return subject.router.assign(where.reshape(-1, 3)).reshape(where.shape[:-1]).cpu().long()
-    return subject.diagram.locate(where, backend=subject.renderer.backend).cpu().long()
+    where = places.to(subject.renderer.device).reshape(-1, 3)
+    cells: Tensor = subject.router.assign(where)
+    return cells.reshape(places.shape[:-1]).cpu().long()
 
 
-def picture_of(subject: Subject, camera: Cameras, image: RenderedImage, look: Look, errors: ViewErrors) -> Tensor:
-    """The picture of a pane.
-
-    Args:
-        subject: what is viewed.
-        camera: that was rendered.
-        image: what it saw.
-        look: whose pane is drawn.
-        errors: of the training views, for the error pane.
-    """
+def picture_of(subject: Subject, image: RenderedImage, look: Look) -> Tensor:
+    """The picture of a look's pane."""
     if look.pane == "depth":
         return picture_of_depth(image.depth, image.opacity)
     if look.pane == "opacity":
         return picture_of_colour(image.opacity[..., None].expand(*image.opacity.shape, 3))
-    if look.pane == "error":
-        return errors.picture(camera, image)
     if look.pane == "cells":
         groups = groups_of(subject.diagram, look.level)[cells_of(subject, image.heaviest)]
         return picture_of_cells(groups, image.opacity, image.colour)
@@ -192,11 +157,11 @@ def cell_at(subject: Subject, camera: Cameras, look: Look, x: float, y: float) -
     """The leaf that a pixel shows, or None if it shows nothing.
 
     Args:
-        subject: what is viewed.
-        camera: of the whole picture.
-        look: hidden cells are not found.
-        x: position from the left, 0..1.
-        y: position from the top, 0..1.
+        subject: What is viewed.
+        camera: Of the whole picture.
+        look: Hidden cells are not found.
+        x: Position from the left, 0..1.
+        y: Position from the top, 0..1.
     """
     sides = ((x, camera.width), (y, camera.height))
     left, top = (min(int(max(0.0, min(share, 1.0)) * size), size - 1) for share, size in sides)
@@ -204,24 +169,11 @@ def cell_at(subject: Subject, camera: Cameras, look: Look, x: float, y: float) -
     return int(cells_of(subject, image.heaviest)) if float(image.opacity) > 0.5 else None
 
 
-def save_shown(run: Run, look: Look) -> Path:
-    """Writes what a look shows of a run as a run beside it; returns the folder.
-
-    Raises:
-        ConfigError: nothing is hidden, or nothing is left.
-        OSError: it cannot be written.
-    """
-    if not look.hidden and look.crop is None:
-        raise ConfigError("everything is shown: hide cells or crop first")
-    source = run.source
-    if look.hidden:
-        shown = torch.ones(source.parts.num_cells, dtype=torch.bool)
-        shown[list(look.hidden)] = False
-        source = editing.cut(source, shown)
-    if look.crop is not None:
-        source = editing.cut(source, Solid.box(*look.crop))
-    folder = run.path.resolve()
-    names = (f"{folder.name}-cut", *(f"{folder.name}-cut-{i}" for i in range(2, 1000)))
-    out = next(path for name in names if not (path := folder.parent / name).exists())
-    editing.write(source, out)
-    return out
+def describe_cell(diagram: VoronoiDiagram, leaf: int, level: int) -> str:
+    """The number, path and centre of a cell of a level, which has a leaf; as Markdown."""
+    groups = groups_of(diagram, level)
+    number, count = int(groups[leaf]), int((groups == groups[leaf]).sum())
+    path = " / ".join(str(step) for step in diagram.paths()[leaf].tolist()[:level] if step >= 0)
+    title = f"**Cell {number}** of {int(groups[-1]) + 1}" + (f" (path {path})" if diagram.depth > 1 else "")
+    centre = ", ".join(f"{value:.3f}" for value in diagram.leaf_centres[leaf].tolist())
+    return title + (f"  \n{count} cells of the finest level" if count > 1 else f"  \ncentre {centre}")

@@ -17,12 +17,12 @@ def watch(trainer: Trainer, *, host: str = "127.0.0.1", port: int = 8080) -> Tra
     """A viewer of a training; its trainer calls :meth:`Training.on_step` after every step.
 
     Args:
-        trainer: what is viewed.
-        host: address to listen at.
-        port: to listen at; 0 is any that is free.
+        trainer: What is viewed.
+        host: Address to listen at.
+        port: To listen at; 0 is any that is free.
 
     Raises:
-        ConfigError: the address cannot be listened at.
+        ConfigError: The address cannot be listened at.
     """
     return Training(Viewer(subject_of(trainer), host=host, port=port), trainer)
 
@@ -39,8 +39,8 @@ class Training:
     a viewer.
 
     Args:
-        viewer: shows it from now on.
-        trainer: what is viewed.
+        viewer: Shows it from now on.
+        trainer: What is viewed.
     """
 
     def __init__(self, viewer: Viewer, trainer: Trainer) -> None:
@@ -73,7 +73,7 @@ class Training:
         self.now, viewer = now, self.viewer
         if not viewer.clients and not self.paused:
             return
-        if now.cells != self.cells:  # after a split, or back at a checkpoint from before one
+        if now.cells != self.cells:  # after a split
             self.cells = now.cells
             for client in viewer.list_clients():
                 viewer.serve_client(client, client.on_diagram)

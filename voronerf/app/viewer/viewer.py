@@ -17,25 +17,19 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 
 import torch
 import viser
-from torch import Tensor
 
 from voronerf.app.run import Run
-from voronerf.app.scenes import Scene
-from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.progress import TrainingError
+from voronerf.app.train.config import ConfigError
 from voronerf.app.train.run_directory import read_curve
 from voronerf.app.viewer.cameras import axial_depth, look_point
 from voronerf.app.viewer.client import Client
 from voronerf.app.viewer.door import guarded
-from voronerf.app.viewer.errors import ViewErrors
 from voronerf.app.viewer.pictures import Look, Subject, picture_of, render_bands, render_look, stack_bands
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.renderer import RenderedImage
-from voronerf.ops._core.backends import BackendUnavailable
 
 log = logging.getLogger(__name__)
 
@@ -51,37 +45,27 @@ REFRESH = 0.05
 EVERYWHERE = ("0.0.0.0", "::", "")
 #: Depth of empty pixels in scene units, the largest that viser takes.
 NOWHERE = 160.0
-#: What may go wrong with what a page asks for, without a fault of the program or of the page.
-EXPECTED = (ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError, MemoryError)
 
 
 class Viewer:
     """Shows a subject to any number of browsers.
 
     Args:
-        subject: what is viewed.
-        host: address to listen at.
-        port: to listen at; 0 is any that is free.
-
-    Attributes:
-        open: opens the run in a directory, or None: then no page can ask for another run.
-        train: trains a scene with some settings, or None: then no page can ask for that.
+        subject: What is viewed.
+        host: Address to listen at.
+        port: To listen at; 0 is any that is free.
 
     Raises:
-        ConfigError: the address cannot be listened at.
+        ConfigError: The address cannot be listened at.
     """
 
     def __init__(self, subject: Subject, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         check_address(host, port)
         self.subject = subject
-        self.open: Callable[[Path], Run] | None = None
-        self.train: Callable[[TrainConfig, Scene], None] | None = None
-        self.busy = False
         self.clients: dict[int, Client] = {}
         self.tasks: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.wake = threading.Event()
         self.rate = 100_000.0  # pixels a second
-        self.errors = ViewErrors(subject.scene, self._render_view)
         # viser draws a box around its address
         with contextlib.redirect_stdout(io.StringIO()), guarded(host):
             self.server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
@@ -112,13 +96,12 @@ class Viewer:
         start.look_at = look_point(scene, cameras, 0).numpy()
         start.fov = 2 * math.atan(cameras.size(0)[1] / 2 / float(cameras.intrinsics[0, 1]))
 
-    def show(self, subject: Subject) -> None:
-        """Shows something else, to every browser."""
+    def show(self, subject: Subject, points: Sequence[tuple[float, float]] = ()) -> None:
+        """Shows something else to every browser, with its curve; see :meth:`show_curve`."""
         self.subject = subject
-        self.errors = ViewErrors(subject.scene, self._render_view)
         self.server.gui.set_panel_label(subject.name)
         self._stand()
-        self.points = [] if subject.run is None else read_curve(subject.folder)
+        self.points = list(points)
         for client in self.list_clients():
             self.serve_client(client, client.on_subject)
 
@@ -131,13 +114,6 @@ class Viewer:
         self.points = list(points)
         for client in self.list_clients():
             self.serve_client(client, client.draw_curve)
-
-    def take_images(self, scene: Scene) -> None:
-        """Takes the scene with its images, which a viewer can do without at first."""
-        self.subject.scene = self.errors.scene = scene
-        self.errors.forget()
-        for client in self.list_clients():
-            self.serve_client(client, client.on_images)
 
     def close(self) -> None:
         """Ends the server; its clients see that it is gone."""
@@ -157,23 +133,6 @@ class Viewer:
         """Has something done by the thread that renders."""
         self.tasks.put(task)
         self.wake.set()
-
-    def work(self, client: Client, work: Callable[[], None]) -> None:
-        """Has a long work done by the thread that renders, one at a time; tells the client why it could not be."""
-
-        def task() -> None:
-            if self.busy:
-                client.tell("Not now", "An export or a training is at work.")
-                return
-            self.busy = True
-            try:
-                work()
-            except EXPECTED as error:
-                client.tell("Not done", str(error))
-            finally:
-                self.busy = False
-
-        self.do(lambda: self.serve_client(client, task))
 
     def serve_client(self, client: Client, work: Callable[[], object]) -> None:
         """Does something that a client asked for; where that fails, the client is disconnected, with a line."""
@@ -229,7 +188,6 @@ class Viewer:
         now = time.perf_counter()
         for client in self.list_clients():
             if now - client.drawn_at > client.cost / REFRESH:
-                self.errors.forget()
                 client.wants_sharp = True
 
     def _draw_coarse(self, client: Client) -> None:
@@ -256,25 +214,20 @@ class Viewer:
         client.wants_sharp = False
         image = stack_bands(bands)
         self._took(camera.width * camera.height, time.perf_counter() - started)
-        picture = self._send(client, camera, image, look, quality=95)
+        self._send(client, camera, image, look, quality=95)
         client.cost, client.drawn_at = time.perf_counter() - started, time.perf_counter()
-        client.on_sharp(picture)
 
-    def _send(self, client: Client, camera: Cameras, image: RenderedImage, look: Look, *, quality: int) -> Tensor:
-        picture = picture_of(self.subject, camera, image, look, self.errors)
+    def _send(self, client: Client, camera: Cameras, image: RenderedImage, look: Look, *, quality: int) -> None:
+        picture = picture_of(self.subject, image, look)
         depth = None
         if client.shows_nodes:  # so that what is drawn into the scene vanishes behind it
             solid = image.opacity > 0.5
             depth = torch.where(solid, axial_depth(camera, image.depth), NOWHERE).clamp(max=NOWHERE).numpy()
         client.handle.scene.set_background_image(picture.numpy(), format="jpeg", jpeg_quality=quality, depth=depth)
         client.handle.flush()
-        return picture
 
     def _took(self, pixels: int, seconds: float) -> None:
         self.rate += 0.3 * (pixels / max(seconds, 1e-6) - self.rate)
-
-    def _render_view(self, camera: Cameras) -> RenderedImage:
-        return render_look(self.subject, camera, Look(pane="error"))
 
 
 def check_address(host: str, port: int) -> None:
@@ -294,12 +247,12 @@ def view_run(run: Run, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
     """The viewer of a trained run; `Viewer.serve` renders for it.
 
     Args:
-        run: such as `voronerf.open_run` opens.
-        host: address to listen at.
-        port: to listen at; 0 is any that is free.
+        run: As `voronerf.open_run` opens it.
+        host: Address to listen at.
+        port: To listen at; 0 is any that is free.
 
     Raises:
-        ConfigError: the address cannot be listened at.
+        ConfigError: The address cannot be listened at.
     """
     viewer = Viewer(Subject.of(run), host=host, port=port)
     viewer.show_curve(read_curve(run.path))
