@@ -1,5 +1,5 @@
-# Set-up happens by itself: a virtual environment in .venv from requirements-ci.txt, and the extension built in place, both
-# redone only when their inputs change. PYTHON is the interpreter to start from.
+# Set-up happens by itself: a virtual environment in .venv from requirements.txt, for tests and checks requirements-ci.txt too,
+# and the extension built in place, each redone only when its inputs change. PYTHON is the interpreter to start from.
 PYTHON ?= python3
 PIP_ARGS ?=
 VENV := .venv
@@ -88,12 +88,19 @@ attack: $(VENV)/.built
 clean:
 	rm -rf $(VENV) build dist *.egg-info voronerf/ops/_core/_C.*.so .mypy_cache .pytest_cache .ruff_cache
 
-$(VENV)/.installed: requirements-ci.txt
+# What is more than `make demo` needs: Warp, pycolmap, viser, mypy, a browser's driver, ...
+test bench paper check docs emulate-cuda sanitize attack $(addprefix isa-check-,$(ISAS)): $(VENV)/.tools
+
+$(VENV)/.installed: requirements.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_ARGS) -r requirements.txt
+	@touch $@
+
+$(VENV)/.tools: requirements-ci.txt $(VENV)/.installed
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_ARGS) -r requirements-ci.txt
 	@touch $@
 
-$(VENV)/.docs: requirements-docs.txt $(VENV)/.installed
+$(VENV)/.docs: requirements-docs.txt $(VENV)/.tools
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_ARGS) -r requirements-docs.txt
 	@touch $@
 
