@@ -1,14 +1,12 @@
 """The loss of a batch of rays, with gradients: one contract, and the ways to it in one process.
 
 r rays, m samples of all rays. A way takes a :class:`Batch`, samples its rays, asks the field and gives a
-:class:`RenderOutput`; ``why_not`` says what keeps a renderer from it. :mod:`voronerf.town.ray_runs` has the way through
-several territories.
+:class:`RenderOutput`; ``why_not`` says what keeps a renderer from it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -22,15 +20,11 @@ from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.sampling import colour_loss
 from voronerf.nerf.volume import Samples, gradient_shares
-from voronerf.ops.forward_with_tape import Outputs, forward_with_tape
+from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.ops.render_loss import RenderLoss, render_loss_gradient
 from voronerf.ops.sighting_gradient import sighting_gradient
 from voronerf.ops.sighting_gradient.reference import seen_there, sighting_loss
 from voronerf.router import VoronoiRouter
-from voronerf.town.parts import Asked, Parts
-
-#: What a network puts out where there is nothing: its density is 0.
-EMPTY = -1e4
 
 
 @dataclass(frozen=True)
@@ -127,86 +121,18 @@ class RayLoss(Protocol):
         ...
 
 
-def why_not_fused(renderer: Renderer, sightings: float = 0.0) -> str | None:
+def why_not_fused(renderer: Renderer) -> str | None:
     """What keeps networks, colours, loss and gradients from being one operation; None if nothing does."""
     field = renderer.field
     if not isinstance(renderer.sampler, Occupancy):
         return "empty space is not skipped"
-    if isinstance(field, VoronoiRouter):
-        return _why_not_by_table(field)
-    if not isinstance(field, Parts):
+    if not isinstance(field, VoronoiRouter):
         return f"the field is a {type(field).__name__}, no router"
-    if len(field.layers) > 1 or field.hidden is not None:
-        return "densities of several layers add up" if len(field.layers) > 1 else "cells are hidden"
-    if sightings:
-        return "sightings are learnt from, and the run has several parts"
-    return next((obstacle for router in field.routers if (obstacle := _why_not_by_table(router))), None)
-
-
-def _why_not_by_table(router: VoronoiRouter) -> str | None:
-    if getattr(type(router.module), "activate", None) is not activate_radiance:
-        return f"{type(router.module).__name__} does not say what its outputs mean (activate = activate_radiance)"
-    if router.coords not in (None, "first3"):
+    if getattr(type(field.module), "activate", None) is not activate_radiance:
+        return f"{type(field.module).__name__} does not say what its outputs mean (activate = activate_radiance)"
+    if field.coords not in (None, "first3"):
         return "other positions than those of the samples decide the cells"
-    return None if router.by_table else f"{type(router.module).__name__} does more than its layer table says"
-
-
-class Networks:
-    """The networks that the samples of a step are asked of, for a loss that knows its gradient to what they put out.
-
-    Attributes:
-        density_scale: The factor on the densities, per scene unit.
-        deltas: [m], the lengths of the samples, times what the factor of a sample's own network differs by.
-
-    Args:
-        asked: The networks, and which samples they are asked about.
-        samples: m samples.
-    """
-
-    @staticmethod
-    def of(field: VoronoiRouter | Parts, samples: Samples, directions: Tensor) -> Networks:
-        """Those of a router, or of parts in one layer, for which :func:`why_not_fused` is None; directions [r, 3]."""
-        given = samples.inputs, directions, samples.ray_index
-        return Networks(
-            [Asked(field, None, *given, 1.0)] if isinstance(field, VoronoiRouter) else field.asked(*given), samples
-        )
-
-    def __init__(self, asked: Sequence[Asked], samples: Samples) -> None:
-        self.asked, self.samples, self.deltas = asked, samples, samples.deltas
-        self.alone = len(asked) == 1 and asked[0].rows is None  # one network speaks for all samples
-        self.outputs: list[Outputs] = []
-        factors = [density_scale(each.router) / each.scale for each in self.asked]
-        self.density_scale, self.factor = factors[0] if factors else 1.0, None
-        if any(factor != factors[0] for factor in factors):
-            self.factor = torch.ones_like(samples.deltas)
-            for each, factor in zip(self.asked, factors, strict=True):
-                self.factor[each.rows] = factor / factors[0]
-            self.deltas = self.deltas * self.factor
-
-    def density(self, found: RenderLoss) -> Tensor:
-        """[m], per scene unit."""
-        return found.density if self.factor is None else found.density * self.factor
-
-    def evaluate(self, backend: str) -> Tensor:
-        """[m, 4], what all networks put out; a sample that none of them speaks for is empty."""
-        tables = [each.router.table_arguments(each.points, each.directions, each.ray_index) for each in self.asked]
-        if self.alone:
-            tables = [{**cast(Any, tables[0]), "rows": self.samples.rows}]
-        self.outputs = [forward_with_tape(cast(Any, table), backend=backend) for table in tables]
-        if self.alone:
-            return self.outputs[0].raw
-        raw = self.deltas.new_full((len(self.deltas), 4), EMPTY)
-        for each, outputs in zip(self.asked, self.outputs, strict=True):
-            raw[each.rows] = outputs.raw
-        return raw
-
-    def learn(self, loss: Tensor, gradient: Tensor, *, backward: bool) -> Tensor:
-        """The loss with gradients; see `Outputs.learn`."""
-        if self.alone:
-            return self.outputs[0].learn(loss, gradient, backward=backward)
-        for each, outputs in zip(self.asked, self.outputs, strict=True):
-            loss = loss + outputs.learn(loss.new_zeros(()), gradient[each.rows], backward=backward)
-        return loss
+    return None if field.by_table else f"{type(field.module).__name__} does more than its layer table says"
 
 
 class Fused:
@@ -223,17 +149,17 @@ class Fused:
     def __call__(self, batch: Batch, generator: torch.Generator | None, *, backward: bool = False) -> RenderOutput:
         """See :class:`RayLoss`."""
         renderer, directions, target, background = self.renderer, batch.rays.directions, batch.target, batch.background
-        field = cast(VoronoiRouter | Parts, renderer.field)
+        field = cast(VoronoiRouter, renderer.field)
         samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, jitter=True, generator=generator)
         all_rays = len(samples.ray_offsets) - 1
         seen = None
         if self.sightings and batch.seen is not None:
             seen = torch.nn.functional.pad(batch.seen, (len(batch.rays) - len(batch.seen), 0), value=math.nan)
-        frozen = isinstance(field, VoronoiRouter) and field.frozen_cells is not None
-        if seen is not None or frozen or isinstance(field, Parts):
+        frozen = field.frozen_cells is not None
+        if seen is not None or frozen:
             samples = samples.counted()
         if frozen:
-            rays = _rays_to_learn(cast(VoronoiRouter, field), samples)
+            rays = _rays_to_learn(field, samples)
             samples, directions, target = samples.of_rays(rays), directions[rays], target[rays]
             if background is not None and background.dim() == 2:
                 background = background[rays]
@@ -241,15 +167,16 @@ class Fused:
         inputs, asked = samples.inputs, batch.rays.origins.requires_grad
         if asked:
             inputs, directions = inputs.detach().requires_grad_(), directions.detach().requires_grad_()
-        networks = Networks.of(field, samples._replace(inputs=inputs), directions)
+        table = field.table_arguments(inputs, directions, samples.ray_index)
+        outputs = forward_with_tape(cast(Any, {**cast(Any, table), "rows": samples.rows}), backend=renderer.backend)
         shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
         found, gradient = render_loss_gradient(
-            networks.evaluate(renderer.backend),
-            networks.deltas,
+            outputs.raw,
+            samples.deltas,
             samples.ray_offsets,
             target,
             background=background,
-            density_scale=networks.density_scale,
+            density_scale=density_scale(field),
             hidden=HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
             backend=renderer.backend,
         )
@@ -262,11 +189,11 @@ class Fused:
             gradient = gradient * shares[:, None]
         if len(target) < all_rays:  # the others count, but learn nothing
             loss, gradient = (values * (len(target) / all_rays) for values in (loss, gradient))
-        loss = networks.learn(loss, gradient, backward=backward)
+        loss = outputs.learn(loss, gradient, backward=backward)
         if asked:
             assert inputs.grad is not None and directions.grad is not None
             self._learn_rays(batch.rays, samples, inputs.grad, directions.grad)
-        return RenderOutput(loss, found.error, found.weights, networks.density(found), samples, found.colour)
+        return RenderOutput(loss, found.error, found.weights, found.density, samples, found.colour)
 
     def _learn_rays(self, rays: Rays, samples: Samples, of_inputs: Tensor, of_directions: Tensor) -> None:
         """Gives rays the gradients to their origins and directions: samples move with them.

@@ -5,9 +5,7 @@ r rays, h x w pixels. Units as in `voronerf.nerf.volume`.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import nullcontext
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -21,7 +19,6 @@ from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.samplers import Occupancy, Stratified
 from voronerf.nerf.volume import Rendered, Samples, per_ray, render_samples
-from voronerf.town.parts import Parts
 
 if TYPE_CHECKING:
     from voronerf.app.scenes import Scene
@@ -54,21 +51,12 @@ class RenderedImage(NamedTuple):
     heaviest: Tensor
 
 
-#: Shows what rays of a picture see: rays, near [r], far [r], background, and whether to find the heaviest samples.
-Look = Callable[[Rays, Tensor, Tensor, Tensor | None, bool], RayColours]
-
-#: Pictures that ask the networks of more parts than these are rendered in so many squares along their longer side: a
-#: square meets few of them, which fit into a bound on memory. It does not depend on a bound, so pictures do not.
-FEW_PARTS, TILES = 4, 8
-
-
 class Renderer:
     """Renders the rays of a scene: fields, asked where a sampler says.
 
     Attributes:
         fields: By name.
         sampler: Can be set at any time.
-        look: How pictures are made; None for this process alone, without randomness. Ranks have a way of their own.
 
     Args:
         fields: By the names of the sampler's networks; "field" has the colours.
@@ -95,7 +83,6 @@ class Renderer:
         if set(fields) != set(wanted):
             raise ValueError(f"Renderer: fields must be {' and '.join(wanted)}, got {sorted(fields)}")
         self.fields, self.sampler, self.backend = dict(fields), sampler, backend
-        self.look: Look | None = None
 
     @property
     def field(self) -> Field:
@@ -172,8 +159,6 @@ class Renderer:
             background: [3] or [r, 3]; None is black.
             heaviest: whether to find the heaviest samples; without it that part of the result means nothing.
         """
-        if self.look is not None:
-            return self.look(rays, near, far, background, heaviest)
         if isinstance(self.sampler, Occupancy):
             given = self.field, rays, near, far, self.sampler
             return render_until_opaque(*given, background=background, heaviest=heaviest)
@@ -183,20 +168,6 @@ class Renderer:
             positions, weights = (last.samples.by_ray(values) for values in (last.samples.positions, last.weights))
             places = positions[torch.arange(len(rays), device=places.device), weights.argmax(-1)]
         return RayColours(last.colour, last.opacity, last.depth, places)
-
-    def _tiles(self, hit: Tensor, size: tuple[int, int], chunk: int) -> Iterator[Tensor | slice]:
-        """The rays of a picture that are to be rendered, int64, in pieces: rows, which is faster, or squares."""
-        field = self.field
-        if not isinstance(field, Parts) or len(field) - len(field.far) <= FEW_PARTS:
-            whole = len(hit) <= chunk and bool(hit.all())
-            yield from (slice(None),) if whole else hit.nonzero()[:, 0].split(chunk)
-            return
-        width, height = size
-        side = max(-(-max(size) // TILES), 1)
-        numbers = torch.arange(width * height, device=hit.device).reshape(height, width)
-        for top, left in itertools.product(range(0, height, side), range(0, width, side)):
-            rows = numbers[top : top + side, left : left + side].reshape(-1)
-            yield from (piece for piece in rows[hit[rows]].split(chunk) if len(piece))
 
     @torch.no_grad()
     def image(
@@ -222,10 +193,10 @@ class Renderer:
             background: [3], None is black.
             heaviest: whether to look for each ray's heaviest sample; without it that part of the result means nothing.
             chunk: rays rendered at a time; bounds the memory. Default 4,096, and with a grid, which leaves few samples
-                of a ray, 131,072; over ranks 16,384.
+                of a ray, 131,072.
         """
         if chunk is None:
-            chunk = 16_384 if self.look is not None else 4096 if self.occupancy is None else 131_072
+            chunk = 4096 if self.occupancy is None else 131_072
         if chunk < 1:
             raise ValueError(f"Renderer.image: chunk must be >= 1, got {chunk}")
         rays = cameras.image_rays(index, cones=self.cones, backend=self.backend)
@@ -237,15 +208,13 @@ class Renderer:
         if heaviest:
             places = rays.origins + far * rays.directions
             places = places if self.contraction is None else self.contraction.points(places)
-        field, eye = self.field, cameras.origins[index]
-        pixel = 1 / float(cameras.intrinsics[index, :2].max())
-        with field.seen_from(eye, pixel) if isinstance(field, Parts) and field.detail else nullcontext():
-            for rows in self._tiles(hit, cameras.size(index), chunk):
-                seen = self.see(rays[rows], first[rows], last[rows], background, heaviest)
-                for whole, part in zip((colour, opacity, depth), seen):
-                    whole[rows] = part.to(whole.dtype)
-                if heaviest:
-                    places[rows] = seen.heaviest
+        every = len(hit) <= chunk and bool(hit.all())
+        for rows in (slice(None),) if every else hit.nonzero()[:, 0].split(chunk):
+            seen = self.see(rays[rows], first[rows], last[rows], background, heaviest)
+            for whole, part in zip((colour, opacity, depth), seen):
+                whole[rows] = part.to(whole.dtype)
+            if heaviest:
+                places[rows] = seen.heaviest
         size = cameras.size(index)[::-1]
         return RenderedImage(
             colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), places.reshape(*size, 3)

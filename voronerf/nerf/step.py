@@ -9,7 +9,6 @@ from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy
 from voronerf.ops._core import backends
 from voronerf.router import VoronoiRouter
-from voronerf.town.parts import Parts
 
 
 class Step:
@@ -39,7 +38,7 @@ class Step:
     @property
     def way(self) -> RayLoss:
         """The fastest way to the loss; here alone it is chosen."""
-        if why_not_fused(self.renderer, self.sightings) is None:
+        if why_not_fused(self.renderer) is None:
             return Fused(self.renderer, self.sightings)
         return Composed(self.renderer, self.sightings)
 
@@ -54,21 +53,15 @@ class Step:
         """
         return self.way(batch, generator, backward=backward)
 
-    def explain(self, territories: int = 1) -> str:
-        """How a step is computed, and what keeps it from a faster way: some lines.
-
-        Args:
-            territories: Those of the training; with several, the renderer is that of one of them.
-        """
+    def explain(self) -> str:
+        """How a step is computed, and what keeps it from a faster way: some lines."""
         renderer, sampler = self.renderer, self.renderer.sampler
         counts = f"{sampler.samples} and {sampler.fine_samples}" if sampler.passes > 1 else f"{sampler.samples}"  # type: ignore[attr-defined]
         lines = [f"samples: {type(sampler).__name__}, {counts} a ray"]
         if isinstance(sampler, Occupancy):
             lines[0] += f", of which {sampler.grid.share:.0%} of the grid are left"
-        if territories > 1:
-            return "\n".join([*lines, *self._explain_territories(territories)])
         lines.append(f"loss: {self.way.explain()}")
-        obstacle = why_not_fused(renderer, self.sightings)
+        obstacle = why_not_fused(renderer)
         if obstacle is None:
             device, dtype = renderer.device, torch.float32
             chosen = backends.chosen("forward_with_tape", device, dtype, backend=renderer.backend)
@@ -80,19 +73,6 @@ class Step:
         if obstacle is not None:
             lines.append(f"not faster: {obstacle}")
         for name, field in renderer.fields.items():
-            if isinstance(field, Parts):
-                lines += field.explain().splitlines()
-            elif isinstance(field, VoronoiRouter) and not field.by_table:
+            if isinstance(field, VoronoiRouter) and not field.by_table:
                 lines.append(f"{name}: {field.explain()}")
         return "\n".join(lines)
-
-    def _explain_territories(self, count: int) -> list[str]:
-        """The way of `voronerf.town.ray_runs`."""
-        obstacle = "points of the sparse model" if self.sightings else why_not_fused(self.renderer)
-        parts = "one operation each" if obstacle is None else f"separate operations: {obstacle}"
-        return [
-            f"loss: partial sums of {count} territories, each with networks and tables of its own",
-            "networks: called for the rays of a territory and for those that reach it from others; forward and "
-            f"backward are {parts}",
-            "not faster: the loss of a ray waits for the sums of all territories that it crosses",
-        ]

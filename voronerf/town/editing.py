@@ -17,30 +17,24 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from voronerf.app.files import write_text
+from voronerf.app.files import json_text, write_text
+from voronerf.app.run import Run
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import write_scene
 from voronerf.app.scenes.scene import Split
-from voronerf.app.train.checkpoint import Checkpoint, checkpoint_path, checkpoint_paths, save_checkpoint
+from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.progress import Stage
 from voronerf.app.train.renderers import LEAST_OPACITY, PICTURE_POINTS, PICTURE_RESOLUTION, make_picture_grid
-from voronerf.app.train.state import Stored
+from voronerf.app.train.run_directory import TOWN
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.occupancy import OccupancyGrid
-from voronerf.nerf.renderer import Renderer
-from voronerf.router import VoronoiRouter
-from voronerf.town.coarse import Coarse, make_coarse
-from voronerf.town.parts import Part, Parts, Similarity, Solid
-from voronerf.town.run_parts import describe_parts, parts_states
+from voronerf.town.geometry import Similarity, Solid
+from voronerf.town.parts import Network, Part, Parts
+from voronerf.town.run import write_parts
 
 #: The most voxels of the grid of a run that was made of others; it has larger ones where it would have more.
 MOST_VOXELS = 1 << 22
-
-#: The learning rate of runs that are trained together after they were joined, of that of the first: on two halves
-#: of a city all of it lost 0.1 to 0.3 dB against a quarter.
-AGAIN = 0.25
 
 
 @dataclass(frozen=True)
@@ -62,60 +56,140 @@ class Source:
     grid: OccupancyGrid | None
 
     @classmethod
-    def of(
-        cls, name: str, config: TrainConfig, scene: Scene, field: VoronoiRouter | Parts, renderer: Renderer
-    ) -> Source:
-        """The source that a run is. A field alone is taken: networks that only say where to sample are left.
+    def of(cls, run: Run) -> Source:
+        """The source that a run is. Of its networks the field alone is taken.
 
         Raises:
             ConfigError: For a field of cones, or one in normalised device coordinates.
         """
+        name, config, scene, renderer = run.path.name, run.config, run.scene, run.renderer
         if config.field_type.cones:
             raise ConfigError(f"{name}: --field {config.field} cannot be joined or cut: its cones cross borders")
-        contraction = renderer.contraction
+        contraction, grid, field = renderer.contraction, renderer.occupancy, renderer.field
         if isinstance(contraction, Perspective):
             raise ConfigError(f"{name}: --contraction ndc cannot be joined or cut: it belongs to one camera")
-        grid = renderer.occupancy
         if isinstance(field, Parts):
             return cls(name, config, scene, field, grid)
+        network = Network(run.router, replace(config, sampling="stratified"))
         if contraction is not None:
-            return cls(name, config, scene, Parts([Part([field], contraction=contraction)]), None)
+            return cls(name, config, scene, Parts([Part([network], contraction=contraction)]), None)
         region = []
         if scene.box is not None:
             low, high = scene.box.tolist()
             region = [Solid.box(low, high)]
             grid = grid or make_picture_grid(replace(config, sampling="stratified"), scene, renderer)
-        return cls(name, config, scene, Parts([Part([field], region=region)]), grid)
+        return cls(name, config, scene, Parts([Part([network], region=region)]), grid)
+
+
+def join(runs: Sequence[Run], out: Path | str, *, frames: Sequence[Similarity] | None = None) -> Source:
+    """Writes one run of several: where they overlap the nearest centre decides.
+
+    Args:
+        runs: At least two; the first gives data, background and settings.
+        out: A new directory; the runs stay as they are.
+        frames: From the scene of each run into that of the new one; None for where they are.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ConfigError: For runs that cannot be joined; see the guide.
+        OSError: When it cannot be written; nothing is left then.
+    """
+    if len(runs) < 2 or (frames is not None and len(frames) != len(runs)):
+        count = "none" if frames is None else f"{len(frames)}"
+        raise ConfigError(f"join needs two runs or more, and a frame for each: got {len(runs)} runs, {count} frames")
+    return _write(join_sources([Source.of(run) for run in runs], frames or [Similarity()] * len(runs)), Path(out))
+
+
+def cut(run: Run, kept: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Source:
+    """Writes a run of what lies in a solid or in some cells; networks that show nothing of it are dropped.
+
+    Args:
+        run: The run; it stays as it is.
+        kept: A solid of the scene, such as ``Solid.box(low, high)``, or numbers of cells.
+        out: A new directory.
+        outside: What does not lie there, in its place.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ConfigError: When nothing is left, or there is no such cell.
+        OSError: When it cannot be written; nothing is left then.
+    """
+    source = Source.of(run)
+    if isinstance(kept, Solid):
+        return _write(cut_source(source, replace(kept, outside=kept.outside != outside)), Path(out))
+    k = source.parts.num_cells
+    if not kept or not 0 <= min(kept) <= max(kept) < k:
+        raise ConfigError(f"--cells must be numbers of 0..{k - 1}, at least one, got {[*kept][:20]}")
+    chosen = torch.full((k,), outside)
+    chosen[list(kept)] = not outside
+    return _write(cut_source(source, chosen), Path(out))
+
+
+def place(
+    run: Run,
+    thing: Run,
+    at: Sequence[float],
+    out: Path | str,
+    *,
+    degrees: Sequence[float] = (0, 0, 0),
+    scale: float = 1.0,
+) -> Source:
+    """Writes a run with an object in it, whose density comes on top of the scene's.
+
+    Args:
+        run: The scene; it stays as it is.
+        thing: The object, cut out or trained on white.
+        at: Where the middle of the bottom of its box shall be.
+        out: A new directory.
+        degrees: Turned about the axes x, y, z, in this order.
+        scale: Of its size.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ConfigError: For an object without bounds.
+        OSError: When it cannot be written; nothing is left then.
+    """
+    source, box = Source.of(thing), thing.scene.box
+    if box is None:
+        raise ConfigError(f"{source.name}: an object must have bounds, which voronerf cut --box or --sphere gives it")
+    foot = torch.cat(((box[0] + box[1])[:2] / 2, box[0, 2:]))
+    standing = Similarity.of(at, degrees, scale) @ Similarity(translation=-foot.double())
+    return _write(join_sources([Source.of(run), source], [Similarity(), standing], on_top=True), Path(out))
 
 
 # Joining --------------------------------------------------------------------------------------------------------------
 
 
-def join(sources: Sequence[Source], frames: Sequence[Similarity], *, on_top: Sequence[bool] = ()) -> Source:
-    """One source of several.
+def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_top: bool = False) -> Source:
+    """One source of several: where they overlap the nearest centre decides.
 
     Args:
         sources: At least one. The first gives the settings, the background, and the data.
         frames: From each into the new scene.
-        on_top: Which are in layers above what came before; default none.
+        on_top: All but the first are in layers above it; their density comes on top of its.
 
     Raises:
         ConfigError: For runs without bounds beside others, or other backgrounds.
     """
     first = sources[0]
     for index, source in enumerate(sources):
-        if source.scene.box is None and (index or (len(sources) > 1 and not all(on_top[1:] or [False]))):
+        if source.scene.box is None and (index or (len(sources) > 1 and not on_top)):
             raise ConfigError(
                 f"{source.name}: must have bounds to be joined, which a run of unbounded space has after "
                 "voronerf cut --box or --sphere"
             )
-        if source.scene.background != first.scene.background:
+        if source.scene.background != first.scene.background and not on_top:
             ours, theirs = (s.scene.background or "none" for s in (first, source))
-            if not (on_top and on_top[index]):
-                raise ConfigError(f"{source.name}: must have the background of {first.name}, {ours}, got {theirs}")
+            raise ConfigError(f"{source.name}: must have the background of {first.name}, {ours}, got {theirs}")
     parts: list[Part] = []
     for index, (source, frame) in enumerate(zip(sources, frames, strict=True)):
-        above = max((part.layer for part in parts), default=-1) + 1 if on_top and on_top[index] else 0
+        above = max((part.layer for part in parts), default=-1) + 1 if on_top and index else 0
         parts += [part.changed(frame=frame @ part.frame, layer=part.layer + above) for part in source.parts]
     every = Parts(parts, backend=first.parts.backend)
     scene, grid = _join_scenes(sources, frames), _join_grids(sources, frames)
@@ -123,37 +197,16 @@ def join(sources: Sequence[Source], frames: Sequence[Similarity], *, on_top: Seq
 
 
 def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Scene) -> TrainConfig:
-    """The settings of a run of parts: those of the first, without splits, with strata as short as in any source."""
+    """The settings of a run of parts: those of the first, with strata as short as in any source."""
     first = sources[0].config
-    samples, rate, hold = int(first.samples or 64), first.lr, first.lr_hold
-    if len(sources) > 1 and rate is not None:  # to be trained further, with fresh moments: not from the beginning
-        rate, hold = rate * AGAIN, 0.0
+    samples = int(first.samples or 64)
     if scene.box is not None:
         diagonal = float((scene.box[1] - scene.box[0]).norm())
         for source, frame in zip(sources, frames, strict=True):
             assert source.scene.box is not None
             own = float((source.scene.box[1] - source.scene.box[0]).norm()) * frame.scale
             samples = max(samples, math.ceil(int(source.config.samples or 64) * diagonal / own - 1e-6))
-    return replace(
-        first,
-        cells=(),
-        split_at=None,
-        split_at_steps=None,
-        max_cells=None,
-        split="all",
-        sampling="stratified",
-        lr=rate,
-        lr_hold=hold,
-        samples=min(samples, 32_000),
-        occupancy=scene.box is not None,
-        contraction="none" if scene.box is not None else first.contraction,
-        sightings=0.0,
-        assignment="nearest",
-        parameters=None,
-        resume=False,
-        out=None,
-        cuda_graph=False,
-    )
+    return replace(first, sampling="stratified", samples=min(samples, 32_000), resume=False, out=None)
 
 
 def _join_scenes(sources: Sequence[Source], frames: Sequence[Similarity]) -> Scene:
@@ -270,7 +323,7 @@ def _grid_like(box: Tensor, shape: Sequence[int], threshold: float) -> Occupancy
 # Cutting --------------------------------------------------------------------------------------------------------------
 
 
-def cut(source: Source, kept: Solid | Tensor) -> Source:
+def cut_source(source: Source, kept: Solid | Tensor) -> Source:
     """What lies in a solid, or in some cells; networks of cells that show nothing of it are dropped.
 
     Space inside of the sphere of a contraction is as it was, so that what is cut out of it needs none.
@@ -321,7 +374,9 @@ def cut(source: Source, kept: Solid | Tensor) -> Source:
         full, shown = grid.occupied.view(-1).nonzero()[:, 0], torch.zeros(parts.num_cells, dtype=torch.bool)
         for offset in _LATTICE:
             if not bool(shown.all()):
-                shown |= parts.shown(grid.points(full, offset.expand(len(full), 3)))
+                places = grid.points(full, offset.expand(len(full), 3))
+                for claim in (claim for layer in range(len(parts.layers)) for claim in parts.claims(layer, places)):
+                    shown[parts.cells_of(claim).long()] = True
         if not bool(shown.all()):
             parts = keep_cells(parts, shown)
     config, scene = source.config, replace(source.scene, box=grid.box)
@@ -433,22 +488,6 @@ def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, in
     return found, float((found.points(at) - to).square().sum(1).mean().sqrt()), len(shared)
 
 
-# Placing --------------------------------------------------------------------------------------------------------------
-
-
-def standing(thing: Source, at: Sequence[float], degrees: Sequence[float], scale: float) -> Similarity:
-    """Where an object is to be: the middle of the bottom of its box at a place, turned about it, and scaled.
-
-    Raises:
-        ConfigError: For an object without a box.
-    """
-    box = thing.scene.box
-    if box is None:
-        raise ConfigError(f"{thing.name}: an object must have bounds, which voronerf cut --box or --sphere gives it")
-    foot = torch.cat(((box[0] + box[1])[:2] / 2, box[0, 2:]))
-    return Similarity.of(at, degrees, scale) @ Similarity(translation=-foot.double())
-
-
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
@@ -462,20 +501,6 @@ def check_out(out: Path) -> None:
         raise ConfigError(f"--out must not hold a run already, got {out}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"--out must be a new or an empty folder, got {out}")
-
-
-def _coarse_levels(source: Source) -> dict[int, Coarse]:
-    """What the parts show from far away, by their numbers, in voxels as long as half a step along a ray."""
-    box, grid, found = source.scene.box, source.grid, dict[int, Coarse]()
-    if len(source.parts) == 1 or box is None:
-        return found
-    side = float((box[1] - box[0]).norm()) / int(source.config.samples or 64) / 2
-    occupied = None if grid is None else lambda points: grid.occupied.view(-1)[grid.cells(points).long()]
-    for index, part in enumerate(source.parts.eval()):
-        level = make_coarse(part, side, occupied, source.parts.backend)
-        if level is not None:
-            found[index] = level
-    return found
 
 
 @contextmanager
@@ -499,38 +524,12 @@ def new_folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def write(source: Source, out: Path) -> None:
-    """Writes a run of parts, whole or not at all; with several parts also their coarse levels.
-
-    Raises:
-        ConfigError: When there is something in the folder.
-        OSError: When it cannot be written; nothing is left then.
-    """
+def _write(source: Source, out: Path) -> Source:
+    """Writes a run of parts, whole or not at all."""
     with new_folder(out) as partial:
         config = replace(source.config, out=out)
-        stored = Stored(
-            config=config.to_values(),
-            step=0,
-            seconds=0.0,
-            rays=config.rays,
-            rays_done=0,
-            stages=(vars(Stage(source.parts.num_cells, 0.0, 0, None, None, 0)),),
-            evaluated=0,
-            skipped=0,
-            rate_factor=1.0,
-            threads=torch.get_num_threads(),
-        )
-        groups: dict[str, dict[str, Tensor]] = dict(parts_states(source.parts))
-        if source.grid is not None:
-            groups["occupancy"] = source.grid.state_dict()
-        groups |= {f"part-{i}.coarse": vars(level) for i, level in _coarse_levels(source).items()}
-        tensors = {
-            # What stands in two places is one tensor, which a file does not take twice.
-            f"{prefix}.{name}": tensor.detach().cpu().contiguous() if "router-" in name else tensor.cpu().clone()
-            for prefix, group in groups.items()
-            for name, tensor in group.items()
-        }
-        values = {**vars(stored), "stages": list(stored.stages), "parts": describe_parts(source.parts)}
-        save_checkpoint(checkpoint_path(partial), Checkpoint(tensors, values))
+        write_parts(partial, config, source.parts, source.grid)
+        write_text(partial / TOWN, json_text({"parts": len(source.parts.parts)}) + "\n")
         write_text(partial / "config.json", config.to_json())
         write_scene(partial / "scene.json", source.scene)
+    return source

@@ -7,7 +7,6 @@ from typing import Any
 
 from voronerf.app.train.progress import Progress
 from voronerf.app.train.trainer import Trainer
-from voronerf.town.joint import JointTrainer
 
 #: Steps between two losses.
 EVERY = 10
@@ -24,7 +23,7 @@ class Board:
         ImportError: TensorBoard is not installed.
     """
 
-    def __init__(self, folder: Path, trainer: Trainer | JointTrainer) -> None:
+    def __init__(self, folder: Path, trainer: Trainer) -> None:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:

@@ -44,7 +44,7 @@ def info(run: Path | None = None, /) -> int:
     if run is not None:
         opened = open_run(run)
         step = Step(opened.renderer, sightings=opened.config.sightings or 0.0)
-        for line in step.explain(opened.config.territories or 1).splitlines():
+        for line in step.explain().splitlines():
             say(line)
         return 0
     for name, value in backends.describe().items():

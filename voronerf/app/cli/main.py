@@ -12,7 +12,6 @@ import threading
 import unicodedata
 import warnings
 from collections.abc import Callable, Iterator
-from typing import TextIO
 
 import torch
 import tyro
@@ -26,18 +25,16 @@ from voronerf.app.cli.export import export
 from voronerf.app.cli.info import info
 from voronerf.app.cli.process import process
 from voronerf.app.cli.render import render
+from voronerf.app.cli.town import cut, join, place
 from voronerf.app.cli.train import command_of, train
 from voronerf.app.cli.view import view
 from voronerf.app.train.config import ConfigError
 from voronerf.app.train.progress import TrainingError
 from voronerf.ops._core.backends import BackendUnavailable
-from voronerf.town import cli_editing as editing
-from voronerf.town import cli_update as update
-from voronerf.town.distributed.group import RankLost, may_tell, own_rank
 
 #: Errors that a user can cause; they are printed as one line. ValueError includes SceneError and CheckpointError.
 EXPECTED = (
-    *(ConfigError, TrainingError, BackendUnavailable, RankLost, ValueError, OSError, ImportError),
+    *(ConfigError, TrainingError, BackendUnavailable, ValueError, OSError, ImportError),
     *(MemoryError, torch.OutOfMemoryError),
 )
 
@@ -54,10 +51,9 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "eval": evaluate_run,
     "render": render,
     "export": export,
-    "join": editing.join,
-    "cut": editing.cut,
-    "place": editing.place,
-    "update": update.update,
+    "join": join,
+    "cut": cut,
+    "place": place,
     "view": view,
     "compare": compare,
     "info": info,
@@ -83,14 +79,9 @@ def main(args: list[str] | None = None) -> int:
     warnings.showwarning = _show_warning
     threading.excepthook = _show_thread_error
     with contextlib.ExitStack() as stack:
-        errors = sys.stderr
-        if own_rank() > 0:  # of several ranks the first one speaks, and another one only of its errors
-            null = stack.enter_context(open(os.devnull, "w"))
-            stack.enter_context(contextlib.redirect_stdout(null))
-            stack.enter_context(contextlib.redirect_stderr(null))
         if args[:1] != ["train"]:  # which ends with a checkpoint
             stack.enter_context(_exit_on_sigterm())
-        return _run(args, errors)
+        return _run(args)
 
 
 @contextlib.contextmanager
@@ -107,8 +98,8 @@ def _exit_on_sigterm() -> Iterator[None]:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-def _run(args: list[str], errors: TextIO) -> int:
-    """Parses the command line and runs the command; prints errors to ``errors``."""
+def _run(args: list[str]) -> int:
+    """Parses the command line and runs the command; prints errors to stderr."""
     try:
         for word in args:  # the parser prints a word that it does not know as it is
             if any(unicodedata.category(char) == "Cc" for char in word):
@@ -121,13 +112,12 @@ def _run(args: list[str], errors: TextIO) -> int:
             config=(tyro.conf.OmitArgPrefixes,),
         )
     except KeyboardInterrupt:
-        print("voronerf: interrupted", file=errors)
+        print("voronerf: interrupted", file=sys.stderr)
         return 130
     except EXPECTED as error:
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
-        if may_tell(error):
-            print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=errors)
+        print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=sys.stderr)
         return 1
     except (RuntimeError, SystemError) as error:
         text = str(error)
@@ -135,7 +125,7 @@ def _run(args: list[str], errors: TextIO) -> int:
             raise
         wanted = re.search(r"tried to allocate (\d+) bytes", text)
         size = f" for {int(wanted[1]) / 2**30:.1f} GiB" if wanted else ""
-        print(f"voronerf: error: not enough memory{size}; try a smaller --width, --rays or --samples", file=errors)
+        print(f"voronerf: error: not enough memory{size}; try a smaller --width, --rays or --samples", file=sys.stderr)
         return 1
 
 

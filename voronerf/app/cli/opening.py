@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,8 +14,11 @@ from voronerf.app.run import Run, open_run, read_crop
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import read_scene
 from voronerf.app.train.config import ConfigError
-from voronerf.town.parts import Parts
+from voronerf.app.train.run_directory import TOWN
+from voronerf.town.run import open_run as open_parts
 
+#: What opens a run directory with a file of that name; others are those of a training.
+OPENERS: dict[str, Callable[..., Run]] = {TOWN: open_parts}
 #: Six numbers of a box, or the one that the viewer has saved.
 Crop = tuple[float, float, float, float, float, float] | Literal["saved"] | None
 
@@ -39,27 +44,19 @@ class Opening:
     """Torch device."""
     backend: str = "auto"
     """Backend of the operations."""
-    memory: str | None = None
-    """Bound on memory, such as 512M, for a run of several parts or territories: networks are read as rays meet them,
-    and those that were not used for longest are dropped."""
-    detail: float | None = None
-    """Draw far parts of a joined run from a coarse level, whose voxels are at most so many pixels wide; 0 is off. The
-    default is 1 for view and render with --memory, and 0 else."""
 
-    def open_without_images(self, run: Path, *, pictures: bool = False) -> Run:
+    def open_without_images(self, run: Path) -> Run:
         """Opens the run with the cameras of its record, unless other data or other sizes are asked for."""
         record = run / "scene.json"
         known = self.data is None and self.downscale is None and record.is_file()
-        return self.open(run, scene=read_scene(record) if known else None, pictures=pictures)
+        return self.open(run, scene=read_scene(record) if known else None)
 
-    def open(self, run: Path, *, scene: Scene | None = None, pictures: bool = False) -> Run:
-        """Opens the run; see :func:`voronerf.open_run`. ``pictures``: to be looked at, not to be measured."""
+    def open(self, run: Path, *, scene: Scene | None = None) -> Run:
+        """Opens a run of any kind."""
         check_counts(samples=self.samples, fine_samples=self.fine_samples, downscale=self.downscale)
-        opened = open_run(run, scene=scene, **{**vars(self), "detail": self.detail or 0.0})
-        coarse = isinstance(opened.router, Parts) and any(part.coarse for part in opened.router)
-        if pictures and self.memory is not None and self.detail is None and coarse:
-            opened.router.detail = 1.0
-        return opened
+        opener = next((opener for file, opener in OPENERS.items() if (run / file).is_file()), open_run)
+        kept = inspect.signature(opener).parameters
+        return opener(run, scene=scene, **{name: value for name, value in vars(self).items() if name in kept})
 
 
 AS_IN_TRAINING = Opening()

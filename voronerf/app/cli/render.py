@@ -41,7 +41,7 @@ def render(
     if fps is not None and not 0.01 <= fps <= 1000:
         raise ConfigError(f"--fps must be 0.01 to 1000, got {fps:g}")
     given = given_path(path, spiral)
-    opened = opening.open_without_images(run, pictures=True)
+    opened = opening.open_without_images(run)
     spiral = spiral or opened.scene.kind == "forward"
     name = path.stem if path is not None else "spiral" if spiral else "turntable"
     out = out or run / f"{name}.mp4"

@@ -16,7 +16,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
 
-import torch
 import tyro
 
 from voronerf.app.cli.board import Board
@@ -24,10 +23,9 @@ from voronerf.app.cli.display import TrainingDisplay, console, say
 from voronerf.app.cli.view import import_viewer
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.run import open_run
-from voronerf.app.scenes import BUILTIN, Scene, SceneError, load_scene
-from voronerf.app.train.checkpoint import checkpoint_paths
+from voronerf.app.scenes import Scene, SceneError, load_scene
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.config_checks import check_device, check_joint, why_no_occupancy
+from voronerf.app.train.config_checks import check_device, why_no_occupancy
 from voronerf.app.train.networks import resolve_config
 from voronerf.app.train.progress import Progress
 from voronerf.app.train.run_directory import (
@@ -41,9 +39,6 @@ from voronerf.app.train.run_directory import (
     write_curve,
 )
 from voronerf.app.train.trainer import Trainer
-from voronerf.town.distributed.group import Group, joined, local_rank, restarts, world_size
-from voronerf.town.distributed.same import check_same, check_same_scene
-from voronerf.town.joint import JointTrainer
 
 #: Makes a `voronerf.app.viewer.Training`, which shows a trainer.
 Watch = Callable[[Trainer], Any]
@@ -83,22 +78,13 @@ def train(
         port: Port that --view listens at; 0 is any that is free.
         explain: Only say how a training step is computed, and what keeps it from a faster way.
     """
-    if world_size() > 1:
-        return train_on_ranks(config, view=view)
     check_device(config.device)
     if view:
         import_viewer().check_address(host, port)
     scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
-    if view and (config.territories or 1) > 1:
-        raise ConfigError(
-            f"--view must be off with several territories, got {config.territories}; `voronerf view` shows their last "
-            "checkpoint"
-        )
     if explain:
         unused = replace(config, out=config.out or Path("runs"), resume=config.resume and config.out is not None)
-        joint = (config.territories or 1) > 1
-        text = JointTrainer(unused, scene).explain() if joint else Trainer(unused, scene).learner.explain()
-        for line in text.splitlines():
+        for line in Trainer(unused, scene).learner.explain().splitlines():
             say(line)
         return 0
     chosen = choose_directory(config, scene)
@@ -131,62 +117,12 @@ def _remove_empty(folder: Path) -> None:
         folder.rmdir()  # fails if something was written, and is then not needed
 
 
-def train_on_ranks(config: TrainConfig, *, view: bool) -> int:
-    """Trains together with the other ranks; all of them call it, and rank 0 alone writes files.
-
-    Args:
-        config: The settings.
-        view: Whether a viewer was asked for.
-
-    Raises:
-        ConfigError: A setting that multi-process training does not support.
-        RankLost: Another rank has ended, or says what is wrong.
-    """
-    device = torch.device(f"cuda:{local_rank()}" if config.device == "cuda" else config.device)
-    config = replace(config, device=str(device))
-    check_device(config.device)
-    if config.territories is None:
-        config = replace(config, territories=1 << (world_size() - 1).bit_length())
-    with joined(device) as group:
-        check_same(group, config)
-        if view:
-            raise ConfigError(
-                f"--view must be off with several ranks, got {world_size()}; `voronerf view` shows their last "
-                "checkpoint"
-            )
-        check_joint(config, world_size())
-        assert config.out is not None
-        reading = config.reading
-        if config.data not in BUILTIN:  # each rank reads its own of one copy
-            reading["images"] = "disk"
-        scene = load_scene(config.data, allow_outside=config.allow_outside, **reading)
-        check_same_scene(group, scene)
-        if group.rank == 0:  # alone, for what it writes is there already when others look
-            again = restarts() > 0 and bool(checkpoint_paths(config.out))
-            config = choose_directory(replace(config, resume=config.resume or again), scene)
-        config = replace(config, resume=group.from_first(config.resume))
-        summary = run_training(config, scene, group=group)
-        first = group.rank == 0
-    if first and summary["complete"]:  # not before the others have left: they would wait for the pictures
-        _draw_joint(config, scene)
-    return 0 if summary["complete"] else 130
-
-
-def _draw_joint(config: TrainConfig, scene: Scene) -> None:
-    """Draws the panels of a joint run from its files."""
-    assert config.out is not None
-    if config.panels:
-        opened = open_run(config.out, scene=scene, backend=config.backend)
-        write_panels(opened.renderer, opened.diagram, scene, config.out / "images", views=config.panels)
-
-
 def run_training(
-    config: TrainConfig, scene: Scene, *, watch: Watch | None = None, group: Group | None = None, quiet: bool = False
+    config: TrainConfig, scene: Scene, *, watch: Watch | None = None, quiet: bool = False
 ) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
 
-    ``watch`` makes what shows the training in a viewer; ``group`` are the ranks that train together. ``quiet`` leaves
-    out all lines but the live one.
+    ``watch`` makes what shows the training in a viewer. ``quiet`` leaves out all lines but the live one.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the step in hand: the checkpoint and the summary are written,
     the pictures are not. A second one ends the process at once.
@@ -195,24 +131,17 @@ def run_training(
     longest = max(scene.test.names, key=lambda name: len(os.fsencode(name)))
     if config.panels and len(os.fsencode(longest)) > LONGEST_NAME:
         raise ConfigError(f"--panels must be 0 with image names of more than {LONGEST_NAME} bytes, got {longest}")
-    with held(config.out) if group is None or group.rank == 0 else contextlib.nullcontext():
-        return _train_and_draw(config, config.out, scene, watch, group, quiet)
+    with held(config.out):
+        return _train_and_draw(config, config.out, scene, watch, quiet)
 
 
-def _train_and_draw(
-    config: TrainConfig, out: Path, scene: Scene, watch: Watch | None, group: Group | None, quiet: bool
-) -> dict[str, Any]:
+def _train_and_draw(config: TrainConfig, out: Path, scene: Scene, watch: Watch | None, quiet: bool) -> dict[str, Any]:
     with contextlib.ExitStack() as stack:
         display = TrainingDisplay(console, scene.name, quiet=quiet)
         with display.progress:
             for note in scene.notes:
                 display.on_event(f"{scene.name}: {note}")
-            told: dict[str, Any] = {"on_step": display.on_step, "on_event": display.on_event}
-            trainer: Trainer | JointTrainer
-            if (config.territories or 1) > 1:
-                trainer = JointTrainer(config, scene, group=group, **told)
-            else:
-                trainer = Trainer(config, scene, **told)
+            trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
             if trainer.lpips is None:
                 display.on_event(trainer.lpips_source)
             if config.occupancy and trainer.occupancy is None:
@@ -222,8 +151,8 @@ def _train_and_draw(
                 obstacle = why_no_occupancy(resolved) or other
                 display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
             watched = None
-            board = Board(out / "tensorboard", trainer) if config.tensorboard and trainer.writes else None
-            if watch is not None and isinstance(trainer, Trainer):
+            board = Board(out / "tensorboard", trainer) if config.tensorboard else None
+            if watch is not None:
                 watched = watch(trainer)
                 stack.callback(watched.close)
 
@@ -242,19 +171,16 @@ def _train_and_draw(
             again = f" --data {shlex.quote(config.data)}" if is_outside(out, config.data) else ""
             say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}{again}")
             return summary
-        if config.panels and isinstance(trainer, Trainer):
+        if config.panels:
             with trainer.averaged():
                 write_panels(trainer.renderer, trainer.diagram, scene, out / "images", views=config.panels)
-        elif group is None:
-            _draw_joint(config, scene)
-        if trainer.writes:
-            write_curve(out)
+        write_curve(out)
         if not quiet:
             say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
         return summary
 
 
-def _train(trainer: Trainer | JointTrainer) -> dict[str, Any]:
+def _train(trainer: Trainer) -> dict[str, Any]:
     """Runs a trainer that the signals of ``STOPPING`` stop; returns the summary."""
     # One that is ignored stays so, as under nohup or where a shell started it in the background.
     before = {number: signal.getsignal(number) for number in STOPPING}
@@ -273,8 +199,7 @@ def _train(trainer: Trainer | JointTrainer) -> dict[str, Any]:
     try:
         return trainer.run()
     except SceneError:  # of images on disk that were cut short: what was learnt stays
-        if isinstance(trainer, Trainer):  # ranks could not save together
-            trainer.save()
+        trainer.save()
         raise
     finally:
         restore()

@@ -22,7 +22,7 @@ def view(run: Path, /, host: str = "127.0.0.1", port: int = 8080, opening: Openi
     """
     viewers = import_viewer()
     viewers.check_address(host, port)
-    viewer = viewers.view_run(opening.open_without_images(run, pictures=True), host=host, port=port)
+    viewer = viewers.view_run(opening.open_without_images(run), host=host, port=port)
     say(f"{viewer.audience}; Ctrl-C ends")
     with contextlib.closing(viewer), contextlib.suppress(KeyboardInterrupt):
         viewer.warm_up()

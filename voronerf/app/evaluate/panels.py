@@ -148,19 +148,12 @@ def _on_white(picture: Tensor, opacity: Tensor) -> Tensor:
     return (picture * share + 255 * (1 - share)).round().to(torch.uint8)
 
 
-def write_panels(
-    renderer: Renderer, diagram: VoronoiDiagram, scene: Scene, folder: Path | None, *, views: int
-) -> list[Path]:
-    """Draws truth, render, error, depth and cells of evenly spread test views, a PNG each; returns the paths.
-
-    Without a folder it only renders, for the other ranks of a joint training.
-    """
+def write_panels(renderer: Renderer, diagram: VoronoiDiagram, scene: Scene, folder: Path, *, views: int) -> list[Path]:
+    """Draws truth, render, error, depth and cells of evenly spread test views, a PNG each; returns the paths."""
     paths = []
     background = scene.background_colour()
     for view in view_numbers(len(scene.test), views):
         image = render_view(renderer, scene, view)
-        if folder is None:
-            continue
         # Each pixel in the colour of the cell of its heaviest sample, as in figure 1 of the paper.
         cells = diagram.locate(image.heaviest.reshape(-1, 3), backend=renderer.backend)
         cells = cells.reshape(image.opacity.shape).cpu()

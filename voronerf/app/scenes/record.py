@@ -5,8 +5,6 @@ With it a run is rendered before the images are read, or where they are not. Fie
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +21,6 @@ from voronerf.nerf.contraction import Contraction, Perspective
 CONTRACTIONS = {"sphere": Contraction, "perspective": Perspective}
 #: What a text of a scene may be.
 WORDS = {"spacing": ("linear", "disparity"), "background": ("white", None), "kind": KINDS}
-#: How far the turns of cameras that were moved together may differ: a training may have refined each.
-TURN = 0.05
 INTEGERS = {"sizes": torch.int64, "models": torch.int32}
 
 
@@ -77,60 +73,14 @@ def _where_they_are(read: Cameras, moved: Cameras) -> Cameras:
     return replace(read, poses=moved.poses.to(read.poses), intrinsics=intrinsics)
 
 
-def within(scene: Scene, run: Path, *, joined: bool) -> Scene:
-    """A scene in the space of the record in a run directory, where there is one, see `recorded` and `placed`.
-
-    Args:
-        scene: As it was read.
-        run: The run directory.
-        joined: Whether the run was made of others, which may have moved its cameras.
+def within(scene: Scene, run: Path) -> Scene:
+    """A scene in the space of the record in a run directory, where there is one, see `placed`.
 
     Raises:
         SceneError: the record is damaged, or it is of another place.
     """
     path = run / "scene.json"
-    if not path.is_file():
-        return scene
-    known = read_scene(path)
-    return (recorded([scene], known) if joined else None) or placed(scene, known)
-
-
-def recorded(scenes: Sequence[Scene], known: Scene) -> Scene | None:
-    """The pictures of scenes where the record of a run that was joined of theirs has their cameras.
-
-    Args:
-        scenes: Those of the first runs, or of all, in the order in which they were joined.
-        known: The record.
-
-    Returns:
-        None if the views of the record do not begin with theirs, each scene moved as a whole.
-
-    Raises:
-        SceneError: One has a background that the others have not.
-    """
-    splits: dict[str, Split] = {}
-    for part in ("train", "test"):
-        read: list[Split] = [getattr(scene, part) for scene in scenes]
-        views: Split = getattr(known, part)
-        plain = [name for split in read for name in split.names]
-        numbered = [f"{number}-{name}" for number, split in enumerate(read) for name in split.names]
-        if [*views.names[: len(plain)]] not in (plain, numbered):
-            return None
-        cameras = views.cameras[torch.arange(len(plain))]
-        first = 0
-        for split in read:
-            turns = cameras.poses[first : first + len(split), :3, :3] @ split.cameras.poses[:, :3, :3].mT.to(
-                cameras.poses
-            )
-            if not torch.allclose(turns, turns[:1].expand_as(turns), atol=TURN):
-                return None
-            first += len(split)
-        every = functools.reduce(Split.joined, read)
-        names, cameras = views.names[: len(plain)], _where_they_are(every.cameras, cameras)
-        splits[part] = replace(every, cameras=cameras, names=names, sightings=None)
-    for scene in scenes:
-        _check_background(scene, known)
-    return replace(scenes[0], train=splits["train"], test=splits["test"], **_space(known))
+    return placed(scene, read_scene(path)) if path.is_file() else scene
 
 
 def placed(scene: Scene, known: Scene) -> Scene:

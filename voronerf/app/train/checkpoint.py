@@ -3,23 +3,16 @@
 The tensors are those of the routers with their diagrams, of the optimiser, of the sample reservoir and of the random
 generators. Everything else (configuration, counters, stages) is JSON in the metadata of the file, beside a checksum for
 each tensor and one for the JSON.
-
-A joint training writes a file for each territory, a checkpoint of its own, and then the checkpoint that names them. The
-networks of an edited run of several parts are in files whose names are hashes of what is in them: networks that did not
-change are not written again, and equal ones are stored once.
 """
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import json
-import re
 import threading
 import warnings
 import zlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +22,10 @@ from safetensors.torch import save
 from torch import Tensor
 
 from voronerf.app.files import parse_json, rename, write_bytes
-from voronerf.town.distributed.group import Group, RankLost
 
 FORMAT = "voronerf-checkpoint-2"
 #: The name of the checksum of the JSON, beside those of the tensors.
 _VALUES = "values"
-#: What `keep` of `load_checkpoint` is asked about the networks of all parts.
-NETWORKS = "part-*.router-*"
-#: The file of the networks of one router of a part.
-_NETWORKS = re.compile(r"(networks|part)-[0-9a-z-]+\.safetensors")
 
 
 class CheckpointError(ValueError):
@@ -85,63 +73,24 @@ def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
         else:
             path.unlink()
     rename(written, last)
-    _remove_parts(run)
-
-
-def part_path(run: Path, token: str, number: int) -> Path:
-    """Where a territory keeps its part of one checkpoint, whose token is like no other."""
-    return checkpoint_path(run).with_name(f"part-{token}-{number}.safetensors")
-
-
-def _remove_parts(run: Path) -> None:
-    """Removes parts and networks that no checkpoint of a run names; none while it has a file that cannot be read."""
-    named: set[str] = set()
-    for path in checkpoint_paths(run):
-        try:
-            with safe_open(path, framework="pt") as file:
-                named |= set(network_files(parse_json(file.metadata()[_VALUES])))
-        except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, OSError):
-            return
-    for path in checkpoint_path(run).parent.glob("*.safetensors"):
-        if _NETWORKS.fullmatch(path.name) and path.name not in named:
-            path.unlink(missing_ok=True)
-
-
-def network_files(values: dict[str, Any]) -> list[str]:
-    """The names of the files with the networks of parts, which the JSON of a checkpoint tells."""
-    return [str(router["file"]) for part in values.get("parts", ()) for router in part["routers"]]
 
 
 class CheckpointWriter:
     """Writes the checkpoints of a run one after the other, beside what the caller does.
 
-    In a joint training all ranks call the same methods. Each writes the files of its territories; when all are there,
-    rank 0 writes the checkpoint that names them, which counts from that moment on.
-
     Args:
         run: The run directory.
         keep: How many checkpoints stay.
-        group: The ranks of a joint training; None for this process alone.
     """
 
-    def __init__(self, run: Path, keep: int, group: Group | None = None) -> None:
-        self.run, self.keep, self.group = run, keep, group
+    def __init__(self, run: Path, keep: int) -> None:
+        self.run, self.keep = run, keep
         self._thread: threading.Thread | None = None
         self._error: BaseException | None = None
-        self._index: Callable[[], Checkpoint] | None = None  # makes a checkpoint whose parts are being written
 
     @property
     def busy(self) -> bool:
-        """Whether a checkpoint is being written; over ranks, where that differs, a new one waits for the one before."""
-        return self.group is None and self._writes
-
-    @property
-    def ready(self) -> bool:
-        """Whether this rank has written its parts, for a checkpoint that is not there yet."""
-        return self._index is not None and not self._writes and self._error is None
-
-    @property
-    def _writes(self) -> bool:
+        """Whether a checkpoint is being written."""
         return self._thread is not None and self._thread.is_alive()
 
     def write(self, checkpoint: Checkpoint) -> None:
@@ -151,53 +100,11 @@ class CheckpointWriter:
             OSError: When the one before could not be written.
         """
         self.wait()
-        self._begin(functools.partial(keep_checkpoint, self.run, checkpoint, self.keep))
-
-    def write_parts(self, parts: Mapping[Path, Checkpoint], index: Callable[[], Checkpoint]) -> None:
-        """Begins to write the parts of a checkpoint; :meth:`commit` writes the checkpoint itself.
-
-        Args:
-            parts: Those of this rank by their files; their tensors must not change.
-            index: Makes the checkpoint that names the parts of all ranks, which are written then; asked on rank 0.
-
-        Raises:
-            OSError: When the checkpoint before could not be written.
-            RankLost: When that is so on another rank.
-        """
-        self.wait()
-
-        def save_all() -> None:
-            for path, part in parts.items():
-                save_checkpoint(path, part)
-
-        self._index = index
-        self._begin(save_all)
-
-    def commit(self) -> None:
-        """Begins to write the checkpoint itself, when all ranks are :attr:`ready`."""
-        self._join()
-        index, self._index = self._index, None
-        if index is not None and (self.group is None or self.group.rank == 0):
-            self._begin(lambda: keep_checkpoint(self.run, index(), self.keep))
-
-    def wait(self) -> None:
-        """Returns when the checkpoint is written, on all ranks.
-
-        Raises:
-            OSError: When it could not be.
-            RankLost: When it could not be on another rank.
-        """
-        self._join_all()
-        if self._index is not None:
-            self.commit()
-            self._join_all()
-
-    def _begin(self, work: Callable[[], None]) -> None:
         self._error = MemoryError("no memory for the thread that writes a checkpoint")  # until that has done so
 
         def run() -> None:
             try:
-                work()
+                keep_checkpoint(self.run, checkpoint, self.keep)
             except BaseException as error:
                 self._error = error
             else:
@@ -207,23 +114,18 @@ class CheckpointWriter:
         self._thread = threading.Thread(target=run, daemon=True)
         self._thread.start()
 
-    def _join(self) -> None:
+    def wait(self) -> None:
+        """Returns when the checkpoint is written.
+
+        Raises:
+            OSError: When it could not be.
+        """
         if self._thread is not None:
             self._thread.join()
             self._thread = None
         if self._error is not None:
             error, self._error = self._error, None
             raise error
-
-    def _join_all(self) -> None:
-        failure: OSError | None = None
-        try:
-            self._join()
-        except OSError as error:
-            failure = error
-        failed = torch.tensor(float(failure is not None), device="cpu" if self.group is None else self.group.device)
-        if (failed if self.group is None else self.group.largest(failed)) > 0:
-            raise failure or RankLost("another rank could not write the checkpoint")
 
 
 def _all(name: str) -> bool:
@@ -255,63 +157,16 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Writes a checkpoint atomically, after the networks of its parts, if it has any.
+    """Writes a checkpoint atomically.
 
     Raises:
         OSError: When it cannot be written; an older checkpoint at ``path`` is then untouched.
     """
-    if "parts" in checkpoint.values:
-        checkpoint = _write_networks(path.parent, checkpoint)
     values = json.dumps(checkpoint.values)
     sums = {name: _checksum(tensor) for name, tensor in checkpoint.tensors.items()}
     sums[_VALUES] = zlib.crc32(values.encode())
     metadata = {"format": FORMAT, "values": values, "checksums": json.dumps(sums)}
     write_bytes(path, save(checkpoint.tensors, metadata))
-
-
-def _write_networks(folder: Path, checkpoint: Checkpoint) -> Checkpoint:
-    """Writes the networks of parts into files of a folder; the checkpoint without them, which names the files."""
-    tensors, parts = dict(checkpoint.tensors), []
-    for i, part in enumerate(checkpoint.values["parts"]):
-        routers = []
-        for j, router in enumerate(part["routers"]):
-            prefix = f"part-{i}.router-{j}."
-            own = {name[len(prefix) :]: tensors.pop(name) for name in sorted(tensors) if name.startswith(prefix)}
-            if not own and "file" in router:  # whoever made the checkpoint has written it
-                routers.append(router)
-                continue
-            kind = {name: value for name, value in router.items() if name != "file"}
-            digest = hashlib.sha256(json.dumps(kind, sort_keys=True).encode())
-            for name, tensor in own.items():
-                digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
-                digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
-            path = folder / f"networks-{digest.hexdigest()}.safetensors"
-            if not path.is_file():
-                save_checkpoint(path, Checkpoint(own, kind))
-            routers.append({**kind, "file": path.name})
-        parts.append({**part, "routers": routers})
-    return replace(checkpoint, tensors=tensors, values={**checkpoint.values, "parts": parts})
-
-
-def _read_networks(path: Path, values: dict[str, Any], keep: Callable[[str], bool]) -> dict[str, Tensor]:
-    """The tensors of the networks of parts, those of one file once.
-
-    Raises:
-        CheckpointError: When a file is missing, damaged or no file of networks.
-    """
-    tensors: dict[str, Tensor] = {}
-    if not keep(NETWORKS):
-        return tensors
-    files: dict[str, Checkpoint] = {}
-    for i, part in enumerate(values.get("parts", ())):
-        for j, router in enumerate(part["routers"]):
-            name = str(router["file"])
-            if not _NETWORKS.fullmatch(name):
-                raise CheckpointError(f"{path}: parts must name files of networks beside it, got {name!r:.100}")
-            if name not in files:
-                files[name] = load_checkpoint(path.with_name(name))
-            tensors |= {f"part-{i}.router-{j}.{key}": tensor for key, tensor in files[name].tensors.items()}
-    return tensors
 
 
 def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
@@ -342,8 +197,7 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
                 what = "has another checksum" if name in found else "is missing"
                 raise CheckpointError(f"{path}: a damaged checkpoint, {name} {what}")
         values = parse_json(metadata["values"])
-        tensors = {name: tensor for name, tensor in tensors.items() if keep(name)} | _read_networks(path, values, keep)
-        return Checkpoint(tensors, values, str(path))
+        return Checkpoint({name: tensor for name, tensor in tensors.items() if keep(name)}, values, str(path))
     except CheckpointError:
         raise
     except (SafetensorError, ValueError, KeyError, AttributeError, OSError) as error:

@@ -93,10 +93,6 @@ class TrainConfig:
     """Each cell has all parameters of its network for itself: with hashgrid a table of features too, which the cells
     share otherwise."""
 
-    territories: int | None = None
-    """Parts of space that are trained as scenes of their own, with cells, table, views and rays of their own; rays that
-    cross their borders are put together. All other settings are those of one of them. They are what processes share
-    out: default 1, with several processes the least power of two that gives each one."""
     cells: tuple[int, ...] = (16,)
     """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again, no number is one network."""
     split_at: tuple[float, ...] | None = None
@@ -145,8 +141,7 @@ class TrainConfig:
     "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points."""
     appearance: bool = False
     """Give each training picture a gain for each channel, for exposure and white balance that differ. The field has the
-    average look of all pictures, and held-out pictures are scored as it shows them. For pictures without transparency,
-    in one territory."""
+    average look of all pictures, and held-out pictures are scored as it shows them. For opaque pictures."""
     refine_cameras: bool = False
     """Let the poses and focal lengths of the training cameras learn with the field, where a step is one operation.
     Held-out cameras stay as they were read."""
@@ -186,8 +181,7 @@ class TrainConfig:
     """Test views of the final evaluation; default all, or as many as --evaluation-share allows."""
     evaluation_share: float = 0.1
     """Share of --budget for evaluations, half of it for the final one. Where that is too short for all their views,
-    evenly spread ones are scored. 0, and always with several territories: evaluations take the time that they need,
-    beside the budget."""
+    evenly spread ones are scored. 0: evaluations take the time that they need, beside the budget."""
     checkpoint_every: float = 30.0
     """Seconds of training between checkpoints, which are written while it goes on."""
     keep_checkpoints: int = 3

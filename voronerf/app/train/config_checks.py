@@ -112,7 +112,6 @@ def check_config(config: TrainConfig, choices: Mapping[str, Sequence[str]]) -> N
     largest = max(config.cells, default=0)
     need(largest <= config.reservoir, "cells", f"not exceed --reservoir, the {config.reservoir} samples of a split")
     need(config.checkpoint_every > 0, "checkpoint_every", "be positive")
-    need(config.territories is None or config.territories >= 1, "territories", "be at least 1")
     need(config.device.startswith("cuda") or not config.cuda_graph, "cuda_graph", "come with --device cuda")
     for name in ("appearance", "refine_cameras"):
         need(
@@ -159,49 +158,6 @@ def _check_splits(config: TrainConfig, need: Callable[[bool, str, str], None]) -
         kind = "fractions" if name == "split_at" else "numbers"
         bound = "above 0" if end is None else f"between 0 and {end:g}"
         need(rising and inside, name, f"be rising {kind} {bound}")
-
-
-def check_joint(config: TrainConfig, ranks: int) -> None:
-    """Rejects settings that joint training does not support.
-
-    Args:
-        config: The settings.
-        ranks: The processes that train together.
-
-    Raises:
-        ConfigError: Names the setting.
-    """
-    rules = {
-        "out": (config.out is not None, "be given with torchrun: restarts resume from it"),
-        "territories": ((config.territories or 1) >= ranks, f"be at least the {ranks} ranks"),
-        "sampling": (
-            SAMPLERS[config.sampling].passes == 1,
-            "take one pass with several territories, as stratified: no territory sees whole rays, where a second looks",
-        ),
-        "field": (
-            not config.field_type.cones,
-            "take points with several territories: a run of parts asks its networks about points",
-        ),
-        "contraction": (
-            config.contraction != "ndc",
-            "be none or sphere with several territories: parts have no normalised device coordinates",
-        ),
-        "appearance": (
-            not config.appearance,
-            "be off with several territories: none of them sees whole rays, whose colours it compares",
-        ),
-        "refine_cameras": (
-            not config.refine_cameras,
-            "be off with several territories: none of them sees whole rays, which move with a camera",
-        ),
-        "cuda_graph": (
-            not config.cuda_graph,
-            "be off with several territories: the host reads the sizes of their messages",
-        ),
-    }
-    for name, (fits, rule) in rules.items():
-        if not fits:
-            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {getattr(config, name)!r}")
 
 
 def check_device(name: str) -> None:

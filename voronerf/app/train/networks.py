@@ -26,9 +26,6 @@ from voronerf.nerf.samplers import SAMPLERS
 from voronerf.ops._core import backends
 from voronerf.ops._core.checks import physical_memory
 from voronerf.router import VoronoiRouter
-from voronerf.town.parts import Parts
-from voronerf.town.run_parts import grouped_parameters, open_parts, parts_states, recipe_of, restore_parts
-from voronerf.town.streaming import Pages
 
 #: Size of the density network of a proposal. It is small, since it only sees coarse intervals.
 PROPOSAL: dict[str, Any] = {"width": 32, "depth": 2, "position_octaves": 6}
@@ -283,31 +280,12 @@ def solve_width(config: TrainConfig, total: int) -> int:
     return low
 
 
-def open_routers(
-    config: TrainConfig, device: torch.device | str, checkpoint: Checkpoint | None, pages: Pages | None = None
-) -> dict[str, VoronoiRouter | Parts]:
-    """The parts of a checkpoint that has some, with their parameters; else what :func:`make_routers` makes.
-
-    Args:
-        config: The settings.
-        device: Of the networks.
-        checkpoint: Of the run that goes on, or is opened.
-        pages: See :func:`voronerf.town.run_parts.open_parts`.
-
-    Raises:
-        CheckpointError: When a part is damaged.
-    """
-    if checkpoint is not None and "parts" in checkpoint.values:
-        return {"field": open_parts(checkpoint, device, config.backend, pages)}
-    return {**make_routers(config, device)}
-
-
 def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, VoronoiRouter]:
     """A router of one cell around each network, for the coarse stage; the seed alone decides its parameters."""
     with torch.random.fork_rng():  # of GPUs as well: manual_seed reaches them
         torch.manual_seed(config.seed)
         networks = {name: make_network(config, name) for name in network_names(config)}
-    routers = {
+    return {
         name: VoronoiRouter(
             network,
             VoronoiDiagram(torch.zeros(1, 3)),
@@ -320,11 +298,9 @@ def make_routers(config: TrainConfig, device: torch.device | str) -> dict[str, V
         ).to(device)
         for name, network in networks.items()
     }
-    routers["field"].recipe = recipe_of(config)
-    return routers
 
 
-def computes_natively(routers: Mapping[str, VoronoiRouter | Parts], config: TrainConfig) -> bool:
+def computes_natively(routers: Mapping[str, VoronoiRouter], config: TrainConfig) -> bool:
     """Whether native CPU ops evaluate all networks, so that torch is left with little to do in a step."""
     device = torch.device(config.device)
     chosen = backends.chosen("routed_mlp", device, torch.float32, backend=config.backend)
@@ -336,15 +312,12 @@ def computes_natively(routers: Mapping[str, VoronoiRouter | Parts], config: Trai
 
 
 def parameter_groups(
-    routers: Mapping[str, VoronoiRouter | Parts], config: TrainConfig
+    routers: Mapping[str, VoronoiRouter], config: TrainConfig
 ) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
     """The parameters in the order that the optimiser numbers them: those of the networks, then the tables."""
-    if isinstance(parts := routers["field"], Parts):
-        return grouped_parameters(parts.routers)
     dense: list[nn.Parameter] = []
     tables: list[nn.Parameter] = []
     for network, router in routers.items():
-        assert isinstance(router, VoronoiRouter)
         patterns = () if _whole(config, network) else config.field_type.sparse_parameters
         for name, parameter in router.module.named_parameters():
             sparse = any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
@@ -352,7 +325,7 @@ def parameter_groups(
     return dense, tables
 
 
-def make_optimizer(routers: Mapping[str, VoronoiRouter | Parts], config: TrainConfig, *, views: int) -> Adam:
+def make_optimizer(routers: Mapping[str, VoronoiRouter], config: TrainConfig, *, views: int) -> Adam:
     """Adam with a decay of 0.99 for the squared gradients, where the default is 0.999.
 
     After a split each cell sees fewer samples and other gradients than its parent. With the default, the moments of the
@@ -383,8 +356,6 @@ def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
     Raises:
         CheckpointError: for a parameter that is missing, of another shape, or not for as many cells as there are.
     """
-    if "parts" in checkpoint.values:  # which are compared where they are made
-        return
     for name in network_names(config):
         state = checkpoint.group(_group(name))
         try:
@@ -402,16 +373,12 @@ def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
                 )
 
 
-def router_states(routers: Mapping[str, VoronoiRouter | Parts]) -> dict[str, dict[str, Any]]:
+def router_states(routers: Mapping[str, VoronoiRouter]) -> dict[str, dict[str, Any]]:
     """The states of the routers, by their names in a checkpoint."""
-    if isinstance(parts := routers["field"], Parts):
-        return {**parts_states(parts)}
     return {_group(name): router.state_dict() for name, router in routers.items()}
 
 
-def restore_routers(
-    routers: Mapping[str, VoronoiRouter | Parts], checkpoint: Checkpoint, *, assign: bool = False
-) -> None:
+def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint, *, assign: bool = False) -> None:
     """Loads the cells of a checkpoint into routers; their number may differ.
 
     Args:
@@ -423,9 +390,6 @@ def restore_routers(
         CheckpointError: When the checkpoint's parameters are of another architecture.
     """
     for name, router in routers.items():
-        if isinstance(router, Parts):
-            restore_parts(router, checkpoint)
-            continue
         try:
             router.load_state_dict(checkpoint.group(_group(name)), assign=assign)
         except RuntimeError as error:

@@ -20,7 +20,6 @@ from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import SAMPLERS, Occupancy, Stratified
 from voronerf.nerf.volume import Space
 from voronerf.router import VoronoiRouter
-from voronerf.town.parts import Parts
 
 #: Samples of a ray of a picture, for each of training: those are at random places, and meet all of a stratum in time.
 #: At most so many: of the 256 of a long training, twice as many would make no picture more than 0.05 dB better.
@@ -41,7 +40,7 @@ PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 def make_renderer(
     config: TrainConfig,
     scene: Scene,
-    routers: Mapping[str, VoronoiRouter | Parts],
+    routers: Mapping[str, VoronoiRouter],
     *,
     samples: int | None = None,
     fine_samples: int | None = None,
@@ -64,8 +63,6 @@ def make_renderer(
     """
     device, backend = next(routers["field"].parameters()).device, backend or config.backend
     contraction = None if config.contraction == "none" else make_contraction(scene, config.contraction, device)
-    if isinstance(routers["field"], Parts):  # each has its own
-        contraction = None
     full_gradient = None
     if scene.kind == "unbounded" and isinstance(contraction, Contraction):
         full_gradient = contraction.radius
@@ -84,10 +81,8 @@ def through_grid(sampler: Stratified, grid: OccupancyGrid, *, picture_samples: i
     return Occupancy(grid, sampler.samples, picture_samples=more, space=sampler.space, backend=sampler.backend)
 
 
-def as_field(router: VoronoiRouter | Parts) -> Field:
+def as_field(router: VoronoiRouter) -> Field:
     """A router as the renderer asks it: with one direction for each ray, or for each sample where it takes no other."""
-    if isinstance(router, Parts):
-        return router
     takes_rays = "ray_index" in inspect.signature(router.module.forward).parameters
     return router if takes_rays else DirectionPerSample(router)
 

@@ -18,6 +18,8 @@ from voronerf.app.scenes import Scene, is_builtin
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
 
+#: File of a run that was made of several.
+TOWN = "town.json"
 #: The folders of a run, in which files are written.
 FOLDERS = ("camera_paths", "checkpoints", "images", "plots", "samples", "tensorboard")
 
@@ -73,6 +75,8 @@ def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
         out = next(folder for name in names if _made(folder := Path("runs") / name))
     elif not config.resume and checkpoint_paths(out):
         raise ConfigError(f"--out must not hold a run already, got {out}: continue it with --resume or choose another")
+    elif (out / TOWN).is_file():
+        raise ConfigError(f"--out must be a run of a training: {out} was made of several runs, which are not trained")
     elif config.resume and not checkpoint_paths(out):
         raise ConfigError(f"--resume needs a checkpoint in --out: there is nothing to resume in {out} yet")
     return replace(config, out=out)

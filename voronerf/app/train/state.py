@@ -21,8 +21,6 @@ from voronerf.app.train.networks import check_shapes, router_states
 from voronerf.app.train.progress import Stage
 from voronerf.app.train.schema import check_types
 from voronerf.router import VoronoiRouter
-from voronerf.town.parts import Parts
-from voronerf.town.run_parts import describe_parts
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,6 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
     try:
         if isinstance(values.get("stages"), list):
             values["stages"] = tuple(values["stages"])
-        values.pop("parts", None)  # which are compared where they are made
         check_types(source, Stored, values)
         for number, stage in enumerate(values["stages"]):
             check_types(f"{source}: stage {number}", Stage, stage)
@@ -73,7 +70,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
 
 def collect(
     stored: Stored,
-    routers: Mapping[str, VoronoiRouter | Parts],
+    routers: Mapping[str, VoronoiRouter],
     optimizer: torch.optim.Optimizer,
     parts: Mapping[str, Mapping[str, Any]],
 ) -> Checkpoint:
@@ -84,10 +81,7 @@ def collect(
         for prefix, group in every.items()
         for name, value in group.items()
     }
-    values = {**asdict(stored), "stages": list(stored.stages)}
-    if isinstance(field := routers["field"], Parts):
-        values["parts"] = describe_parts(field)
-    return Checkpoint(tensors, values)
+    return Checkpoint(tensors, {**asdict(stored), "stages": list(stored.stages)})
 
 
 def check_resumed(config: TrainConfig, checkpoint: Checkpoint) -> None:

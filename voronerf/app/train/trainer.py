@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ from voronerf.app.train.networks import (
     check_memory,
     computes_natively,
     make_optimizer,
-    open_routers,
+    make_routers,
     resolve_config,
     restore_routers,
 )
@@ -60,8 +60,6 @@ from voronerf.ops import Guard
 from voronerf.ops._core import backends
 from voronerf.ops.adam.reference import judge
 from voronerf.router import VoronoiRouter
-from voronerf.town.errors import usual_errors
-from voronerf.town.parts import Parts
 
 #: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
 READ_EVERY = 50
@@ -102,7 +100,7 @@ class Trainer:
             raise ValueError("Trainer: config.out must name the run directory, got None")
         if config.resume:  # the space is that of the run, whatever the views
             checkpoint = last_checkpoint(config.out)
-            scene = within(scene, config.out, joined="parts" in checkpoint.values)
+            scene = within(scene, config.out)
         self.out, self.scene = config.out, scene
         self.on_step, self.on_event, self.clock = on_step, on_event, clock or time.perf_counter
         self.device = torch.device(config.device)
@@ -127,7 +125,7 @@ class Trainer:
             refinement=Refinement(scene.train.cameras.to(self.device)) if config.refine_cameras else None,
             backend=config.backend,
         )
-        self.routers = open_routers(config, self.device, checkpoint)
+        self.routers = make_routers(config, self.device)
         for router in self.routers.values():
             router.generator = self.draws
         #: Whether native ops compute the networks: then steps are the same bit for bit on any number of threads.
@@ -138,13 +136,13 @@ class Trainer:
         self.renderer = make_renderer(config, scene, self.routers, occupancy=grid)
         self.cells = Cells(
             self.renderer,
-            cast(dict[str, VoronoiRouter], self.routers),  # of parts it asks for what they have alone
+            self.routers,
             self.plan,
             config.split_rule,
             generator=self.generator,
         )
         self.learner = Step(self.renderer, sightings=config.sightings or 0.0)
-        obstacle = "the run has several parts" if isinstance(self.router, Parts) else why_not_fused(self.renderer)
+        obstacle = why_not_fused(self.renderer)
         if config.refine_cameras and obstacle is not None:
             raise ConfigError(f"--refine-cameras must be off where a step is not one operation: {obstacle}")
         self.guard = Guard.on(self.device)  # of steps whose loss or gradients are not finite
@@ -161,15 +159,11 @@ class Trainer:
         self.metrics: list[dict[str, Any]] = []
         self.stopped = self.described = False
         self.loss = math.nan
-        self.errors: Tensor | None = None  # of each cell, see `usual_errors`
         self.writer = CheckpointWriter(self.out, config.keep_checkpoints)
         if checkpoint is not None:
             self._resume(checkpoint)
         self.saved_at = self.seconds
         self._begin_stage()
-
-    #: Whether this process writes the files of the run.
-    writes = True
 
     @property
     def skipped(self) -> int:
@@ -177,8 +171,8 @@ class Trainer:
         return int(self.guard.skipped)
 
     @property
-    def router(self) -> VoronoiRouter | Parts:
-        """The router whose colours count, or the parts of a run that was joined."""
+    def router(self) -> VoronoiRouter:
+        """The router whose colours count."""
         return self.routers["field"]
 
     @property
@@ -278,7 +272,6 @@ class Trainer:
         self.advance()
         while not self._check_moments():
             self.advance()
-        self._find_errors()
         self.save()
 
     def advance(self, until: float = math.inf) -> None:
@@ -480,10 +473,9 @@ class Trainer:
         balances = [] if split is None else list(split.balances.values())
         if self.plan[level].most is not None and not balances:
             return False
-        if self.writes:
-            kept = io.BytesIO()  # which benchmarks/balance.py can read
-            np.savez(kept, points=points.cpu().numpy(), importance=importance.cpu().numpy())
-            write_bytes(self.out / "samples" / f"level-{level + 1}.npz", kept.getvalue())
+        kept = io.BytesIO()  # which benchmarks/balance.py can read
+        np.savez(kept, points=points.cpu().numpy(), importance=importance.cpu().numpy())
+        write_bytes(self.out / "samples" / f"level-{level + 1}.npz", kept.getvalue())
         if split is not None and balances:
             cells.divide(split, self.optimizer)
         if self.config.init == "random":  # the averages are of other networks
@@ -552,8 +544,7 @@ class Trainer:
             **mean_scores(scores),
         }
         self.metrics = [m for m in self.metrics if m["step"] < self.step] + [now]
-        if self.writes:
-            write_text(self.out / "metrics.jsonl", "".join(json_text(m) + "\n" for m in self.metrics))
+        write_text(self.out / "metrics.jsonl", "".join(json_text(m) + "\n" for m in self.metrics))
         self.say(
             f"{self.seconds:7.1f} s  step {self.step:6d}  {self.diagram.num_cells:4d} cells  "
             f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} views)"
@@ -580,16 +571,15 @@ class Trainer:
             "width": self.config.width,
             "stages": [asdict(stage) for stage in self.stages],
         }
-        if self.writes:
-            write_text(self.out / "summary.json", json_text(summary, indent=2) + "\n")
+        write_text(self.out / "summary.json", json_text(summary, indent=2) + "\n")
         return summary
 
     def save(self, *, wait: bool = True) -> None:
         """Writes ``checkpoints/last.safetensors``; without ``wait`` it is begun, and :attr:`writer` ends it."""
         refinement = self.batches.refinement
-        if self.writes and not self.described:  # not earlier: a run whose first step fails leaves nothing
+        if not self.described:  # not earlier: a run whose first step fails leaves nothing
             write_text(self.out / "config.json", self.config.to_json())
-        if self.writes and (refinement is not None or not self.described):
+        if refinement is not None or not self.described:
             refined = None if refinement is None else refinement.cameras.to("cpu")
             write_scene(self.out / "scene.json", self.scene, refined=refined)
         self.described = True
@@ -597,12 +587,6 @@ class Trainer:
         self.saved_at = self.seconds
         if wait:
             self.writer.wait()
-
-    def _find_errors(self) -> None:
-        """Finds the errors that an update compares new pictures with."""
-        if self.step:
-            with self.averaged():
-                self.errors = usual_errors(self.renderer, self.router, self.batches)
 
     def state(self) -> Checkpoint:
         """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
@@ -624,8 +608,6 @@ class Trainer:
             "reservoir": self.cells.reservoir.state_dict(),
             "generator": {"state": self.generator.get_state(), "draws": self.draws.get_state()},
         }
-        if self.errors is not None:
-            parts["errors"] = {"usual": self.errors}
         if self.occupancy is not None:
             parts["occupancy"] = self.occupancy.state_dict()
         for name, learnt in self.learnt_of_pictures.items():
@@ -650,15 +632,12 @@ class Trainer:
                 self.occupancy.load_state_dict(checkpoint.group("occupancy"))
             for name, learnt in self.learnt_of_pictures.items():
                 learnt.load_state_dict(checkpoint.group(name))
-            if (
-                stored.stages[0]["cells"] == 1 or stored.step
-            ):  # else nothing was trained since it was made of other runs
-                self.cells.reservoir.load_state_dict(checkpoint.group("reservoir"))
-                generators = checkpoint.group("generator")
-                self.generator.set_state(generators["state"])
-                drawn = generators["draws"]
-                if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
-                    self.draws.set_state(drawn)  # else the run began on another kind of device
+            self.cells.reservoir.load_state_dict(checkpoint.group("reservoir"))
+            generators = checkpoint.group("generator")
+            self.generator.set_state(generators["state"])
+            drawn = generators["draws"]
+            if self.draws is not self.generator and drawn.shape == self.draws.get_state().shape:
+                self.draws.set_state(drawn)  # else the run began on another kind of device
         except (ValueError, KeyError, TypeError, RuntimeError) as error:
             raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
         threads = torch.get_num_threads()

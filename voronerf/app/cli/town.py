@@ -1,4 +1,4 @@
-"""``voronerf join | cut | place``: runs made of runs, in new files."""
+"""``voronerf join | cut | place``: runs of several parts."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 import tyro
 
 from voronerf.app.cli.display import say
+from voronerf.app.cli.opening import AS_IN_TRAINING
 from voronerf.app.files import read_json
-from voronerf.app.run import Run, open_run
-from voronerf.app.scenes.record import read_scene
+from voronerf.app.run import Run
 from voronerf.app.train.config import ConfigError
-from voronerf.town.editing import align as find_frame
-from voronerf.town.editing import check_out
-from voronerf.town.parts import Similarity, Solid
+from voronerf.town import editing
+from voronerf.town.editing import Source, check_out
+from voronerf.town.geometry import Similarity, Solid
 
 #: Numbers of a transform on the command line.
 MOVE = "tx ty tz rx ry rz s"
@@ -23,23 +23,17 @@ MOVE = "tx ty tz rx ry rz s"
 
 def opened(run: Path) -> Run:
     """A run with its cameras, without its images."""
-    record = run / "scene.json"
-    if not record.is_file():
+    if not (run / "scene.json").is_file():
         raise ConfigError(f"{run}: must hold a run with the record of its scene, scene.json")
-    return open_run(run, scene=read_scene(record))
+    return AS_IN_TRAINING.open_without_images(run)
 
 
-def size_of(run: Path) -> int:
-    """Bytes of the networks of a run and of what its last checkpoint has beside them."""
-    files = [run / "checkpoints" / "last.safetensors", *(run / "checkpoints").glob("networks-*.safetensors")]
-    return sum(file.stat().st_size for file in files)
-
-
-def tell(made: Run) -> int:
+def tell(out: Path, made: Source) -> int:
     """Says what was written."""
-    counts = {"cell": made.router.num_cells, "part": len(getattr(made.router, "parts", (0,)))}
+    counts = {"cell": made.parts.num_cells, "part": len(made.parts.parts)}
     cells, parts = (f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items())
-    say(f"wrote {made.path}: {cells} in {parts}, {size_of(made.path) / 2**20:.1f} MiB")
+    size = sum(file.stat().st_size for file in (out / "checkpoints").iterdir())
+    say(f"wrote {out}: {cells} in {parts}, {size / 2**20:.1f} MiB")
     return 0
 
 
@@ -71,14 +65,14 @@ def join(
     sources = [opened(run) for run in runs]
     if align:
         for number, run in enumerate(sources[1:], 1):
-            frame, error, count = find_frame(sources[0].scene, run.scene, str(runs[number]))
+            frame, error, count = editing.align(sources[0].scene, run.scene, str(runs[number]))
             say(
                 f"{runs[number]}: scale {frame.scale:.6g}, {count} images in common, "
                 f"their cameras {error:.3g} scene units apart"
             )
             frames[number] = frame
     every = [frames.get(number, Similarity()) for number in range(len(runs))]
-    return tell(Run.join(sources, out, frames=every))
+    return tell(out, editing.join(sources, out, frames=every))
 
 
 def given_frames(runs: int, move: Sequence[tuple[str, str]], transforms: Path | None) -> dict[int, Similarity]:
@@ -147,7 +141,8 @@ def cut(
         solid = Solid.box(box[:3], box[3:]) if box is not None else None if sphere is None else Solid(ball=sphere)
     except ValueError as error:
         raise ConfigError(f"--{given[0]}: {error}") from None
-    return tell(opened(run).cut(list(cells or ()) if solid is None else solid, out, outside=outside))
+    kept = list(cells or ()) if solid is None else solid
+    return tell(out, editing.cut(opened(run), kept, out, outside=outside))
 
 
 def place(
@@ -174,4 +169,4 @@ def place(
         Similarity.of(at, turn, scale)
     except ValueError as error:
         raise ConfigError(f"--scale, --turn, --at: {error}") from None
-    return tell(opened(run).place(opened(thing), at, out, degrees=turn, scale=scale))
+    return tell(out, editing.place(opened(run), opened(thing), at, out, degrees=turn, scale=scale))

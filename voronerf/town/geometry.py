@@ -1,0 +1,219 @@
+"""Where things stand in a scene: similarities and convex solids."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+#: How far a rotation may be from orthonormal, which rounding in a file makes it.
+_ORTHONORMAL = 1e-4
+
+
+def _eye() -> Tensor:
+    return torch.eye(3, dtype=torch.float64)
+
+
+def _zeros() -> Tensor:
+    return torch.zeros(3, dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """``x -> scale * rotation @ x + translation``, from the frame of a part to that of the scene.
+
+    Args:
+        scale: Positive and finite.
+        rotation: [3, 3], orthonormal, no mirror image.
+        translation: [3].
+
+    Raises:
+        ValueError: For anything else.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.town.geometry import Similarity
+        >>> move = Similarity.of((1.0, 0, 0), degrees=(0, 0, 90), scale=2)
+        >>> move.points(torch.tensor([[1.0, 0, 0]])).round(decimals=3)
+        tensor([[1., 2., 0.]])
+        >>> (move @ move.inverse).is_identity
+        True
+    """
+
+    scale: float = 1.0
+    rotation: Tensor = field(default_factory=_eye)
+    translation: Tensor = field(default_factory=_zeros)
+
+    def __post_init__(self) -> None:
+        for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
+            value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            object.__setattr__(self, name, value)
+            if value.shape != shape or not bool(value.isfinite().all()):
+                raise ValueError(f"Similarity: {name} must be {list(shape)} finite numbers, got {value.tolist()}")
+        if not 0 < self.scale < math.inf:
+            raise ValueError(f"Similarity: scale must be positive and finite, got {self.scale}")
+        if float((self.rotation @ self.rotation.T - _eye()).abs().max()) > _ORTHONORMAL:
+            raise ValueError(f"Similarity: rotation must be orthonormal, got {self.rotation.tolist()}")
+        if float(torch.linalg.det(self.rotation)) < 0:
+            raise ValueError("Similarity: rotation must not mirror, its determinant is -1")
+
+    @classmethod
+    def of(
+        cls,
+        translation: Sequence[float] = (0, 0, 0),
+        degrees: Sequence[float] = (0, 0, 0),
+        scale: float = 1.0,
+    ) -> Similarity:
+        """From angles about the axes x, y and z of the scene, turned in this order."""
+        rotation = _eye()
+        for axis, angle in enumerate(degrees):
+            c, s, turn = math.cos(math.radians(angle)), math.sin(math.radians(angle)), _eye()
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
+            rotation = turn @ rotation
+        return cls(float(scale), rotation, torch.tensor(translation, dtype=torch.float64))
+
+    @classmethod
+    def of_matrix(cls, matrix: Any) -> Similarity:
+        """From a matrix [3, 4] or [4, 4]."""
+        matrix = torch.as_tensor(matrix, dtype=torch.float64)
+        if matrix.dim() != 2 or matrix.shape[0] not in (3, 4) or matrix.shape[1] != 4:
+            raise ValueError(f"Similarity: a matrix must have shape [4, 4] or [3, 4], got {list(matrix.shape)}")
+        scale = float(matrix[0, :3].norm())
+        return cls(scale, matrix[:3, :3] / (scale or 1), matrix[:3, 3])
+
+    @functools.cached_property
+    def is_identity(self) -> bool:
+        """Whether it moves nothing, but for rounding."""
+        still = (self.rotation - _eye()).abs().max() < 1e-12 and self.translation.abs().max() < 1e-12
+        return bool(still) and abs(self.scale - 1) < 1e-12
+
+    @functools.cached_property
+    def inverse(self) -> Similarity:
+        """From the scene to the part."""
+        return Similarity(1 / self.scale, self.rotation.T, -(self.translation @ self.rotation) / self.scale)
+
+    def __matmul__(self, first: Similarity) -> Similarity:
+        """This one after another."""
+        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.points(first.translation))
+
+    def points(self, points: Tensor) -> Tensor:
+        """Points [..., 3] of the part in the scene."""
+        if self.is_identity:
+            return points
+        return points @ (self.scale * self.rotation.T).to(points) + self.translation.to(points)
+
+    def directions(self, directions: Tensor) -> Tensor:
+        """Unit vectors [..., 3] of the part in the scene."""
+        return directions if self.is_identity else directions @ self.rotation.T.to(directions)
+
+    def to_values(self) -> dict[str, Any]:
+        """As values of JSON, the arguments."""
+        return {"scale": self.scale, "rotation": self.rotation.tolist(), "translation": self.translation.tolist()}
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A convex solid: what lies behind all its planes, or in a ball; or with ``outside`` all the rest of space.
+
+    Args:
+        planes: (a, b, c, d) each, for ``a x + b y + c z <= d``.
+        ball: Centre and radius (x, y, z, r), in place of planes.
+        outside: The space around it.
+
+    Raises:
+        ValueError: A solid that is empty or has no bounds at all.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.town.geometry import Solid
+        >>> box = Solid.box((0, 0, 0), (1, 2, 3))
+        >>> box.holds(torch.tensor([[0.5, 1.5, 2.5], [0.5, 2.5, 0]]))
+        tensor([ True, False])
+    """
+
+    planes: tuple[tuple[float, ...], ...] = ()
+    ball: tuple[float, ...] | None = None
+    outside: bool = False
+
+    def __post_init__(self) -> None:
+        rows = [*self.planes, *([] if self.ball is None else [self.ball])]
+        if not rows or (self.ball is not None and self.planes) or any(len(row) != 4 for row in rows):
+            raise ValueError("Solid: must have planes of four numbers, or a ball of four")
+        if not all(math.isfinite(x) for row in rows for x in row):
+            raise ValueError("Solid: planes and ball must be finite")
+        if self.ball is not None and self.ball[3] <= 0:
+            raise ValueError(f"Solid: the radius of a ball must be positive, got {self.ball[3]}")
+
+    @classmethod
+    def box(cls, low: Sequence[float], high: Sequence[float], *, outside: bool = False) -> Solid:
+        """The box between two corners.
+
+        Raises:
+            ValueError: The second corner is not above the first.
+        """
+        if not all(a < b for a, b in zip(low, high, strict=True)):
+            raise ValueError(f"Solid: a box must have its second corner above the first, got {[*low]} and {[*high]}")
+        unit = _eye().tolist()
+        above = [(*unit[i], float(high[i])) for i in range(3)]
+        below = [(*(-x for x in unit[i]), -float(low[i])) for i in range(3)]
+        return cls(tuple(above + below), outside=outside)
+
+    def holds(self, points: Tensor) -> Tensor:
+        """Which of the points [n, 3] it has: bool [n]."""
+        if self.ball is not None:
+            ball = points.new_tensor(self.ball)
+            inside = (points - ball[:3]).square().sum(-1) <= ball[3] ** 2
+        else:
+            planes = points.new_tensor(self.planes)
+            inside = (points @ planes[:, :3].T <= planes[:, 3]).all(-1)
+        return ~inside if self.outside else inside
+
+    def bounds(self) -> Tensor:
+        """float32 [2, 3], the box around the solid; for ``outside`` around what it leaves out.
+
+        Raises:
+            ValueError: For planes that leave a direction open.
+        """
+        if self.ball is not None:
+            centre, radius = torch.tensor(self.ball[:3]), self.ball[3]
+            return torch.stack((centre - radius, centre + radius))
+        planes = torch.tensor(self.planes, dtype=torch.float64)
+        normals, ends = planes[:, :3], planes[:, 3]
+        corners = []
+        for rows in itertools.combinations(range(len(planes)), 3):
+            if abs(float(torch.linalg.det(normals[list(rows)]))) > 1e-9:
+                corner = torch.linalg.solve(normals[list(rows)], ends[list(rows)])
+                if bool((normals @ corner <= ends + 1e-6 * (1 + ends.abs())).all()):
+                    corners.append(corner)
+        if not corners:
+            raise ValueError("Solid: must have bounds")
+        points = torch.stack(corners).float()
+        return torch.stack((points.amin(0), points.amax(0)))
+
+    def moved(self, move: Similarity) -> Solid:
+        """The same solid after a similarity."""
+        if self.ball is not None:
+            centre = move.points(torch.tensor(self.ball[:3], dtype=torch.float64)).tolist()
+            return Solid(ball=(*centre, self.ball[3] * move.scale), outside=self.outside)
+        planes = torch.tensor(self.planes, dtype=torch.float64)
+        normals = move.directions(planes[:, :3])
+        ends = planes[:, 3] * move.scale + normals @ move.translation
+        rows = torch.cat((normals, ends[:, None]), 1).tolist()
+        return Solid(tuple(map(tuple, rows)), outside=self.outside)
+
+    def to_values(self) -> dict[str, Any]:
+        """As values of JSON, the arguments."""
+        return {"planes": [*map(list, self.planes)], "ball": self.ball and list(self.ball), "outside": self.outside}
+
+    @classmethod
+    def from_values(cls, values: dict[str, Any]) -> Solid:
+        """What :meth:`to_values` gave."""
+        ball = None if values["ball"] is None else tuple(map(float, values["ball"]))
+        return cls(tuple(tuple(map(float, row)) for row in values["planes"]), ball, bool(values["outside"]))

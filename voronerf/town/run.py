@@ -1,0 +1,211 @@
+"""Runs of several parts: their files, and how they are opened.
+
+A run directory with the file ``town.json`` is one. Its checkpoint has the tensors ``part-N.diagram.*`` and
+``part-N.owner`` of each part, and what is empty; ``values["parts"]`` says where the parts stand, and names the files of
+their networks, which are checkpoints beside it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.app.run import Run
+from voronerf.app.scenes import Scene, load_scene
+from voronerf.app.scenes.record import read_scene
+from voronerf.app.train.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    checkpoint_path,
+    last_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
+from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.config_checks import check_device
+from voronerf.app.train.networks import check_shapes, make_routers, parameter_groups, restore_routers
+from voronerf.app.train.renderers import through_grid
+from voronerf.app.train.run_directory import TOWN, check_folders, check_stored_paths
+from voronerf.diagram import VoronoiDiagram
+from voronerf.nerf.average import load_averages
+from voronerf.nerf.contraction import Contraction
+from voronerf.nerf.occupancy import OccupancyGrid
+from voronerf.nerf.renderer import Renderer
+from voronerf.nerf.samplers import Stratified
+from voronerf.nerf.volume import Space
+from voronerf.router import VoronoiRouter
+from voronerf.town.geometry import Similarity, Solid
+from voronerf.town.parts import Network, Part, Parts
+
+
+def is_town(run: Path) -> bool:
+    """Whether a run directory holds a run of several parts."""
+    return (run / TOWN).is_file()
+
+
+def write_parts(run: Path, config: TrainConfig, parts: Parts, grid: OccupancyGrid | None) -> None:
+    """Writes the checkpoint of a run of parts, after the files of their networks; a router in two places has one.
+
+    Raises:
+        OSError: When it cannot be written.
+    """
+    folder, names = checkpoint_path(run).parent, dict[int, str]()
+    for network in (network for part in parts for network in part.networks):
+        if id(network.router) not in names:
+            names[id(network.router)] = name = f"networks-{len(names)}.safetensors"
+            tensors = {f"router.{key}": tensor.cpu().clone() for key, tensor in network.router.state_dict().items()}
+            save_checkpoint(folder / name, Checkpoint(tensors, {"config": network.config.to_values()}))
+    placed = [place_of(part, [names[id(network.router)] for network in part.networks]) for part in parts]
+    save_checkpoint(checkpoint_path(run), index_of(config, [*parts], placed, grid))
+
+
+def place_of(part: Part, files: Sequence[str]) -> dict[str, Any]:
+    """What the values of a checkpoint say of a part."""
+    seen = part.contraction
+    return {
+        "networks": list(files),
+        "frame": part.frame.to_values(),
+        "region": [solid.to_values() for solid in part.region],
+        "layer": part.layer,
+        "contraction": None if seen is None else {"centre": seen.centre.tolist(), "radius": seen.radius},
+    }
+
+
+def index_of(
+    config: TrainConfig, parts: Sequence[Part], placed: list[dict[str, Any]], grid: OccupancyGrid | None
+) -> Checkpoint:
+    """The checkpoint that names the files of the networks of parts."""
+    tensors: dict[str, Tensor] = {} if grid is None else {f"occupancy.{k}": v for k, v in grid.state_dict().items()}
+    for number, part in enumerate(parts):
+        tensors |= {f"part-{number}.diagram.{name}": value for name, value in part.diagram.state_dict().items()}
+        tensors[f"part-{number}.owner"] = part.owner
+    tensors = {name: value.cpu().clone() for name, value in tensors.items()}
+    return Checkpoint(tensors, {"config": config.to_values(), "parts": placed})
+
+
+def config_of(checkpoint: Checkpoint) -> TrainConfig:
+    """The settings in a checkpoint."""
+    return TrainConfig.from_json(json.dumps(checkpoint.values["config"]), checkpoint.source)
+
+
+def open_network(path: Path, device: torch.device | str, backend: str) -> Network:
+    """The networks of a file, with their averaged weights.
+
+    Raises:
+        CheckpointError: When it is missing, damaged, or of other networks than its settings say.
+    """
+    keep: Callable[[str], bool] = lambda name: name.startswith("router.") or name.endswith(".average")  # noqa: E731
+    checkpoint = load_checkpoint(path, keep=keep)
+    config = replace(config_of(checkpoint), sampling="stratified")
+    check_shapes(config, checkpoint)
+    routers = make_routers(config, device)
+    restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
+    load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)
+    router: VoronoiRouter = routers["field"].eval()
+    router.backend = backend
+    return Network(router, config)
+
+
+def open_parts(run: Path, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> Parts:
+    """The parts that a checkpoint of a run names; a network that stands in several places is one object.
+
+    Raises:
+        CheckpointError: When something is missing, damaged or does not fit.
+    """
+    made: dict[str, Network] = {}
+    found = []
+    for index, values in enumerate(checkpoint.values["parts"]):
+        try:
+            for name in values["networks"]:
+                if Path(name).name != name:
+                    raise ValueError(f"networks must be files beside the checkpoint, got {name!r:.100}")
+                if name not in made:
+                    made[name] = open_network(checkpoint_path(run).with_name(name), device, backend)
+            seen = values["contraction"]
+            part = Part(
+                [made[name] for name in values["networks"]],
+                VoronoiDiagram.from_state(checkpoint.group(f"part-{index}"), "diagram.").to(device),
+                checkpoint.tensors[f"part-{index}.owner"],
+                frame=Similarity(**values["frame"]),
+                contraction=None if seen is None else Contraction(torch.tensor(seen["centre"]), float(seen["radius"])),
+                region=[Solid.from_values(solid) for solid in values["region"]],
+                layer=int(values["layer"]),
+            )
+        except (ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
+            line = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise CheckpointError(f"{checkpoint.source}: part {index}: {line}") from None
+        found.append(part)
+    return Parts(found, backend=backend)
+
+
+def open_run(
+    path: Path | str,
+    *,
+    scene: Scene | None = None,
+    data: str | Path | None = None,
+    downscale: int | None = None,
+    allow_outside: bool = False,
+    samples: int | None = None,
+    device: str = "cpu",
+    backend: str = "auto",
+) -> Run:
+    """Opens a run of several parts: one that was joined, cut or placed, or trained in territories.
+
+    Args:
+        path: The run directory.
+        scene: The scene, if it is loaded already; where it has images, those of the first run.
+        data: Scene folder of the first run; None for that of its training.
+        downscale: Factor on the images; None for that of the training.
+        allow_outside: Also read images that lie outside of the scene folder.
+        samples: Samples per ray; None for those of the run.
+        device: Torch device.
+        backend: Backend of the operations.
+
+    Raises:
+        CheckpointError: If there is no usable checkpoint.
+        ConfigError: For an argument that cannot be used, or a folder of the run that is a link to elsewhere.
+        SceneError: If the scene cannot be read.
+    """
+    path = Path(path)
+    check_device(device)
+    check_folders(path)
+    checkpoint = last_checkpoint(path)
+    config = config_of(checkpoint)
+    if scene is None and data is None:
+        check_stored_paths(path, data=config.data)
+    config = replace(
+        config,
+        data=config.data if data is None else str(data),
+        downscale=config.downscale if downscale is None else downscale,
+    )
+    scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
+    scene = _in_place(scene, read_scene(path / "scene.json"))
+    parts = open_parts(path, checkpoint, device, backend)
+    space = Space(None, scene.spacing, False, None)
+    sampler: Stratified = Stratified(samples or int(config.samples or 64), space=space, backend=backend)
+    if state := checkpoint.group("occupancy"):
+        sampler = through_grid(sampler, OccupancyGrid.from_state(state, device=device), picture_samples=samples)
+    return Run(path, config, scene, {"field": parts}, Renderer({"field": parts}, sampler, backend=backend))  # type: ignore[dict-item]
+
+
+def _in_place(read: Scene, known: Scene) -> Scene:
+    """The pictures of a scene where a run has their cameras, which are the first in its record.
+
+    Raises:
+        ConfigError: For other pictures.
+    """
+    splits = {}
+    for name in ("train", "test"):
+        own, recorded = getattr(read, name), getattr(known, name)
+        names = recorded.names[: len(own)]
+        if names not in (own.names, tuple(f"0-{each}" for each in own.names)):
+            raise ConfigError(f"{read.name}: must be the scene of the first run that {known.name} was made of")
+        cameras = replace(own.cameras, poses=recorded.cameras.poses[: len(own)].to(own.cameras.poses))
+        splits[name] = replace(own, cameras=cameras, names=names, sightings=None)
+    return replace(known, **splits)
