@@ -1,13 +1,13 @@
-"""The ways of a call are not measured in these tests: the most promising is taken, on a loaded machine too."""
+"""Ways are not measured in these tests: the most promising one runs, on a loaded machine too."""
 
 from __future__ import annotations
 
 import pytest
 
-from voronerf.router import ways
+from voronerf.router import dispatch
 
 
 @pytest.fixture(autouse=True)
 def unmeasured(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "measures" not in request.keywords:
-        monkeypatch.setattr(ways, "measured", lambda found, call, grouping: [0.0] * len(found))
+        monkeypatch.setattr(dispatch, "measure", lambda found, call, grouping: [0.0] * len(found))

@@ -1,7 +1,7 @@
 """A routed call as one operation in a graph of ``torch.compile`` or ``torch.export``.
 
 The operation runs the router as it is, and its backward runs the call again. It is for routers with ``fuse=True``,
-whose ``forward`` does the same in every call, after one call outside of the graph: this says what the results are like.
+whose ``forward`` does the same in every call, after one call outside of the graph, which says what it returns.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import contextlib
 import itertools
 import weakref
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from voronerf.ops._core.compiler import constant_result
 from voronerf.router.double import Double
-from voronerf.router.layout import tensors_of
+from voronerf.router.layout import Layout, tensors_of
 
 _ROUTERS: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
 _NUMBERS = itertools.count()
@@ -26,29 +26,27 @@ _PLAIN = (type(None), bool, int, float, str)
 Spec = tuple[Any, ...]  # of an argument: ("tensor",) or ("plain", value), with names in front of keyword arguments
 
 
-class Known:
-    """The calls of a router that a graph may hold, and a number by which the operation finds the router."""
+class Graph(NamedTuple):
+    """What a call returns: tuples, lists and dicts of numbers of tensors; features and dtype of each tensor."""
 
-    def __init__(self, router: nn.Module) -> None:
-        self.number, self.calls = next(_NUMBERS), dict[Any, Any]()
-        _ROUTERS[self.number] = router
+    structure: Any
+    tensors: list[tuple[tuple[int, ...], torch.dtype]]
 
-    def note(self, method: str, args: Any, kwargs: Any, lead: int, result: Any) -> None:
-        """Remembers what a call gives: the structure of its results, and features and dtype of each tensor.
 
-        Args:
-            method: The method of the module.
-            args: The call's.
-            kwargs: The call's.
-            lead: Leading dimensions, which all results have.
-            result: What it returned.
-        """
-        spec = spec_of(args, kwargs)
-        if spec is not None and (method, spec) not in self.calls:
-            found, count = tensors_of(result), itertools.count()
-            structure = _structure(result, count)
-            if structure is not None and next(count) == len(found):
-                self.calls[method, spec] = structure, [(tuple(t.shape[lead:]), t.dtype) for t in found]
+def number_of(router: nn.Module) -> int:
+    """A new number, by which the operation finds a router."""
+    number = next(_NUMBERS)
+    _ROUTERS[number] = router
+    return number
+
+
+def graph_of(result: Any, layout: Layout) -> Graph | None:
+    """What a call returns that gave this as its module saw it; None for other than tensors in tuples, lists, dicts."""
+    found, count = tensors_of(result), itertools.count()
+    structure, lead = _structure(result, count), 1 if layout.flat else len(layout.lead)
+    if structure is None or next(count) != len(found):
+        return None
+    return Graph(structure, [(tuple(t.shape[lead:]), t.dtype) for t in found])
 
 
 def spec_of(args: Any, kwargs: Any) -> Spec | None:
@@ -88,7 +86,8 @@ def built(structure: Any, tensors: list[Tensor]) -> Any:
 @constant_result
 def structure_of(number: int, method: str, spec: Spec) -> Any:
     """The structure of a call's results; None for a call that is not known."""
-    return _ROUTERS[number]._known.calls.get((method, spec), (None, None))[0]
+    graph = _ROUTERS[number]._dispatch.graphs.get((method, spec))
+    return None if graph is None else graph.structure
 
 
 def _call(
@@ -97,7 +96,7 @@ def _call(
     """The tensors that a call of a router returns.
 
     Args:
-        number: Of the router's :class:`Known`.
+        number: Of the router.
         method: The method.
         spec: ``repr`` of the call's :func:`spec_of`.
         positions: [..., 3], which decide the cells.
@@ -127,7 +126,7 @@ def _routed(
 
 @_routed.register_fake
 def _(number: int, method: str, spec: str, positions: Tensor, *tensors: list[Tensor]) -> list[Tensor]:
-    shapes = _ROUTERS[number]._known.calls[method, ast.literal_eval(spec)][1]
+    shapes = _ROUTERS[number]._dispatch.graphs[method, ast.literal_eval(spec)].tensors
     return [positions.new_empty((*positions.shape[:-1], *features), dtype=dtype) for features, dtype in shapes]
 
 

@@ -80,7 +80,7 @@ class Fused:
         self._module = call.module
         trace = Trace(call, given, assume)
         self._n, self._inputs, self._shared, self._parameters = trace.n, trace.inputs, trace.shared, trace.parameters
-        self._result, self._outputs = trace.result, trace.outputs
+        self.result, self._outputs = trace.result, trace.outputs
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
         if not all(isinstance(value, fx.Node) and value.meta["on"] == SAMPLES for value in self._outputs):
             raise Unfusable("a result depends on no sample")
@@ -278,9 +278,13 @@ class Fused:
         with torch.set_grad_enabled(recorded or self._differentiates):
             self._compute(values, grouping, sort)
         found = [values[node] if recorded else values[node].detach() for node in self._outputs]
-        return Results(self._result, found, grouping if sort else None)
+        return Results(self.result, found, grouping if sort else None)
 
     def _compute(self, values: dict[Any, Any], grouping: Grouping, sort: bool) -> None:
+        order = None if sort else grouping.source
+        if len(self._runs) == 1 and not self._weights and not self._between:
+            self._compute_run(self._runs[0], values, grouping, order)
+            return
         grouped = GroupedRun(grouping, {})
         for node in self._weights:
             if node not in values:
@@ -291,7 +295,7 @@ class Fused:
                 if self._ready[node] == number or (number > last and self._ready[node] > last):
                     _compute(node, values, grouped)
             if number in self._runs:
-                self._compute_run(self._runs[number], values, grouping, None if sort else grouping.source)
+                self._compute_run(self._runs[number], values, grouping, order)
 
     def _compute_run(self, run: Run, values: dict[Any, Any], grouping: Grouping, order: Tensor | None) -> None:
         n = values[self._n]

@@ -31,12 +31,13 @@ from voronerf.router.cells import (
     renew_cells,
     stack_parameters,
 )
-from voronerf.router.compiled import Known, built, spec_of, structure_of
+from voronerf.router.compiled import built, number_of, spec_of, structure_of
+from voronerf.router.dispatch import Dispatch
 from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
 from voronerf.router.optimizers import check_optimizer, drop_state, freeze_cells, move_state, watch_optimizers
+from voronerf.router.probe import Options
 from voronerf.router.table import LayeredField, described_by_table, each_direction, parameters_of_table
-from voronerf.router.ways import Choices, Wish, evaluate
 
 # Centres of a flat diagram beyond which it may look cells up by a grid of its own.
 _MANY = 256
@@ -162,7 +163,7 @@ class VoronoiRouter(nn.Module):
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._layered = isinstance(module, LayeredField)
-        self._choices, self._known = Choices(), Known(self)
+        self._dispatch, self._number = Dispatch(), number_of(self)
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
         self.register_buffer("frozen_cells", None, persistent=False)
         self._by_table = self._layered and described_by_table(self.module)
@@ -501,26 +502,17 @@ class VoronoiRouter(nn.Module):
             TypeError: For a module that mixes samples.
         """
         if self.by_table:
-            return self._evaluate_table(self._coords_of_table(coords, args, kwargs), False, *args, **kwargs)
+            return self._evaluate_table(self._coords_of_table(coords, args, kwargs), *args, **kwargs)
         if self._layered:
             args, kwargs = each_direction(args, kwargs)
         return self._route("forward", *args, coords=coords, **kwargs)
 
     @property
     def by_table(self) -> bool:
-        """Whether a layer table describes all that the module computes: then :meth:`raw` gives its outputs."""
+        """Whether a layer table describes all that the module computes."""
         if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
             self._by_table = described_by_table(self.module)
         return self._by_table
-
-    def raw(self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> Tensor:
-        """What the networks of a field with a layer table give before its ``activate``: [n, out].
-
-        Arguments are those of ``forward``.
-        """
-        given = positions, directions, ray_index
-        found: Tensor = self._evaluate_table(self._coords_of_table(None, given, {}), True, *given)
-        return found
 
     def _coords_of_table(self, coords: Tensor | None, args: Any, kwargs: Any) -> Tensor | None:
         """The positions that decide the cells; None for those of the samples."""
@@ -530,7 +522,6 @@ class VoronoiRouter(nn.Module):
     def _evaluate_table(
         self,
         coords: Tensor | None,
-        raw: bool,
         positions: Tensor,
         directions: Tensor | None = None,
         ray_index: Tensor | None = None,
@@ -543,11 +534,10 @@ class VoronoiRouter(nn.Module):
             directions = ray_index = None
         given: dict[str, Any] = {"directions": directions, "direction_index": ray_index}
         given.update(self._where(positions, coords), frozen=self.frozen_cells, backend=self.backend)
-        outputs = routed_mlp(positions, **parameters_of_table(field, self.num_cells), **given)[0]
-        return outputs if raw else field.activate(outputs)
+        return field.activate(routed_mlp(positions, **parameters_of_table(field, self.num_cells), **given)[0])
 
     def table_arguments(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any] | None:
-        """The arguments with which ``routed_mlp`` gives what :meth:`raw` does; None where that is not all it does.
+        """``routed_mlp`` arguments for what the networks give before ``activate``, or None if unsupported.
 
         Arguments are those of ``forward``.
         """
@@ -562,9 +552,9 @@ class VoronoiRouter(nn.Module):
         return {**given, **where}
 
     def last_output(self, positions: Tensor) -> Tensor | None:
-        """The last of the outputs of :meth:`raw`, [n, width], without the layers that it does not need.
+        """The last output of the layer table, [n, width], without the layers that it does not need.
 
-        None where it needs the view direction, or :meth:`raw` does more than the networks.
+        None where it needs the view direction, or other positions than the samples' decide the cells.
 
         Args:
             positions: [n, 3] in scene units.
@@ -589,7 +579,7 @@ class VoronoiRouter(nn.Module):
         """
         if self._by_table:
             return "forward: fused, by the layer table of the field"
-        return self._choices.explain(("forward", *self.methods))
+        return self._dispatch.explain(("forward", *self.methods))
 
     def __getattr__(self, name: str) -> Any:
         """The routed methods, beside what a module has."""
@@ -617,12 +607,11 @@ class VoronoiRouter(nn.Module):
         ):
             rule = coords if coords is not None else self.coords
             spec = spec_of(args, kwargs)
-            structure = None if spec is None else structure_of(self._known.number, method, spec)
+            structure = None if spec is None else structure_of(self._number, method, spec)
             if structure is not None:
                 tensors = [value for value in (*args, *kwargs.values()) if isinstance(value, Tensor)]
                 positions, parameters = find_positions(rule, args, kwargs), list(self.module.parameters())
-                number, text = self._known.number, repr(spec)
-                found = torch.ops.voronerf.routed(number, method, text, positions, tensors, parameters)
+                found = torch.ops.voronerf.routed(self._number, method, repr(spec), positions, tensors, parameters)
                 return built(structure, found)
         if torch.compiler.is_compiling() or "torch._dynamo" in sys.modules:
             return self._route_uncompiled(method, *args, coords=coords, **kwargs)
@@ -636,10 +625,7 @@ class VoronoiRouter(nn.Module):
         if rule is None and self._layered:
             rule = "first3"
         positions = find_positions(rule, args, kwargs)
-        result = self._call(self.module, method, positions, args, kwargs)
-        if method in self._choices.fused:
-            self._known.note(method, args, kwargs, positions.dim() - 1, result)
-        return result
+        return self._call(self.module, method, positions, args, kwargs)
 
     _route_uncompiled = not_compiled(_route_as_it_is, _NO_GRAPH)
 
@@ -659,8 +645,8 @@ class VoronoiRouter(nn.Module):
         )
         call = Call(module, method, layout, [*names, *kwargs], args, kwargs)
         grouping = self._group(method, positions)
-        wish = Wish(self.fuse, self.way, bool(self.methods), self.assume)
-        return evaluate(call, grouping, self._choices, wish, self.frozen_cells)
+        options = Options(self.fuse, self.way, bool(self.methods), self.assume)
+        return self._dispatch.evaluate(call, grouping, options, self.frozen_cells).restored(layout)
 
     def _group(self, method: str, positions: Tensor) -> Grouping:
         """The samples in their cells; other methods that are called with the same positions share it."""
@@ -694,23 +680,23 @@ class VoronoiRouter(nn.Module):
         return {**tables, "child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_watch": None, "_assigned": None, "_known": None}
+        return {**self.__dict__, "_watch": None, "_assigned": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
-        self._known = Known(self)
+        self._number = number_of(self)
         freeze_cells(self.module, self.frozen_cells)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> VoronoiRouter:
         detach_results(self, memo)
         copied = memo[id(self)] = type(self).__new__(type(self))
         copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in self.__getstate__().items()})
-        copied._known = Known(copied)
+        copied._number = number_of(copied)
         freeze_cells(copied.module, copied.frozen_cells)
         return copied
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:
-        self._choices.forget()
+        self._dispatch.forget()
         self._assigned = None
         super()._apply(fn, recurse)
         freeze_cells(self.module, self.frozen_cells)

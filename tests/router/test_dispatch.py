@@ -12,7 +12,7 @@ from router_fields import masked_loop
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
-from voronerf.router import ways
+from voronerf.router import dispatch
 from voronerf.router.grouped import Grouped, Loop
 from voronerf.router.grouping import Grouping
 from voronerf.router.layout import Call, Layout
@@ -32,7 +32,7 @@ def test_the_fastest_is_taken_and_said(monkeypatch: pytest.MonkeyPatch, fastest:
         calls.append([way.name for way in found])
         return [0.001 if way.name == fastest else 0.004 for way in found]
 
-    monkeypatch.setattr(ways, "measured", measured)
+    monkeypatch.setattr(dispatch, "measure", measured)
     router, x = VoronoiRouter(network(), CENTRES, coords="first3", fuse=True), uniform((200,))
     for _ in range(3):
         torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
@@ -47,7 +47,7 @@ def test_the_fastest_is_taken_and_said(monkeypatch: pytest.MonkeyPatch, fastest:
 
 
 def test_what_is_about_as_fast_and_more_promising_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ways, "measured", lambda found, call, grouping: [1.01, 1.0])
+    monkeypatch.setattr(dispatch, "measure", lambda found, call, grouping: [1.01, 1.0])
     router = VoronoiRouter(network(), CENTRES, coords="first3")
     router(uniform((200,)))
     assert router.explain().startswith("forward: grouped: ")
@@ -64,7 +64,7 @@ def test_what_is_about_as_fast_and_more_promising_is_taken(monkeypatch: pytest.M
     ],
 )
 def test_a_way_by_name_is_not_measured(monkeypatch: pytest.MonkeyPatch, way: Any, fuse: bool, taken: str) -> None:
-    monkeypatch.setattr(ways, "measured", None)
+    monkeypatch.setattr(dispatch, "measure", None)
     router, x = VoronoiRouter(network(), CENTRES, coords="first3", fuse=fuse, way=way), uniform((200,))
     torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
     assert router.explain() == f"forward: {taken}"
@@ -124,11 +124,11 @@ def test_times_are_those_of_a_step() -> None:
     seen.clear()
     layout = Call(router.module, "forward", Layout((300,), None, frozenset()), ["input"], (x,), {})
     grouping = Grouping(router.diagram.locate(x), 300, 6, x.device, "auto")
-    times = ways.measured([Grouped(), Loop()], layout, grouping)
+    times = dispatch.measure([Grouped(), Loop()], layout, grouping)
     assert len(times) == 2 and all(0 < time < 10 for time in times) and seen.count("backward") >= 2 * (1 + 6)
     with torch.no_grad():
         seen.clear()
-        ways.measured([Grouped(), Loop()], layout, grouping)
+        dispatch.measure([Grouped(), Loop()], layout, grouping)
         assert not seen
 
 
@@ -145,8 +145,8 @@ class Decides(nn.Module):
 
 @pytest.mark.filterwarnings("ignore:VoronoiRouter")
 def test_a_module_that_reads_values_is_tried_again_by_doubling(monkeypatch: pytest.MonkeyPatch) -> None:
-    tries, call, own = [], [0], ways.Trial.is_groupable
-    monkeypatch.setattr(ways.Trial, "is_groupable", lambda trial: tries.append(call[0]) or own(trial))
+    tries, call, own = [], [0], dispatch.Probe.is_groupable
+    monkeypatch.setattr(dispatch.Probe, "is_groupable", lambda trial: tries.append(call[0]) or own(trial))
     router, x = VoronoiRouter(Decides(), CENTRES, coords="first3"), uniform((60,))
     for number in range(100):
         call[0] = number

@@ -1,0 +1,289 @@
+"""How a routed call runs: fused, grouped or cell by cell.
+
+The loop over cells defines the result. The first call of a kind makes a :class:`CallPlan` with the ways that give the
+same (:mod:`voronerf.router.probe`). Of these each call takes the one that was fastest for the first batch of about its
+size, or with ``way=`` the one that was named.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+import time
+import traceback
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.ops._core.backends import BackendUnavailable
+from voronerf.router import rules  # noqa: F401  registers the rules
+from voronerf.router.compiled import Graph, graph_of, spec_of
+from voronerf.router.double import Double
+from voronerf.router.fused import Fused
+from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
+from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters
+from voronerf.router.layout import Call, Results, map_tensors
+from voronerf.router.probe import Options, Probe, check_rays
+
+_OP = "VoronoiRouter"
+_FEWEST = 8  # samples; a first call of fewer is not probed and runs cell by cell
+_PLANS = 256  # kinds of calls that are remembered
+_TURNS, _SECONDS = 8, 0.08  # a way is measured at most so often, and no more than twice after so many seconds
+_EQUAL = 1.02  # of the least time: an earlier way of a plan is taken unless it is slower by more
+_OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
+
+
+@dataclass
+class CallPlan:
+    """How the calls of one kind run.
+
+    Attributes:
+        ways: Those that give what the loop gives, the most promising first and the loop last.
+        measured: Whether the first batch of each size decides between the ways; else the first one runs.
+        open: Whether another batch may run grouped, though the first did not.
+        chosen: The fastest way and why, by the size of a batch and the number of cells.
+        skip: The next calls that run cell by cell before another way is tried again.
+        wait: ``skip`` after the next batch that cannot be grouped.
+    """
+
+    ways: list[Way]
+    measured: bool = False
+    open: bool = False
+    chosen: dict[tuple[int, int], tuple[Way, str]] = field(default_factory=dict)
+    skip: int = 0
+    wait: int = 0
+
+    def postpone(self) -> None:
+        """Has the next calls run cell by cell, twice as many each time."""
+        self.skip, self.wait = self.wait, 2 * self.wait or 1
+
+
+class Dispatch:
+    """The plans of a router. Copies of a router begin anew."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()  # held while a plan is made
+        self.forget()
+
+    def __reduce__(self) -> tuple[type[Dispatch], tuple[()]]:
+        return Dispatch, ()
+
+    def forget(self) -> None:
+        """Drops all plans, after a change of dtype, device or parameters' names."""
+        self.plans: dict[Any, CallPlan] = {}
+        self.graphs: dict[Any, Graph] = {}  # of fused calls, by method and spec, for graphs of torch.compile
+        self._warned: set[str] = set()
+        self._latest: dict[str, dict[str, str]] = {}
+
+    def explain(self, methods: tuple[str, ...]) -> str:
+        """How each method has run so far, and why."""
+        latest = [(method, self._latest.get(method, {"not called yet": ""})) for method in methods]
+        ways = [(method, *way) for method, ways in latest for way in list(ways.items())]
+        return "\n".join(f"{method}: {name}{f': {why}' if why else ''}" for method, name, why in ways)
+
+    def evaluate(self, call: Call, grouping: Grouping, options: Options, frozen: Tensor | None) -> Results:
+        """Runs a call on the samples of all cells, or on two placeholders.
+
+        Args:
+            call: The call.
+            grouping: Its samples by cell.
+            options: What the user asked for.
+            frozen: bool [k]; samples in these cells are evaluated without gradients.
+        """
+        if grouping.device.type == "cpu":
+            keep_freed_memory()
+        plan = self._plan(call, grouping, options)
+        if frozen is None or not torch.is_grad_enabled() or not call.layout.n:
+            return self._run(plan, call, grouping)
+        return self._run_apart(plan, call, grouping, frozen)
+
+    def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
+        """The plan for calls of this kind, which the first of them makes."""
+        layout, key = call.layout, _kind_of(call, grouping.device, options.fuse)
+        plan = self.plans.get(key)
+        if plan is not None and not (plan.open and plan.skip == 0 and layout.n >= _FEWEST):
+            return plan
+        call.changed(lambda tensor, kind: tensor)  # arguments that are refused are so before anything is probed
+        with self._lock, torch.random.fork_rng([grouping.device] if grouping.device.type == "cuda" else []):
+            if layout.n < _FEWEST:
+                if layout.n:
+                    Probe(call, grouping).check_parameters()
+                return CallPlan([Loop(f"first calls of fewer than {_FEWEST} samples")])
+            probe = Probe(call, grouping)
+            if plan is not None and not probe.is_groupable():
+                plan.postpone()
+                return plan
+            if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
+                check_rays(call)
+            ways, is_open = probe.find_ways(options, self._warn_once)
+        if isinstance(ways[0], Fused):
+            spec, graph = spec_of(call.args, call.kwargs), graph_of(ways[0].result, layout)
+            if spec is not None and graph is not None:
+                self.graphs[call.method, spec] = graph
+        if len(self.plans) >= _PLANS:
+            self.plans.clear()
+        plan = self.plans[key] = CallPlan(ways, options.way == "fastest", is_open)
+        return plan
+
+    def _choose(self, plan: CallPlan, call: Call, grouping: Grouping) -> tuple[Way, str]:
+        """The way of a call, and what there is to say about it."""
+        n, k = call.layout.n, grouping.k
+        ways = [way for way in plan.ways if k > 1 or not isinstance(way, Grouped)]
+        if plan.skip:
+            plan.skip -= 1
+            ways = ways[-1:]
+        if not plan.measured or len(ways) == 1 or n < _FEWEST:
+            return ways[0], ways[0].why
+        size = n.bit_length() // 2, k  # batches of up to four times as many samples
+        if size not in plan.chosen:
+            with self._lock:
+                times = measure(ways, call, grouping)
+            first = next(i for i, time in enumerate(times) if time <= _EQUAL * min(times))
+            texts = [f"{way.name} {1e3 * time:.3g} ms" for way, time in zip(ways, times, strict=True)]
+            others = ", ".join(texts[:first] + texts[first + 1 :])
+            way, own = ways[first], f"{1e3 * times[first]:.3g} ms for {n} samples, {others}" if min(times) else ""
+            plan.chosen[size] = way, "; ".join(filter(None, (way.why, own)))
+        return plan.chosen[size]
+
+    def _run(self, plan: CallPlan, call: Call, grouping: Grouping) -> Results:
+        """Runs a call as planned, or cell by cell where its batch cannot be grouped."""
+        way, why = self._choose(plan, call, grouping)
+        latest, warns = self._latest.setdefault(call.method, {}), len(plan.ways) == 1
+        if isinstance(way, Grouped):
+            try:
+                results, plan.wait = way.run(call, grouping), 0
+                latest[way.name] = why
+                return results
+            except Exception as error:
+                lacking = (BackendUnavailable, MemoryError, torch.OutOfMemoryError)
+                if isinstance(error, lacking) or "can't allocate memory" in str(error):
+                    raise
+                plan.postpone()
+                reason = error if isinstance(error, Ungroupable) else f"its forward fails ({error})"
+                way, why, warns = plan.ways[-1], f"for some batches, since {reason}", True
+        layout = call.layout
+        try:
+            results = way.run(call, grouping)
+        except Exception as error:
+            if len(layout.lead) > 1 and not layout.flat and len(error.args) == 1 and isinstance(error.args[0], str):
+                hint = f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]"
+                error.args = (f"{error.args[0]}\n{hint}",)
+            raise
+        if grouping.k == 1 and isinstance(way, Loop):
+            latest["the module itself"] = "there is one cell"
+            return results
+        latest[way.name] = why
+        if why and warns and grouping.k > 1 and layout.n >= _FEWEST:
+            self._warn_once(f"cells {call.method}", f"{call.name} runs cell by cell: {why}")
+        return results
+
+    def _run_apart(self, plan: CallPlan, call: Call, grouping: Grouping, frozen: Tensor) -> Results:
+        """Runs a call for samples in frozen cells, bool [k], without gradients, and for the others with them."""
+        n, cells = grouping.n, grouping.cells
+        cells = torch.zeros(n, dtype=torch.int32, device=grouping.device) if cells is None else cells
+        still = frozen.index_select(0, cells)
+        found, rows = list[Results](), list[Tensor]()
+        for own, context in ((~still, contextlib.nullcontext()), (still, torch.no_grad())):
+            rows.append(own.nonzero()[:, 0])
+            if len(rows[-1]):
+                part = grouping.of_entries(rows[-1], cells[rows[-1]])
+                with context:
+                    found.append(self._run(plan, call, part))
+        order, tensors = torch.cat(rows), []
+        for parts in zip(*(results.unsorted for results in found), strict=True):
+            joined = torch.cat(parts)
+            # The backward of index_copy is a gather, where that of an index would add up.
+            joined = torch.zeros_like(joined).index_copy(0, order, joined)
+            if joined.is_floating_point() and not len(rows[0]):  # a batch without samples to learn from is no error
+                joined = _Constant.apply(joined, *(p for p in cell_parameters(call.module) if p.requires_grad))
+            tensors.append(joined)
+        return Results(found[0].value, tensors)
+
+    def _warn_once(self, topic: str, message: str) -> None:
+        """Warns, the first time that a topic comes up, at the line that called the router."""
+        if topic not in self._warned:
+            files = [frame.f_code.co_filename for frame, _ in traceback.walk_stack(sys._getframe())]
+            level = next((i for i, file in enumerate(files) if not file.startswith(_OWN)), len(files))
+            warnings.warn(f"{_OP}: {message}", stacklevel=level + 1)
+        self._warned.add(topic)
+
+
+def _kind_of(call: Call, device: torch.device, fused: bool) -> Any:
+    """What tells kinds of calls apart: types and sizes of the arguments but for the number of samples, and modes.
+
+    Numbers count by their value only where they would go into a fused network.
+    """
+    autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
+    d = len(call.layout.lead)
+    kind = [call.method, call.module.training, torch.is_grad_enabled(), autocast, tuple(call.kwargs), d]
+    for value in (*call.args, *call.kwargs.values()):
+        if isinstance(value, Tensor):
+            ones = tuple(size == 1 for size in value.shape[:d])
+            kind.append((tuple(value.shape[d:]), value.dim(), value.dtype, value.requires_grad, ones))
+        else:
+            by_value = (type(None), bool, str, int, float) if fused else (type(None), bool, str)
+            kind.append(value if isinstance(value, by_value) else type(value))
+    return tuple(kind)
+
+
+class _Constant(torch.autograd.Function):
+    """Values that depend on parameters, with no gradient to them."""
+
+    @staticmethod
+    def forward(values: Tensor, *parameters: Tensor) -> Tensor:
+        return values.view_as(values)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.count = len(inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, ...]:
+        return (None,) * ctx.count
+
+
+def measure(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
+    """Seconds that each way takes for the batch of a call, forward and, where there are gradients, backward.
+
+    The ways take turns, and the least time of each counts. A double of the module takes what they write and the
+    gradients; random numbers go on as if nothing had run.
+    """
+    double, leaves = Double(call.module), list[Tensor]()
+
+    def leaf(value: Tensor) -> Tensor:
+        taken = value.detach().requires_grad_(value.requires_grad and torch.is_grad_enabled())
+        leaves.extend([taken] * taken.requires_grad)
+        return taken
+
+    double.fill({id(p): leaf(p) for _, _, p in owned_parameters(call.module)})
+    double.own_buffers()
+    args, kwargs = map_tensors((call.args, call.kwargs), leaf)
+    again, cuda = replace(call, module=double.module, args=args, kwargs=kwargs), grouping.device.type == "cuda"
+
+    # Beside other work the processor's time says more, but it leaves out what other threads do.
+    clock = time.perf_counter if cuda or torch.get_num_threads() > 1 else time.thread_time
+
+    def seconds(way: Way) -> float:
+        if cuda:
+            torch.cuda.synchronize(grouping.device)
+        start = clock()
+        outputs = [t for t in way.run(again, grouping.anew()).unsorted if t.requires_grad and t.is_floating_point()]
+        if outputs and leaves:
+            # Of a sum: with gradients of their own for the outputs torch imports sympy.
+            total = torch.stack([(t * torch.ones_like(t)).sum().float() for t in outputs]).sum()
+            torch.autograd.grad(total, leaves, allow_unused=True)
+        if cuda:
+            torch.cuda.synchronize(grouping.device)
+        return clock() - start
+
+    turns, began = list[list[float]](), clock()
+    with torch.random.fork_rng([grouping.device] if cuda else []):
+        while len(turns) < 2 or (len(turns) < _TURNS and clock() - began < _SECONDS):
+            turns.append([seconds(way) for way in ways])
+    return [min(times) for times in zip(*turns, strict=True)]

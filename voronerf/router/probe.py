@@ -1,0 +1,254 @@
+"""Which ways give what the loop over cells gives.
+
+Each runs once on a few samples of the first batch, in a copy of the module whose cells have parameters of their own;
+results and gradients are compared.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.ops._core.backends import BackendUnavailable
+from voronerf.ops._core.tolerances import agree, agree_gradients
+from voronerf.router.cells import clone_module
+from voronerf.router.double import Double, Forbidden
+from voronerf.router.fused import Fused
+from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Way
+from voronerf.router.grouping import Grouping, cell_parameters
+from voronerf.router.layout import RAY, Call, Results, map_tensors, tensors_of
+from voronerf.router.trace import Unfusable, rows_for
+
+_OP = "VoronoiRouter"
+_SAMPLES, _CELLS = (41, 43, 47, 53), 3  # numbers of samples of a probe, of which one is taken, and their cells
+_PIECE = 8 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
+
+Outcome = tuple[Results, list[Tensor]]  # and gradients
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user asked for.
+
+    Attributes:
+        fuse: Whether ``forward`` does the same in every call.
+        way: "fastest", or the way that is taken without measuring: "fused", "grouped" or "loop".
+        several: Whether methods besides ``forward`` are routed; then one that cannot be fused leaves the others fused.
+        assume: What ``any()`` and ``all()`` of samples give in a fused method, by their code.
+    """
+
+    fuse: bool
+    way: str
+    several: bool
+    assume: Mapping[str, bool] = field(default_factory=dict)
+
+
+class Probe:
+    """A copy of a module and a few samples of a call, in cells of their own whose parameters differ."""
+
+    def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
+        self._made_of = call, grouping
+        device = grouping.device
+        self._n = n = rows_for(call.module, tensors_of((call.args, call.kwargs)), _SAMPLES)
+        picked = torch.arange(n, device=device) * call.layout.n // n
+        cells = (torch.arange(n, device=device) * 7 % 5 // 2).int()
+        self._entries = Grouping(cells, n, _CELLS, device, grouping.backend, rows=picked)
+        self._entries.source, self._entries.occupied  # noqa: B018  found here: under a mode torch imports its compiler
+        generator = torch.Generator().manual_seed(0)
+        memo = {id(p): _perturbed(p, generator) for p in cell_parameters(call.module)}
+        module = clone_module(call.module, memo).to(dtype)
+        self._leaves: list[Tensor] = []
+
+        def leaf(value: Tensor) -> Tensor:
+            """An argument with a gradient of its own, where it takes one."""
+            own = value.detach().to(dtype if value.is_floating_point() else None)
+            if value.requires_grad and torch.is_grad_enabled():
+                self._leaves.append(own.requires_grad_())
+            return own
+
+        args, kwargs = map_tensors((call.args, call.kwargs), leaf)
+        self._call = replace(call, module=module, args=args, kwargs=kwargs)
+
+    def find_ways(self, options: Options, warn_once: Callable[[str, str], None]) -> tuple[list[Way], bool]:
+        """The ways that give what the loop gives, the loop last; and whether another batch may have more of them.
+
+        Raises:
+            TypeError: Where the module changes its parameters or mixes samples.
+            ValueError: Where the one method cannot be fused, though it must be.
+        """
+        call = self._call
+        for loop in (Loop(), Loop(again=True)):
+            try:
+                expected = self._outcome(loop)
+                break
+            except Forbidden:
+                raise
+            except Exception as error:  # perhaps its code runs again in the backward pass
+                why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
+        else:
+            return [Loop(why)], False
+        if loop.keeps:
+            says = f"{call.name} keeps a parameter as `{loop.keeps}`, which is of that call alone"
+            warn_once(f"keeps {call.method}", says)
+        ways, is_open, unfused = list[Way](), False, ""
+        if options.fuse and options.way in ("fastest", "fused"):
+            try:
+                ways.append(self._fused(loop, expected, options.assume))
+            except Exception as error:
+                self._check_rows(loop)
+                why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
+                says = f"fuse=True needs a network that can be fused, but in {call.name} {why}"
+                if not options.several:
+                    raise ValueError(f"{_OP}: {says}") from error
+                unfused = f"not fused, since {why}"
+                warn_once(f"fuse {call.method}", says)
+        if options.way in ("fastest", "grouped") or (options.way == "fused" and not ways):
+            try:
+                tried = Grouped(quiet=True)
+                if self._agrees(tried, loop, expected):
+                    piece = min(max(_PIECE * self._n // tried.widest, 1 << 10), 1 << 16)
+                    ways.append(Grouped(piece, why=unfused))
+                else:
+                    loop.why = "its forward on the samples of all cells gives other results than on those of one cell"
+            except BackendUnavailable:
+                raise
+            except Ungroupable as error:
+                loop.why, is_open = str(error), error.of_batch
+            except Exception as error:
+                loop.why = f"its forward fails on the samples of all cells ({type(error).__name__}: {error})"
+        if not ways:
+            self._check_rows(loop)
+        elif loop.again:
+            ways = ways[:1]  # cannot be measured, since some checkpoints refuse torch.autograd.grad
+        return [*ways, loop], is_open and not ways
+
+    def check_parameters(self) -> None:
+        """Raises TypeError where the module changes its parameters."""
+        try:
+            with torch.no_grad():
+                self._run(Loop())
+        except Forbidden:
+            raise
+        except Exception:
+            return  # the call itself says so
+
+    def is_groupable(self) -> bool:
+        """Whether the module runs for all cells at once on this batch, right or wrong."""
+        try:
+            with torch.no_grad():
+                self._run(Grouped(quiet=True))
+        except Exception:
+            return False
+        return True
+
+    def _run(self, way: Way) -> Results:
+        """The results of a way, with random numbers of 0."""
+        with NoRandomness() if isinstance(way, Loop) else contextlib.nullcontext():  # a fused network draws none
+            return way.run(self._call, self._entries)
+
+    def _outcome(self, way: Way) -> Outcome:
+        """Results, and gradients of a weighted sum of them."""
+        results, generator, total = self._run(way), torch.Generator().manual_seed(7), []
+        for tensor in results.tensors:
+            if tensor.requires_grad:
+                tensor = torch.view_as_real(tensor) if tensor.is_complex() else tensor
+                weights = torch.randn(tensor.shape, generator=generator).to(tensor)
+                total.append((tensor * weights).sum().float())
+        if not total or not torch.is_grad_enabled():
+            return results, []
+        torch.stack(total).sum().backward()  # not torch.autograd.grad, which some checkpoints refuse
+        leaves = [t for t in (*self._call.module.parameters(), *self._leaves) if t.requires_grad]
+        gradients = [torch.zeros_like(t) if t.grad is None else t.grad for t in leaves]
+        for leaf in leaves:
+            leaf.grad = None
+        return results, gradients
+
+    def _agrees(self, way: Way, loop: Way, expected: Outcome) -> bool:
+        """Whether a way gives what the loop gives; where it does not, whether it does in float64.
+
+        A deep network of fast sines makes its own rounding as large as its results.
+        """
+        if _same(self._outcome(way), expected):
+            return True
+        try:
+            exact = Probe(*self._made_of, dtype=torch.float64)
+            return _same(exact._outcome(way), exact._outcome(loop))
+        except Exception:
+            return False
+
+    def _fused(self, loop: Way, expected: Outcome, assume: Mapping[str, bool]) -> Way:
+        """The network as one operation; raises where something stands in the way."""
+        with NoRandomness():
+            module, given = self._made_of[0].module, self._call.arranged(self._entries)
+            count = rows_for(module, given)
+            way = Fused(replace(self._call, module=module), [rows[:count] for rows in given], assume)
+        if not self._agrees(way, loop, expected):
+            raise Unfusable("the traced network gives other results than its forward")
+        return way
+
+    def _check_rows(self, loop: Loop) -> None:
+        """Raises TypeError where results for samples change when others are left out."""
+        bounds = [(cell, first, (first + last) // 2, last) for cell, first, last in self._entries.occupied]
+        halves = [half for cell, a, b, c in bounds for half in ((cell, a, b), (cell, b, c))]
+        with NoRandomness():
+            apart = loop.on(self._call, self._entries, halves)
+        if not all(map(agree, apart.tensors, self._run(loop).tensors)):
+            name = type(self._call.module).__name__
+            raise TypeError(
+                f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when other "
+                "samples are left out: it mixes samples (attention or statistics over a batch)"
+            )
+
+
+def _same(found: Outcome, expected: Outcome) -> bool:
+    (a, ours), (b, theirs) = found, expected
+    alike = len(a.tensors) == len(b.tensors) and len(ours) == len(theirs)
+    return alike and all(map(agree, a.tensors, b.tensors)) and agree_gradients(ours, theirs)
+
+
+@torch.no_grad()
+def _perturbed(parameter: Tensor, generator: torch.Generator) -> nn.Parameter:
+    """Entries for the cells of a probe, [3, ...], each some way off the router's own."""
+    with torch.inference_mode(False):
+        values = parameter.detach()[torch.arange(_CELLS, device=parameter.device) % parameter.shape[0]].clone()
+        if (values.is_floating_point() or values.is_complex()) and values.numel():
+            numbers = torch.view_as_real(values) if values.is_complex() else values
+            size = float(numbers.float().square().mean().sqrt()) or 0.1
+            numbers += (0.2 * size * torch.randn(numbers.shape, generator=generator)).to(numbers)
+        return nn.Parameter(values, requires_grad=parameter.requires_grad)
+
+
+def check_rays(call: Call) -> None:
+    """Raises ValueError where [n, 1, f] gives other results than [rays, samples, f], for a few samples of one cell."""
+    lead = call.layout.lead
+    for samples in (6, lead[-1]):  # a module may be made for a number of samples
+        try:
+            whole, alone = _of_few(call, (*[1] * (len(lead) - 2), min(lead[-2], 2), min(lead[-1], samples)))
+        except Exception:
+            continue
+        if len(whole) != len(alone) or not all(agree(b.flatten(), a.flatten()) for a, b in zip(whole, alone)):
+            raise ValueError(
+                f"{_OP}: module must give for [n, 1, f] what it gives for [rays, samples, f], but "
+                f"{type(call.module).__name__} does not: it mixes the samples of a ray, or squeezes or flattens its "
+                "arguments; for that, layout='flat' calls it with [n, f]"
+            )
+        return
+
+
+def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
+    """What the first cell's module returns for a few samples, seen as rays and as the router shows them."""
+    found: list[Tensor] = []
+
+    def first(tensor: Tensor, kind: str) -> Tensor:
+        found.append(tensor.detach()[tuple(slice(size) for size in (few[:-1] if kind == RAY else few))])
+        return found[-1]
+
+    args, kwargs = call.changed(first)
+    small = replace(call, layout=replace(call.layout, lead=few), args=args, kwargs=kwargs)
+    cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
+    with torch.no_grad(), NoRandomness():
+        return [tensors_of(Double(call.module).run(small, rows, cell)) for rows in (found, small.arranged(None))]
