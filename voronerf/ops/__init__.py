@@ -16,7 +16,6 @@ from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_pixels import draw_pixels
 from voronerf.ops.draw_pixels.reference import Runs
-from voronerf.ops.first_solid import Solids, first_solid
 from voronerf.ops.forward_with_tape import Outputs, forward_with_tape
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
@@ -52,14 +51,12 @@ __all__ = [
     "RenderLoss",
     "Rule",
     "Runs",
-    "Solids",
     "adam",
     "balance_centres",
     "cell_sort",
     "compose_runs",
     "composite",
     "draw_pixels",
-    "first_solid",
     "forward_with_tape",
     "frequency_encode",
     "grouped_linear",

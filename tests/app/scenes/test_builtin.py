@@ -7,8 +7,8 @@ from helpers import refuses
 
 from voronerf.app.scenes import builtin_scene, load_scene
 from voronerf.app.scenes.builtin.caster import Caster
-from voronerf.app.scenes.builtin.opaque import bounds, cast
-from voronerf.app.scenes.builtin.opaque_solids import SOLIDS
+from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, shaded
+from voronerf.app.scenes.builtin.plain import SOLIDS
 from voronerf.app.scenes.builtin.solids import Box, Cylinder, Sphere, Torus, rotation
 from voronerf.app.scenes.carving import carve_box
 from voronerf.nerf.cameras import Cameras
@@ -21,6 +21,16 @@ def scene():
 
 def white(points, normals):
     return np.ones_like(points)
+
+
+def cast(origins, directions, solids=SOLIDS):
+    """(colour [r, 3], depth [r]) of any rays, each tested with every solid."""
+    caster = Caster(solids, LIGHT)
+    origins = np.broadcast_to(origins, directions.shape)
+    every = np.arange(len(solids))
+    none = np.zeros_like(every)
+    depth, number = caster.first(origins.T, directions.T, every, none, none, none + len(origins))
+    return shaded(origins, directions, depth, number, caster), depth
 
 
 def inside(solid, points):
@@ -55,7 +65,7 @@ def test_hits_against_marching(solid):
     origins = (2 * origins / np.linalg.norm(origins, axis=-1, keepdims=True)).astype(np.float32)
     directions = generator.normal(size=(150, 3)) * 0.35 - origins
     directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
-    found, _ = Caster([[solid]])(origins, directions)
+    _, found = cast(origins, directions, [solid])
     steps = np.arange(0.5, 3.5, 1e-3)
     hits = 0
     for origin, direction, distance in zip(origins, directions, found):
@@ -78,7 +88,7 @@ def test_hits_against_marching(solid):
 
 
 def test_every_solid_is_seen_and_in_the_box():
-    box = bounds()
+    box = bounds(SOLIDS)
     for solid in SOLIDS:
         own = solid.bounds()
         assert (own[0] >= box[0]).all() and (own[1] <= box[1]).all()
@@ -128,10 +138,23 @@ def test_views_differ_by_highlights():
     assert np.abs(colours[0] - colours[1]).max() > 0.02
 
 
+def test_shadows_are_cast_by_the_same_solids():
+    """A patch of floor behind a wall, seen from the lamp's side and from above: dark only where the wall stands."""
+    floor = Box((0, 0, -0.1), lambda p, n: np.ones_like(p), gloss=0.0, half=(2.0, 2.0, 0.1))
+    wall = Box((0, 0, 0.5), lambda p, n: np.ones_like(p), gloss=0.0, half=(0.3, 0.02, 0.5))
+    origin = np.array([[0.0, 0.0, 4.0]], np.float32)
+    # A point in the wall's shadow: the lamp stands at (0.45, -0.55, 0.70), so shadows fall towards (-x, +y).
+    targets = np.array([[-0.2, 0.3, 0.0], [0.2, -0.3, 0.0]], np.float32)
+    directions = (targets - origin) / np.linalg.norm(targets - origin, axis=1, keepdims=True)
+    colour, depth = cast(origin, directions, [floor, wall])
+    np.testing.assert_allclose(depth, np.linalg.norm(targets - origin, axis=1), atol=1e-3)
+    assert colour[0, 0] < 0.8 * colour[1, 0]
+
+
 def test_sizes():
     assert load_scene("builtin", downscale=50).train.images.shape == (100, 2, 2, 4)
     assert builtin_scene(1, train_views=1, test_views=1).train.images.shape == (1, 1, 1, 4)
-    refuses("size must be >= 1, got 0", builtin_scene, 0)
+    refuses("builtin: size must be >= 1, got 0", builtin_scene, 0)
     refuses("at least one view", builtin_scene, 4, train_views=0)
 
 

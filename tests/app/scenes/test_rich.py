@@ -1,13 +1,10 @@
 """The rich built-in scene: what stands in it, and that it is seen and lit."""
 
-import numpy as np
 from helpers import refuses
 
 from voronerf.app.scenes import load_scene, rich_scene
-from voronerf.app.scenes.builtin.caster import Caster
-from voronerf.app.scenes.builtin.opaque import cast
 from voronerf.app.scenes.builtin.rich import SOLIDS
-from voronerf.app.scenes.builtin.solids import Box, Cylinder, Sphere, Torus, normalised
+from voronerf.app.scenes.builtin.solids import Box, Cylinder, Sphere, Torus
 
 
 def test_every_kind_is_there_often_and_stands_on_the_plinth():
@@ -25,7 +22,7 @@ def test_the_scene_is_of_the_usual_form():
     seen = scene.test.images[0][alpha > 0.99][:, :3].float()
     assert float(seen.std(0).mean()) > 25, "many colours"
     assert scene.box is not None and bool((scene.box[1] > scene.box[0]).all())
-    refuses("rich_scene: size must be >= 1, got 0", rich_scene, 0)
+    refuses("builtin-rich: size must be >= 1, got 0", rich_scene, 0)
 
 
 def test_it_is_named_on_the_command_line(monkeypatch):
@@ -33,16 +30,3 @@ def test_it_is_named_on_the_command_line(monkeypatch):
 
     monkeypatch.setitem(data.BUILTIN, "builtin-rich", lambda size: size)
     assert load_scene("builtin-rich", downscale=4) == 25
-
-
-def test_shadows_are_cast_by_the_same_solids():
-    """A patch of floor behind a wall, seen from the lamp's side and from above: dark only where the wall stands."""
-    floor = Box((0, 0, -0.1), lambda p, n: np.ones_like(p), gloss=0.0, half=(2.0, 2.0, 0.1))
-    wall = Box((0, 0, 0.5), lambda p, n: np.ones_like(p), gloss=0.0, half=(0.3, 0.02, 0.5))
-    origin = np.array([[0.0, 0.0, 4.0]], np.float32)
-    # A point in the wall's shadow: the lamp stands at (0.45, -0.55, 0.70), so shadows fall towards (-x, +y).
-    targets = np.array([[-0.2, 0.3, 0.0], [0.2, -0.3, 0.0]], np.float32)
-    directions = normalised(targets - origin)
-    colour, depth = cast(origin, directions, Caster([(floor, wall)]))
-    np.testing.assert_allclose(depth, np.linalg.norm(targets - origin, axis=1), atol=1e-3)
-    assert colour[0, 0] < 0.8 * colour[1, 0]

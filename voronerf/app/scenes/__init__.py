@@ -70,9 +70,8 @@ def load_scene(
     """Loads a scene.
 
     Args:
-        source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of 16, with
-            "builtin-city:4x4,rebuilt=5" for other buildings on block 5, or a folder with `transforms_train.json`
-            (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, LLFF's
+        source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of 16, or a folder
+            with `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, LLFF's
             `poses_bounds.npy`, Metashape's `cameras.xml`, Polycam's `keyframes` or Record3D's `metadata.json`.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,
             and for photographs the least factor that leaves at most 512 pixels a side.

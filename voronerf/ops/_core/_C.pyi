@@ -369,18 +369,6 @@ class Sightings(NamedTuple):
     s: int  # int64
     m: int  # int64
 
-class SolidsOnRays(NamedTuple):
-    origins: Tensor | None  # const float32*
-    directions: Tensor | None  # const float32*
-    r: int  # int64
-    one_origin: bool
-    one_direction: bool
-    kinds: Tensor | None  # const int32*
-    centres: Tensor | None  # const float32*
-    turns: Tensor | None  # const float32*
-    measures: Tensor | None  # const float32*
-    m: int  # int64
-
 TableType: tuple[str, ...]  # float32 bfloat16 float16
 
 # AdamRule[], AdamGuard, const float32**, float32**, float32**, float32**, int64[], Cpu
@@ -456,9 +444,6 @@ def encode_backward(_0: Encoding, _1: Tensor | None, _2: Tensor | None, _3: Tens
 
 # int64, int64, Cpu
 def encode_workspace(_0: int, _1: int, _2: Cpu) -> int: ...
-
-# SolidsOnRays, float32*, int32*, Cpu
-def first_solid(_0: SolidsOnRays, _1: Tensor | None, _2: Tensor | None, _3: Cpu) -> None: ...
 
 # LinearInputs, any*, Cpu
 def grouped_linear(_0: LinearInputs, _1: Tensor | None, _2: Cpu) -> None: ...

@@ -6,7 +6,6 @@ scene unit wide. Each block adds the same number of views from its streets and f
 
 from __future__ import annotations
 
-import functools
 import math
 import os
 import re
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from voronerf.app.scenes.builtin.caster import Caster
 from voronerf.app.scenes.builtin.city_solids import city
-from voronerf.app.scenes.builtin.opaque import SUPERSAMPLES, bounds, render_views, see
+from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, render_views
 from voronerf.app.scenes.builtin.solids import Array, rotation
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.scene import Scene, Split
@@ -38,7 +37,6 @@ def city_scene(
     blocks: int | tuple[int, int] = 1,
     train_views: int = TRAIN_VIEWS,
     test_views: int = TEST_VIEWS,
-    rebuilt: int | None = None,
     images: str = "memory",
 ) -> Scene:
     """Computes the city.
@@ -48,14 +46,11 @@ def city_scene(
         blocks: on each side, or along x and along y, 1 to 32.
         train_views: of each block, every other one from its streets and the rest from above.
         test_views: of each block, at other places than the training views.
-        rebuilt: the block that has other buildings, trees and cars, 0 to blocks**2 - 1, row by row; or None. The views
-            and all other blocks are the same: for what happens when a scene changes.
         images: "memory"; "cached", which also keeps them in a store of the cache, where a next call finds them; or
             "disk", which maps them from there.
 
     Raises:
-        ValueError: a size or number of views below 1, too many blocks, a block that there is not, or another place for
-            the images.
+        ValueError: a size or number of views below 1, too many blocks, or another place for the images.
         SceneError: the store cannot be written.
 
     Examples:
@@ -70,16 +65,11 @@ def city_scene(
     sides = (blocks, blocks) if isinstance(blocks, int) else tuple(blocks)
     if len(sides) != 2 or not 1 <= min(sides) <= max(sides) <= MOST:
         raise ValueError(f"city_scene: blocks must be 1 to {MOST}, got {blocks}")
-    if rebuilt is not None and not 0 <= rebuilt < sides[0] * sides[1]:
-        raise ValueError(f"city_scene: rebuilt must be a block of 0 to {sides[0] * sides[1] - 1}, got {rebuilt}")
     if images not in ("memory", "cached", "disk"):
         raise ValueError(f"city_scene: images must be memory, cached or disk, got {images!r:.60}")
-    groups, name = city(sides, rebuilt), f"builtin-city-{sides[0]}x{sides[1]}"
-    name += "" if rebuilt is None else f"-rebuilt-{rebuilt}"
+    solids, name = city(sides), f"builtin-city-{sides[0]}x{sides[1]}"
     made_of = sides[0] if sides[0] == sides[1] else list(sides)
-    solids = [solid for group in groups for solid in group]
-    box = bounds(solids)
-    look = functools.partial(see, caster=Caster(groups))
+    caster = Caster(solids, LIGHT)
 
     def views(part: str, seed: int, count: int) -> Split:
         cameras = city_cameras(size, sides, count, seed)
@@ -89,38 +79,29 @@ def city_scene(
             return found if images == "disk" else found.clone()
 
         kept = None if images == "memory" else keep
-        found = render_views(cameras, part, look, box=box, supersamples=SUPERSAMPLES, keep=kept)
-        return replace(found, on_disk=images == "disk")
+        return replace(render_views(cameras, part, caster, kept), on_disk=images == "disk")
 
     train, test = views("train", 0, train_views), views("test", 1, test_views)
     far = math.hypot(*sides) + 3
-    return Scene(name, train, test, NEAR, far, torch.from_numpy(box), "linear", "white")
+    return Scene(name, train, test, NEAR, far, torch.from_numpy(bounds(solids)), "linear", "white")
 
 
 def city_views(cameras: Cameras, blocks: tuple[int, int]) -> Split:
     """The city from other cameras, which are square and have one focal length; in memory."""
-    groups = city(blocks, None)
-    solids = [solid for group in groups for solid in group]
-    look = functools.partial(see, caster=Caster(groups))
-    return render_views(cameras, "view", look, box=bounds(solids), supersamples=SUPERSAMPLES)
+    return render_views(cameras, "view", Caster(city(blocks), LIGHT))
 
 
 def city_of(size: int, text: str, images: str) -> Scene:
-    """The city of blocks such as "4x4", "4x8" or "4x4,rebuilt=5"; in the cache if it is larger than one block.
+    """The city of blocks such as "4x4" or "4x8"; in the cache if it is larger than one block.
 
     Raises:
         SceneError: other blocks than these.
     """
-    blocks, comma, rest = text.partition(",")
-    found, number = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", blocks), re.fullmatch(r"rebuilt=(\d{1,4})", rest)
+    found = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", text)
     if found is None or max(int(found[1]), int(found[2])) > MOST:
-        raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, 2x4, ... or {MOST}x{MOST}, got {blocks!r:.60}")
-    sides = int(found[1]), int(found[2])
-    most = sides[0] * sides[1] - 1
-    if comma and (number is None or int(number[1]) > most):
-        raise SceneError(f"builtin-city: after the blocks must come rebuilt=0 to rebuilt={most}, got {rest!r:.60}")
-    where = "disk" if images == "disk" else "memory" if blocks == "1x1" else "cached"
-    return city_scene(size, blocks=sides, rebuilt=None if number is None else int(number[1]), images=where)
+        raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, 2x4, ... or {MOST}x{MOST}, got {text!r:.60}")
+    where = "disk" if images == "disk" else "memory" if text == "1x1" else "cached"
+    return city_scene(size, blocks=(int(found[1]), int(found[2])), images=where)
 
 
 def city_cameras(size: int, blocks: tuple[int, int], views: int, seed: int) -> Cameras:

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from voronerf.app.scenes.builtin.opaque_solids import Colour, plain
 from voronerf.app.scenes.builtin.solids import Array, Box, Cylinder, Solid, Sphere, Texture, rotation
+from voronerf.app.scenes.builtin.textures import Colour, plain
 
 STREET = 0.12  # half of its width
 KERB = 0.008  # height of the pavement
@@ -195,12 +195,9 @@ def _building(x: float, y: float, half: tuple[float, float], height: float, rand
     return parts
 
 
-def block(column: int, row: int, *, rebuilt: bool = False) -> list[Solid]:
-    """What stands on one block, around the origin; streets run through x and y of -0.5 and 0.5.
-
-    A block that is ``rebuilt`` has other buildings, trees and cars in its place.
-    """
-    random = np.random.default_rng((column, row, 1) if rebuilt else (column, row))
+def block(column: int, row: int) -> list[Solid]:
+    """What stands on one block, around the origin; streets run through x and y of -0.5 and 0.5."""
+    random = np.random.default_rng((column, row))
     inner = 0.5 - STREET
     parts: list[Solid] = [Box((0, 0, KERB / 2), _paving, 0.05, 10, half=(inner, inner, KERB / 2))]
     park = int(random.integers(12))  # of the four lots one or none is a park
@@ -233,22 +230,18 @@ def block(column: int, row: int, *, rebuilt: bool = False) -> list[Solid]:
     return parts
 
 
-def city(blocks: tuple[int, int], rebuilt: int | None = None) -> list[list[Solid]]:
-    """The solids of so many blocks along x and y, the ground first and then block by block; one may be rebuilt."""
+def city(blocks: tuple[int, int]) -> list[Solid]:
+    """The solids of so many blocks along x and y, the ground first and then block by block."""
     across, along = blocks[0] / 2, blocks[1] / 2
+    corner = np.array((across, along, 0), dtype=np.float32)
     half = (across, along, DEPTH / 2)
-    groups: list[list[Solid]] = [[Box((0, 0, -DEPTH / 2), _ground_of(across, along), 0.03, 8, half=half)]]
+    found: list[Solid] = [
+        Box((0, 0, -DEPTH / 2), lambda points, normals: ground(points + corner, normals), 0.03, 8, half=half)
+    ]
     for row in range(blocks[1]):
         for column in range(blocks[0]):
-            x, y, number = column + 0.5 - across, row + 0.5 - along, row * blocks[0] + column
-            groups.append([_moved(solid, x, y) for solid in block(column, row, rebuilt=rebuilt == number)])
-    return groups
-
-
-def _ground_of(across: float, along: float) -> Texture:
-    corner = np.array((across, along, 0), dtype=np.float32)
-    return lambda points, normals: ground(points + corner, normals)
-
-
-def _moved(solid: Solid, x: float, y: float) -> Solid:
-    return replace(solid, centre=(solid.centre[0] + x, solid.centre[1] + y, solid.centre[2]))
+            x, y = column + 0.5 - across, row + 0.5 - along
+            for solid in block(column, row):
+                place = (solid.centre[0] + x, solid.centre[1] + y, solid.centre[2])
+                found.append(replace(solid, centre=place))
+    return found

@@ -7,21 +7,12 @@ rings, a fence of posts, and small crates. Light, cameras and views are those of
 from __future__ import annotations
 
 import colorsys
-import functools
 import math
 
-from voronerf.app.scenes.builtin.caster import Caster
-from voronerf.app.scenes.builtin.opaque import (
-    SUPERSAMPLES,
-    TEST_VIEWS,
-    TRAIN_VIEWS,
-    bounds,
-    builtin_cameras,
-    render_scene,
-    see,
-)
-from voronerf.app.scenes.builtin.opaque_solids import FLOOR, bricks, checker, diagonals, globe, mosaic, plain, spiral
+from voronerf.app.scenes.builtin.pictures import TEST_VIEWS, TRAIN_VIEWS, hemisphere_scene
+from voronerf.app.scenes.builtin.plain import FLOOR
 from voronerf.app.scenes.builtin.solids import Box, Cylinder, Solid, Sphere, Torus, rotation
+from voronerf.app.scenes.builtin.textures import bricks, checker, diagonals, globe, mosaic, plain, spiral
 from voronerf.app.scenes.scene import Scene
 
 COURSES, BRICKS = 16, 12  # of the tower
@@ -45,10 +36,7 @@ def rich_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views: i
         >>> scene.train.images.shape[1:3]
         torch.Size([4, 4])
     """
-    cameras = builtin_cameras("rich_scene", size, train_views, test_views)
-    return render_scene(
-        "builtin-rich", cameras, functools.partial(see, caster=Caster([SOLIDS])), bounds(SOLIDS), SUPERSAMPLES
-    )
+    return hemisphere_scene("builtin-rich", SOLIDS, size, train_views, test_views)
 
 
 def _hue(share: float, value: float = 0.9, saturation: float = 0.7) -> tuple[float, float, float]:

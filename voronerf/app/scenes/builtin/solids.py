@@ -1,24 +1,24 @@
 """Solids that rays are cast against: spheres, boxes, cylinders and tori, each in its own frame.
 
-n points. Which of them a ray meets first, and where, is said by :func:`voronerf.ops.first_solid`. NumPy, so that views
-can be shaded in parallel threads.
+n points, r rays. Distances are along unit directions, infinite for a miss. Rays start outside of every solid; one that
+starts inside of the box around a torus does not see it.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
-Rows = NDArray[np.int64]
 Axes = tuple[Array, Array, Array]
 """x, y and z of vectors, of shapes that broadcast."""
-
+TRACE_STEPS = 40
+SURFACE = 5e-4  # a traced ray closer than this to a torus has hit it
 
 # points [n, 3] and normals [n, 3] in the solid's frame -> colour [n, 3] in 0..1
 Texture = Callable[[Array, Array], Array]
@@ -40,12 +40,11 @@ def normalised(vectors: Array) -> Array:
     return vectors / np.sqrt(x * x + y * y + z * z)[:, None]
 
 
-def turned(vectors: Array, matrix: Array | None) -> Array:
-    """vectors [n, 3] @ matrix [3, 3], without the threads that a matrix product would start."""
-    if matrix is None:
-        return vectors
-    x, y, z = vectors.T
-    return np.stack([x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3)], axis=-1)
+def turned(vectors: Axes, matrix: Array) -> Axes:
+    """vectors @ matrix [3, 3, ...], whose further axes broadcast with theirs; without threads of a matrix product."""
+    x, y, z = vectors
+    first, second, third = (x * matrix[0, i] + y * matrix[1, i] + z * matrix[2, i] for i in range(3))
+    return first, second, third
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +71,12 @@ class Solid(ABC):
 
     @abstractmethod
     def measures(self) -> tuple[float, ...]:
-        """Those of its kind, see :class:`voronerf.ops.Solids`."""
+        """What `distance` takes, at most three numbers."""
+
+    @staticmethod
+    @abstractmethod
+    def distance(origins: Axes, directions: Axes, measures: Array) -> Array:
+        """Distance [r] of rays in the frames of solids with measures [3, r]."""
 
     @abstractmethod
     def normal(self, points: Array) -> Array:
@@ -88,10 +92,14 @@ class Solid(ABC):
 
     def surface(self, points: Array) -> tuple[Array, Array]:
         """(normals [n, 3] in the world, colours [n, 3]) of points on the surface."""
-        local = turned(points - np.array(self.centre, dtype=np.float32), self.turn)
+        local = points - np.array(self.centre, dtype=np.float32)
+        if self.turn is not None:
+            local = np.stack(turned(tuple(local.T), self.turn), axis=-1)
         normals = self.normal(local)
-        back = None if self.turn is None else self.turn.T
-        return turned(normals, back), self.texture(local, normals)
+        colours = self.texture(local, normals)
+        if self.turn is not None:
+            normals = np.stack(turned(tuple(normals.T), self.turn.T), axis=-1)
+        return normals, colours
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +113,14 @@ class Sphere(Solid):
 
     def measures(self) -> tuple[float, ...]:  # noqa: D102
         return (self.radius**2,)
+
+    @staticmethod
+    def distance(origins: Axes, directions: Axes, measures: Array) -> Array:  # noqa: D102
+        (ox, oy, oz), (dx, dy, dz) = origins, directions
+        b = ox * dx + oy * dy + oz * dz
+        root = b * b - (ox * ox + oy * oy + oz * oz) + measures[0]
+        t = -b - np.sqrt(np.maximum(root, 0))
+        return np.where((root >= 0) & (t > 0), t, np.float32(np.inf))
 
     def normal(self, points: Array) -> Array:  # noqa: D102
         return normalised(points)
@@ -121,6 +137,11 @@ class Box(Solid):
 
     def measures(self) -> tuple[float, ...]:  # noqa: D102
         return self.half
+
+    @staticmethod
+    def distance(origins: Axes, directions: Axes, measures: Array) -> Array:  # noqa: D102
+        enter, leave = slab(origins, directions, measures)
+        return np.where((leave > enter) & (enter > 0), enter, np.float32(np.inf))
 
     def normal(self, points: Array) -> Array:  # noqa: D102
         face = np.argmax(np.abs(points) / np.array(self.half, dtype=np.float32), axis=-1)[:, None]
@@ -142,6 +163,20 @@ class Cylinder(Solid):
     def measures(self) -> tuple[float, ...]:  # noqa: D102
         return self.radius**2, self.half_height
 
+    @staticmethod
+    def distance(origins: Axes, directions: Axes, measures: Array) -> Array:  # noqa: D102
+        # the ray is inside between the later of its two entries (tube, slab) and the earlier of its two exits
+        (ox, oy, oz), (dx, dy, dz), (square, half_height, _) = origins, directions, measures
+        a = np.maximum(dx * dx + dy * dy, np.float32(1e-12))
+        b, c = ox * dx + oy * dy, ox * ox + oy * oy - square
+        root = b * b - a * c
+        spread = np.sqrt(np.maximum(root, 0))
+        dz = np.where(np.abs(dz) < 1e-9, np.float32(1e-9), dz)
+        low, high = (-half_height - oz) / dz, (half_height - oz) / dz
+        enter = np.maximum((-b - spread) / a, np.minimum(low, high))
+        leave = np.minimum((-b + spread) / a, np.maximum(low, high))
+        return np.where((root >= 0) & (enter <= leave) & (enter > 0), enter, np.float32(np.inf))
+
     def normal(self, points: Array) -> Array:  # noqa: D102
         x, y, z = points.T
         around = np.hypot(x, y)
@@ -153,7 +188,7 @@ class Cylinder(Solid):
 
 @dataclass(frozen=True, eq=False)
 class Torus(Solid):
-    """A ring around the z axis of its frame."""
+    """A ring around the z axis of its frame, found by sphere tracing its exact distance (Hart 1996)."""
 
     ring: float = 1.0
     tube: float = 0.25
@@ -164,19 +199,35 @@ class Torus(Solid):
     def measures(self) -> tuple[float, ...]:  # noqa: D102
         return self.ring, self.tube, self.ring + self.tube
 
+    @staticmethod
+    def distance(origins: Axes, directions: Axes, measures: Array) -> Array:  # noqa: D102
+        ring, tube, outer = measures
+        t, leave = slab(origins, directions, np.stack((outer, outer, tube)))
+        found = np.full_like(t, np.inf)
+        rows = ((leave > t) & (t > 0)).nonzero()[0]
+        state = np.stack([each[rows] for each in (t, leave, *origins, *directions, ring, tube)])
+        for _ in range(TRACE_STEPS):
+            t, leave, ox, oy, oz, dx, dy, dz, ring, tube = state
+            gap = np.hypot(np.hypot(ox + t * dx, oy + t * dy) - ring, oz + t * dz) - tube
+            arrived = gap < SURFACE
+            found[rows[arrived]] = t[arrived]
+            state[0] = t + gap
+            on = ~arrived & (state[0] < leave)
+            rows, state = rows[on], state[:, on]
+        return found
+
     def normal(self, points: Array) -> Array:  # noqa: D102
         x, y, z = points.T
         inward = 1 - self.ring / np.hypot(x, y)
         return normalised(np.stack((x * inward, y * inward, z), axis=-1))
 
 
-def slab(origins: Axes, directions: Axes, half: Sequence[float | Array]) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Where rays are inside of a box around the origin: (enter, leave, hit). One behind them is missed."""
+def slab(origins: Axes, directions: Axes, half: Array) -> tuple[Array, Array]:
+    """Where rays enter and leave a box around the origin with half sides [3, ...]; a miss enters after it leaves."""
     lows, highs = [], []
     for o, d, side in zip(origins, directions, half):
         d = np.where(np.abs(d) < 1e-9, np.float32(1e-9), d)
         low, high = (-side - o) / d, (side - o) / d
         lows.append(np.minimum(low, high))
         highs.append(np.maximum(low, high))
-    enter, leave = np.maximum(np.maximum(*lows[:2]), lows[2]), np.minimum(np.minimum(*highs[:2]), highs[2])
-    return enter, leave, (leave > enter) & (enter > 0)
+    return np.maximum(np.maximum(*lows[:2]), lows[2]), np.minimum(np.minimum(*highs[:2]), highs[2])

@@ -1,17 +1,15 @@
-"""The solids of the built-in scene, and the textures of their surfaces."""
+"""Textures of solids: points [n, 3] and normals [n, 3] in a solid's frame to colours [n, 3]."""
 
 from __future__ import annotations
 
-import colorsys
 import math
 
 import numpy as np
 
-from voronerf.app.scenes.builtin.solids import Array, Box, Cylinder, Solid, Sphere, Texture, Torus, rotation
+from voronerf.app.scenes.builtin.solids import Array, Texture
 
 Colour = tuple[float, float, float]
 
-FLOOR = -0.46  # height of the plinth's top
 MOSAIC: tuple[Colour, ...] = (
     (0.86, 0.79, 0.66),
     (0.72, 0.68, 0.62),
@@ -106,26 +104,3 @@ def spiral(points: Array, normals: Array) -> Array:
     outward = (normals[:, :2] * points[:, :2]).sum(axis=-1) / np.hypot(points[:, 0], points[:, 1])
     tube = np.arctan2(normals[:, 2], outward) / (2 * math.pi)
     return _pick(((0.20, 0.66, 0.34), (0.56, 0.84, 0.40), (0.86, 0.92, 0.52)), _azimuth(points) * 12 + 3 * tube)
-
-
-def _solids() -> tuple[Solid, ...]:
-    """Everything in the scene."""
-    parts: list[Solid] = [
-        Cylinder((0, 0, FLOOR - 0.08), mosaic, 0.08, 10, radius=1.18, half_height=0.08),
-        Sphere((0.62, 0.30, FLOOR + 0.36), checker, 0.55, 40, rotation("x", 24), radius=0.36),
-        Box((-0.60, 0.38, FLOOR + 0.30), diagonals, 0.15, 12, rotation("z", 28), half=(0.27, 0.27, 0.30)),
-        Cylinder((-0.02, -0.70, FLOOR + 0.21), bricks, 0.10, 10, radius=0.31, half_height=0.21),
-        Cylinder((0, 0, FLOOR + 0.50), barber_pole, 0.25, 20, radius=0.13, half_height=0.50),
-        Sphere((0, 0, FLOOR + 1.22), globe, 0.45, 30, radius=0.24),
-        Torus((0, 0, FLOOR + 0.66), spiral, 0.40, 30, rotation("x", -20), ring=0.38, tube=0.105),
-    ]
-    count = 12
-    for index in range(count):
-        azimuth = 2 * math.pi * (index + 0.5) / count
-        colour = colorsys.hsv_to_rgb(index / count, 0.75, 0.92)
-        place = (1.05 * math.cos(azimuth), 1.05 * math.sin(azimuth), FLOOR + 0.095)
-        parts.append(Sphere(place, plain(colour), 0.6, 40, radius=0.095))
-    return tuple(parts)
-
-
-SOLIDS = _solids()

@@ -1,0 +1,61 @@
+"""The built-in scene: ray-cast from formulas, so that everything runs with no download.
+
+A mosaic plinth carries a sphere, a box, a drum and a column with a ring and a globe, among a circle of marbles: fine
+texture spread over space, sharp edges, hard shadows (which views share) and highlights (which move with the view).
+Images have alpha, by supersampling. Units, axes and camera distance are those of Blender synthetic scenes.
+"""
+
+from __future__ import annotations
+
+import colorsys
+import math
+
+from voronerf.app.scenes.builtin.pictures import TEST_VIEWS, TRAIN_VIEWS, hemisphere_scene
+from voronerf.app.scenes.builtin.solids import Box, Cylinder, Solid, Sphere, Torus, rotation
+from voronerf.app.scenes.builtin.textures import barber_pole, bricks, checker, diagonals, globe, mosaic, plain, spiral
+from voronerf.app.scenes.scene import Scene
+
+FLOOR = -0.46  # height of the plinth's top
+
+
+def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views: int = TEST_VIEWS) -> Scene:
+    """Computes the scene.
+
+    Args:
+        size: of the square images, pixels.
+        train_views: spread over the upper hemisphere on a spherical Fibonacci lattice.
+        test_views: on an orbit that rises and falls twice, apart from the training views.
+
+    Raises:
+        ValueError: a size or number of views below 1.
+
+    Examples:
+        >>> from voronerf.app.scenes import builtin_scene
+        >>> scene = builtin_scene(8)
+        >>> scene.train.cameras.width, len(scene.train), len(scene.test)
+        (8, 100, 25)
+    """
+    return hemisphere_scene("builtin", SOLIDS, size, train_views, test_views)
+
+
+def _solids() -> tuple[Solid, ...]:
+    """Everything in the scene."""
+    parts: list[Solid] = [
+        Cylinder((0, 0, FLOOR - 0.08), mosaic, 0.08, 10, radius=1.18, half_height=0.08),
+        Sphere((0.62, 0.30, FLOOR + 0.36), checker, 0.55, 40, rotation("x", 24), radius=0.36),
+        Box((-0.60, 0.38, FLOOR + 0.30), diagonals, 0.15, 12, rotation("z", 28), half=(0.27, 0.27, 0.30)),
+        Cylinder((-0.02, -0.70, FLOOR + 0.21), bricks, 0.10, 10, radius=0.31, half_height=0.21),
+        Cylinder((0, 0, FLOOR + 0.50), barber_pole, 0.25, 20, radius=0.13, half_height=0.50),
+        Sphere((0, 0, FLOOR + 1.22), globe, 0.45, 30, radius=0.24),
+        Torus((0, 0, FLOOR + 0.66), spiral, 0.40, 30, rotation("x", -20), ring=0.38, tube=0.105),
+    ]
+    count = 12
+    for index in range(count):
+        azimuth = 2 * math.pi * (index + 0.5) / count
+        colour = colorsys.hsv_to_rgb(index / count, 0.75, 0.92)
+        place = (1.05 * math.cos(azimuth), 1.05 * math.sin(azimuth), FLOOR + 0.095)
+        parts.append(Sphere(place, plain(colour), 0.6, 40, radius=0.095))
+    return tuple(parts)
+
+
+SOLIDS = _solids()
