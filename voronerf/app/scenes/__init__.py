@@ -13,11 +13,7 @@ from voronerf.app.scenes.builtin.city import city_of
 from voronerf.app.scenes.colmap import find_model, load_colmap
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.llff import FILE, load_llff
-from voronerf.app.scenes.metashape import FILE as METASHAPE
-from voronerf.app.scenes.metashape import load_metashape
 from voronerf.app.scenes.photographs import Reading
-from voronerf.app.scenes.polycam import find_polycam, load_polycam
-from voronerf.app.scenes.record3d import find_record3d, load_record3d
 from voronerf.app.scenes.scene import KINDS, Scene, Split
 from voronerf.app.scenes.transforms import load_transforms
 
@@ -46,9 +42,6 @@ FORMATS = {
     "colmap": Format("a COLMAP model in sparse/0", load_colmap, find_model),
     "transforms": Format("transforms.json", load_transforms),
     "llff": Format(FILE, load_llff),
-    "metashape": Format(METASHAPE, load_metashape),
-    "polycam": Format("Polycam's keyframes/cameras", load_polycam, find_polycam),
-    "record3d": Format("Record3D's metadata.json with rgb", load_record3d, find_record3d),
 }
 
 
@@ -70,9 +63,9 @@ def load_scene(
     """Loads a scene.
 
     Args:
-        source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of 16, or a folder
-            with `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in `sparse/0`, LLFF's
-            `poses_bounds.npy`, Metashape's `cameras.xml`, Polycam's `keyframes` or Record3D's `metadata.json`.
+        source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of 16; or a folder with
+            `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in
+            `sparse/0`, or LLFF's `poses_bounds.npy`.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,
             and for photographs the least factor that leaves at most 512 pixels a side.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path

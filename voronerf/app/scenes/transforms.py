@@ -53,18 +53,6 @@ class Frame:
     mask: Path | None = None
 
 
-def read_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file.
-
-    Raises:
-        SceneError: the file cannot be read, or holds something else; names it.
-    """
-    values = _read(path)
-    if not isinstance(values, dict):
-        raise SceneError(f"{path}: must be an object of JSON")
-    return values
-
-
 def _read(path: Path) -> Any:
     try:
         return read_json(path)
@@ -300,9 +288,7 @@ def has_lens(entries: dict[str, Any], frames: Sequence[Frame]) -> bool:
     return any(given.get(key) is not None for given in (entries, *(f.entries for f in frames)) for key in LENS)
 
 
-def capture_scene(
-    folder: Path, listed: Sequence[Listed], held_out: Tensor, reading: Reading, about: str | None = None
-) -> Scene:
+def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, reading: Reading) -> Scene:
     """Makes the scene of a capture from its frames, see `load_transforms`.
 
     Args:
@@ -310,13 +296,12 @@ def capture_scene(
         listed: its c images.
         held_out: bool [c], the test views.
         reading: how it is read.
-        about: a line about the files; default: the name of the first.
 
     Raises:
         SceneError: as `load_transforms`.
     """
     path, entries, _ = listed[0]
-    notes = [about or f"{path.name} of {len(listed)} images"]
+    notes = [f"{path.name} of {len(listed)} images"]
     if any(entry.frame.entries.get("depth_file_path") is not None for entry in listed):
         notes.append("its depth images are not used")
     applied = entries.get("applied_transform")

@@ -41,7 +41,7 @@ class TrainConfig:
     """Scene folder (--format says which there are), or a built-in scene: "builtin", "builtin-rich"
     with hundreds of solids, or "builtin-city:4x4", a city of so many
     blocks."""
-    format: Literal["auto", "blender", "colmap", "transforms", "llff", "metashape", "polycam", "record3d"] = "auto"
+    format: Literal["auto", "blender", "colmap", "transforms", "llff"] = "auto"
     """What is read of a scene folder; auto is the first of them that it holds, in this order."""
     kind: Literal["auto", "object", "forward", "inside-out", "unbounded"] = "auto"
     """Kind of scene: an object on white; cameras that look the same way; that look outwards; or that look at one place
