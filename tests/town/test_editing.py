@@ -1,11 +1,10 @@
-"""Runs that are joined, cut and placed: as files, as pictures, and trained further."""
+"""Runs that are joined, cut and placed: as files and as pictures."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
-import shutil
 import signal
 from dataclasses import replace
 
@@ -13,17 +12,16 @@ import pytest
 import torch
 from helpers import refuses
 
-from voronerf import Run, open_run
+from voronerf import open_run, town
 from voronerf.app.cli.main import main
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.scenes.record import read_scene
 from voronerf.app.train.checkpoint import CheckpointError
 from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.run_directory import choose_directory
 from voronerf.app.train.trainer import Trainer
-from voronerf.nerf import Batch, Step
-from voronerf.nerf.ray_loss import Composed, Fused
-from voronerf.town import editing
-from voronerf.town.parts import Parts, Similarity, Solid
+from voronerf.town import Similarity, Solid, editing
+from voronerf.town.parts import Parts
 
 SMALL = ("log2_entries=10", "levels=4")
 
@@ -71,17 +69,40 @@ def opened(runs, scene):
     return [open_run(run, scene=scene) for run in runs]
 
 
+def joined_run(runs, out, frames=None):
+    town.join(runs, out, frames=frames)
+    return town.open_run(out, scene=runs[0].scene)
+
+
+def cut_run(run, kept, out, outside=False):
+    town.cut(run, kept, out, outside=outside)
+    return town.open_run(out, scene=run.scene)
+
+
+def placed_run(run, thing, at, out, scale=1.0):
+    town.place(run, thing, at, out, scale=scale)
+    return town.open_run(out, scene=run.scene)
+
+
+def in_region(part, points):
+    """Which points of the scene lie in all solids of a part."""
+    own = part.frame.inverse.points(points)
+    return (
+        torch.stack([solid.holds(own) for solid in part.region]).all(0) if part.region else torch.ones(len(own)).bool()
+    )
+
+
 def contents(folder):
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_runs_of_different_fields_are_joined(opened, runs, tmp_path) -> None:
     before = [contents(run) for run in runs]
-    joined = Run.join(opened, tmp_path / "joined")
+    joined = joined_run(opened, tmp_path / "joined")
     assert isinstance(joined.router, Parts) and joined.router.num_cells == sum(run.router.num_cells for run in opened)
     points = torch.rand(400, 3) * 2 - 1
     centres = torch.cat([run.diagram.leaf_centres for run in opened])
-    inside = joined.router[0].in_region(points)
+    inside = in_region(joined.router[0], points)
     nearest = torch.cdist(points, centres).argmin(1)[inside]
     who = joined.router.assign(points)[inside]
     k = opened[0].router.num_cells
@@ -91,15 +112,13 @@ def test_runs_of_different_fields_are_joined(opened, runs, tmp_path) -> None:
     for own, run in ((who < k, opened[0]), (who >= k, opened[1])):
         assert torch.allclose(density[own], run.router(*asked)[1][inside][own], rtol=1e-4, atol=1e-5)
     assert joined.evaluate(lpips="off")["psnr"] > 8
-    told = Step(joined.renderer).explain()
-    assert "networks, colours, loss and gradients in one operation" in told and "part 1: 4 of 4 cells, NeRF" in told
     assert [contents(run) for run in runs] == before
 
 
 def test_a_joined_run_is_the_same_when_opened_again(opened, tmp_path, scene) -> None:
     frames = [Similarity(), Similarity.of((0.5, 0, 0), (0, 0, 45), 0.8)]
-    first = Run.join(opened, tmp_path / "joined", frames=frames)
-    again = open_run(tmp_path / "joined", scene=scene)
+    first = joined_run(opened, tmp_path / "joined", frames=frames)
+    again = town.open_run(tmp_path / "joined", scene=scene)
     assert torch.equal(first.render(0).colour, again.render(0).colour)
     assert torch.equal(first.scene.box, again.scene.box) and again.scene.box[1, 0] > scene.box[1, 0]
     assert again.config.samples > 16
@@ -107,16 +126,16 @@ def test_a_joined_run_is_the_same_when_opened_again(opened, tmp_path, scene) -> 
 
 def test_a_joined_run_is_joined_and_cut_again(opened, tmp_path) -> None:
     frames = [Similarity(), Similarity.of((3, 0, 0))]
-    pair = Run.join(opened, tmp_path / "pair", frames=frames)
-    four = Run.join([pair, pair], tmp_path / "four", frames=[Similarity(), Similarity.of((0, 3, 0), (0, 0, 90))])
-    assert len(four.router) == 4 and four.router.num_cells == 2 * pair.router.num_cells
+    pair = joined_run(opened, tmp_path / "pair", frames=frames)
+    four = joined_run([pair, pair], tmp_path / "four", frames=[Similarity(), Similarity.of((0, 3, 0), (0, 0, 90))])
+    assert len([*four.router]) == 4 and four.router.num_cells == 2 * pair.router.num_cells
     files = list((tmp_path / "four" / "checkpoints").glob("networks-*"))
     assert len(files) == 2  # what stands in two places is stored once
-    assert four.router[0][0] is four.router[2][0]
+    assert four.router[0].networks[0].router is four.router[2].networks[0].router
     low, high = pair.router[1].frame.points(opened[1].scene.box)
-    back = four.cut(Solid.box(low.tolist(), high.tolist()), tmp_path / "back")
-    assert len(back.router) < 4 and any(
-        torch.equal(p[0].diagram.centres, pair.router[1][0].diagram.centres) for p in back.router
+    back = cut_run(four, Solid.box(low.tolist(), high.tolist()), tmp_path / "back")
+    assert len([*back.router]) < 4 and any(
+        torch.equal(p.diagram.centres, pair.router[1].diagram.centres) for p in back.router
     )
     x = torch.rand(300, 3) * (high - low) + low
     asked = x, torch.tensor([[0.0, 0, 1]]), torch.zeros(300, dtype=torch.int32)
@@ -125,10 +144,10 @@ def test_a_joined_run_is_joined_and_cut_again(opened, tmp_path) -> None:
 
 def test_the_grid_has_all_that_the_grids_of_the_runs_have(opened, tmp_path) -> None:
     frames = [Similarity(), Similarity.of((0.7, 0.2, 0.1), (20, 30, 40), 0.6)]
-    joined = Run.join(opened, tmp_path / "joined", frames=frames)
+    joined = joined_run(opened, tmp_path / "joined", frames=frames)
     grid = joined.renderer.occupancy
     for run, frame in zip(opened, frames, strict=True):
-        own = run.source.grid
+        own = editing.Source.of(run).grid
         full = own.occupied.view(-1).nonzero()[:, 0]
         points = own.points(full, torch.rand(len(full), 3))
         assert grid.occupied.view(-1)[grid.cells(frame.points(points)).long()].all()
@@ -140,7 +159,7 @@ def test_a_region_is_cut_exactly(opened, tmp_path) -> None:
     points = torch.rand(500, 3) * 2 - 1
     asked = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(500, dtype=torch.int32)
     inside = ball.holds(points)
-    kept, rest = run.cut(ball, tmp_path / "kept"), run.cut(ball, tmp_path / "rest", outside=True)
+    kept, rest = cut_run(run, ball, tmp_path / "kept"), cut_run(run, ball, tmp_path / "rest", outside=True)
     for found, where in ((kept, inside), (rest, ~inside)):
         density, occupied = found.router(*asked)[1], found.router.assign(points) >= 0
         assert not density[~where].any()
@@ -154,105 +173,39 @@ def test_a_region_is_cut_exactly(opened, tmp_path) -> None:
 
 def test_cells_are_cut(opened, tmp_path) -> None:
     run = opened[1]
-    kept = run.cut([1, 2], tmp_path / "kept")
-    assert kept.router.num_cells == 2 and kept.router[0][0].module.trunk[0].weight.shape[0] == 2
-    rest = run.cut([1, 2], tmp_path / "rest", outside=True)
+    kept = cut_run(run, [1, 2], tmp_path / "kept")
+    assert kept.router.num_cells == 2 and kept.router[0].networks[0].router.module.trunk[0].weight.shape[0] == 2
+    rest = cut_run(run, [1, 2], tmp_path / "rest", outside=True)
     assert rest.router.num_cells == run.router.num_cells - 2
-    refuses("--cells must be numbers of 0..", lambda: run.cut([99], tmp_path / "no"), error=ConfigError)
-    refuses("--cells must be numbers of 0..", lambda: run.cut([], tmp_path / "no"), error=ConfigError)
-    refuses("nothing is left", lambda: run.cut(Solid.box((5, 5, 5), (6, 6, 6)), tmp_path / "no"), error=ConfigError)
+    refuses("--cells must be numbers of 0..", lambda: cut_run(run, [99], tmp_path / "no"), error=ConfigError)
+    refuses("--cells must be numbers of 0..", lambda: cut_run(run, [], tmp_path / "no"), error=ConfigError)
+    refuses(
+        "nothing is left", lambda: cut_run(run, Solid.box((5, 5, 5), (6, 6, 6)), tmp_path / "no"), error=ConfigError
+    )
     refuses(
         "nothing is left",
-        lambda: run.cut(range(run.router.num_cells), tmp_path / "no", outside=True),
+        lambda: cut_run(run, range(run.router.num_cells), tmp_path / "no", outside=True),
         error=ConfigError,
     )
     assert not (tmp_path / "no").exists()
 
 
 def test_an_object_is_placed_on_top(opened, tmp_path) -> None:
-    thing = opened[0].cut(Solid(ball=(0, 0, 0, 0.5)), tmp_path / "thing")
-    both = opened[1].place(thing, (0.1, 0.2, 0.5), tmp_path / "both", scale=0.5)
+    thing = cut_run(opened[0], Solid(ball=(0, 0, 0, 0.5)), tmp_path / "thing")
+    both = placed_run(opened[1], thing, (0.1, 0.2, 0.5), tmp_path / "both", scale=0.5)
     assert [part.layer for part in both.router] == [0, 1]
     foot = both.router[1].frame.points(torch.cat((thing.scene.box.mean(0)[:2], thing.scene.box[0, 2:]))[None])
     assert torch.allclose(foot, torch.tensor([[0.1, 0.2, 0.5]]), atol=1e-5)
     points = torch.rand(500, 3) * 2 - 1
     asked = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(500, dtype=torch.int32)
-    assert (both.router(*asked)[1] >= opened[1].router(*asked)[1] * both.router[0].in_region(points) - 1e-5).all()
-    again = both.cut([both.router.num_cells - 1], tmp_path / "again")  # the object alone
+    assert (both.router(*asked)[1] >= opened[1].router(*asked)[1] * in_region(both.router[0], points) - 1e-5).all()
+    again = cut_run(both, [both.router.num_cells - 1], tmp_path / "again")  # the object alone
     assert [part.layer for part in again.router] == [0]
-
-
-@pytest.mark.parametrize("backward", [False, True])
-def test_parts_learn_in_one_operation(opened, tmp_path, scene, backward) -> None:
-    """Networks of two architectures and sizes, one of them moved and scaled, as torch differentiates them."""
-    frames = [Similarity(), Similarity.of((0.5, 0.1, 0), (0, 20, 30), 0.7)]
-    run = Run.join(opened, tmp_path / "run", frames=frames)
-    run.router.parts[1][0].module.density_scale = 7.0
-    run.router.requires_grad_().train()
-    rays = scene.train.cameras.image_rays(1)
-    r = len(rays)
-    batch = Batch(rays, torch.full((r,), 1.0), torch.full((r,), 6.0), torch.rand(r, 3), torch.ones(3))
-    assert isinstance(Step(run.renderer).way, Fused)
-    grads, results = [], []
-    for kind in (Composed, Fused):
-        run.router.zero_grad()
-        found = kind(run.renderer, 0.0)(batch, torch.Generator().manual_seed(0), backward=backward)
-        if not backward:
-            (2 * found.loss).backward()
-        grads.append([parameter.grad for parameter in run.router.parameters()])
-        results.append(found)
-    first, second = results
-    for name in ("loss", "error", "weights", "density"):
-        assert torch.allclose(getattr(first, name), getattr(second, name), rtol=1e-4, atol=1e-5), name
-    for one, two in zip(*grads, strict=True):
-        assert (one - two).norm() <= 2e-3 * one.norm()  # what next to no light reaches learns nothing in one of them
-    assert (first.density == 0).any() and all(bool(grad.any()) for grad in grads[1])
-
-
-def test_a_joined_run_trains_and_resumes_bit_for_bit(opened, tmp_path, scene) -> None:
-    joined = Run.join(opened, tmp_path / "one")
-    before = joined.evaluate(lpips="off")["psnr"]
-    shutil.copytree(tmp_path / "one", tmp_path / "two")
-
-    def trained(name: str, *stops: int) -> Trainer:
-        config = replace(joined.config, out=tmp_path / name, resume=True, steps=60, budget=None, evaluations=1)
-        for stop in stops:
-            trainer = Trainer(config, scene)
-            while trainer.step < stop:
-                trainer.train_step()
-                trainer.step += 1
-            trainer.save()
-        return trainer
-
-    whole, halves = trained("one", 60), trained("two", 25, 60)
-    again = open_run(tmp_path / "one", scene=scene)
-    assert again.evaluate(lpips="off")["psnr"] > before
-    for a, b in zip(whole.router.parameters(), halves.router.parameters(), strict=True):
-        assert torch.equal(a, b)
-    assert len(list((tmp_path / "one" / "checkpoints").glob("networks-*"))) >= 2
-
-
-def test_only_named_networks_stay(opened, tmp_path, scene) -> None:
-    joined = Run.join(opened, tmp_path / "run")
-    config = replace(joined.config, out=tmp_path / "run", resume=True, steps=4, budget=None, keep_checkpoints=1)
-    trainer = Trainer(config, scene)
-    first = {path.name for path in (tmp_path / "run" / "checkpoints").glob("networks-*")}
-    trainer.train_step()
-    trainer.step = 1
-    trainer.save()
-    now = {path.name for path in (tmp_path / "run" / "checkpoints").glob("networks-*")}
-    assert len(now) == 2 and not first & now
-    with torch.no_grad():
-        next(trainer.router[0][0].parameters()).add_(1)
-    trainer.step = 2
-    trainer.save()
-    later = {path.name for path in (tmp_path / "run" / "checkpoints").glob("networks-*")}
-    assert len(later & now) == 1  # networks that did not change are not written again
 
 
 @pytest.mark.parametrize("what", ["gone", "damaged", "elsewhere"])
 def test_damaged_networks_are_named(opened, tmp_path, scene, what: str) -> None:
-    Run.join(opened, tmp_path / "run")
+    joined_run(opened, tmp_path / "run")
     path = next((tmp_path / "run" / "checkpoints").glob("networks-*"))
     if what == "gone":
         path.unlink()
@@ -266,16 +219,16 @@ def test_damaged_networks_are_named(opened, tmp_path, scene, what: str) -> None:
         assert data.count(path.name.encode()) >= 1
         index.write_bytes(data.replace(path.name.encode(), b"../" + path.name.encode()[3:]))
     with pytest.raises(CheckpointError, match=r"networks-|last\.safetensors"):
-        open_run(tmp_path / "run", scene=scene)
+        town.open_run(tmp_path / "run", scene=scene)
 
 
 def test_a_full_disk_leaves_nothing(opened, tmp_path, monkeypatch) -> None:
     def full(path, checkpoint):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr(editing, "save_checkpoint", full)
+    monkeypatch.setattr("voronerf.town.run.save_checkpoint", full)
     with pytest.raises(OSError, match=r"No space left on device.*joined"):
-        Run.join(opened, tmp_path / "joined")
+        joined_run(opened, tmp_path / "joined")
     assert not list(tmp_path.iterdir())
 
 
@@ -288,55 +241,54 @@ def test_a_command_that_is_ended_leaves_nothing(runs, tmp_path, monkeypatch) -> 
 
 
 def test_out_is_a_new_folder(opened, tmp_path) -> None:
-    Run.join(opened, tmp_path / "run")
+    joined_run(opened, tmp_path / "run")
     before = contents(tmp_path / "run")
-    refuses("--out must not hold a run already", lambda: Run.join(opened, tmp_path / "run"), error=ConfigError)
+    refuses("--out must not hold a run already", lambda: joined_run(opened, tmp_path / "run"), error=ConfigError)
     (tmp_path / "file").write_text("mine")
-    refuses("--out must be a new or an empty folder", lambda: Run.join(opened, tmp_path / "file"), error=ConfigError)
+    refuses("--out must be a new or an empty folder", lambda: joined_run(opened, tmp_path / "file"), error=ConfigError)
     assert contents(tmp_path / "run") == before and (tmp_path / "file").read_text() == "mine"
 
 
 def test_what_cannot_be_joined(opened, tmp_path, scene) -> None:
-    refuses("two runs or more", lambda: Run.join(opened[:1], tmp_path / "no"), error=ConfigError)
+    refuses("two runs or more", lambda: joined_run(opened[:1], tmp_path / "no"), error=ConfigError)
     cones = replace(opened[0], config=replace(opened[0].config, field="mipnerf", field_options=(), occupancy=False))
     refuses(
-        "cannot be joined or cut: its cones", lambda: Run.join([cones, opened[1]], tmp_path / "no"), error=ConfigError
+        "cannot be joined or cut: its cones", lambda: joined_run([cones, opened[1]], tmp_path / "no"), error=ConfigError
     )
     endless = replace(opened[1], scene=replace(scene, box=None))
-    refuses("must have bounds to be joined", lambda: Run.join([opened[0], endless], tmp_path / "no"), error=ConfigError)
     refuses(
-        "an object must have bounds", lambda: opened[0].place(endless, (0, 0, 0), tmp_path / "no"), error=ConfigError
+        "must have bounds to be joined", lambda: joined_run([opened[0], endless], tmp_path / "no"), error=ConfigError
+    )
+    refuses(
+        "an object must have bounds",
+        lambda: placed_run(opened[0], endless, (0, 0, 0), tmp_path / "no"),
+        error=ConfigError,
     )
     black = replace(opened[1], scene=replace(scene, background=None))
     refuses(
         "must have the background of first, white, got none",
-        lambda: Run.join([opened[0], black], tmp_path / "no"),
+        lambda: joined_run([opened[0], black], tmp_path / "no"),
         error=ConfigError,
     )
 
 
-def test_pictures_of_all_runs_are_where_the_joined_run_has_them(opened, scene, tmp_path, monkeypatch) -> None:
+def test_pictures_are_where_the_joined_run_has_their_cameras(opened, scene, tmp_path) -> None:
     frames = [Similarity.of((3, 0, 0), (0, 0, 90), 0.5), Similarity.of((0, 0, 1), (40, 0, 0))]
-    joined = Run.join(opened, tmp_path / "joined", frames=frames)
-    moved = [editing.moved_cameras(scene.test.cameras, frame).poses for frame in frames]
-    assert torch.allclose(joined.scene.test.cameras.poses, moved[0], atol=1e-5)
-    resumed = Trainer(replace(joined.config, out=joined.path, resume=True, steps=2, budget=None), scene)
-    assert torch.allclose(resumed.scene.test.cameras.poses, moved[0], atol=1e-5)
-    assert joined.scene.box.equal(joined.source.scene.box)
-    loaded = []
-    monkeypatch.setattr("voronerf.app.run.load_scene", lambda data, **given: loaded.append(data) or scene)
-    both = open_run(joined.path, data=["a", "b"])
-    assert loaded == ["a", "b"] and both.config.data == "a"
-    assert torch.allclose(both.scene.test.cameras.poses, torch.cat(moved), atol=1e-5)
-    for split, own in ((both.scene.train, scene.train), (both.scene.test, scene.test)):
-        assert torch.equal(split.images, torch.cat((own.images, own.images)))
-        assert split.names == tuple(f"{i}-{name}" for i in (0, 1) for name in own.names)
-    refuses("several scenes must be those", lambda: open_run(joined.path, data=["a", "b", "c"]), error=ConfigError)
-    poses = scene.test.cameras.poses.clone()
-    poses[1, :3, :3] = poses[1, :3, :3].roll(1, 0)  # another camera under the same name
-    monkeypatch.undo()
-    other = replace(scene, test=replace(scene.test, cameras=replace(scene.test.cameras, poses=poses)))
-    assert torch.equal(open_run(joined.path, scene=other).scene.test.cameras.poses, poses)
+    joined = joined_run(opened, tmp_path / "joined", frames=frames)
+    moved = editing.moved_cameras(scene.test.cameras, frames[0]).poses
+    assert torch.allclose(joined.scene.test.cameras.poses, moved, atol=1e-5)
+    assert torch.equal(joined.scene.test.images, scene.test.images)
+    record = read_scene(tmp_path / "joined" / "scene.json")
+    assert record.test.names == tuple(f"{i}-{name}" for i in (0, 1) for name in scene.test.names)
+    other = replace(scene, test=replace(scene.test, names=("a", "b")))
+    assert torch.equal(town.open_run(joined.path, scene=other).scene.test.cameras.poses, scene.test.cameras.poses)
+
+
+def test_a_run_of_parts_is_neither_opened_nor_trained_as_one_of_a_training(opened, tmp_path, scene) -> None:
+    path = joined_run(opened, tmp_path / "joined").path
+    refuses("is a run made of several runs", lambda: open_run(path, scene=scene), error=ConfigError)
+    config = replace(opened[0].config, out=path, resume=True)
+    refuses("which are not trained", lambda: choose_directory(config, scene), error=ConfigError)
 
 
 def test_runs_are_aligned_by_shared_images(scene) -> None:
@@ -380,22 +332,22 @@ def test_an_unbounded_run_is_cut_and_gets_an_object(tmp_path, scene) -> None:
     with torch.no_grad():
         run.router.module.density.bias += 4  # so that there is something to cut
     assert run.renderer.contraction is not None
-    refuses("must lie within", lambda: run.cut(Solid(ball=(0, 0, 0, 99)), tmp_path / "no"), error=ConfigError)
-    thing = run.cut(Solid(ball=(0, 0, 0, 0.6)), tmp_path / "thing")
+    refuses("must lie within", lambda: cut_run(run, Solid(ball=(0, 0, 0, 99)), tmp_path / "no"), error=ConfigError)
+    thing = cut_run(run, Solid(ball=(0, 0, 0, 0.6)), tmp_path / "thing")
     assert thing.scene.box is not None and thing.renderer.occupancy is not None
     assert thing.router[0].contraction is None
-    both = run.place(thing, (0, 0, 0.5), tmp_path / "both", scale=0.4)
+    both = placed_run(run, thing, (0, 0, 0.5), tmp_path / "both", scale=0.4)
     assert both.scene.box is None and both.router[0].contraction is not None and both.renderer.occupancy is None
     points = torch.randn(300, 3)
     asked = points, torch.tensor([[0.0, 0, 1]]), torch.zeros(300, dtype=torch.int32)
     alone = run.router(run.renderer.contraction.points(points), *asked[1:])[1]
     assert torch.allclose(
-        both.router(*asked)[1] - alone * (both.router[1].in_region(both.router[1].own_points(points)) == 0),
-        both.router(*asked)[1] * (both.router[1].in_region(both.router[1].own_points(points)) != 0),
+        both.router(*asked)[1] - alone * (in_region(both.router[1], points) == 0),
+        both.router(*asked)[1] * (in_region(both.router[1], points) != 0),
         atol=1e-4,
     )
     assert both.evaluate(lpips="off", views=1)["psnr"] > 5
-    refuses("must have bounds to be joined", lambda: Run.join([thing, run], tmp_path / "no"), error=ConfigError)
+    refuses("must have bounds to be joined", lambda: joined_run([thing, run], tmp_path / "no"), error=ConfigError)
 
 
 # On the command line --------------------------------------------------------------------------------------------------
@@ -411,7 +363,7 @@ def test_the_commands(runs, tmp_path, capsys) -> None:
     assert main(["join", one, two, "--out", str(tmp_path / "same"), "--transforms", str(file)]) == 0
     moves = ["--move", "2", "2.5 0 0 0 0 0 1", "--move", "3", "5 0 0 0 0 0 1"]
     assert main(["join", one, two, one, "--out", str(tmp_path / "three"), *moves]) == 0
-    frames = [part.frame for part in open_run(tmp_path / "three", scene=read_scene(runs[0] / "scene.json")).router]
+    frames = [part.frame for part in town.open_run(tmp_path / "three", scene=read_scene(runs[0] / "scene.json")).router]
     assert [frame.translation.tolist() for frame in frames] == [[0, 0, 0], [2.5, 0, 0], [5, 0, 0]]
     index = {
         name: sorted(path.name for path in (tmp_path / name / "checkpoints").iterdir()) for name in ("joined", "same")

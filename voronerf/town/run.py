@@ -18,7 +18,7 @@ from torch import Tensor
 
 from voronerf.app.run import Run
 from voronerf.app.scenes import Scene, load_scene
-from voronerf.app.scenes.record import read_scene
+from voronerf.app.scenes.record import placed, read_scene
 from voronerf.app.train.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -27,7 +27,7 @@ from voronerf.app.train.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.config_checks import check_device
 from voronerf.app.train.networks import check_shapes, make_routers, parameter_groups, restore_routers
 from voronerf.app.train.renderers import through_grid
@@ -195,17 +195,17 @@ def open_run(
 
 
 def _in_place(read: Scene, known: Scene) -> Scene:
-    """The pictures of a scene where a run has their cameras, which are the first in its record.
+    """The pictures of a scene where the record of a run has their cameras first; others where they were read.
 
     Raises:
-        ConfigError: For other pictures.
+        SceneError: For pictures of another place.
     """
     splits = {}
     for name in ("train", "test"):
         own, recorded = getattr(read, name), getattr(known, name)
         names = recorded.names[: len(own)]
         if names not in (own.names, tuple(f"0-{each}" for each in own.names)):
-            raise ConfigError(f"{read.name}: must be the scene of the first run that {known.name} was made of")
+            return placed(read, known)
         cameras = replace(own.cameras, poses=recorded.cameras.poses[: len(own)].to(own.cameras.poses))
         splits[name] = replace(own, cameras=cameras, names=names, sightings=None)
     return replace(known, **splits)

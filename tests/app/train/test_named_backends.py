@@ -5,7 +5,6 @@ from tiny_runs import small
 
 from voronerf.app.train.trainer import Trainer
 from voronerf.ops._core import native
-from voronerf.town.joint import JointTrainer
 
 
 @pytest.mark.native
@@ -43,12 +42,3 @@ def test_a_step_says_how_it_is_computed(tmp_path, scene):
         "loss: networks, colours and loss are separate operations",
         "not faster: empty space is not skipped",
     ]
-
-
-def test_a_step_of_territories_says_how_it_is_computed(tmp_path, scene):
-    config = small(tmp_path, occupancy=True, occupancy_resolution=8, territories=2, field="hashgrid", depth=1)
-    lines = JointTrainer(config, scene).explain().splitlines()
-    assert lines[0].startswith("samples: Occupancy, ")
-    assert lines[1] == "loss: partial sums of 2 territories, each with networks and tables of its own"
-    assert lines[2].endswith("forward and backward are one operation each")
-    assert lines[3].startswith("not faster: the loss of a ray waits")

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import refuses
 from tiny_runs import assert_resumes, small
 
 import voronerf.app.train.appearance as appearance_module
@@ -14,7 +13,6 @@ from voronerf import HashGridField, VoronoiRouter, open_run
 from voronerf.app.scenes.record import with_refined
 from voronerf.app.train.appearance import Appearance
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.config_checks import check_joint
 from voronerf.app.train.refinement import Refinement, rotation
 from voronerf.app.train.renderers import through_grid
 from voronerf.app.train.trainer import Trainer
@@ -86,9 +84,6 @@ def test_resume_is_bit_for_bit_and_runs_open_with_refined_cameras(tmp_path, scen
     smaller = replace(scene, train=replace(scene.train, cameras=scene.train.cameras.downscaled(2)))
     lens = with_refined(smaller, tmp_path / "whole").train.cameras.intrinsics
     torch.testing.assert_close(lens, ends["cameras.intrinsics"] / 2)
-    refuses(
-        "--appearance must be off for a run that is updated", run.update, scene, tmp_path / "new", error=ConfigError
-    )
 
 
 def test_what_pictures_learn_is_refused_where_it_cannot_work(tmp_path, scene):
@@ -98,9 +93,6 @@ def test_what_pictures_learn_is_refused_where_it_cannot_work(tmp_path, scene):
         ConfigError, match="--refine-cameras must be off where a step is not one operation: empty space"
     ):
         Trainer(small(tmp_path, refine_cameras=True), opaque(scene))
-    for settings in ({"appearance": True}, {"refine_cameras": True}):
-        with pytest.raises(ConfigError, match="must be off with several territories"):
-            check_joint(TrainConfig(out=tmp_path, territories=2, **settings), 1)
     with pytest.raises(ConfigError, match="--refine-cameras must be off with --precision"):
         TrainConfig(refine_cameras=True, precision="bf16")
 
