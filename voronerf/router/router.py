@@ -154,7 +154,6 @@ class VoronoiRouter(nn.Module):
         self.module: nn.Module = clone_module(module)
         stack_parameters(self.module, own.num_cells, share)
         #: What a file needs to make the module again, if whoever made it has said so.
-        self.recipe: dict[str, Any] | None = None
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
         self._watch: Any = None  # of optimisers that hold the state of other cells
         self.assignment, self.temperature = assignment, temperature
