@@ -17,7 +17,7 @@ SUFFIXES = (".json",)
 
 
 def export_cameras(run: Run, path: Path | str, *, to_files: bool = False) -> int:
-    """Writes the training cameras, as the run has refined them, and the test cameras, which stay held out.
+    """Writes the training cameras, and the test cameras, which stay held out.
 
     Args:
         run: The run.
@@ -35,7 +35,7 @@ def export_cameras(run: Run, path: Path | str, *, to_files: bool = False) -> int
     Examples:
         >>> from voronerf import Run
         >>> from voronerf.app.export import export_cameras
-        >>> def refined(run: Run) -> int:
+        >>> def count(run: Run) -> int:
         ...     return export_cameras(run, "capture/transforms.json", to_files=True)
     """
     path, transform, shots = Path(path), run.scene.transform, dict[str, list[Shot]]()

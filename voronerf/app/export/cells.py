@@ -30,16 +30,16 @@ def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None, to_fi
     The objects are named `cell_0000` and so on, and have the colours that the cells have in pictures.
 
     Args:
-        run: trained run, as `open_run` opens it.
-        path: file to write, .glb.
+        run: The run.
+        path: File to write, .glb.
         box: [2, 3]; default the scene's, or that around the sphere of the contraction.
-        to_files: whether positions are those of the scene's files, in metres if those are, rather than the scene's.
+        to_files: Positions are those of the scene's files, rather than the scene's.
 
     Raises:
-        ConfigError: no box.
+        ConfigError: No box.
         ImportError: trimesh or scipy is missing.
-        ValueError: another suffix.
-        OSError: the file cannot be written.
+        ValueError: Another suffix.
+        OSError: The file cannot be written.
 
     Examples:
         >>> from voronerf import Run
@@ -63,7 +63,7 @@ def cell_meshes(diagram: VoronoiDiagram, box: Tensor) -> dict[int, Any]:
     """The leaves of a diagram, clipped to a box, as ``trimesh.Trimesh`` by their numbers; without those outside of it.
 
     Args:
-        diagram: of any depth.
+        diagram: Of any depth.
         box: [2, 3].
 
     Raises:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from voronerf.app.export.space import (
+    VIEWS,
     Nodes,
     Track,
     ask,
@@ -25,7 +26,7 @@ from voronerf.app.export.space import (
     hidden_and_seen,
     in_silence,
     placed,
-    training_views,
+    views_of,
     write_geometry,
 )
 from voronerf.app.run import Run
@@ -40,6 +41,8 @@ RESOLUTION = 256
 HALVING = 1 / 30
 #: Bytes of memory that a node takes at the most, in marching cubes.
 NODE = 40
+#: Pixels along the longer side of the views, at least.
+VIEW_SIDE = 128
 #: Volume of the smallest part that is kept, as a share of the largest.
 SMALLEST = 1e-3
 
@@ -60,22 +63,21 @@ def export_mesh(
     open: its surfaces end where the box ends, and where no camera looks.
 
     Args:
-        run: trained run, as `open_run` opens it.
-        path: file to write, .ply, .glb or .obj.
-        resolution: cubes along the longest side of the box; default 256, or what fits into the memory.
-        density: of the surface, per scene unit; default that of which a thirtieth of that side lets half of the light
+        run: The run.
+        path: File to write, .ply, .glb or .obj.
+        resolution: Cubes along the longest side of the box; default 256, or what fits into memory.
+        density: Of the surface, per scene unit; default that of which a thirtieth of that side lets half of the light
             pass.
         box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
-        to_files: whether positions are those of the scene's files, in metres if those are, rather than the scene's.
-        track: shows progress: it is given the parts of each of the three long works, a sequence, and the work's name,
-            and yields the parts.
+        to_files: Positions are those of the scene's files, rather than the scene's.
+        track: Shows progress: yields the items of a sequence, and is given its name.
 
     Raises:
-        ConfigError: a resolution that does not fit into the memory, a density that is not positive, no box,
-            or no surface in it.
+        ConfigError: A resolution that does not fit into memory, a density that is not positive, no box, or no surface
+            in it.
         ImportError: trimesh, scikit-image or scipy is missing.
-        ValueError: another suffix.
-        OSError: the file cannot be written.
+        ValueError: Another suffix.
+        OSError: The file cannot be written.
 
     Examples:
         >>> from voronerf import Run
@@ -144,7 +146,9 @@ def _resolution(box: Tensor, wanted: int | None) -> int:
 
 
 def _views_of(run: Run, nodes: Nodes, track: Track) -> tuple[Any, Any]:
-    views = list(training_views(run, track=track))
+    cameras = run.scene.train.cameras
+    cameras = cameras.downscaled(max(max(cameras.width, cameras.height) // VIEW_SIDE, 1))
+    views = views_of(run, cameras, VIEWS, track)
     hidden, seen = np.empty(nodes.shape, dtype=bool), np.empty(nodes.shape, dtype=bool)
     for first, last in track(nodes.slabs(), "what the views see"):
         parts = hidden_and_seen(nodes.slab(first, last), views, nodes.side)

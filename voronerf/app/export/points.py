@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from voronerf.app.export.space import VIEWS, box_of, check_export, placed, training_views, write_geometry
+from voronerf.app.export.space import VIEWS, box_of, check_export, placed, views_of, write_geometry
 from voronerf.app.run import Run
 from voronerf.app.train.config import ConfigError
 
@@ -27,17 +27,17 @@ def export_points(
     neighbours spread the least.
 
     Args:
-        run: trained run, as `open_run` opens it.
-        path: file to write, .ply.
-        count: points at the most, drawn at random where the views have more.
+        run: The run.
+        path: File to write, .ply.
+        count: Points at the most, drawn at random where the views have more.
         box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
-        to_files: whether positions are those of the scene's files, in metres if those are, rather than the scene's.
+        to_files: Positions are those of the scene's files, rather than the scene's.
 
     Raises:
-        ConfigError: a count below 1, no box, or views that show nothing in it.
+        ConfigError: A count below 1, no box, or views that show nothing in it.
         ImportError: trimesh or scipy is missing.
-        ValueError: another suffix.
-        OSError: the file cannot be written.
+        ValueError: Another suffix.
+        OSError: The file cannot be written.
 
     Examples:
         >>> from voronerf import Run
@@ -61,10 +61,11 @@ def _surface(run: Run, count: int, box: Tensor | None) -> Any:
     cameras = run.scene.train.cameras
     # Many pixels show the background; of an object often seven in eight.
     side = int((8 * count / min(VIEWS, len(cameras)) * max(cameras.width / cameras.height, 1)) ** 0.5) + 1
+    cameras = cameras.downscaled(max(max(cameras.width, cameras.height) // side, 1))
     low, high = box_of(run, box)
     points, colours, towards = [], [], []
-    for view in training_views(run, side):
-        shown = view.distance.isfinite() & ((view.surface >= low) & (view.surface <= high)).all(-1)
+    for view in views_of(run, cameras, VIEWS):
+        shown = ((view.surface >= low) & (view.surface <= high)).all(-1)
         points.append(view.surface[shown])
         colours.append(view.colour[shown])
         towards.append(view.camera.origins.cpu() - view.surface[shown])

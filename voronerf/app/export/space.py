@@ -1,4 +1,4 @@
-"""What exports share: their files, the densities of a field on a grid, and what its cameras see.
+"""What exports share: their files, the densities of a field on a grid, and what the training views show.
 
 n points, c cameras. Positions and densities are in scene units.
 """
@@ -6,7 +6,7 @@ n points, c cameras. Positions and densities are in scene units.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,19 +26,21 @@ Track = Callable[[Sequence[Any], str], Iterable[Any]]
 PACKAGES = {"trimesh": "trimesh", "skimage": "scikit-image", "scipy": "scipy"}
 #: Points that a field is asked for at a time.
 CHUNK = 1 << 17
-#: Views that are rendered to find out what cameras see, and the pixels along their longer side.
-VIEWS, VIEW_SIDE = 64, 128
+#: Views that are rendered to find out what cameras see.
+VIEWS = 64
 #: Opacity from which a pixel shows a surface.
 SOLID = 0.5
+#: Distance from the origin beyond which a pixel of a contracted scene shows none.
+FARTHEST = 1e6
 
 
 def check_export(path: Path, suffixes: tuple[str, ...]) -> None:
-    """Finds out before the work is done whether a file can be written; makes its folder.
+    """Makes the folder of a file.
 
     Raises:
-        ValueError: a suffix that is not in ``suffixes``.
-        ImportError: a package of the extra is missing.
-        OSError: the folder cannot be made.
+        ValueError: A suffix that is not in ``suffixes``.
+        ImportError: A package of the extra is missing.
+        OSError: The folder cannot be made.
     """
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: the file must end in {' or '.join(suffixes)}")
@@ -67,7 +69,7 @@ def box_of(run: Run, box: Tensor | None = None) -> Tensor:
     """The box [2, 3] that is exported: the one given, the scene's, or one around the sphere of a contraction.
 
     Raises:
-        ConfigError: the given box is empty or not finite, or the scene has no box.
+        ConfigError: The given box is empty or not finite, or the scene has no box.
     """
     if box is not None:
         run = run.cropped(box)
@@ -83,16 +85,16 @@ def box_of(run: Run, box: Tensor | None = None) -> Tensor:
 def ask(
     run: Run, points: Tensor, directions: Tensor, *, side: float, everywhere: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """The colours [n, 3] and densities [n] that a run has at points [n, 3], seen along unit directions [n, 3].
+    """The colours [n, 3] and densities [n] of a run at points.
 
-    Where rays find nothing, since the occupancy grid is empty there, the density is 0 and the colour black.
+    Where the occupancy grid is empty, the density is 0 and the colour black.
 
     Args:
-        run: trained run, as `open_run` opens it.
+        run: The run.
         points: [n, 3].
-        directions: [n, 3], or [1, 3] for all.
-        side: of a cube around a point, for fields that are asked about Gaussians.
-        everywhere: ask the field where the grid is empty, too.
+        directions: Unit vectors [n, 3] along which the points are seen, or [1, 3] for all.
+        side: Of a cube around a point, for fields of cones.
+        everywhere: Also evaluate the field where the grid is empty.
     """
     renderer = run.renderer
     colour, density = torch.zeros(len(points), 3), torch.zeros(len(points))
@@ -171,23 +173,20 @@ class View:
     """What one camera sees."""
 
     camera: Cameras  # the camera alone
-    distance: Tensor  # [h, w], along the ray to the surface, infinite if it meets none
     colour: Tensor  # [h, w, 3]
-    surface: Tensor  # [h, w, 3], the point that each pixel shows
+    surface: Tensor  # [h, w, 3], the point that each pixel shows; NaN where it shows none
 
 
-def training_views(run: Run, side: int = VIEW_SIDE, track: Track = in_silence) -> Iterator[View]:
-    """Renders up to `VIEWS` evenly spread training views, reduced by the largest number that leaves `side` pixels."""
-    cameras = run.scene.train.cameras
-    cameras = cameras.downscaled(max(max(cameras.width, cameras.height) // side, 1))
-    numbers = torch.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().long().tolist()
+def views_of(run: Run, cameras: Cameras, most: int, track: Track = in_silence) -> list[View]:
+    """Renders up to so many of the cameras, evenly spread."""
+    views, contraction = [], run.renderer.contraction
+    numbers = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()
     for number in track(numbers, "views"):
         image = run.render(cameras, number)
-        camera, surface, contraction = cameras[[number]], image.heaviest.cpu(), run.renderer.contraction
-        surface = surface if contraction is None else contraction.inverse(surface)
-        distance = (surface - camera.origins[0].cpu()).norm(dim=-1)
-        distance = torch.where(image.opacity.cpu() > SOLID, distance, torch.inf)
-        yield View(camera, distance, image.colour.cpu(), surface)
+        surface = image.heaviest.cpu() if contraction is None else contraction.inverse(image.heaviest.cpu())
+        shown = (image.opacity.cpu() > SOLID) & (surface.abs().amax(-1) < FARTHEST)
+        views.append(View(cameras[[number]], image.colour.cpu(), torch.where(shown[..., None], surface, torch.nan)))
+    return views
 
 
 def hidden_and_seen(points: Tensor, views: list[View], side: float) -> tuple[Tensor, Tensor]:
@@ -202,13 +201,14 @@ def hidden_and_seen(points: Tensor, views: list[View], side: float) -> tuple[Ten
     inside_one = torch.zeros(len(points), dtype=torch.bool)
     waiting = torch.arange(len(points))
     for view in views:
-        height, width = view.distance.shape
+        distance = (view.surface - view.camera.origins[0]).norm(dim=-1).nan_to_num(torch.inf)
+        height, width = distance.shape
         positions = points[waiting]
         pixels, depth = view.camera.project(positions, 0)
         x, y = pixels.floor().long().unbind(-1)
         inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
         rows, x, y, depth = waiting[inside], x[inside], y[inside], depth[inside]
-        gap = view.distance[y, x] - (positions[inside] - view.camera.origins[0]).norm(dim=-1)
+        gap = distance[y, x] - (positions[inside] - view.camera.origins[0]).norm(dim=-1)
         margin = 2 * side + 2 * depth / view.camera.intrinsics[0, 1]
         inside_one[rows] = True
         visible[rows[gap > -margin]] = True

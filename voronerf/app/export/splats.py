@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from voronerf.app.export.space import SOLID, Track, check_export, in_silence
+from voronerf.app.export.space import Track, View, check_export, in_silence, views_of
 from voronerf.app.files import write_bytes
 from voronerf.app.render.paths import quaternions, rotations
 from voronerf.app.run import Run
@@ -115,24 +115,24 @@ def export_splats(
     """Writes the surface of a run as 3D Gaussians that are fitted to the run's own pictures.
 
     Args:
-        run: trained run, as `open_run` opens it.
-        path: file to write, .ply.
+        run: The run.
+        path: File to write, .ply.
         count: Gaussians at the most.
-        seconds: of fitting.
+        seconds: Of fitting.
         box: [2, 3], what is exported; None for everything.
-        to_files: whether positions are those of the scene's files, in metres if those are, rather than the scene's.
-        track: shows progress: it is given the views, and then the hundredths of the time.
-        clock: counts seconds.
+        to_files: Positions are those of the scene's files, rather than the scene's.
+        track: Shows progress: yields the items of a sequence, and is given its name.
+        clock: Counts seconds.
 
     Returns:
-        The Gaussians in scene units, and "before" and "after": how near their pictures of held-out views are to the
-        run's own, PSNR in dB, at first and as fitted.
+        The Gaussians in scene units, and "before" and "after": PSNR in dB of their pictures of held-out views against
+        the run's own, at first and as fitted.
 
     Raises:
-        ConfigError: a count below 1, negative seconds, an empty box, or views that show nothing.
-        ImportError: a package of the extra is missing.
-        ValueError: another suffix.
-        OSError: the file cannot be written.
+        ConfigError: A count below 1, negative seconds, an empty box, or views that show nothing.
+        ImportError: A package of the extra is missing.
+        ValueError: Another suffix.
+        OSError: The file cannot be written.
 
     Examples:
         >>> from voronerf import Run
@@ -149,37 +149,29 @@ def export_splats(
     run = run if box is None else run.cropped(box)
     background = run.scene.background_colour()
     background = torch.zeros(3) if background is None else background
-    held_out = [(camera, colour) for camera, colour, _ in _pictures(run, run.scene.test.cameras, SCORED, in_silence)]
-    pictures = list(_pictures(run, run.scene.train.cameras, VIEWS, track))
-    splats = _first(pictures, count, run)
+    held_out = views_of(run, _small(run.scene.test.cameras), SCORED)
+    views = views_of(run, _small(run.scene.train.cameras), VIEWS, track)
+    splats = _first(views, count, run)
     scores = {"before": _score(splats, held_out, background)}
-    fit(splats, [picture[:2] for picture in pictures], background, seconds=seconds, track=track, clock=clock)
+    fit(splats, views, background, seconds=seconds, track=track, clock=clock)
     scores["after"] = _score(splats, held_out, background)
     transform = run.scene.transform if to_files else None
     write_bytes(path, (splats if transform is None else splats.moved(torch.linalg.inv(transform))).bytes())
     return splats, scores
 
 
-def _pictures(run: Run, cameras: Cameras, most: int, track: Track) -> list[tuple[Cameras, Tensor, Tensor]]:
-    """Up to so many of the cameras, without distortion; colours [h, w, 3], and the points that pixels show, or NaN."""
+def _small(cameras: Cameras) -> Cameras:
+    """Cameras without distortion, of at most ``LONGEST`` pixels."""
     factor = -(-max(cameras.width, cameras.height) // LONGEST)
-    cameras = replace(cameras, distortion=None, models=None, sizes=None).downscaled(factor)
-    found, contraction = [], run.renderer.contraction
-    numbers = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()
-    for number in track(numbers, "views"):
-        image = run.render(cameras, number)
-        surface = image.heaviest.cpu() if contraction is None else contraction.inverse(image.heaviest.cpu())
-        shown = (image.opacity.cpu() > SOLID) & (surface.abs().amax(-1) < 1e6)
-        found.append((cameras[[number]], image.colour.cpu(), torch.where(shown[..., None], surface, math.nan)))
-    return found
+    return replace(cameras, distortion=None, models=None, sizes=None).downscaled(factor)
 
 
-def _first(pictures: list[tuple[Cameras, Tensor, Tensor]], count: int, run: Run) -> Splats:
-    """Flat Gaussians at points of the pictures that are drawn at random, as wide as they are apart."""
+def _first(views: list[View], count: int, run: Run) -> Splats:
+    """Flat Gaussians at random points of the views, as wide as they are apart."""
     from scipy.spatial import cKDTree
 
-    points = torch.cat([surface.reshape(-1, 3) for _, _, surface in pictures])
-    colours = torch.cat([colour.reshape(-1, 3) for _, colour, _ in pictures])
+    points = torch.cat([view.surface.reshape(-1, 3) for view in views])
+    colours = torch.cat([view.colour.reshape(-1, 3) for view in views])
     shown = points.isfinite().all(-1).nonzero()[:, 0]
     if run.scene.box is not None:
         low, high = run.scene.box
@@ -292,21 +284,22 @@ def picture(splats: Splats, camera: Cameras, background: Tensor, pairs: Pairs | 
 
 
 @torch.no_grad()
-def _score(splats: Splats, held_out: list[tuple[Cameras, Tensor]], background: Tensor) -> float:
-    errors = [(picture(splats, camera, background) - colour).square().mean() for camera, colour in held_out]
+def _score(splats: Splats, views: list[View], background: Tensor) -> float:
+    """PSNR in dB, the mean over the views."""
+    errors = [(picture(splats, view.camera, background) - view.colour).square().mean() for view in views]
     return float(-10 * torch.stack(errors).clamp_min(1e-10).log10().mean())
 
 
 def fit(
     splats: Splats,
-    pictures: list[tuple[Cameras, Tensor]],
+    views: list[View],
     background: Tensor,
     *,
     seconds: float,
     track: Track = in_silence,
     clock: Callable[[], float] = time.perf_counter,
 ) -> int:
-    """Fits Gaussians to pictures [h, w, 3] of cameras by Adam, in place; returns the number of steps."""
+    """Fits Gaussians to views by Adam, in place; returns the number of steps."""
     width = float(splats.scales.exp().median())
     values = vars(splats)
     rates = {name: rate * (width if name == "positions" else 1) for name, rate in RATES.items()}
@@ -316,7 +309,7 @@ def fit(
     )
     known: dict[int, Pairs] = {}
     draw = torch.Generator().manual_seed(0)
-    views: list[int] = []
+    numbers: list[int] = []
     started, step = clock(), 0
     for hundredth in track(range(100), "fitting"):
         if hundredth in AGAIN:
@@ -324,12 +317,12 @@ def fit(
         while clock() - started < seconds * (hundredth + 1) / 100:
             for group in adam.param_groups:
                 group["lr"] = group["rate"] * 0.1 ** (hundredth / 100)
-            views = views or torch.randperm(len(pictures), generator=draw).tolist()
-            number = views.pop()
-            camera, colour = pictures[number]
+            numbers = numbers or torch.randperm(len(views), generator=draw).tolist()
+            number = numbers.pop()
+            view = views[number]
             if number not in known:
-                known[number] = find_pairs(splats, camera)
-            error = (picture(splats, camera, background, known[number]) - colour).square().mean()
+                known[number] = find_pairs(splats, view.camera)
+            error = (picture(splats, view.camera, background, known[number]) - view.colour).square().mean()
             adam.zero_grad()
             error.backward()
             adam.step()

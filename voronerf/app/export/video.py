@@ -28,20 +28,20 @@ def export_video(
     """Renders a video along a camera path, a spiral, or a turntable.
 
     Args:
-        run: trained run, as `open_run` opens it.
-        path: file to write, .mp4.
-        flight: the frames and their rate; None for a spiral or a turntable.
-        spiral: go where the training cameras are; a scene that was taken from one side is never turned.
-        frames: of a spiral or a turntable.
-        fps: frames a second; None for those of the flight, else 24.
+        run: The run.
+        path: File to write, .mp4.
+        flight: The frames and their rate; None for a spiral or a turntable.
+        spiral: Go where the training cameras are; a scene that was taken from one side is never turned.
+        frames: Of a spiral or a turntable.
+        fps: Frames a second; None for those of the flight, else 24.
         box: [2, 3], what is shown; None for everything.
-        track: shows progress over the frames.
+        track: Shows progress: yields the items of a sequence, and is given its name.
 
     Raises:
-        ConfigError: an empty box.
+        ConfigError: An empty box.
         ImportError: imageio-ffmpeg is missing.
-        ValueError: another suffix.
-        OSError: the file cannot be written.
+        ValueError: Another suffix.
+        OSError: The file cannot be written.
 
     Examples:
         >>> from voronerf import Run
