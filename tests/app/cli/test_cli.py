@@ -105,11 +105,9 @@ def test_settings_of_a_file(run, tmp_path, fails):
 def test_exports_of_a_run(run, tmp_path, capsys, fails):
     pytest.importorskip("trimesh", reason="trimesh is not installed")
     pytest.importorskip("skimage", reason="scikit-image is not installed")
-    frames = orbit_cameras(2, radius=3, elevation=10, width=8, height=8, focal=9)
-    write_camera_path(tmp_path / "flight.json", CameraPath(frames, fps=5))
-    files = [tmp_path / name for name in ("mesh.glb", "cells.glb", "flight.mp4")]
-    options = f"--resolution 8 --density 0.01 --path {tmp_path / 'flight.json'}"  # of a run of a few steps
-    succeeds("export", run, "--mesh", files[0], "--cells", files[1], "--video", files[2], options)
+    files = [tmp_path / name for name in ("mesh.glb", "cells.glb", "transforms.json")]
+    options = "--resolution 8 --density 0.01"  # of a run of a few steps
+    succeeds("export", run, "--mesh", files[0], "--cells", files[1], "--cameras", files[2], options)
     assert all(file.stat().st_size for file in files)
     assert "3 of 3 cells" in capsys.readouterr().out
     fails("no surface in the box", "export", run, "--crop 9 9 9 9.5 9.5 9.5 --points", tmp_path / "points.ply")

@@ -7,15 +7,12 @@ from typing import Literal
 
 from voronerf.app.cli.display import say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
-from voronerf.app.cli.render import given_path
 from voronerf.app.export import cameras as camera_files
 from voronerf.app.export import cells as cell_files
 from voronerf.app.export import mesh as mesh_files
 from voronerf.app.export import points as point_files
 from voronerf.app.export import splats as splat_files
 from voronerf.app.export.space import check_export
-from voronerf.app.export.video import export_video
-from voronerf.app.render.video import check_video
 from voronerf.app.train.config import ConfigError
 
 
@@ -27,18 +24,15 @@ def export(
     mesh: Path | None = None,
     cells: Path | None = None,
     cameras: Path | None = None,
-    video: Path | None = None,
     count: int | None = None,
     fit: float = 60.0,
     resolution: int | None = None,
     density: float | None = None,
     crop: Crop = None,
     coordinates: Literal["scene", "files"] = "scene",
-    path: Path | None = None,
-    spiral: bool = False,
     opening: Opening = AS_IN_TRAINING,
 ) -> int:
-    """Write a trained run as Gaussians, points, a mesh, the cells of its diagram, its cameras, or a video.
+    """Write a trained run as Gaussians, points, a mesh, the cells of its diagram, or its cameras.
 
     Args:
         run: The run directory.
@@ -46,20 +40,17 @@ def export(
         points: Coloured points with normals on the surface, .ply.
         mesh: The surface as a coloured mesh, .ply, .glb or .obj.
         cells: The cells of the diagram, clipped to the box, an object of its own colour each, .glb.
-        cameras: Training and test cameras, as --refine-cameras has left them, as transforms.json. Images in the folder
-            images beside it are named with their sizes.
-        video: A turntable, or the video of --spiral or --path, .mp4.
+        cameras: Training and test cameras as transforms.json. Images in the folder images beside it are named with
+            their sizes.
         count: Points or Gaussians at the most; default 200,000 points, 100,000 Gaussians.
         fit: Seconds for which the Gaussians are fitted.
-        resolution: Cubes of the mesh along the longest side of the box; default 256, or what fits into the memory.
-        density: Density of the mesh's surface per scene unit; default that of which a thirtieth of the
-            longest side of the box lets half of the light pass.
+        resolution: Cubes of the mesh along the longest side of the box; default 256, or what fits into memory.
+        density: Density of the mesh's surface per scene unit; default that of which a thirtieth of the longest side of
+            the box lets half of the light pass.
         crop: What is exported, x y z of the lowest and of the highest corner, or "saved" for the viewer's crop; default
             the scene's box, or that around the sphere of a contraction, but splats of everything.
         coordinates: Positions are those of the scene as it is rendered, or those of its files: in metres, if the
             capture is in metres.
-        path: Camera path in nerfstudio's format, for the video.
-        spiral: Go where the training cameras are, in the video; default for a forward-facing scene.
         opening: How the run is opened.
     """
     check_counts(count=count)
@@ -70,14 +61,11 @@ def export(
         cells: cell_files.SUFFIXES,
         cameras: camera_files.SUFFIXES,
     }
-    if not any((splat, points, mesh, cells, cameras, video)):
-        raise ConfigError("export needs a file: --splat, --points, --mesh, --cells, --cameras or --video")
+    if not any((splat, points, mesh, cells, cameras)):
+        raise ConfigError("export needs a file: --splat, --points, --mesh, --cells or --cameras")
     for file, suffixes in outputs.items():
         if file is not None:
             check_export(file, suffixes)
-    if video is not None:
-        check_video(video)
-    given = given_path(path, spiral)
     opened = opening.open_without_images(run)
     box, to_files = crop_box(opened, crop), coordinates == "files"
     if splat is not None:
@@ -101,7 +89,4 @@ def export(
         say(f"wrote {cells}: {len(scene.geometry)} of {opened.diagram.num_cells} cells")
     if cameras is not None:
         say(f"wrote {cameras}: {camera_files.export_cameras(opened, cameras, to_files=to_files)} cameras")
-    if video is not None:
-        export_video(opened, video, flight=given, spiral=spiral, box=box, track=tracked)
-        say(f"wrote {video}")
     return 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from voronerf.app.cli.display import say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
 from voronerf.app.export.video import export_video
-from voronerf.app.render.paths import CameraPath, read_camera_path
+from voronerf.app.render.paths import read_camera_path
 from voronerf.app.render.video import check_video
 from voronerf.app.train.config import ConfigError
 
@@ -40,22 +40,17 @@ def render(
     check_counts(frames=frames)
     if fps is not None and not 0.01 <= fps <= 1000:
         raise ConfigError(f"--fps must be 0.01 to 1000, got {fps:g}")
-    given = given_path(path, spiral)
+    if path is not None and spiral:
+        raise ConfigError("--spiral must be off with --path, which has the frames")
+    flight = None if path is None else read_camera_path(path)
+    if flight is not None:
+        flight = replace(flight, frames=flight.frames.downscaled(opening.downscale or 1))
     opened = opening.open_without_images(run)
     spiral = spiral or opened.scene.kind == "forward"
     name = path.stem if path is not None else "spiral" if spiral else "turntable"
     out = out or run / f"{name}.mp4"
     check_video(out)
-    if given is not None:
-        given = replace(given, frames=given.frames.downscaled(opening.downscale or 1))
     box = crop_box(opened, crop)
-    export_video(opened, out, flight=given, spiral=spiral, frames=frames, fps=fps, box=box, track=tracked)
+    export_video(opened, out, flight=flight, spiral=spiral, frames=frames, fps=fps, box=box, track=tracked)
     say(f"wrote {out}")
     return 0
-
-
-def given_path(path: Path | None, spiral: bool) -> CameraPath | None:
-    """Reads the camera path of --path, if there is one."""
-    if path is not None and spiral:
-        raise ConfigError("--spiral must be off with --path, which has the frames")
-    return None if path is None else read_camera_path(path)

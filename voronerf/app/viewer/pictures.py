@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +22,7 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.field import Field
 from voronerf.nerf.renderer import RenderedImage, Renderer, render_camera
+from voronerf.router import VoronoiRouter
 
 PANES = ("colour", "depth", "opacity", "cells")
 
@@ -60,7 +60,7 @@ class Subject:
     name: str
     folder: Path
     scene: Scene
-    router: Any
+    router: VoronoiRouter
     renderer: Renderer
     weights: Callable[[], AbstractContextManager[None]] = nullcontext
 
@@ -72,14 +72,13 @@ class Subject:
     @property
     def diagram(self) -> VoronoiDiagram:
         """The cells, which a split replaces."""
-        diagram: VoronoiDiagram = self.router.diagram
-        return diagram
+        return self.router.diagram
 
 
 class VisibleCells(nn.Module):
     """A field without the density of hidden cells, bool [k]."""
 
-    def __init__(self, field: Field, router: Any, hidden: Tensor) -> None:
+    def __init__(self, field: Field, router: VoronoiRouter, hidden: Tensor) -> None:
         super().__init__()
         self.field, self.router, self.hidden = field, router, hidden
 
@@ -137,8 +136,7 @@ def render_look(subject: Subject, camera: Cameras, look: Look) -> RenderedImage:
 def cells_of(subject: Subject, places: Tensor) -> Tensor:
     """The leaves int64 [...] of places [..., 3], as `RenderedImage.heaviest` has them."""
     where = places.to(subject.renderer.device).reshape(-1, 3)
-    cells: Tensor = subject.router.assign(where)
-    return cells.reshape(places.shape[:-1]).cpu().long()
+    return subject.router.assign(where).reshape(places.shape[:-1]).cpu().long()
 
 
 def picture_of(subject: Subject, image: RenderedImage, look: Look) -> Tensor:
