@@ -127,3 +127,7 @@ def dashed(name: str) -> str:
 def escape(text: str) -> str:
     """Text inside of a table's cell."""
     return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+if __name__ == "__main__":
+    print(markdown())

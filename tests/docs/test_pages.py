@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import inspect
 import re
-import sys
 from pathlib import Path
 
 import pytest
+from helpers import script
 
 ROOT = Path(__file__).resolve().parents[2]
 RUNNABLE = ("README.md", "docs/quickstart.md", "docs/method.md")
@@ -41,34 +40,28 @@ def test_promises_name_tests_that_are_there() -> None:
     assert len(named) > 20 and not missing, missing
 
 
-def test_every_option_of_every_command_is_on_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "docs/scripts"))
-    import options
+@functools.cache
+def options() -> dict[str, set[str]]:
+    """The options of each command, as docs/options.md shows them."""
+    text = script(ROOT / "docs" / "scripts" / "options.py")
+    commands = re.findall(r"^## voronerf (\w+)\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
+    return {name: set(re.findall(r"--[a-z][a-z-]+", part)) for name, part in commands}
 
+
+def test_every_option_is_on_the_page() -> None:
     from voronerf.app.cli.main import COMMANDS
     from voronerf.app.train.config import TrainConfig
 
-    text = options.markdown()
-    for command in COMMANDS:
-        assert f"## voronerf {command}\n" in text
-    for field in dataclasses.fields(TrainConfig):
-        assert f"\n| `--{field.name.replace('_', '-')}`" in text, field.name
-    assert "\n| `RUN` |" in text and "\n| `--frames` |" in text
-    sys.modules.pop("options")
+    assert set(options()) == set(COMMANDS)
+    assert {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(TrainConfig)} <= options()["train"]
+    assert "--frames" in options()["render"]
 
 
 @pytest.mark.parametrize("name", [name for name in PAGES if "changelog" not in name])
 def test_options_on_a_page_exist(name: str) -> None:
-    from voronerf.app.cli.train import train
-    from voronerf.app.train.config import TrainConfig
-
-    fields = dataclasses.fields(TrainConfig)
-    known = {f"--{field.name.replace('_', '-')}" for field in fields}
-    known |= {f"--{parameter}" for parameter in inspect.signature(train).parameters}
-    known |= {f"--no-{field.name.replace('_', '-')}" for field in fields if isinstance(field.default, bool)}
-    for line in re.findall(r"voronerf train( [^`\n|]*)", (ROOT / name).read_text()):
-        for option in re.findall(r"(?<!\w)--[a-z-]+", line):
-            assert option in known, f"{name}: voronerf train has no {option}"
+    for command, line in re.findall(r"voronerf (\w+)( [^`\n|#]*)", (ROOT / name).read_text()):
+        for option in re.findall(r"(?<!\w)--[a-z-]+", line) if command in options() else ():
+            assert option in options()[command], f"{name}: voronerf {command} has no {option}"
 
 
 @functools.cache
