@@ -14,7 +14,6 @@ from voronerf.app.evaluate.lpips import Lpips, find_lpips
 from voronerf.app.evaluate.scores import score_views
 from voronerf.app.files import json_text, read_json, write_text
 from voronerf.app.scenes import Scene, load_scene
-from voronerf.app.scenes.record import with_refined
 from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.config_checks import check_device
@@ -235,7 +234,6 @@ def open_run(
         downscale=config.downscale if downscale is None else downscale,
     )
     scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
-    scene = with_refined(scene, path) if config.refine_cameras else scene
     renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
     state = checkpoint.group("occupancy")
     grid = None

@@ -4,18 +4,15 @@ import json
 import logging
 import math
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from helpers import refuses
 from PIL import Image
 from scene_files import rewrite, write_blender, write_capture
 
-from voronerf.app.scenes import SceneError, builtin_scene, load_scene
+from voronerf.app.scenes import builtin_scene, load_scene
 from voronerf.app.scenes.photographs import find_frame
-from voronerf.app.scenes.scene import Sightings, Split
 from voronerf.nerf import Space, Stratified, render_rays
 from voronerf.nerf.cameras import Cameras, focus_point, orbit_cameras
 
@@ -305,26 +302,3 @@ def test_fox(caplog):
     assert "17 of 67 listed images are missing" in caplog.text
     assert scene.train.images.shape == (43, 240, 135, 3) and scene.test.images.shape == (7, 240, 135, 3)
     assert scene.train.cameras.distortion is not None
-
-
-def test_splits_are_joined_where_their_images_differ_in_size():
-    def split(views, width, height, names, **more):
-        cameras = orbit_cameras(views, radius=2, elevation=5, width=width, height=height, focal=9)
-        images = torch.randint(0, 256, (views, height, width, 3), dtype=torch.uint8)
-        return Split(cameras, images, names, **more)
-
-    seen = Sightings(torch.tensor([1 * 12 + 2 * 4 + 3]), torch.tensor([5.0]))  # view 1, row 2, column 3
-    masks = torch.tensor([[[True, False, True, True, True, True], [True] * 6]])
-    also = Sightings(torch.tensor([1 * 6 + 4]), torch.tensor([7.0]))  # row 1, column 4
-    first, others = split(2, 4, 3, ("a", "b"), sightings=seen), split(1, 6, 2, ("a",), masks=masks, sightings=also)
-    joined = Split.joined(first, others)
-    assert joined.names == ("a", "b", "1-a") and [joined.cameras.size(i) for i in range(3)] == [(4, 3), (4, 3), (6, 2)]
-    for index, (one, own) in enumerate(((first, 0), (first, 1), (others, 0))):
-        assert torch.equal(joined.truth(index, None), one.truth(own, None))
-        assert torch.equal(joined.cameras.poses[index], one.cameras.poses[own])
-    assert bool(joined.mask(1).all()) and torch.equal(joined.mask(2), masks[0])
-    assert joined.sightings.pixels.tolist() == [(1 * 3 + 2) * 6 + 3, (2 * 3 + 1) * 6 + 4]
-    assert joined.sightings.distances.tolist() == [5.0, 7.0]
-    transparent = replace(others, images=torch.zeros(1, 2, 6, 4, dtype=torch.uint8))
-    refuses("must have the same channels, got 3 and 4", Split.joined, first, transparent, error=SceneError)
-    refuses("must be in memory", Split.joined, first, replace(others, on_disk=True), error=SceneError)

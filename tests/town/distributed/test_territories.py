@@ -9,8 +9,6 @@ from helpers import refuses, seeded
 
 from voronerf import NeRF, OccupancyGrid, VoronoiDiagram, VoronoiRouter
 from voronerf.app.scenes import builtin_scene, city_scene
-from voronerf.app.scenes.scene import Sightings
-from voronerf.app.train.batches import RayBatches
 from voronerf.nerf import Batch, Rays, Renderer, Stratified
 from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.rays import intersect_box
@@ -19,24 +17,6 @@ from voronerf.town.distributed.territories import Territories, cut_space, halve
 from voronerf.town.ray_runs import LINKS, JointLoss, Map, Territory, see_together
 
 BOX = torch.tensor([[0.0, 0, 0], [4.0, 2, 2]])
-
-
-def test_a_copy_of_some_views_draws_the_same_rays():
-    scene = builtin_scene(12, train_views=8, test_views=1)
-    cameras = replace(scene.train.cameras, sizes=torch.tensor([[12, 12], [9, 7]] * 4))
-    masks = torch.rand(8, 12, 12, generator=seeded()) < 0.8
-    seen = Sightings(torch.arange(0, 8 * 144, 5), torch.linspace(2, 4, 231))
-    for train in (scene.train, replace(scene.train, cameras=cameras, masks=masks, sightings=seen)):
-        for views in (torch.tensor([1, 2, 6]), torch.arange(8)):
-            whole, own = replace(scene, train=train), replace(scene, train=train.copy(views))
-            found = [
-                RayBatches(each, torch.device("cpu"), sightings=True, views=chosen).draw(500, seeded())
-                for each, chosen in ((whole, views), (own, None))
-            ]
-            assert torch.equal(found[0].rays.origins, found[1].rays.origins)
-            for name in ("near", "far", "target", "background", "seen"):
-                first, second = (getattr(each, name) for each in found)
-                assert first is second is None or torch.equal(first, second), name
 
 
 def line(count=2):

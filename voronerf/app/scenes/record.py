@@ -24,13 +24,8 @@ WORDS = {"spacing": ("linear", "disparity"), "background": ("white", None), "kin
 INTEGERS = {"sizes": torch.int64, "models": torch.int32}
 
 
-def write_scene(path: Path, scene: Scene, *, refined: Cameras | None = None) -> None:
+def write_scene(path: Path, scene: Scene) -> None:
     """Writes a scene without its images.
-
-    Args:
-        path: The file.
-        scene: The scene.
-        refined: The training cameras as a training has moved them; None for those of the scene.
 
     Raises:
         OSError: it cannot be written.
@@ -44,85 +39,34 @@ def write_scene(path: Path, scene: Scene, *, refined: Cameras | None = None) -> 
     for part in ("train", "test"):
         split = getattr(scene, part)
         values[part] = {"names": list(split.names), **_of_fields(split.cameras)}
-    if refined is not None:
-        values["train"] |= _of_fields(refined)
     write_text(path, json_text(values) + "\n")
-
-
-def with_refined(scene: Scene, run: Path) -> Scene:
-    """A scene with the training cameras that a run has moved, where its pictures are those of the run.
-
-    Raises:
-        SceneError: the record in the run directory is damaged.
-    """
-    path = run / "scene.json"
-    if not path.is_file():
-        return scene
-    own, known = scene.train, read_scene(path).train
-    if own.names != known.names:
-        return scene
-    return replace(scene, train=replace(own, cameras=_where_they_are(own.cameras, known.cameras)))
-
-
-def _where_they_are(read: Cameras, moved: Cameras) -> Cameras:
-    """Cameras as they were read, with the poses and the focal lengths that a record has of them."""
-    # The principal points stay, and so they tell how much larger these images are.
-    intrinsics = torch.cat(
-        (moved.intrinsics[:, :2] * (read.intrinsics / moved.intrinsics)[:, 2:], read.intrinsics[:, 2:]), 1
-    )
-    return replace(read, poses=moved.poses.to(read.poses), intrinsics=intrinsics)
-
-
-def within(scene: Scene, run: Path) -> Scene:
-    """A scene in the space of the record in a run directory, where there is one, see `placed`.
-
-    Raises:
-        SceneError: the record is damaged, or it is of another place.
-    """
-    path = run / "scene.json"
-    return placed(scene, read_scene(path)) if path.is_file() else scene
 
 
 def placed(scene: Scene, known: Scene) -> Scene:
     """The views of a scene in the space of another one of the same place.
 
-    Photographs are moved, turned and scaled as they are read, by what the cameras of their folder say. They are moved
-    here to where the other scene's would be.
+    Photographs are moved, turned and scaled by what the cameras of their folder say. They are moved here to where the
+    other scene's would be.
 
     Raises:
         SceneError: they cannot be of one place: one has a background that the other has not, or only one was moved.
     """
-    _check_background(scene, known)
-    train, test = scene.train, scene.test
+    if scene.background != known.background:
+        ours, theirs = (each.background or "none" for each in (known, scene))
+        raise SceneError(f"{scene.name}: background must be that of {known.name}, {ours}, got {theirs}")
+    splits = {"train": scene.train, "test": scene.test}
     if known.transform is not None and scene.transform is not None:
         move = known.transform @ torch.linalg.inv(scene.transform)
         if not torch.allclose(move, torch.eye(4, dtype=move.dtype), atol=1e-6):
             scale = float(torch.linalg.det(move[:3, :3]).abs()) ** (1 / 3)
-            train, test = (_moved(part, move, scale) for part in (train, test))
+            for name, part in splits.items():
+                seen = part.sightings
+                seen = None if seen is None else seen._replace(distances=scale * seen.distances)
+                splits[name] = replace(part, cameras=part.cameras.moved(move), sightings=seen)
     elif known.transform is not None or scene.transform is not None:
         which = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
         raise SceneError(f"{scene.name}: must be in the frame of {known.name}, got one that is {which} (--normalise)")
-    return replace(scene, train=train, test=test, **_space(known))
-
-
-def _space(known: Scene) -> dict[str, Any]:
-    """What a scene has of the space of a record."""
-    return {
-        name: getattr(known, name) for name in ("near", "far", "box", "spacing", "kind", "contraction", "transform")
-    }
-
-
-def _check_background(scene: Scene, known: Scene) -> None:
-    if scene.background != known.background:
-        ours, theirs = (each.background or "none" for each in (known, scene))
-        raise SceneError(f"{scene.name}: background must be that of {known.name}, {ours}, got {theirs}")
-
-
-def _moved(part: Split, move: Tensor, scale: float) -> Split:
-    """The views after a similarity [4, 4] of that scale."""
-    seen = part.sightings
-    seen = None if seen is None else seen._replace(distances=scale * seen.distances)
-    return replace(part, cameras=part.cameras.moved(move), sightings=seen)
+    return replace(known, name=scene.name, notes=scene.notes, **splits)
 
 
 def read_scene(path: Path) -> Scene:

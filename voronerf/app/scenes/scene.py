@@ -5,14 +5,12 @@ c images of h x w pixels. World units and axes as in `voronerf.nerf.cameras`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.store import check_mapped
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
@@ -63,60 +61,6 @@ class Split:
 
     def __len__(self) -> int:
         return len(self.names)
-
-    def copy(self, views: Tensor) -> Split:
-        """Some views alone, with images in memory of their own.
-
-        Args:
-            views: int64, ascending.
-        """
-        seen = self.sightings
-        if seen is not None:
-            size = self.images.shape[1] * self.images.shape[2]
-            own = torch.isin(seen.pixels // size, views)
-            pixels, distances = seen.pixels[own], seen.distances[own]
-            view = torch.searchsorted(views, pixels // size)
-            seen = Sightings(view * size + pixels % size, distances) if len(pixels) else None
-        names = tuple(self.names[view] for view in views.tolist())
-        masks = None if self.masks is None else self.masks[views]
-        return Split(self.cameras[views], self.images[views], names, masks, sightings=seen)
-
-    @staticmethod
-    def joined(first: Split, others: Split) -> Split:
-        """The images of both, in memory, and their sightings.
-
-        Raises:
-            SceneError: one has transparent pixels and the other has not, or they are on disk.
-        """
-        both = first, others
-        if first.on_disk or others.on_disk:
-            raise SceneError("pictures that are joined must be in memory, got some on disk (--images memory)")
-        if first.images.shape[-1] != others.images.shape[-1]:
-            channels = " and ".join(str(each.images.shape[-1]) for each in both)
-            raise SceneError(f"pictures that are joined must have the same channels, got {channels}")
-        cameras = Cameras.joined([each.cameras for each in both])
-
-        def stacked(tensors: Sequence[Tensor]) -> Tensor:
-            every = tensors[0].new_zeros(len(cameras), cameras.height, cameras.width, *tensors[0].shape[3:])
-            for start, tensor in zip((0, len(first)), tensors, strict=True):
-                every[start : start + len(tensor), : tensor.shape[1], : tensor.shape[2]] = tensor
-            return every
-
-        masks = None
-        if first.masks is not None or others.masks is not None:
-            masks = stacked([torch.ones_like(e.images[..., 0]).bool() if e.masks is None else e.masks for e in both])
-        seen = list[Sightings]()
-        for start, each in zip((0, len(first)), both, strict=True):
-            if each.sightings is not None:
-                pixels, (height, width) = each.sightings.pixels, each.images.shape[1:3]
-                view, row = start + pixels // (height * width), pixels // width % height
-                pixels = (view * cameras.height + row) * cameras.width + pixels % width
-                seen.append(Sightings(pixels, each.sightings.distances))
-        sightings = Sightings(*(torch.cat(tensors) for tensors in zip(*seen, strict=True))) if seen else None
-        names = (*first.names, *others.names)
-        if len(set(names)) < len(names):
-            names = (*first.names, *(f"1-{name}" for name in others.names))
-        return Split(cameras, stacked([each.images for each in both]), names, masks, sightings=sightings)
 
     def truth(self, index: int, background: Tensor | None) -> Tensor:
         """One image in 0..1 over `background` ([3]; None is black, as in rendering), float32 [h, w, 3]."""

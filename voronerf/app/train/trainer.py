@@ -21,7 +21,7 @@ from voronerf.app.evaluate.lpips import Lpips, find_lpips
 from voronerf.app.evaluate.scores import ViewScore, evaluate, mean_scores
 from voronerf.app.files import json_text, write_bytes, write_text
 from voronerf.app.scenes import Scene
-from voronerf.app.scenes.record import within, write_scene
+from voronerf.app.scenes.record import write_scene
 from voronerf.app.train import state
 from voronerf.app.train.appearance import Appearance
 from voronerf.app.train.batches import RayBatches
@@ -98,9 +98,8 @@ class Trainer:
     ) -> None:
         if config.out is None:
             raise ValueError("Trainer: config.out must name the run directory, got None")
-        if config.resume:  # the space is that of the run, whatever the views
+        if config.resume:
             checkpoint = last_checkpoint(config.out)
-            scene = within(scene, config.out)
         self.out, self.scene = config.out, scene
         self.on_step, self.on_event, self.clock = on_step, on_event, clock or time.perf_counter
         self.device = torch.device(config.device)
@@ -580,8 +579,7 @@ class Trainer:
         if not self.described:  # not earlier: a run whose first step fails leaves nothing
             write_text(self.out / "config.json", self.config.to_json())
         if refinement is not None or not self.described:
-            refined = None if refinement is None else refinement.cameras.to("cpu")
-            write_scene(self.out / "scene.json", self.scene, refined=refined)
+            write_scene(self.out / "scene.json", self.scene)
         self.described = True
         self.writer.write(self.state())
         self.saved_at = self.seconds
