@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -28,6 +29,7 @@ from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.occupancy import OccupancyGrid
+from voronerf.router import VoronoiRouter
 from voronerf.town.geometry import Similarity, Solid
 from voronerf.town.parts import Network, Part, Parts
 from voronerf.town.run import TOWN, write_parts
