@@ -16,6 +16,7 @@ import pytest
 import torch
 from helpers import on_any_number_of_threads
 from op_cases import need, refused, strided
+from tolerances import assert_as_exact
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map_only
@@ -39,6 +40,8 @@ RUNS = [
 ]
 NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "adam")
 """Ops that check their tensors in ways of their own."""
+SINGLE = ("balance_centres", "cell_sort", "march_rays", "pixel_rays")
+"""Ops without floating-point numbers, or with those of one size alone."""
 
 
 def rows(runs):
@@ -61,7 +64,7 @@ natively = dict.fromkeys(name for name, backend, _ in RUNS if backend == "native
 native_op = pytest.mark.parametrize("name", list(natively))
 
 
-def prepare(name, backend, device):
+def prepare(name, backend, device, dtype=torch.float32):
     """The op as a function of its tensors, and a maker of those by their number."""
     op, _, kind = name.partition(", ")
     case = CASES[op]
@@ -72,7 +75,7 @@ def prepare(name, backend, device):
         return tensor.to(device).detach().requires_grad_(tensor.is_floating_point())
 
     def make(n):
-        given = tree_map_only(Tensor, ready, case.make(Draw(n, **case.kinds[kind]), n))
+        given = tree_map_only(Tensor, ready, case.make(Draw(n, dtype=dtype, **case.kinds[kind]), n))
         rest.update({name: value for name, value in given.items() if not holds_tensors(value)})
         return {name: value for name, value in given.items() if holds_tensors(value)}
 
@@ -147,6 +150,19 @@ def test_any_size_gives_what_the_reference_gives(device, backend, name):
         given = tensors(n)
         expected = results(functools.partial(run, backend="reference"), given)
         assert_close(results(run, given), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64], ids=str)
+@rows([run for run in RUNS if run[1] != "reference" and run[0].partition(",")[0] not in SINGLE])
+def test_dtypes(device, backend, name, dtype):
+    """Values and gradients have the dtypes of the reference's, and are as close to those of float64."""
+    need(name.partition(", ")[0], backend, device, dtype)
+    run, tensors = prepare(name, backend, device, dtype)
+    given = tensors(65)
+    wide = tree_map_only(Tensor, lambda tensor: tensor.double() if tensor.is_floating_point() else tensor, given)
+    plain, exact = (results(functools.partial(run, backend="reference"), inputs) for inputs in (given, wide))
+    for part, same, right in zip(results(run, given), plain, exact, strict=True):
+        assert_as_exact(part, same, right) if same.is_floating_point() else torch.testing.assert_close(part, right)
 
 
 @smooth_op
