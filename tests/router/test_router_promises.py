@@ -79,7 +79,7 @@ class Forward(nn.Module):
         (lambda net, h: h + torch.rand_like(h), r"draws random numbers"),
         (lambda net, h: F.dropout(h, 0.5), r"torch.nn.functional.dropout draws random numbers"),
         (lambda net, h: h if h.max() > 0 else -h, r"has no row for each of 37 samples: it mixes or selects them"),
-        (lambda net, h: h if (h > 0).any() else -h, r"promise what it gives by assume="),
+        (lambda net, h: h if (h > 0).any() else -h, r"depends on values; write it with torch.where"),
         (lambda net, h: torch.autograd.grad(h.sum(0)[None].sum(), h)[0], "no row for each"),
     ],
 )
@@ -322,21 +322,6 @@ def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any
     for wrong, rule in ((number, "have strings as keys, got 3"), ([state], "be a mapping, got list")):
         with pytest.raises(TypeError, match=f"load_state_dict: state_dict must {rule}"):
             router.load_state_dict(wrong)
-
-
-def test_a_promise_about_samples_lets_a_module_fuse() -> None:
-    class Masked(Forward):
-        def forward(self, x: Tensor) -> Tensor:
-            mask = x[:, 0] < 5
-            if not mask.any():
-                return self.b(self.a(x))
-            return super().forward(x)
-
-    field = Masked(lambda net, h: torch.tanh(h))
-    router = VoronoiRouter(field, centres(), coords="first3", fuse=True, assume={"mask.any()": True}, way="fused")
-    x = uniform((50,))
-    torch.testing.assert_close(router(x), router.cell(0)(x))
-    assert router.explain() == "forward: fused"
 
 
 @pytest.mark.parametrize("width", [37, 74, 259, 1147])

@@ -153,10 +153,9 @@ def keeps(net: Any) -> None:
     net.kept, net.calls = net.weight, net.calls + 1
 
 
-def test_attributes_are_of_one_run_and_kept_parameters_are_said() -> None:
+def test_attributes_are_of_one_run() -> None:
     router, x = VoronoiRouter(Itself(keeps), CENTRES, coords="first3"), uniform((60,))
-    with pytest.warns(UserWarning, match="Itself.forward keeps a parameter as `kept`, which is of that call alone"):
-        found = router(x)
+    found = router(x)
     torch.testing.assert_close(found, masked_loop(router, router.diagram.locate(x), [x])[0][0])
     assert router.module.calls == 0 and not hasattr(router.module, "kept")
 

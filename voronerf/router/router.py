@@ -88,8 +88,6 @@ class VoronoiRouter(nn.Module):
             samples, also with ``fuse``.
         fuse: Promises that ``forward`` does the same in every call. Its network is traced once and runs as one
             operation, or is refused with the line that stands in the way.
-        assume: Promises what ``any()`` and ``all()`` of samples give where a fused ``forward`` asks, by the code or a
-            part of it: ``{"mask.any()": True}``.
         way: "fastest" measures the ways of a call on the first batch of its kind and, within a factor of four, its
             size. "fused", "grouped" and "loop" take that way, or the next in this order where it is not possible, and
             do not depend on timings.
@@ -132,7 +130,6 @@ class VoronoiRouter(nn.Module):
         methods: Sequence[str] = (),
         share: Sequence[str] = (),
         fuse: bool = False,
-        assume: Mapping[str, bool] | None = None,
         way: Literal["fastest", "fused", "grouped", "loop"] = "fastest",
         layout: Literal["rays", "flat"] = "rays",
         assignment: Assignment = "nearest",
@@ -155,7 +152,6 @@ class VoronoiRouter(nn.Module):
         self._watch: Any = None  # of optimisers that hold the state of other cells
         self.assignment, self.temperature = assignment, temperature
         self.backend, self.coords, self.fuse, self.way, self.layout = backend, coords, fuse, way, layout
-        self.assume = dict(assume or {})
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._layered = isinstance(module, LayeredField)
@@ -600,7 +596,7 @@ class VoronoiRouter(nn.Module):
         )
         call = Call(module, method, layout, [*names, *kwargs], args, kwargs)
         grouping = self._group(method, positions)
-        options = Options(self.fuse, self.way, bool(self.methods), self.assume)
+        options = Options(self.fuse, self.way, bool(self.methods))
         return self._dispatch.evaluate(call, grouping, options, self.frozen_cells).restored(layout)
 
     def _group(self, method: str, positions: Tensor) -> Grouping:
