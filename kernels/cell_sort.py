@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import Any
 
 import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch, on_stream
 from voronerf.ops._core.checks import check_range
-from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.declare import declared
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,12 +39,11 @@ def _offsets_kernel(keys: wp.array(dtype=wp.int32), n: wp.int32, offsets: wp.arr
     offsets[cell] = low
 
 
-@custom_op("cell_sort_warp")
-def cell_sort(cells: Tensor, k: int) -> Iterator[tuple[Tensor, Tensor]]:
+@declared("cell_sort").custom_op("cell_sort_warp")
+def cell_sort(given: Any, found: tuple[Tensor, Tensor]) -> None:
     """Stable order and cell offsets; see ``voronerf.ops.cell_sort``."""
-    n = cells.shape[0]
-    order, offsets = cells.new_empty(n), cells.new_empty(k + 1)
-    yield order, offsets
+    cells, k, n = given.cells, given.k, given.n
+    order, offsets = found
     check_range("cell_sort", "cells", cells, k)
     # The sort needs room for twice the pairs, and leaves them in the first half.
     keys, rows = cells.new_empty(2, 2 * n)

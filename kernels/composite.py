@@ -11,18 +11,18 @@ whole ray. Second derivatives come from the reference formula.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 import warp as wp
-from torch import Tensor
 
 from voronerf.kernels._launch import filled, launch
-from voronerf.ops._core.custom_op import custom_op, in_float32
-from voronerf.ops.composite.autograd import Arriving, RaySamples, register
+from voronerf.ops._core.custom_op import in_float32
+from voronerf.ops._core.declare import declared
+from voronerf.ops.composite import reference
 
 wp.set_module_options({"enable_backward": False})
+_OP = declared("composite")
 
 _OPAQUE = wp.constant(wp.float32(1.0e30))
 """Stands for infinite density: as opaque over any length but 0, and 0 times it is 0."""
@@ -156,46 +156,36 @@ def _composite_backward_kernel(arriving: Results, given: Samples, found: Gradien
             found.sigma[i] = to_optical * given.deltas[i]
 
 
-def composite(*given: Tensor | None) -> Any:
-    """Absorption and emission along rays; see ``voronerf.ops.composite``."""
-    return in_float32(_forward, RaySamples._make(given))
+@_OP.custom_op("composite_warp")
+def _forward(given: Any, found: Any) -> None:
+    found.weights.zero_()  # samples that belong to no ray
+    outputs = filled(Results(), **found._replace(weights=found.weights.view(-1))._asdict())
+    launch(_composite_kernel, given.r, [_inputs(given), outputs], given.sigma)
 
 
-@custom_op("composite_warp")
-def _forward(given: RaySamples) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    colour, opacity, depth, weights = results = given.results()
-    yield results
-    # Samples that belong to no ray.
-    weights.zero_()
-    outputs = filled(Results(), colour=colour, opacity=opacity, depth=depth, weights=weights.view(-1))
-    launch(_composite_kernel, given.rays, [_inputs(given), outputs], colour)
+@_OP.backward_op("composite_warp_backward", _forward, reference.composite)
+def _backward(given: Any, arriving: Any, gradients: Any) -> None:
+    sigma, rgb, r, c = given.sigma, given.rgb, given.r, given.c
+    shapes = {"colour": (r, c), "opacity": (r,), "depth": (r,), "weights": sigma.shape}
+    arrived = {
+        name: sigma.new_zeros(shape) if getattr(arriving, name) is None else getattr(arriving, name)
+        for name, shape in shapes.items()
+    }
+    found, of_samples = {"left": sigma.new_empty(r)}, {"sigma": sigma, "rgb": rgb, "depths": sigma, "deltas": sigma}
+    for name, like in of_samples.items():
+        gradient = getattr(gradients, name)
+        gradient = like.new_zeros(like.shape) if gradient is None else gradient.zero_()
+        found[name] = gradient.view(-1, c) if name == "rgb" else gradient.view(-1)
+    arrivals = filled(Results(), **{**arrived, "weights": arrived["weights"].reshape(-1)})
+    launch(_composite_backward_kernel, r, [arrivals, _inputs(given), filled(Gradients(), **found)], sigma)
+    if gradients.background is not None:
+        seen = arrived["colour"] * found["left"][:, None]
+        gradients.background.copy_(seen if gradients.background.dim() == 2 else seen.sum(dim=0, dtype=torch.float64))
 
 
-@custom_op("composite_warp_backward")
-def _backward(arriving: Arriving, given: RaySamples, wanted: Sequence[bool]) -> Iterator[list[Tensor]]:
-    sigma, rgb = given.sigma, given.rgb
-    results = given.gradients([*[True] * 4, wanted[4]])
-    yield results
-    *to_samples, to_background = results
-    colour, opacity, depth, weights = (
-        torch.zeros_like(part) if gradient is None else gradient for gradient, part in zip(arriving, given.results())
-    )
-    left = sigma.new_empty(given.rays)
-    for result in to_samples:
-        result.zero_()
-    to_sigma, to_rgb, to_depths, to_deltas = to_samples
-    arrived = filled(Results(), colour=colour, opacity=opacity, depth=depth, weights=weights.reshape(-1))
-    found = filled(Gradients(), sigma=to_sigma.view(-1), rgb=to_rgb.view(-1, rgb.shape[-1]), left=left)
-    filled(found, depths=to_depths.view(-1), deltas=to_deltas.view(-1))
-    launch(_composite_backward_kernel, given.rays, [arrived, _inputs(given), found], sigma)
-    if to_background.numel():
-        seen = colour * left[:, None]
-        to_background.copy_(seen if to_background.dim() == 2 else seen.sum(dim=0, dtype=torch.float64))
-
-
-def _inputs(given: RaySamples) -> Any:
+def _inputs(given: Any) -> Any:
     """The inputs of both kernels. Samples are numbered through all rays."""
-    sigma, rgb, offsets, rays = given.sigma, given.rgb, given.ray_offsets, given.rays
+    sigma, rgb, offsets, rays = given.sigma, given.rgb, given.ray_offsets, given.r
     behind = rgb.new_empty(0, rgb.shape[-1])
     if given.background is not None:
         behind = given.background.expand(rays, rgb.shape[-1])
@@ -212,4 +202,4 @@ def _inputs(given: RaySamples) -> Any:
     )
 
 
-register(_forward, _backward)
+composite = in_float32(_forward)

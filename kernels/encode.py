@@ -7,17 +7,19 @@ is float32; second derivatives come from the reference formulas.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from typing import Any
 
 import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch
-from voronerf.ops._core.custom_op import custom_op, in_float32
-from voronerf.ops._core.derivatives import OfOne
-from voronerf.ops.frequency_encode.autograd import Encoding, register
+from voronerf.ops._core.custom_op import in_float32
+from voronerf.ops._core.declare import declared
+from voronerf.ops.frequency_encode import reference
+from voronerf.ops.integrated_encode import reference as integrated
 
 wp.set_module_options({"enable_backward": False})
+_FREQUENCY, _INTEGRATED = declared("frequency_encode"), declared("integrated_encode")
 
 
 @wp.kernel
@@ -83,38 +85,36 @@ def _encode_backward_kernel(
         grad_variances[i, j] = to_variance
 
 
-def frequency_encode(x: Tensor, octaves: int, include_input: bool = True) -> Tensor:
-    """``[x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...]``; see ``voronerf.ops.frequency_encode``."""
-    encoded: Tensor = in_float32(_encode, Encoding(x, None, octaves, include_input))
-    return encoded
+@_FREQUENCY.custom_op("frequency_encode_warp")
+def _frequency(given: Any, out: Tensor) -> None:
+    launch(_encode_kernel, given.x.shape, [*_inputs(given.x, None, *given[1:]), array(out, out)], out)
 
 
-def integrated_encode(means: Tensor, variances: Tensor, octaves: int) -> Tensor:
-    """Expected encoding of a Gaussian; see ``voronerf.ops.integrated_encode``."""
-    encoded: Tensor = in_float32(_encode, Encoding(means, variances, octaves, False))
-    return encoded
+@_FREQUENCY.backward_op("frequency_encode_warp_backward", _frequency, reference.frequency_encode)
+def _frequency_backward(given: Any, arriving: Any, gradients: Any) -> None:
+    _fill_gradients(arriving.result, *gradients, None, _inputs(given.x, None, *given[1:]))
 
 
-@custom_op("encode_warp")
-def _encode(given: Encoding) -> Iterator[Tensor]:
-    out = given.result()
-    yield out
-    launch(_encode_kernel, given.x.shape, [*_inputs(given), array(out, out)], out)
+@_INTEGRATED.custom_op("integrated_encode_warp")
+def _integrated(given: Any, out: Tensor) -> None:
+    launch(_encode_kernel, given.means.shape, [*_inputs(*given, False), array(out, out)], out)
 
 
-@custom_op("encode_warp_backward")
-def _backward(arriving: OfOne, given: Encoding, wanted: Sequence[bool]) -> Iterator[list[Tensor]]:
-    of_x, of_variances = results = given.gradients()
-    yield results
-    to_spread = of_x[:0] if given.variances is None else of_variances
-    inputs = [array(arriving.result, of_x), *_inputs(given), array(of_x, of_x), array(to_spread, of_x)]
-    launch(_encode_backward_kernel, given.x.shape, inputs, of_x)
+@_INTEGRATED.backward_op("integrated_encode_warp_backward", _integrated, integrated.integrated_encode)
+def _integrated_backward(given: Any, arriving: Any, gradients: Any) -> None:
+    of_means, of_variances = (given.means.new_empty(given.means.shape) if part is None else part for part in gradients)
+    _fill_gradients(arriving.result, of_means, of_variances, _inputs(*given, False))
 
 
-def _inputs(given: Encoding) -> list[object]:
-    x, variances = given.x, given.variances
+def _fill_gradients(gradient: Tensor, of_x: Tensor, of_variances: Tensor | None, inputs: list[object]) -> None:
+    to_spread = of_x[:0] if of_variances is None else of_variances
+    launched = [array(gradient, of_x), *inputs, array(of_x, of_x), array(to_spread, of_x)]
+    launch(_encode_backward_kernel, of_x.shape, launched, of_x)
+
+
+def _inputs(x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> list[object]:
     spread = array(x[:0] if variances is None else variances, x)
-    return [array(x, x), spread, variances is not None, given.octaves, given.include_input]
+    return [array(x, x), spread, variances is not None, octaves, include_input]
 
 
-register(_encode, _backward)
+frequency_encode, integrated_encode = in_float32(_frequency), in_float32(_integrated)

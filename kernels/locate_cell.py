@@ -6,15 +6,13 @@ Nothing outside the tables is read; a walk that leads out of them or ends at no 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
-import torch
 import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch, of_both_dtypes
-from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.declare import declared
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -59,11 +57,9 @@ def _locate_cell_kernel(
 of_both_dtypes(_locate_cell_kernel)
 
 
-@custom_op("locate_cell_warp")
-def locate_cell(points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int) -> Iterator[Tensor]:
+@declared("locate_cell").custom_op("locate_cell_warp")
+def locate_cell(given: Any, leaves: Tensor) -> None:
     """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
-    leaves = points.new_empty(points.shape[0], dtype=torch.int32)
-    yield leaves
-    given = [array(tensor, points) for tensor in (points, centres, child_offsets, child)]
-    inputs = [*given, depth, array(leaves, points)]
-    launch(_locate_cell_kernel, points.shape[0], inputs, points)
+    *tables, depth = given
+    inputs = [*[array(tensor, leaves) for tensor in tables], depth, array(leaves, leaves)]
+    launch(_locate_cell_kernel, given.n, inputs, leaves)

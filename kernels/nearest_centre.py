@@ -6,15 +6,13 @@ that the answer is that of the reference and of csrc/ to the last index.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
-import torch
 import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch, of_both_dtypes
-from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.declare import declared
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -44,10 +42,8 @@ def _nearest_centre_kernel(
 of_both_dtypes(_nearest_centre_kernel)
 
 
-@custom_op("nearest_centre_warp")
-def nearest_centre(points: Tensor, centres: Tensor) -> Iterator[Tensor]:
+@declared("nearest_centre").custom_op("nearest_centre_warp")
+def nearest_centre(given: Any, cells: Tensor) -> None:
     """Index of the nearest centre of every point; see ``voronerf.ops.nearest_centre``."""
-    cells = points.new_empty(points.shape[0], dtype=torch.int32)
-    yield cells
-    given = [array(tensor, points) for tensor in (points, centres, cells)]
-    launch(_nearest_centre_kernel, points.shape[0], given, points)
+    inputs = [array(tensor, cells) for tensor in (*given, cells)]
+    launch(_nearest_centre_kernel, given.n, inputs, cells)

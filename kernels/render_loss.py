@@ -7,7 +7,7 @@ sample where the gradient of its density is to be, a second one comes back with 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import Any
 
 import torch
 import warp as wp
@@ -15,10 +15,9 @@ from torch import Tensor
 
 from voronerf.kernels._launch import array, filled, launch
 from voronerf.kernels.composite import _OPAQUE, _absorbed, _density
-from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.declare import declared
 from voronerf.ops.composite.reference import check_ray_offsets
-from voronerf.ops.render_loss.autograd import Results, register, results
-from voronerf.ops.render_loss.reference import RenderLossInputs
+from voronerf.ops.render_loss.autograd import register
 
 wp.set_module_options({"enable_backward": False})
 
@@ -117,27 +116,25 @@ def _density_kernel(raw: wp.array2d(dtype=wp.float32), scale: wp.float32, densit
     density[i] = _softplus(raw[i, 3]) * scale
 
 
-def render_loss(given: RenderLossInputs) -> list[Tensor]:
+def render_loss(raw: Tensor, *others: Any) -> list[Tensor]:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
-    *parts, _ = _render_loss(given._replace(raw=given.raw.float()))
+    *parts, _ = _render_loss(raw.float(), *others)
     return parts
 
 
-@custom_op("render_loss_warp")
-def _render_loss(given: RenderLossInputs) -> Iterator[Results]:
-    loss, colour, weights, density, error, gradient = results(given)
-    yield loss, colour, weights, density, error, gradient
-    raw, target, m, r = given.raw, given.target, given.raw.shape[0], given.target.shape[0]
+@declared("render_loss_gradient").custom_op("render_loss_warp")
+def _render_loss(given: Any, found: Any) -> None:
+    raw, target, m, r = given.raw, given.target, given.m, given.r
     check_ray_offsets("render_loss", given.ray_offsets, m)
-    for of_strays in (weights, gradient):  # samples that belong to no ray
+    for of_strays in (found.weights, found.gradient):  # samples that belong to no ray
         of_strays.zero_()
     behind = target.new_empty(0, 3) if given.background is None else given.background.expand_as(target)
     compared = {"target": target, "background": behind, "scale": given.density_scale, "hidden": given.hidden}
     inputs = filled(Inputs(), raw=raw, deltas=given.deltas, offsets=given.ray_offsets, **compared)
-    outputs = filled(Found(), colour=colour, weights=weights, error=error, gradient=gradient)
-    launch(_render_loss_kernel, r, [inputs, outputs], raw)
-    launch(_density_kernel, m, [array(raw, raw), given.density_scale, array(density, raw)], raw)
-    loss.copy_(error.mean(dtype=torch.float64) / 3)
+    outputs = {name: getattr(found, name) for name in ("colour", "weights", "error", "gradient")}
+    launch(_render_loss_kernel, r, [inputs, filled(Found(), **outputs)], raw)
+    launch(_density_kernel, m, [array(raw, raw), given.density_scale, array(found.density, raw)], raw)
+    found.loss.copy_(found.error.mean(dtype=torch.float64) / 3)
 
 
 register(_render_loss)

@@ -6,13 +6,14 @@ float64. Targets are sorted by torch.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import Any
 
 import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch
-from voronerf.ops._core.custom_op import custom_op, in_float32
+from voronerf.ops._core.custom_op import in_float32
+from voronerf.ops._core.declare import declared
 
 wp.set_module_options({"enable_backward": False})
 
@@ -81,16 +82,11 @@ def _resample_kernel(
         depths[ray, j] = wp.float32(depth)
 
 
-def resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Tensor:
-    """Depths drawn in proportion to the weights of the bins; see ``voronerf.ops.resample``."""
-    depths: Tensor = in_float32(_resample, (weights, edges, count, uniforms))
-    return depths
+@declared("resample").custom_op("resample_warp")
+def _resample(given: Any, depths: Tensor) -> None:
+    targets = depths[:0] if given.uniforms is None else given.uniforms.sort(dim=1).values
+    inputs = [array(tensor, depths) for tensor in (given.weights, given.edges, targets)]
+    launch(_resample_kernel, given.r, [*inputs, given.uniforms is not None, array(depths, depths)], depths)
 
 
-@custom_op("resample_warp")
-def _resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Iterator[Tensor]:
-    depths = edges.new_empty(edges.shape[0], count)
-    yield depths
-    targets = depths[:0] if uniforms is None else uniforms.sort(dim=1).values
-    given = [array(tensor, depths) for tensor in (weights, edges, targets)]
-    launch(_resample_kernel, depths.shape[0], [*given, uniforms is not None, array(depths, depths)], depths)
+resample = in_float32(_resample)

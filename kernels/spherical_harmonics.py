@@ -5,17 +5,18 @@ The arithmetic is float32; second derivatives come from the reference formula.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from typing import Any
 
 import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch
-from voronerf.ops._core.custom_op import custom_op, in_float32
-from voronerf.ops._core.derivatives import OfOne
-from voronerf.ops.spherical_harmonics.autograd import Harmonics, register
+from voronerf.ops._core.custom_op import in_float32
+from voronerf.ops._core.declare import declared
+from voronerf.ops.spherical_harmonics import reference
 
 wp.set_module_options({"enable_backward": False})
+_OP = declared("spherical_harmonics")
 
 
 @wp.kernel
@@ -86,27 +87,16 @@ def _harmonics_backward_kernel(
     found[i, 2] = to_z
 
 
-def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
-    """Bands 0 to degree - 1; see ``voronerf.ops.spherical_harmonics``."""
-    encoded: Tensor = in_float32(_forward, Harmonics(directions, degree))
-    return encoded
+@_OP.custom_op("spherical_harmonics_warp")
+def _forward(given: Any, out: Tensor) -> None:
+    launch(_harmonics_kernel, given.n, [array(given.directions, out), given.degree, array(out, out)], out)
 
 
-@custom_op("spherical_harmonics_warp")
-def _forward(given: Harmonics) -> Iterator[Tensor]:
-    directions, degree = given
-    out = directions.new_empty(directions.shape[0], degree**2)
-    yield out
-    launch(_harmonics_kernel, out.shape[0], [array(directions, out), degree, array(out, out)], out)
+@_OP.backward_op("spherical_harmonics_warp_backward", _forward, reference.spherical_harmonics)
+def _backward(given: Any, arriving: Any, gradients: Any) -> None:
+    found, directions = gradients.directions, given.directions
+    inputs = [array(arriving.result, found), array(directions, found), given.degree, array(found, found)]
+    launch(_harmonics_backward_kernel, given.n, inputs, found)
 
 
-@custom_op("spherical_harmonics_warp_backward")
-def _backward(arriving: OfOne, given: Harmonics, wanted: Sequence[bool]) -> Iterator[list[Tensor]]:
-    directions, degree = given
-    found = directions.new_empty(directions.shape)
-    yield [found]
-    inputs = [array(arriving.result, found), array(directions, found), degree, array(found, found)]
-    launch(_harmonics_backward_kernel, found.shape[0], inputs, found)
-
-
-register(_forward, _backward)
+spherical_harmonics = in_float32(_forward)

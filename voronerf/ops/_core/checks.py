@@ -183,6 +183,11 @@ class Checked:
             check_tensor(self.op, name, tensor)
             self.tensor(name, tensor, dtypes, *shape[tensor.dim() == len(shape) - 1 :])
 
+    def first_float(self) -> Tensor:
+        """The first floating-point tensor."""
+        assert self._float is not None
+        return self._float[1]
+
     def no_inference(self) -> None:
         """`check_no_inference` of all tensors."""
         if torch.is_grad_enabled() and not torch.compiler.is_compiling():
@@ -255,6 +260,20 @@ def check_positive(op: str, name: str, value: float) -> None:
     check_number(op, name, value)
     if not value > 0:
         raise ValueError(f"{op}: {name} must be positive, got {value}")
+
+
+def check_interval(op: str, name: str, value: float, low: float, high: float, rule: str) -> None:
+    """`check_number`, and ValueError outside of an interval that ``rule`` writes, such as "[0, 1)"."""
+    check_number(op, name, value)
+    if not (low <= value < high or (value == high and rule.endswith("]"))):
+        raise ValueError(f"{op}: {name} must lie in {rule}, got {value}")
+
+
+def check_kind(op: str, name: str, value: object, kind: type) -> None:
+    """Raises TypeError unless ``value`` is an instance of a class of this library."""
+    if not isinstance(value, kind):
+        article = "" if kind.__name__.endswith("s") else "an " if kind.__name__[0] in "AEIOM" else "a "
+        raise TypeError(f"{op}: {name} must be {article}{kind.__name__}, got {type(value).__name__}")
 
 
 def check_flag(op: str, name: str, value: bool) -> None:

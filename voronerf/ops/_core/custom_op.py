@@ -56,20 +56,43 @@ def custom_op(
 
         signature = inspect.signature(steps, eval_str=True)
         (results,) = typing.get_args(signature.return_annotation)
-        structs = Structs(signature)
-
-        def flat(*arguments: Any) -> Any:
-            return run(*structs.packed(arguments))
-
-        flat.__signature__ = structs.flat_signature(results)  # type: ignore[attr-defined]
-        schema = torch.library.infer_schema(flat, mutates_args=())
-        op = torch.library.custom_op(f"voronerf::{name}", flat, mutates_args=(), device_types=devices, schema=schema)
-        op.register_fake(fake or (lambda *arguments: next(steps(*structs.packed(arguments)))))
-        made = Op(op, run, devices, structs, listed=typing.get_origin(results) is list)
-        made.__module__, made.__name__, made.__doc__ = steps.__module__, steps.__name__, steps.__doc__
-        return made
+        structs = Structs(signature.replace(return_annotation=results))
+        made = fake or (lambda *flat: next(steps(*structs.packed(flat))))
+        return make_op(name, run, made, structs, steps, devices=devices)
 
     return declare
+
+
+def make_op(
+    name: str,
+    run: Callable[..., Any],
+    fake: Callable[..., Any],
+    structs: Structs,
+    described: Callable[..., Any],
+    *,
+    devices: tuple[str, ...] = ("cpu", "cuda"),
+) -> Op:
+    """The custom op ``voronerf::name``.
+
+    Args:
+        name: of the op.
+        run: gives its results, from its arguments with named tuples.
+        fake: gives memory for them, from its arguments one by one.
+        structs: its arguments and results.
+        described: the function whose module, name and docstring it gets.
+        devices: device types that it runs on.
+    """
+
+    def flat(*arguments: Any) -> Any:
+        return run(*structs.packed(arguments))
+
+    flat.__signature__ = signature = structs.flat_signature()  # type: ignore[attr-defined]
+    schema = torch.library.infer_schema(flat, mutates_args=())
+    op = torch.library.custom_op(f"voronerf::{name}", flat, mutates_args=(), device_types=devices, schema=schema)
+    op.register_fake(fake)
+    made = Op(op, run, devices, structs, listed=typing.get_origin(signature.return_annotation) is list)
+    made.__module__, made.__name__, made.__doc__ = described.__module__, described.__name__, described.__doc__
+    return made
 
 
 class Structs:
@@ -82,24 +105,24 @@ class Structs:
     """
 
     def __init__(self, signature: inspect.Signature) -> None:
-        self._parameters = list(signature.parameters.values())
+        self._parameters, self._results = list(signature.parameters.values()), signature.return_annotation
         self.kinds = [kind if hasattr(kind := given.annotation, "_fields") else None for given in self._parameters]
         self._widths = [1 if kind is None else len(kind._fields) for kind in self.kinds]
         self._any = any(kind is not None for kind in self.kinds)
         self._alone = self._any and len(self.kinds) == 1
-        hints = [given.annotation for given in self.flat_signature(None).parameters.values()]
+        hints = [given.annotation for given in self.flat_signature().parameters.values()]
         kinds = (Tensor, Tensor | None)
         self.tensors = [place for place, hint in enumerate(hints) if hint in kinds]
         self.lists = [place for place, hint in enumerate(hints) if any(of in kinds for of in typing.get_args(hint))]
         self.lists = [place for place in self.lists if place not in self.tensors]
 
-    def flat_signature(self, results: Any) -> inspect.Signature:
+    def flat_signature(self) -> inspect.Signature:
         """The signature with the fields of named tuples in their place."""
         found = []
         for given, kind in zip(self._parameters, self.kinds):
             hints = {given.name: given.annotation} if kind is None else typing.get_type_hints(kind)
             found += [inspect.Parameter(name, given.kind, annotation=hint) for name, hint in hints.items()]
-        return inspect.Signature(found, return_annotation=results)
+        return inspect.Signature(found, return_annotation=self._results)
 
     def packed(self, flat: Sequence[Any]) -> Sequence[Any]:
         """The arguments of the function."""
@@ -222,18 +245,18 @@ def _nested(flat: list[Any], lengths: list[int]) -> tuple[Any, ...]:
     return tuple(next(entries) if n < 0 else [next(entries) for _ in range(n)] for n in lengths)
 
 
-def in_float32(op: Op, given: tuple[Any, ...]) -> Any:
-    """What an op gives that computes in float32, in the dtype of the tensors it is given.
+def in_float32(op: Op) -> Callable[..., Any]:
+    """The function that has an op, which computes in float32, compute for other dtypes of its floating-point tensors.
 
-    Args:
-        op: of floating-point tensors of one dtype, the first argument among them; its results are a tensor or a tuple
-            of them.
-        given: its arguments or, as a named tuple, its only one.
+    All of them have the dtype of the first argument; the results are a tensor or a tuple of them.
     """
-    alone = hasattr(given, "_make")
-    if given[0].dtype is torch.float32:
-        return op(given) if alone else op(*given)
-    narrow = given[0].dtype
-    wide = [part.float() if isinstance(part, Tensor) and part.is_floating_point() else part for part in given]
-    found = op(type(given)._make(wide)) if alone else op(*wide)  # type: ignore[attr-defined]
-    return found.to(narrow) if isinstance(found, Tensor) else tuple(part.to(narrow) for part in found)
+
+    def run(*given: Any) -> Any:
+        narrow = given[0].dtype
+        if narrow is torch.float32:
+            return op(*given)
+        wide = [part.float() if isinstance(part, Tensor) and part.is_floating_point() else part for part in given]
+        found = op(*wide)
+        return found.to(narrow) if isinstance(found, Tensor) else tuple(part.to(narrow) for part in found)
+
+    return run

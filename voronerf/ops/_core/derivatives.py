@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -85,51 +85,50 @@ def second_derivatives(
     return [None if tensor is None else next(seconds) for tensor in tensors]
 
 
-class OfOne(NamedTuple):
-    """The gradient that arrives at an op with one result."""
-
-    result: Tensor | None
-
-
 def register_derivatives(
-    forward: Op, backward: Op, formula: Callable[..., Tensor | Sequence[Tensor]], smooth: Sequence[str]
+    forward: Op,
+    backward: Op,
+    formula: Callable[..., Tensor | Sequence[Tensor]],
+    places: Sequence[int],
+    width: int,
+    count: int,
 ) -> None:
     """Registers the derivatives of an op whose gradients are another op, and whose further ones are those of a formula.
 
     Args:
-        forward: ``forward(given)``, of a named tuple.
-        backward: ``backward(arriving, given, wanted)`` gives the gradients to the smooth parts of ``given``, in a list:
-            of what has arrived at the results, a named tuple with None for zero, and a bool for each smooth part. What
-            is not wanted or not there may be anything.
-        formula: takes the parts of ``given``, and gives what ``forward`` does.
-        smooth: the fields of ``given`` that have gradients.
+        forward: of ``width`` arguments; it gives ``count`` tensors.
+        backward: takes what has arrived at the results, None for zero, the arguments of ``forward``, and a bool for
+            each of those with gradients. It gives these in a list; what is not wanted or not there may be anything.
+        formula: takes and gives what ``forward`` does.
+        places: of the arguments with gradients.
+        width: arguments of ``forward``.
+        count: its results.
     """
-    kind: Any = forward.structs.kinds[0]
-    arrived: Any = backward.structs.kinds[0]
-    count, places = len(arrived._fields), [kind._fields.index(name) for name in smooth]
 
-    def placed(values: Sequence[Tensor | None]) -> Any:
-        """The values in the places of the smooth parts."""
-        found: list[Tensor | None] = [None] * len(kind._fields)
+    def placed(given: Sequence[Any], values: Sequence[Tensor | None]) -> list[Any]:
+        found = list(given)
         for place, value in zip(places, values):
             found[place] = value
-        return kind._make(found)
+        return found
+
+    nothing = [None] * width
 
     def first(ctx: Any, *arriving: Tensor | None) -> tuple[Any, ...]:
-        given = kind._make(_kept(ctx, forward))
+        given = _kept(ctx, forward)
         wanted = [ctx.needs_input_grad[place] for place in places]
         found: list[Tensor | None] = []
         if any(gradient is not None for gradient in arriving):
-            parts = backward(arrived._make(arriving), given, wanted)
+            parts = backward(*arriving, *given, wanted)
             found = [part if want else None for part, want in zip(parts, wanted)]
-        return (placed(found),)
+        return tuple(placed(nothing, found))
 
     def second(ctx: Any, cotangents: Sequence[Tensor | None]) -> tuple[Any, ...]:
-        arriving, given, wanted = backward.structs.packed(_kept(ctx, backward))
+        *flat, wanted = _kept(ctx, backward)
+        arriving, given = flat[:count], flat[count:]
         leaves, graph = aliases([*arriving, *(given[place] for place in places)])
         inputs = leaves[count:]
         with torch.enable_grad():
-            results = formula(*given._replace(**dict(zip(smooth, inputs))))
+            results = formula(*placed(given, inputs))
             outputs = zip((results,) if isinstance(results, Tensor) else results, leaves)
             pairs = [
                 (leaf, cotangent)
@@ -138,28 +137,28 @@ def register_derivatives(
             ]
             used = [(part, gradient) for part, gradient in outputs if gradient is not None]
             found = second_derivatives(used, pairs, leaves, graph)
-        return arrived._make(found[:count]), placed(found[count:]), None
+        return *found[:count], *placed(nothing, found[count:]), None
 
     forward.register_autograd(first, setup_context=_keeping(forward))
     backward.register_autograd(second, setup_context=_keeping(backward))
 
 
 def _keeping(op: Op) -> Callable[..., None]:
-    """Saves the arguments of an op, of its custom op one by one."""
+    """Saves the arguments of an op."""
 
     def keep(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        flat = list(op.structs.flat(inputs))
+        rest = list(inputs)
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*[flat[place] for place in op.structs.tensors])
+        ctx.save_for_backward(*[rest[place] for place in op.structs.tensors])
         for place in op.structs.tensors:
-            flat[place] = None
-        ctx.rest = flat
+            rest[place] = None
+        ctx.rest = rest
 
     return keep
 
 
 def _kept(ctx: Any, op: Op) -> list[Any]:
-    flat = list(ctx.rest)
+    found = list(ctx.rest)
     for place, tensor in zip(op.structs.tensors, ctx.saved_tensors):
-        flat[place] = tensor
-    return flat
+        found[place] = tensor
+    return found

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, Implementation
-from voronerf.ops._core.checks import INDEX, Checked, check_integer
+from voronerf.ops._core.checks import INDEX
+from voronerf.ops._core.declare import declare
 
-_OP = backends.declare("cell_sort", native=Implementation(EVERYWHERE, INDEX), warp=Implementation(EVERYWHERE, INDEX))
 
-
-def cell_sort(cells: Tensor, k: int, *, backend: str = "auto") -> tuple[Tensor, Tensor]:
+@declare(native=Implementation(EVERYWHERE, INDEX), warp=Implementation(EVERYWHERE, INDEX))
+def cell_sort(
+    cells: Annotated[Tensor, "int32 [n]"], k: Annotated[int, "1.."], *, backend: str = "auto"
+) -> tuple[Annotated[Tensor, "int32 [n]"], Annotated[Tensor, "int32 [k + 1]"]]:
     """Stable order of samples by cell, and where each cell begins.
 
     ``x[order]`` is sorted by cell, and the samples of a cell keep their order; ``y_sorted`` is put back by
@@ -44,8 +47,3 @@ def cell_sort(cells: Tensor, k: int, *, backend: str = "auto") -> tuple[Tensor, 
         >>> x[order]  # cells 0, 0, 2, 2; cell 1 is empty
         tensor([11, 13, 10, 12])
     """
-    Checked(_OP).tensor("cells", cells, INDEX, "n")
-    check_integer(_OP, "k", k, 1)
-    run = backends.resolve(_OP, backend=backend, device=cells.device, dtype=cells.dtype)
-    order, offsets = run(cells, k)
-    return order, offsets

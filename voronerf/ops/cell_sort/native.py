@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.checks import check_range
-from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.declare import declared
 
 WAYS = native.compiled.CellSortWay
 """Of sorting on CUDA; "automatic" is by the number of cells."""
 
 
-@custom_op("cell_sort")
-def cell_sort(cells: Tensor, k: int) -> Iterator[tuple[Tensor, Tensor]]:
+@declared("cell_sort").custom_op()
+def cell_sort(given: Any, found: tuple[Tensor, Tensor]) -> None:
     """Stable order and cell offsets; see ``voronerf.ops.cell_sort``."""
-    order, offsets = cells.new_empty(cells.shape[0]), cells.new_empty(k + 1)
-    yield order, offsets
-    sort(cells, order, offsets, "cell_sort")
+    sort(given.cells, *found, "cell_sort")
 
 
 def sort(cells: Tensor, order: Tensor, offsets: Tensor, caller: str, way: str = "automatic") -> None:

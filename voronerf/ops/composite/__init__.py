@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import FLOATING, INDEX, LIKE_FIRST, Checked, check_count
+from voronerf.ops._core.declare import declare
 from voronerf.ops.composite.reference import Composite
 
-_OP = backends.declare("composite", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS))
 
-
+@declare(
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+    smooth=["sigma", "rgb", "depths", "deltas", "background"],
+    small=["sigma"],
+)
 def composite(
-    sigma: Tensor,
-    rgb: Tensor,
-    depths: Tensor,
-    deltas: Tensor,
+    sigma: Annotated[Tensor, "floating [m] if ray_offsets else [r, s]"],
+    rgb: Annotated[Tensor, "same [m, c] if ray_offsets else [r, s, c]"],
+    depths: Annotated[Tensor, "same [m] if ray_offsets else [r, s]"],
+    deltas: Annotated[Tensor, "same [m] if ray_offsets else [r, s]"],
     *,
-    ray_offsets: Tensor | None = None,
-    background: Tensor | None = None,
+    ray_offsets: Annotated[Tensor | None, "int32 [r+1]"] = None,
+    background: Annotated[Tensor | None, "same [r?, c]"] = None,
     backend: str = "auto",
 ) -> Composite:
     """Volume rendering: colour, opacity and depth of rays, from the density and colour of their samples.
@@ -59,15 +64,3 @@ def composite(
         >>> result.colour, result.depth, result.weights
         (tensor([[1., 0., 0.]]), tensor([2.]), tensor([[0., 1., 0.]]))
     """
-    given = Checked(_OP)
-    samples = ("r", "s") if ray_offsets is None else ("m",)
-    given.tensor("sigma", sigma, FLOATING, *samples)
-    given.tensor("rgb", rgb, LIKE_FIRST, *samples, "c")
-    given.tensor("depths", depths, LIKE_FIRST, *samples)
-    given.tensor("deltas", deltas, LIKE_FIRST, *samples)
-    given.optional("ray_offsets", ray_offsets, INDEX, "r+1")
-    given.each_or_all("background", background, LIKE_FIRST, "r", "c")
-    given.no_inference()
-    check_count(_OP, "sigma", sigma.numel())
-    run = backends.resolve(_OP, backend=backend, device=sigma.device, dtype=sigma.dtype)
-    return Composite(*run(sigma, rgb, depths, deltas, ray_offsets, background))

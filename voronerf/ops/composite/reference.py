@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,10 +30,10 @@ class Composite(NamedTuple):
         (torch.Size([1, 3]), torch.Size([1]), torch.Size([1, 4]))
     """
 
-    colour: Tensor
-    opacity: Tensor
-    depth: Tensor
-    weights: Tensor
+    colour: Annotated[Tensor, "same [r, c]"]
+    opacity: Annotated[Tensor, "same [r]"]
+    depth: Annotated[Tensor, "same [r]"]
+    weights: Annotated[Tensor, "same [m] if ray_offsets else [r, s]"]
 
 
 def check_ray_offsets(op: str, ray_offsets: Tensor, m: int) -> None:

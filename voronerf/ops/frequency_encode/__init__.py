@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import FLOATING, Checked, check_flag, check_integer
-
-_OP = backends.declare(
-    "frequency_encode", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS, "encode")
-)
+from voronerf.ops._core.declare import declare
 
 
-def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True, backend: str = "auto") -> Tensor:
+@declare(native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS, "encode"), smooth=["x"])
+def frequency_encode(
+    x: Annotated[Tensor, "floating [n, d]"],
+    octaves: Annotated[int, "0..127"],  # 2^128 is beyond float32
+    *,
+    include_input: bool = True,
+    backend: str = "auto",
+) -> Annotated[Tensor, "same [n, d * (include_input + 2 * octaves)]"]:
     """``[x, sin x, cos x, sin 2x, cos 2x, ..., sin 2^(L-1) x, cos 2^(L-1) x]``, each a block of d features.
 
     The layout of nerf-pytorch: no factor of pi, and x itself first. Mildenhall et al. 2020, equation 4. Angles are
@@ -35,11 +39,3 @@ def frequency_encode(x: Tensor, octaves: int, *, include_input: bool = True, bac
         >>> frequency_encode(x, 2).round(decimals=4)  # x, sin x, cos x, sin 2x, cos 2x
         tensor([[ 1.0000,  0.8415,  0.5403,  0.9093, -0.4161]])
     """
-    given = Checked(_OP)
-    given.tensor("x", x, FLOATING, "n", "d")
-    given.no_inference()
-    check_flag(_OP, "include_input", include_input)
-    check_integer(_OP, "octaves", octaves, 0, 127)  # 2^128 is beyond float32
-    run = backends.resolve(_OP, backend=backend, device=x.device, dtype=x.dtype)
-    encoded: Tensor = run(x, octaves, include_input)
-    return encoded

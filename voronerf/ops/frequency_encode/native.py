@@ -1,4 +1,4 @@
-"""The encodings of the compiled module: the frequency encoding and, with variances, the integrated one.
+"""``frequency_encode`` of the compiled module, and what the integrated encoding has in common with it.
 
 n points, d features, L octaves. The arithmetic is float32; half types are cast on the way in and out. Second
 derivatives come from the reference formulas.
@@ -6,64 +6,65 @@ derivatives come from the reference formulas.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from typing import Any
 
 from torch import Tensor
 
 from voronerf.ops._core import native
-from voronerf.ops._core.custom_op import custom_op, in_float32
-from voronerf.ops._core.derivatives import OfOne
-from voronerf.ops.frequency_encode.autograd import Encoding, register
+from voronerf.ops._core.custom_op import in_float32
+from voronerf.ops._core.declare import declared
+from voronerf.ops.frequency_encode import reference
+
+_OP = declared("frequency_encode")
 
 
-def frequency_encode(x: Tensor, octaves: int, include_input: bool = True) -> Tensor:
-    """``[x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...]``; see ``voronerf.ops.frequency_encode``."""
-    encoded: Tensor = in_float32(encode, Encoding(x, None, octaves, include_input))
-    return encoded
+@_OP.custom_op("frequency_encode_native")
+def _forward(given: Any, out: Tensor) -> None:
+    encode(out, given.x, None, given.octaves, given.include_input)
 
 
-@custom_op("encode_native")
-def encode(given: Encoding) -> Iterator[Tensor]:
-    """The frequency encoding or, with variances, the integrated one."""
-    out = given.result()
-    yield out
+@_OP.backward_op("frequency_encode_native_backward", _forward, reference.frequency_encode)
+def _backward(given: Any, arriving: Any, gradients: Any) -> None:
+    encode_backward(arriving.result, gradients.x, None, given.x, None, given.octaves, given.include_input)
+
+
+frequency_encode = in_float32(_forward)
+
+
+def encode(out: Tensor, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> None:
+    """Fills ``out`` with the frequency encoding or, with variances, the integrated one."""
     native.on_huge_pages(out)
-    compiled, machine = native.compiled, native.machine(out)
-    inputs = _inputs(given)
-    if isinstance(machine, compiled.Cuda):
-        compiled.encode(inputs, out, machine)
-    else:
-        compiled.encode(inputs, out, _workspace(given, machine), machine)
+    native.compiled.encode(_taken(out.shape[1], x, variances, octaves, include_input), out, *_where(x, octaves))
 
 
-@custom_op("encode_native_backward")
-def _backward(arriving: OfOne, given: Encoding, wanted: Sequence[bool]) -> Iterator[list[Tensor]]:
-    of_x, of_variances = results = given.gradients()
-    yield results
-    compiled, machine = native.compiled, native.machine(of_x)
-    assert arriving.result is not None
-    inputs = _inputs(given), arriving.result, of_x, None if given.variances is None else of_variances
-    if isinstance(machine, compiled.Cuda):
-        compiled.encode_backward(*inputs, machine)
-    else:
-        compiled.encode_backward(*inputs, _workspace(given, machine), machine)
+def encode_backward(
+    gradient: Tensor,
+    of_x: Tensor | None,
+    of_variances: Tensor | None,
+    x: Tensor,
+    variances: Tensor | None,
+    octaves: int,
+    include_input: bool,
+) -> None:
+    """Fills the gradients to x and to the variances."""
+    of_x, of_variances = (
+        like.new_empty(like.shape) if part is None and like is not None else part
+        for part, like in ((of_x, x), (of_variances, variances))
+    )
+    inputs = _taken(gradient.shape[1], x, variances, octaves, include_input)
+    native.compiled.encode_backward(inputs, gradient, of_x, of_variances, *_where(x, octaves))
 
 
-def _inputs(given: Encoding) -> native.compiled.Encoding:
-    n, d = given.x.shape
+def _taken(width: int, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> Any:
+    n, d = x.shape
     return native.compiled.Encoding(
-        x=given.x,
-        variances=given.variances,
-        n=n,
-        d=d,
-        octaves=given.octaves,
-        include_input=given.include_input,
-        width=d * (given.include_input + 2 * given.octaves),
+        x=x, variances=variances, n=n, d=d, octaves=octaves, include_input=include_input, width=width
     )
 
 
-def _workspace(given: Encoding, machine: native.compiled.Cpu) -> Tensor:
-    return given.x.new_empty(native.compiled.encode_workspace(given.x.shape[1], given.octaves, machine))
-
-
-register(encode, _backward)
+def _where(x: Tensor, octaves: int) -> tuple[Any, ...]:
+    """On the CPU a workspace comes before the machine."""
+    compiled, machine = native.compiled, native.machine(x)
+    if isinstance(machine, compiled.Cuda):
+        return (machine,)
+    return x.new_empty(compiled.encode_workspace(x.shape[1], octaves, machine)), machine

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import FLOATING, LIKE_FIRST, Checked, check_integer
+from voronerf.ops._core.declare import declare
 
-_OP = backends.declare(
-    "integrated_encode", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS, "encode")
+
+@declare(
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS, "encode"),
+    smooth=["means", "variances"],
 )
-
-
-def integrated_encode(means: Tensor, variances: Tensor, octaves: int, *, backend: str = "auto") -> Tensor:
+def integrated_encode(
+    means: Annotated[Tensor, "floating [n, 3]"],
+    variances: Annotated[Tensor, "same [n, 3]"],
+    octaves: Annotated[int, "0..127"],  # 2^128 is beyond float32
+    *,
+    backend: str = "auto",
+) -> Annotated[Tensor, "same [n, 6 * octaves]"]:
     """Expectation of the frequency encoding over a Gaussian with diagonal covariance.
 
     Block l holds ``sin(2^l mu) exp(-4^l var / 2)`` and then ``cos(2^l mu) exp(-4^l var / 2)``, three features each: the
@@ -38,11 +46,3 @@ def integrated_encode(means: Tensor, variances: Tensor, octaves: int, *, backend
         >>> integrated_encode(means, torch.full((1, 3), 4.0), 1).round(decimals=4)  # a wide Gaussian: closer to 0
         tensor([[0.1139, 0.0000, 0.0000, 0.0731, 0.1353, 0.1353]])
     """
-    given = Checked(_OP)
-    given.tensor("means", means, FLOATING, "n", 3)
-    given.tensor("variances", variances, LIKE_FIRST, "n", 3)
-    given.no_inference()
-    check_integer(_OP, "octaves", octaves, 0, 127)  # 2^128 is beyond float32
-    run = backends.resolve(_OP, backend=backend, device=means.device, dtype=means.dtype)
-    encoded: Tensor = run(means, variances, octaves)
-    return encoded

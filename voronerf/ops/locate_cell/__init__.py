@@ -3,21 +3,37 @@ diagrams."""
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
-from voronerf.ops._core.checks import FLOATING, INDEX, Checked, check_integer
+from voronerf.ops._core.declare import declare
 from voronerf.ops.nearest_centre import of_one_dtype
 
-_OP = backends.declare(
-    "locate_cell", native=Implementation(EVERYWHERE, COORDINATES), warp=Implementation(EVERYWHERE, COORDINATES)
+
+def _prepare(given: Any) -> Any:
+    m, g = given.child.shape[0], given.child_offsets.shape[0] - 1
+    if m < 1 or g < 1:
+        count = f"{m} centres in {g} diagrams"
+        raise ValueError(f"locate_cell: centres must hold at least one centre of one diagram, got {count}")
+    return (*of_one_dtype(given.points, given.centres), given.child_offsets, given.child, given.depth)
+
+
+@declare(
+    native=Implementation(EVERYWHERE, COORDINATES),
+    warp=Implementation(EVERYWHERE, COORDINATES),
+    prepare=_prepare,
 )
-
-
 def locate_cell(
-    points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, *, depth: int, backend: str = "auto"
-) -> Tensor:
+    points: Annotated[Tensor, "floating [n, 3]"],
+    centres: Annotated[Tensor, "floating [m, 3]"],
+    child_offsets: Annotated[Tensor, "int32 [g+1]"],
+    child: Annotated[Tensor, "int32 [m]"],
+    *,
+    depth: Annotated[int, "1.."],
+    backend: str = "auto",
+) -> Annotated[Tensor, "int32 [n]"]:
     """Leaf of every point in a tree of diagrams: on each level, the nearest centre of the diagram that holds the point.
 
     Diagram 0 is the root; diagram j owns rows ``child_offsets[j]`` to ``child_offsets[j + 1]`` of ``centres``. Exact,
@@ -53,16 +69,3 @@ def locate_cell(
         >>> locate_cell(points, centres, child_offsets, child, depth=2)
         tensor([0, 1, 2], dtype=torch.int32)
     """
-    given = Checked(_OP)
-    given.tensor("points", points, FLOATING, "n", 3)
-    given.tensor("centres", centres, FLOATING, "m", 3)
-    given.tensor("child_offsets", child_offsets, INDEX, "g+1")
-    given.tensor("child", child, INDEX, "m")
-    check_integer(_OP, "depth", depth, 1)
-    if given.sizes["m"] < 1 or given.sizes["g"] < 1:
-        count = f"{given.sizes['m']} centres in {given.sizes['g']} diagrams"
-        raise ValueError(f"{_OP}: centres must hold at least one centre of one diagram, got {count}")
-    points, centres = of_one_dtype(points, centres)
-    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
-    leaf: Tensor = run(points, centres, child_offsets, child, depth)
-    return leaf

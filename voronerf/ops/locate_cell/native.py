@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
+from typing import Any
 
-import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
-from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.declare import declared
 
 
-@custom_op("locate_cell")
-def locate_cell(points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int) -> Iterator[Tensor]:
+@declared("locate_cell").custom_op()
+def locate_cell(given: Any, leaves: Tensor) -> None:
     """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
-    leaves = points.new_empty(points.shape[0], dtype=torch.int32)
-    yield leaves
-    find(leaves, points, centres, (child_offsets, child, depth), "locate_cell")
+    points, centres, *tree = given
+    find(leaves, points, centres, tree, "locate_cell")
 
 
 def find(
     leaves: Tensor,
     points: Tensor,
     centres: Tensor,
-    tree: tuple[Tensor, Tensor, int],
+    tree: Sequence[Any],
     caller: str,
     rows: Tensor | None = None,
 ) -> None:

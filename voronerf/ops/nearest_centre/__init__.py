@@ -2,19 +2,40 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
-from voronerf.ops._core.checks import FLOATING, Checked
+from voronerf.ops._core.declare import declare
 
-_OP = backends.declare(
-    "nearest_centre", native=Implementation(EVERYWHERE, COORDINATES), warp=Implementation(EVERYWHERE, COORDINATES)
+
+def of_one_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+    """What is compared, in one type for all backends: float64 where either is, float32 otherwise."""
+    if points.dtype is centres.dtype is torch.float32 and not (points.requires_grad or centres.requires_grad):
+        return points, centres
+    dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
+    return points.detach().to(dtype), centres.detach().to(dtype)
+
+
+def _prepare(given: Any) -> tuple[Tensor, Tensor]:
+    if given.centres.shape[0] < 1:
+        raise ValueError("nearest_centre: centres must hold at least one centre, got none")
+    return of_one_dtype(*given)
+
+
+@declare(
+    native=Implementation(EVERYWHERE, COORDINATES),
+    warp=Implementation(EVERYWHERE, COORDINATES),
+    prepare=_prepare,
 )
-
-
-def nearest_centre(points: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
+def nearest_centre(
+    points: Annotated[Tensor, "floating [n, 3]"],
+    centres: Annotated[Tensor, "floating [k, 3]"],
+    *,
+    backend: str = "auto",
+) -> Annotated[Tensor, "int32 [n]"]:
     """Index of the nearest centre of every point: ``argmin_c |x - v_c|``.
 
     Exact: the direct form of the distance is used, and ties go to the lowest index. A point that is not finite goes to
@@ -36,20 +57,3 @@ def nearest_centre(points: Tensor, centres: Tensor, *, backend: str = "auto") ->
         >>> nearest_centre(points, centres)
         tensor([0, 1, 0], dtype=torch.int32)
     """
-    given = Checked(_OP)
-    given.tensor("points", points, FLOATING, "n", 3)
-    given.tensor("centres", centres, FLOATING, "k", 3)
-    if given.sizes["k"] < 1:
-        raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
-    points, centres = of_one_dtype(points, centres)
-    run = backends.resolve(_OP, backend=backend, device=points.device, dtype=points.dtype)
-    cells: Tensor = run(points, centres)
-    return cells
-
-
-def of_one_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
-    """What is compared, in one type for all backends: float64 where either is, float32 otherwise."""
-    if points.dtype is centres.dtype is torch.float32 and not (points.requires_grad or centres.requires_grad):
-        return points, centres
-    dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
-    return points.detach().to(dtype), centres.detach().to(dtype)

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import Any
 
-import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
-from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.declare import declared
 
 
-@custom_op("nearest_centre")
-def nearest_centre(points: Tensor, centres: Tensor) -> Iterator[Tensor]:
+@declared("nearest_centre").custom_op()
+def nearest_centre(given: Any, cells: Tensor) -> None:
     """Index of the nearest centre of every point; see ``voronerf.ops.nearest_centre``."""
-    cells = points.new_empty(points.shape[0], dtype=torch.int32)
-    yield cells
-    find(cells, points, centres)
+    find(cells, given.points, given.centres)
 
 
 def find(cells: Tensor, points: Tensor, centres: Tensor, rows: Tensor | None = None) -> None:

@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import FLOATING, INDEX, Checked, check_count, check_number, check_positive, detached
-from voronerf.ops.render_loss.reference import RenderLoss, RenderLossInputs
+from voronerf.ops._core.declare import declare
+from voronerf.ops.render_loss.reference import RenderLoss
 
-_OP = backends.declare(
-    "render_loss", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
+
+@declare(
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+    smooth=["raw"],
+    small=["raw"],
 )
-_GRADIENT = backends.declare(
-    "render_loss_gradient",
-    native=Implementation(EVERYWHERE, (torch.float32,), file="render_loss"),
-    reference=Implementation(file="render_loss"),
-)
-
-
 def render_loss(
-    raw: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor,
-    target: Tensor,
+    raw: Annotated[Tensor, "floating [m, 4]"],
+    deltas: Annotated[Tensor, "wide [m]"],
+    ray_offsets: Annotated[Tensor, "int32 [r+1]"],
+    target: Annotated[Tensor, "wide [r, 3]"],
     *,
-    background: Tensor | None = None,
-    density_scale: float,
-    hidden: float = 0.0,
+    background: Annotated[Tensor | None, "wide [r?, 3]"] = None,
+    density_scale: Annotated[float, "positive"],
+    hidden: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
 ) -> RenderLoss:
     """The mean squared error of rendered rays, from what the networks put out for their samples.
@@ -70,21 +68,25 @@ def render_loss(
         >>> raw.grad[:, :3].round(decimals=4)  # lighter
         tensor([[-0.0833, -0.0833, -0.0833]])
     """
-    given = _checked(_OP, raw, deltas, ray_offsets, target, background, density_scale, hidden)
-    return RenderLoss(*backends.resolve(_OP, backend=backend, device=raw.device, dtype=raw.dtype)(given))
 
 
+@declare(
+    native=Implementation(EVERYWHERE, (torch.float32,), file="render_loss"),
+    reference=Implementation(file="render_loss"),
+    smooth=["raw"],
+    small=["raw"],
+)
 def render_loss_gradient(
-    raw: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor,
-    target: Tensor,
+    raw: Annotated[Tensor, "floating [m, 4]"],
+    deltas: Annotated[Tensor, "wide [m]"],
+    ray_offsets: Annotated[Tensor, "int32 [r+1]"],
+    target: Annotated[Tensor, "wide [r, 3]"],
     *,
-    background: Tensor | None = None,
-    density_scale: float,
-    hidden: float = 0.0,
+    background: Annotated[Tensor | None, "wide [r?, 3]"] = None,
+    density_scale: Annotated[float, "positive"],
+    hidden: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
-) -> tuple[RenderLoss, Tensor]:
+) -> tuple[RenderLoss, Annotated[Tensor, "same [m, 4]"]]:
     """`render_loss` and the gradient of its loss to ``raw``, for `forward_with_tape`; nothing is differentiable.
 
     Args:
@@ -111,34 +113,3 @@ def render_loss_gradient(
         >>> float(result.loss), gradient[:, :3].round(decimals=4)
         (0.25, tensor([[-0.0833, -0.0833, -0.0833]]))
     """
-    given = _checked(_GRADIENT, raw, deltas, ray_offsets, target, background, density_scale, hidden)
-    *parts, gradient = backends.resolve(_GRADIENT, backend=backend, device=raw.device, dtype=raw.dtype)(given)
-    return RenderLoss(*parts), gradient
-
-
-def _checked(
-    op: str,
-    raw: Tensor,
-    deltas: Tensor,
-    ray_offsets: Tensor,
-    target: Tensor,
-    background: Tensor | None,
-    density_scale: float,
-    hidden: float,
-) -> RenderLossInputs:
-    """The arguments, of which the outputs of the networks alone are part of a graph."""
-    tensors = Checked(op)
-    tensors.tensor("raw", raw, FLOATING, "m", 4)
-    wide = (torch.promote_types(raw.dtype, torch.float32),)
-    tensors.tensor("deltas", deltas, wide, "m")
-    tensors.tensor("ray_offsets", ray_offsets, INDEX, "r+1")
-    tensors.tensor("target", target, wide, "r", 3)
-    tensors.each_or_all("background", background, wide, "r", 3)
-    tensors.no_inference()
-    check_count(op, "raw", raw.numel())
-    check_positive(op, "density_scale", density_scale)
-    check_number(op, "hidden", hidden)
-    if not 0 <= hidden < 1:
-        raise ValueError(f"{op}: hidden must lie in [0, 1), got {hidden}")
-    constant = detached(deltas), ray_offsets, detached(target), detached(background)
-    return RenderLossInputs(raw, *constant, float(density_scale), float(hidden))

@@ -1,4 +1,4 @@
-"""What native and Warp share of ``render_loss``: memory for its results, and its derivatives by the reference."""
+"""The derivatives of the native and the Warp kernel of ``render_loss``, which find the gradient with the loss."""
 
 from __future__ import annotations
 
@@ -8,37 +8,29 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.custom_op import Op
-from voronerf.ops.render_loss.reference import RenderLossInputs, render_loss
-
-Results = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-
-
-def results(given: RenderLossInputs) -> Results:
-    """Memory for loss, colour, weights, density, error, and the gradient of the loss to ``raw``."""
-    raw, r, m = given.raw, given.target.shape[0], given.raw.shape[0]
-    loss, colour, error = raw.new_empty(()), raw.new_empty(r, 3), raw.new_empty(r)
-    return loss, colour, raw.new_empty(m), raw.new_empty(m), error, raw.new_empty(m, 4)
+from voronerf.ops.render_loss.reference import render_loss
 
 
 def register(forward: Op) -> None:
-    """Registers the derivatives of an op that gives `results`."""
+    """Registers the derivatives of an op that gives what ``render_loss_gradient`` does."""
     forward.register_autograd(_backward, setup_context=_setup)
 
 
-def _setup(ctx: Any, inputs: tuple[RenderLossInputs], output: Results) -> None:
-    *tensors, ctx.density_scale, ctx.hidden = inputs[0]
+def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    *tensors, density_scale, hidden = inputs
+    ctx.numbers = density_scale, hidden
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(*output[1:])
     ctx.save_for_backward(*tensors, output[-1])
 
 
-def _backward(ctx: Any, of_loss: Tensor | None, *_: Tensor | None) -> tuple[Any]:
+def _backward(ctx: Any, of_loss: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, ...]:
     """Scales the gradient; where that is differentiated again, it comes from the reference formula."""
-    *tensors, gradient = ctx.saved_tensors
+    raw, *others, gradient = ctx.saved_tensors
     found = None
     if of_loss is not None and torch.is_grad_enabled():
-        given = RenderLossInputs._make([*tensors, ctx.density_scale, ctx.hidden])
-        (found,) = torch.autograd.grad(render_loss(given).loss, given.raw, of_loss, create_graph=True)
+        loss = render_loss(raw, *others, *ctx.numbers).loss
+        (found,) = torch.autograd.grad(loss, raw, of_loss, create_graph=True)
     elif of_loss is not None:
         found = of_loss * gradient
-    return (RenderLossInputs._make([found, *[None] * 6]),)
+    return found, *[None] * 6

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -30,32 +30,27 @@ class RenderLoss(NamedTuple):
         (torch.Size([4]), torch.Size([2]))
     """
 
-    loss: Tensor
-    colour: Tensor
-    weights: Tensor
-    density: Tensor
-    error: Tensor
+    loss: Annotated[Tensor, "wide []"]
+    colour: Annotated[Tensor, "wide [r, 3]"]
+    weights: Annotated[Tensor, "wide [m]"]
+    density: Annotated[Tensor, "wide [m]"]
+    error: Annotated[Tensor, "wide [r]"]
 
 
-class RenderLossInputs(NamedTuple):
-    """What ``render_loss`` takes; ``voronerf.ops.render_loss`` says what each is."""
-
-    raw: Tensor
-    deltas: Tensor
-    ray_offsets: Tensor
-    target: Tensor
-    background: Tensor | None
-    density_scale: float
-    hidden: float
-
-
-def render_loss(given: RenderLossInputs) -> RenderLoss:
+def render_loss(
+    raw: Tensor,
+    deltas: Tensor,
+    ray_offsets: Tensor,
+    target: Tensor,
+    background: Tensor | None,
+    density_scale: float,
+    hidden: float,
+) -> RenderLoss:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
-    raw, deltas, ray_offsets, target, background, density_scale, hidden = given
     raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
     check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
     if hidden and raw.requires_grad:
-        found = render_loss(given._replace(raw=raw.detach()))
+        found = render_loss(raw.detach(), deltas, ray_offsets, target, background, density_scale, hidden)
         unseen = found.weights <= hidden * -torch.expm1(-found.density * deltas)
         raw = torch.where(unseen[:, None], raw.detach(), raw)
     colours, density = torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
@@ -66,8 +61,8 @@ def render_loss(given: RenderLossInputs) -> RenderLoss:
 
 
 @torch.enable_grad()
-def render_loss_gradient(given: RenderLossInputs) -> tuple[Tensor, ...]:
+def render_loss_gradient(raw: Tensor, *others: Any) -> tuple[Tensor, ...]:
     """The result of `render_loss`, and the gradient of its loss to ``raw``."""
-    given = given._replace(raw=given.raw.detach().requires_grad_())
-    found = render_loss(given)
-    return found.loss.detach(), *found[1:], torch.autograd.grad(found.loss, given.raw)[0]
+    raw = raw.detach().requires_grad_()
+    found = render_loss(raw, *others)
+    return found.loss.detach(), *found[1:], torch.autograd.grad(found.loss, raw)[0]

@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import FLOATING, LIKE_FIRST, Checked, check_count, check_integer
+from voronerf.ops._core.checks import check_count
+from voronerf.ops._core.declare import declare
 
-_OP = backends.declare("resample", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS))
+
+def _prepare(given: Any) -> Any:
+    check_count("resample", "depths", given.weights.shape[0] * given.count)
+    if given.weights.shape[1] < 1:
+        raise ValueError("resample: weights must have at least one bin, got none")
+    return given
 
 
+@declare(
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+    small=["weights"],
+    prepare=_prepare,
+)
 def resample(
-    weights: Tensor, edges: Tensor, count: int, *, uniforms: Tensor | None = None, backend: str = "auto"
-) -> Tensor:
+    weights: Annotated[Tensor, "floating [r, s]"],
+    edges: Annotated[Tensor, "same [r, s+1]"],
+    count: Annotated[int, "1.."],
+    *,
+    uniforms: Annotated[Tensor | None, "same [r, count]"] = None,
+    backend: str = "auto",
+) -> Annotated[Tensor, "same [r, count]"]:
     """Inverse-CDF sampling: depths from the piecewise constant density with mass ``weights[:, i]`` in bin i of a ray.
 
     Mildenhall et al. 2020, section 5.2. Weights that are negative or not finite count as 0. If all weights of a ray are
@@ -39,17 +57,3 @@ def resample(
         >>> resample(weights, edges, 4)
         tensor([[2.1250, 2.3750, 2.6250, 2.8750]])
     """
-    given = Checked(_OP)
-    given.tensor("weights", weights, FLOATING, "r", "s")
-    given.tensor("edges", edges, LIKE_FIRST, "r", "s+1")
-    check_integer(_OP, "count", count, 1)
-    given.sizes["count"] = count
-    given.optional("uniforms", uniforms, LIKE_FIRST, "r", "count")
-    check_count(_OP, "weights", weights.numel())
-    check_count(_OP, "depths", given.sizes["r"] * count)
-    if given.sizes["s"] < 1:
-        raise ValueError(f"{_OP}: weights must have at least one bin, got none")
-    run = backends.resolve(_OP, backend=backend, device=weights.device, dtype=weights.dtype)
-    uniforms = None if uniforms is None else uniforms.detach()
-    depths: Tensor = run(weights.detach(), edges.detach(), count, uniforms)
-    return depths

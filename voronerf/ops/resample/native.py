@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
-from voronerf.ops._core.custom_op import custom_op, in_float32
+from voronerf.ops._core.custom_op import in_float32
+from voronerf.ops._core.declare import declared
 
 
-@custom_op("resample_native")
-def _resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Iterator[Tensor]:
-    r, s = weights.shape
-    depths = edges.new_empty(r, count)
-    yield depths
-    compiled, machine = native.compiled, native.machine(weights)
+@declared("resample").custom_op("resample_native")
+def _resample(given: Any, depths: Tensor) -> None:
+    compiled, machine = native.compiled, native.machine(depths)
+    tensors, sizes = (given.weights, given.edges, given.uniforms, depths), (given.r, given.s, given.count)
     if isinstance(machine, compiled.Cuda):
-        workspace = weights.new_empty(r, s, dtype=torch.float64)
-        compiled.resample(weights, edges, uniforms, depths, workspace, r, s, count, machine)
+        compiled.resample(*tensors, depths.new_empty(given.r, given.s, dtype=torch.float64), *sizes, machine)
     else:
-        compiled.resample(weights, edges, uniforms, depths, r, s, count, machine)
+        compiled.resample(*tensors, *sizes, machine)
 
 
-def resample(weights: Tensor, edges: Tensor, count: int, uniforms: Tensor | None) -> Tensor:
-    """Depths drawn in proportion to the weights of the bins; see ``voronerf.ops.resample``."""
-    depths: Tensor = in_float32(_resample, (weights, edges, count, uniforms))
-    return depths
+resample = in_float32(_resample)

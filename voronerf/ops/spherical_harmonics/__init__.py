@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import FLOATING, Checked, check_integer
-
-_OP = backends.declare(
-    "spherical_harmonics", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
-)
+from voronerf.ops._core.declare import declare
 
 
-def spherical_harmonics(directions: Tensor, degree: int, *, backend: str = "auto") -> Tensor:
+@declare(native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS), smooth=["directions"])
+def spherical_harmonics(
+    directions: Annotated[Tensor, "floating [n, 3]"], degree: Annotated[int, "1..4"], *, backend: str = "auto"
+) -> Annotated[Tensor, "same [n, degree**2]"]:
     """The real spherical harmonics of bands 0 to degree - 1, an orthonormal basis of functions of a direction.
 
     Order, signs and constants are those of tiny-cuda-nn's ``SphericalHarmonics`` and torch-ngp's ``SHEncoder`` (Müller
@@ -38,10 +38,3 @@ def spherical_harmonics(directions: Tensor, degree: int, *, backend: str = "auto
         >>> spherical_harmonics(up, 4).shape
         torch.Size([1, 16])
     """
-    given = Checked(_OP)
-    given.tensor("directions", directions, FLOATING, "n", 3)
-    given.no_inference()
-    check_integer(_OP, "degree", degree, 1, 4)
-    run = backends.resolve(_OP, backend=backend, device=directions.device, dtype=directions.dtype)
-    encoded: Tensor = run(directions, degree)
-    return encoded

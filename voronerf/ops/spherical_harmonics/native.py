@@ -6,39 +6,28 @@ formula.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from typing import Any
 
 from torch import Tensor
 
 from voronerf.ops._core import native
-from voronerf.ops._core.custom_op import custom_op, in_float32
-from voronerf.ops._core.derivatives import OfOne
-from voronerf.ops.spherical_harmonics.autograd import Harmonics, register
+from voronerf.ops._core.custom_op import in_float32
+from voronerf.ops._core.declare import declared
+from voronerf.ops.spherical_harmonics import reference
+
+_OP = declared("spherical_harmonics")
 
 
-def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
-    """Bands 0 to degree - 1; see ``voronerf.ops.spherical_harmonics``."""
-    encoded: Tensor = in_float32(_forward, Harmonics(directions, degree))
-    return encoded
-
-
-@custom_op("spherical_harmonics_native")
-def _forward(given: Harmonics) -> Iterator[Tensor]:
-    directions, degree = given
-    out = directions.new_empty(directions.shape[0], degree**2)
-    yield out
+@_OP.custom_op("spherical_harmonics_native")
+def _forward(given: Any, out: Tensor) -> None:
     native.on_huge_pages(out)
-    native.compiled.spherical_harmonics(directions, out, directions.shape[0], degree, native.machine(out))
+    native.compiled.spherical_harmonics(given.directions, out, given.n, given.degree, native.machine(out))
 
 
-@custom_op("spherical_harmonics_native_backward")
-def _backward(arriving: OfOne, given: Harmonics, wanted: Sequence[bool]) -> Iterator[list[Tensor]]:
-    directions, degree = given
-    found = directions.new_empty(directions.shape)
-    yield [found]
-    assert arriving.result is not None
-    inputs = directions, arriving.result, found, directions.shape[0], degree
-    native.compiled.spherical_harmonics_backward(*inputs, native.machine(found))
+@_OP.backward_op("spherical_harmonics_native_backward", _forward, reference.spherical_harmonics)
+def _backward(given: Any, arriving: Any, gradients: Any) -> None:
+    inputs = given.directions, arriving.result, gradients.directions, given.n, given.degree
+    native.compiled.spherical_harmonics_backward(*inputs, native.machine(gradients.directions))
 
 
-register(_forward, _backward)
+spherical_harmonics = in_float32(_forward)

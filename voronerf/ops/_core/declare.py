@@ -1,0 +1,426 @@
+"""One declaration an op: the signature of its public function.
+
+::
+
+    @declare(native=Implementation(EVERYWHERE, COORDINATES))
+    def nearest_centre(
+        points: Annotated[Tensor, "floating [n, 3]"],
+        centres: Annotated[Tensor, "floating [k, 3]"],
+        *,
+        backend: str = "auto",
+    ) -> Annotated[Tensor, "int32 [n]"]:
+        \"\"\"What it computes, which needs no body.\"\"\"
+
+The decorator makes the function: it checks the arguments, chooses a backend, and calls its implementation with the
+arguments one after another. From the same signature come the schema of custom ops, memory for their results (which is
+their fake), their gradients (`Declaration.derivatives`), and the members of compiled structs (`Declaration.struct`).
+
+A tensor is written as its dtypes and its shape. The dtypes are ``floating``, names of some (``float32|float64``),
+``same`` as the first floating-point tensor, or ``wide``, the same but at least float32. The shape has numbers, letters,
+a letter plus one, and arguments that are integers; ``r?`` is a dimension that may be missing, with one row for all. Of
+``[m] if ray_offsets else [r, s]`` the first holds where that argument is given. In the shape of a result an entry is
+any expression of letters and arguments. An int is written as a range (``1..4``, ``0..``), a float as ``positive``, or
+an interval (``[0, 1)``), a str as its choices (``linear|disparity``).
+"""
+
+from __future__ import annotations
+
+import collections
+import inspect
+import re
+import typing
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from voronerf.ops._core import backends, checks
+from voronerf.ops._core.backends import Implementation
+from voronerf.ops._core.checks import FLOATING, LIKE_FIRST, MAX_COUNT
+from voronerf.ops._core.custom_op import Op, Structs, make_op
+from voronerf.ops._core.derivatives import register_derivatives
+
+F = TypeVar("F", bound=Callable[..., Any])
+_DECLARED: dict[str, Declaration] = {}
+_DTYPES = {"floating": FLOATING, "same": LIKE_FIRST, "wide": LIKE_FIRST}
+
+
+def declare(
+    *,
+    native: Implementation | None = None,
+    warp: Implementation | None = None,
+    reference: Implementation | None = None,
+    smooth: Sequence[str] = (),
+    small: Sequence[str] = (),
+    prepare: Callable[[Any], Any] | None = None,
+) -> Callable[[F], F]:
+    """Makes the public function of an op from its signature, and puts its row into the table of backends.
+
+    Args:
+        native: of csrc/.
+        warp: of kernels/.
+        reference: in plain PyTorch.
+        smooth: the arguments that have gradients. The others are detached.
+        small: the arguments whose elements an int32 must number.
+        prepare: takes the checked arguments, as a named tuple, and gives those of the implementations; it checks what
+            the signature cannot say.
+    """
+
+    def of(function: F) -> F:
+        name = backends.declare(function.__name__, native=native, warp=warp, reference=reference or Implementation())
+        made: F = Declaration(name, function, smooth, small, prepare).public(function)
+        return made
+
+    return of
+
+
+def declared(name: str) -> Declaration:
+    """The declaration of an op."""
+    return _DECLARED[name]
+
+
+class Shaped(NamedTuple):
+    """A tensor of a signature."""
+
+    dtypes: tuple[torch.dtype, ...]
+    shape: tuple[int | str, ...]
+    wide: bool = False
+    condition: str = ""
+    otherwise: tuple[int | str, ...] = ()
+    maybe: bool = False
+
+    @staticmethod
+    def parse(text: str) -> Shaped:
+        """Of what a signature says."""
+        found = re.fullmatch(r"([\w|]+) \[(.*?)\](?: if (\w+) else \[(.*)\])?", text)
+        assert found is not None, f"a tensor is written as dtypes and a shape, got {text!r}"
+        dtypes, shape, condition, otherwise = found.groups()
+        known = _DTYPES.get(dtypes)
+        if known is None:
+            known = tuple(getattr(torch, name) for name in dtypes.split("|"))
+        entries = _entries(shape.replace("?", ""))
+        return Shaped(known, entries, dtypes == "wide", condition or "", _entries(otherwise or ""), "?" in shape)
+
+
+def _entries(text: str) -> tuple[int | str, ...]:
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    return tuple(int(part) if part.isdigit() else part for part in parts)
+
+
+class Argument(NamedTuple):
+    """An argument of a signature."""
+
+    name: str
+    kind: Any
+    optional: bool
+    rule: Any
+
+    def lines(self, op: str, detach: bool, bind: bool) -> Iterator[str]:
+        """The check of its value, as Python."""
+        name, kind, rule, place = self.name, self.kind, self.rule, f"'{op}', '{self.name}', {self.name}"
+        if kind is Tensor:
+            shape, entries = repr(rule.shape), "".join(f", {entry!r}" for entry in rule.shape)
+            if rule.condition:
+                shape = f"({shape} if {rule.condition} is not None else {rule.otherwise!r})"
+            if rule.maybe:
+                yield f"check_tensor({place})"
+                shape = f"{shape}[{name}.dim() == {len(rule.shape) - 1} :]"
+            dtypes = "wide" if rule.wide else f"{name}_dtypes"
+            entries = f", *{shape}" if rule.condition or rule.maybe else entries
+            yield f"given.tensor('{name}', {name}, {dtypes}{entries})"
+            if detach and (not rule.dtypes or {*rule.dtypes} & {*FLOATING}):
+                yield f"if {name}.requires_grad: {name} = {name}.detach()"
+        elif kind is int:
+            yield f"check_integer({place}, {rule[0]}, {rule[1]})"
+            if bind:
+                yield f"given.sizes['{name}'] = {name}"
+        elif kind is float:
+            yield f"{name}_rule({place})"
+            yield f"{name} = float({name})"
+        else:
+            checks = {bool: f"check_flag({place})", str: f"check_choice({place}, {name}_rule)"}
+            yield checks.get(kind, f"check_kind({place}, {name}_kind)")
+
+
+class Declaration:
+    """What the signature of an op says.
+
+    Attributes:
+        name: of the op.
+        arguments: one after another, without ``backend``.
+        results: tensors, by their names.
+        Inputs: the arguments as a named tuple, which has the letters of their shapes as attributes.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        smooth: Sequence[str],
+        small: Sequence[str],
+        prepare: Callable[[Any], Any] | None,
+    ) -> None:
+        self.name, self.smooth, self._small, self._prepare = name, smooth, small, prepare
+        hints = typing.get_type_hints(function, include_extras=True)
+        of_result = hints.pop("return")
+        hints.pop("backend")
+        self.arguments = [_argument(name, hint) for name, hint in hints.items()]
+        self.Inputs = _named(f"{name}_inputs", list(hints))
+        for letter, place in self._letters().items():
+            setattr(self.Inputs, letter, property(eval(f"lambda given: {place}")))
+        self._pack, self.results = _results(of_result)
+        memory = "".join(f"{self._memory(each)}, " for each in self.results.values())
+        self._Results = _named("results", list(self.results))
+        self._hint: Any = Tensor if len(self.results) == 1 else tuple[(Tensor,) * len(self.results)]  # type: ignore[misc]
+        text = (
+            memory[:-2] if len(self.results) == 1 else f"({memory})" if "result0" in self.results else f"make({memory})"
+        )
+        self._allocate = eval(f"lambda given: {text}", {"make": self._Results, "torch": torch})
+        _DECLARED[name] = self
+
+    def _tensors(self) -> list[Argument]:
+        return [argument for argument in self.arguments if argument.kind is Tensor]
+
+    def _letters(self) -> dict[str, str]:
+        """The expression of each letter that shapes speak of."""
+        found: dict[str, list[str]] = {}
+        for name, _, optional, rule in self._tensors():
+            for shape, condition in ((rule.shape, rule.condition), (rule.otherwise, f"not {rule.condition}")):
+                known = [f"given.{rule.condition} is {'' if condition.startswith('not') else 'not '}None"]
+                known = known if rule.condition else [f"given.{name} is not None"] if optional else []
+                for place, entry in enumerate(() if rule.maybe else shape):
+                    if isinstance(entry, str) and entry not in [argument.name for argument in self.arguments]:
+                        letter, _, one = entry.partition("+")
+                        size = f"given.{name}.shape[{place}]{' - 1' if one else ''}"
+                        found.setdefault(letter, []).append(" if ".join([size, *known]))
+        for ways in found.values():
+            ways.sort(key=lambda way: " if " in way)  # those that need no question first
+        return {
+            letter: ways[0] if " if " not in ways[0] else " else ".join([*ways, "0"]) for letter, ways in found.items()
+        }
+
+    def _memory(self, result: Shaped) -> str:
+        """The expression of new memory for a result."""
+        tensors = [each for each in self._tensors() if not each.optional]
+        same = [each for each in tensors if {*each.rule.dtypes} <= {*(result.dtypes or FLOATING)}]
+        first, dtype = (same[0], "") if same else (tensors[0], f", dtype={result.dtypes[0]}")
+        return f"given.{first.name}.new_empty({self._shape(result)}{dtype})"
+
+    def _values(self) -> dict[str, str]:
+        """The expressions of arguments and letters."""
+        found = {**{each.name: f"given.{each.name}" for each in self.arguments}, **self._letters()}
+        for name in [each.name for each in self._tensors() if each.rule.maybe]:
+            found[f"{name}_per_ray"] = f"(given.{name} is not None and given.{name}.dim() > 1)"
+        return found
+
+    def _given(self, text: str) -> str:
+        """An expression of arguments and letters, as one of ``given``."""
+        values = self._values()
+        return re.sub(rf"\b({'|'.join(values)})\b", lambda found: f"({values[found[1]]})", text)
+
+    def _shape(self, result: Shaped) -> str:
+        first, second = (
+            "(" + "".join(self._given(str(entry)) + ", " for entry in shape) + ")"
+            for shape in (result.shape, result.otherwise)
+        )
+        return f"{first} if given.{result.condition} is not None else {second}" if result.condition else first
+
+    def public(self, function: Callable[..., Any]) -> Any:
+        """The public function, from its `source`."""
+        parameters = inspect.signature(function).parameters.values()
+        head = [_parameter(each.name, each.empty).replace(kind=each.kind, default=each.default) for each in parameters]
+        self.source = f"def {self.name}{inspect.Signature(head)}:\n" + "".join(f"    {line}\n" for line in self._body())
+        scope: dict[str, Any] = {
+            **{
+                f"check_{name}": getattr(checks, f"check_{name}")
+                for name in ("choice", "count", "flag", "integer", "kind", "tensor")
+            },
+            **{f"{each.name}_rule": each.rule for each in self.arguments},
+            **{f"{each.name}_kind": each.kind for each in self.arguments},
+            **{f"{each.name}_dtypes": each.rule.dtypes for each in self._tensors()},
+            "Checked": checks.Checked,
+            "resolve": backends.resolve,
+            "Inputs": self.Inputs,
+            "prepare": self._prepare,
+            "pack": self._pack,
+            "promote_types": torch.promote_types,
+            "float32": torch.float32,
+        }
+        exec(compile(self.source, f"<declaration of {self.name}>", "exec"), scope)
+        made = scope[self.name]
+        made.__doc__, made.__module__, made.__wrapped__ = function.__doc__, function.__module__, function
+        made.__annotations__ = function.__annotations__
+        return made
+
+    def _body(self) -> Iterator[str]:
+        names = ", ".join(each.name for each in self.arguments)
+        sizes = {entry for each in self._tensors() for entry in each.rule.shape}
+        checked: list[Argument] = []
+        yield f"given = Checked('{self.name}')"
+        for each in self.arguments:
+            if each.kind is Tensor and each.rule.wide and not any(other.rule.wide for other in checked):
+                yield "wide = [promote_types(given.first_float().dtype, float32)]"
+            checked += [each] if each.kind is Tensor else []
+            lines = each.lines(self.name, each.name not in self.smooth, each.name in sizes)
+            if each.optional:
+                yield f"if {each.name} is not None:"
+            yield from (f"    {line}" if each.optional else line for line in lines)
+        if self.smooth:
+            yield "given.no_inference()"
+        for name in self._small:
+            yield f"check_count('{self.name}', '{name}', {name}.numel())"
+        if self._prepare is not None:
+            yield f"{names}, = prepare(Inputs({names}))"
+        first = self.arguments[0].name
+        yield f"run = resolve('{self.name}', backend=backend, device={first}.device, dtype={first}.dtype)"
+        yield f"return run({names})" if self._pack is None else f"return pack(run({names}))"
+
+    def custom_op(self, name: str = "", **options: Any) -> Callable[[Callable[..., None]], Op]:
+        """Makes ``fill(given, found)`` a custom op: it is handed the arguments, and memory for the results.
+
+        Args:
+            name: of the custom op; without it that of the op.
+            options: of `make_op`.
+        """
+
+        new, inputs = tuple.__new__, self.Inputs
+
+        def allocate(*flat: Any) -> Any:
+            return self._allocate(self.Inputs._make(flat))
+
+        def of(fill: Callable[..., None]) -> Op:
+            def run(*flat: Any) -> Any:
+                given = new(inputs, flat)
+                found = self._allocate(given)
+                fill(given, found)
+                return found
+
+            signature = inspect.Signature(self._flat(), return_annotation=self._hint)
+            return make_op(name or self.name, run, allocate, Structs(signature), fill, **options)
+
+        return of
+
+    def backward_op(self, name: str, forward: Op, formula: Callable[..., Any]) -> Callable[[Callable[..., None]], Op]:
+        """Makes ``fill(given, arriving, gradients)`` the gradients of a custom op.
+
+        It is handed the arguments; named tuples of the gradients of the results, None for zero; and of memory for those
+        of the smooth arguments, None where not wanted or not there.
+
+        Args:
+            name: of the custom op.
+            forward: the op that it is the backward of, made by `custom_op`.
+            formula: the reference, whose derivatives are the further ones.
+        """
+        count, width = len(self.results), len(self.arguments)
+        places = [place for place, each in enumerate(self.arguments) if each.name in self.smooth]
+        gradients = _named("gradients", [self.arguments[place].name for place in places])
+
+        new, inputs = tuple.__new__, self.Inputs
+
+        def memory(*flat: Any) -> list[Tensor]:
+            empty, parts = flat[count].new_empty, zip(flat[-1], [flat[count + place] for place in places])
+            return [empty(part.shape if want and part is not None else 0) for want, part in parts]
+
+        def of(fill: Callable[..., None]) -> Op:
+            def run(*flat: Any) -> list[Tensor]:
+                given, found = new(inputs, flat[count:-1]), memory(*flat)
+                parts = zip(found, flat[-1], places)
+                there = [part if want and given[place] is not None else None for part, want, place in parts]
+                fill(given, self._Results._make(flat[:count]), gradients._make(there))
+                return found
+
+            arriving = [_parameter(f"of_{each}", Tensor | None) for each in self.results]
+            wanted = _parameter("wanted", Sequence[bool])
+            signature = inspect.Signature([*arriving, *self._flat(), wanted], return_annotation=list[Tensor])
+            op = make_op(name, run, memory, Structs(signature), fill)
+            register_derivatives(forward, op, formula, places, width, count)
+            return op
+
+        return of
+
+    def _flat(self) -> list[inspect.Parameter]:
+        return [_parameter(each.name, each.kind | None if each.optional else each.kind) for each in self.arguments]
+
+    def inputs(self, kind: Any, **others: str) -> Callable[[Any], Any]:
+        """What makes a struct of the compiled module of the arguments.
+
+        Args:
+            kind: the struct, whose members are arguments or letters of their shapes.
+            others: expressions of these, for members that are neither.
+
+        Raises:
+            NameError: a member that is none of this.
+        """
+        return self._struct(
+            kind, "given", {**self._values(), **{name: self._given(text) for name, text in others.items()}}
+        )
+
+    def outputs(self, kind: Any) -> Callable[[Any], Any]:
+        """What makes a struct of the compiled module, whose members are the results, of memory for these."""
+        return self._struct(kind, "found", {name: f"found.{name}" for name in self.results})
+
+    def _struct(self, kind: Any, source: str, values: dict[str, str]) -> Callable[[Any], Any]:
+        if unknown := [name for name in kind._fields if name not in values]:
+            raise NameError(f"{self.name}: {kind.__name__} must have members of its declaration, got {unknown}")
+        members = ", ".join(values[name] for name in kind._fields)
+        made: Callable[[Any], Any] = eval(
+            f"lambda {source}: new(kind, ({members},))", {"new": tuple.__new__, "kind": kind}
+        )
+        return made
+
+
+def _named(name: str, fields: Sequence[str]) -> Any:
+    make: Any = collections.namedtuple  # whose fields a type checker wants to read
+    return make(name, fields)
+
+
+def _parameter(name: str, kind: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=kind)
+
+
+def _argument(name: str, hint: Any) -> Argument:
+    rule = ""
+    if typing.get_origin(hint) is typing.Annotated:
+        hint, rule = typing.get_args(hint)
+    kinds = [kind for kind in typing.get_args(hint) or (hint,) if kind is not type(None)]
+    (kind,) = kinds
+    made: Any = rule
+    if kind is Tensor:
+        made = Shaped.parse(rule)
+    elif kind is int:
+        low, _, high = rule.partition("..")
+        made = int(low), int(high or MAX_COUNT)
+    elif kind is float:
+        made = _of_floats(rule)
+    elif kind is str:
+        made = rule.split("|")
+    return Argument(name, kind, hint is not kind, made)
+
+
+def _of_floats(rule: str) -> Callable[[str, str, float], None]:
+    if rule == "positive":
+        return checks.check_positive
+    if not rule:
+        return checks.check_number
+    low, high = (float(end) for end in rule[1:-1].split(","))
+    return lambda op, name, value: checks.check_interval(op, name, value, low, high, rule)
+
+
+def _results(hint: Any) -> tuple[Callable[[Any], Any] | None, dict[str, Shaped]]:
+    """What puts results together for the caller, if anything, and all tensors by their names."""
+    if hint is type(None):
+        return None, {}
+    if typing.get_origin(hint) is typing.Annotated:
+        return None, {"result": Shaped.parse(typing.get_args(hint)[1])}
+    if hasattr(hint, "_fields"):
+        fields = typing.get_type_hints(hint, include_extras=True)
+        return hint._make, {name: _results(field)[1]["result"] for name, field in fields.items()}
+    first, *others = typing.get_args(hint)
+    if hasattr(first, "_fields"):  # what is found, and its gradient
+        count = len(first._fields)
+        return lambda found: (first(*found[:count]), *found[count:]), {
+            **_results(first)[1],
+            "gradient": _results(*others)[1]["result"],
+        }
+    return None, {f"result{place}": _results(part)[1]["result"] for place, part in enumerate((first, *others))}
