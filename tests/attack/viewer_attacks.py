@@ -16,7 +16,7 @@ from attempts import REFUSED, RIGHT, Failed
 from given import FIELDS
 from hostile import VALUES, damaged
 
-from voronerf import open_run
+from voronerf.app import open_run
 
 sys.path.append(str(Path(__file__).parents[1] / "app" / "viewer"))
 

@@ -40,7 +40,7 @@ def run():
     scene = replace(builtin_scene(24, train_views=20, test_views=1), box=BOX)
     diagram = VoronoiDiagram(torch.rand(5, 3, generator=seeded()) - 0.5)
     router = SimpleNamespace(diagram=diagram)
-    return Run(Path("unused"), SimpleNamespace(), scene, {"field": router}, renderer_of({"field": shell}, samples=192))
+    return Run(Path("unused"), SimpleNamespace(), scene, router, renderer_of({"field": shell}, samples=192))
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
@@ -266,7 +266,7 @@ def test_cameras_are_read_back(run, tmp_path):
     """With images beside the file, twice as large as those of the training."""
     move = torch.eye(4, dtype=torch.float64)
     move[:3] = torch.tensor([[0.0, -2, 0, 1], [2, 0, 0, 0], [0, 0, 2, 3]])
-    moved = Run(run.path, run.config, replace(run.scene, transform=move), run.routers, run.renderer)
+    moved = replace(run, scene=replace(run.scene, transform=move))
     (tmp_path / "images").mkdir()
     for name in (*run.scene.train.names, *run.scene.test.names):
         Image.new("RGB", (48, 48)).save(tmp_path / "images" / f"{name}.png")

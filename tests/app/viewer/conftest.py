@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pytest
+from helpers import trained
 
-from voronerf import open_run
+from voronerf.app import open_run
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.trainer import Trainer
 
-TINY = {"steps": 120, "cells": (3, 2), "split_at_steps": (60, 100), "rays": 256, "samples": 24, "evaluations": 3}
+TINY = {"steps": 120, "cells": (3, 2), "split_at": (60, 100), "rays": 256, "samples": (24,), "evaluations": 3}
 
 
 @pytest.fixture(scope="session")
@@ -20,7 +20,7 @@ def scene():
 @pytest.fixture(scope="session")
 def run(tmp_path_factory, scene):
     folder = tmp_path_factory.mktemp("viewed")
-    Trainer(TrainConfig(out=folder, **TINY), scene).run()
+    trained(TrainConfig(out=folder, **TINY), scene)
     return open_run(folder, scene=scene)
 
 

@@ -36,12 +36,11 @@ class Tab:
         pictures: of the background, uint8 arrays [h, w, 3] in order.
         gui: properties of the parts of the panel, by label or, for text, by their first words.
         nodes: what is drawn into the scene, by name.
-        files: what was downloaded, by name.
     """
 
     def __init__(self, viewer, cameras, index=0, *, size=(48, 48), number=0) -> None:
         self.viewer, self.size = viewer, size
-        self.pictures, self.depths, self.gui, self.nodes, self.files, self.notes = [], [], {}, {}, {}, []
+        self.pictures, self.depths, self.gui, self.nodes, self.notes = [], [], {}, {}, []
         protocol = f"viser-v{viser.__version__}"
         self.socket = connect(f"ws://{viewer.host}:{viewer.port}", subprotocols=[protocol], max_size=None)
         self.number, self.version = number, None
@@ -118,6 +117,10 @@ class Tab:
             for part in self.gui.values():
                 if part["uuid"] == message["uuid"]:
                     part.update(message["updates"])
+        elif kind == "GuiRemoveMessage":
+            self.gui = {
+                label: part for label, part in self.gui.items() if message["uuid"] not in (part["uuid"], part["folder"])
+            }
         elif kind.startswith("Gui") and "uuid" in message:
             label = props.get("label") or props.get("_markdown", kind)[:20]
             self.gui[label] = {
@@ -126,19 +129,10 @@ class Tab:
                 "value": message.get("value"),
                 **props,
             }
-        elif kind == "GuiRemoveMessage":
-            self.gui = {
-                label: part for label, part in self.gui.items() if message["uuid"] not in (part["uuid"], part["folder"])
-            }
         elif kind == "RemoveSceneNodeMessage":
             self.nodes = {name: node for name, node in self.nodes.items() if not name.startswith(message["name"])}
         elif "name" in message and props:
             self.nodes[message["name"]] = {"kind": kind, "owner": message.get("owner", ""), **props}
-        elif kind == "FileTransferStartDownload":
-            self.files[message["filename"]] = b""
-        elif kind == "FileTransferPart":
-            name = list(self.files)[-1]
-            self.files[name] += message["content"]
         elif kind == "NotificationShowMessage":
             self.notes.append(props or message)
 

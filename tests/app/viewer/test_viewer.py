@@ -24,14 +24,14 @@ import viser
 from tab import Tab
 from websockets.exceptions import ConnectionClosed
 
-from voronerf import open_run
+from voronerf.app import open_run
 from voronerf.app.cli import main
 from voronerf.app.cli.opening import crop_box
 from voronerf.app.evaluate.panels import palette
 from voronerf.app.render.paths import read_camera_path
 from voronerf.app.scenes.record import read_scene
-from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.trainer import Trainer
+from voronerf.app.train import Callback, ConfigError, Scores, TrainConfig, build, train
+from voronerf.app.train import run as run_training
 from voronerf.app.viewer import view_run, watch
 from voronerf.app.viewer.cameras import scene_bounds
 from voronerf.nerf import orbit_cameras
@@ -238,50 +238,46 @@ def test_a_canvas_without_pixels_is_passed_over(scene, tab) -> None:
 
 def test_a_training_is_the_same_with_a_viewer(tmp_path, scene, monkeypatch) -> None:
     monkeypatch.setattr("voronerf.app.viewer.client.SHARP", 128)
-    settings = {"steps": 40, "cells": (3,), "split_at_steps": (20,), "rays": 128, "samples": 16, "evaluations": 2}
-    plain = Trainer(TrainConfig(out=tmp_path / "plain", **settings), scene)
-    plain.run()
-    watched = Trainer(TrainConfig(out=tmp_path / "watched", **settings), scene)
-    training = watch(watched, port=0)
+    config = TrainConfig(steps=40, cells=(3,), split_at=(20,), rays=128, samples=(16,), evaluations=2)
+    plain, watched = build(config, scene), build(config, scene)
+    scores, same_scores = Scores(None), Scores(None)
+    run_training(plain, [scores])
+    training = watch(watched, same_scores, port=0)
     viewer = training.viewer
-    tab = Tab(
-        viewer,
-        scene.test.cameras,
-    )
+    tab = Tab(viewer, scene.test.cameras)
     tab.until(lambda: "Show" in tab.gui)
 
-    def on_step(now):
-        if now.step == 10:
-            tab.set("Show", "cells")
-        if now.step == 30:
-            tab.read()
-            tab.set("Pause", True)
-            tab.until(lambda: training.paused)
-            threading.Timer(0.3, tab.set, ("Pause", True)).start()
-        tab.look(scene.test.cameras, now.step % 2)
-        training.on_step(now)
+    class Visitor(Callback):
+        def after_step(self, state):
+            if state.step == 10:
+                tab.set("Show", "cells")
+            if state.step == 30:
+                tab.read()
+                tab.set("Pause", True)
+                tab.until(lambda: training.paused)
+                threading.Timer(0.3, tab.set, ("Pause", True)).start()
+            if state.step == 39:
+                tab.read()
+                assert "3 cells" in str(tab.gui.values())
+            tab.look(scene.test.cameras, state.step % 2)
 
-    watched.on_step = on_step
-    watched.run()
-    tab.read()
-    pictures = len(tab.pictures)
-    assert pictures > 5 and "3 cells" in str(tab.gui.values())
+    run_training(watched, [same_scores, Visitor(), training])
+    tab.until(lambda: "Pause" not in tab.gui)
+    assert len(tab.pictures) > 5
     tab.close()
     viewer.close()
-    for name, router in plain.routers.items():
-        assert same(dict(router.state_dict()), dict(watched.routers[name].state_dict()))
-    assert [line["psnr"] for line in plain.metrics] == [line["psnr"] for line in watched.metrics]
+    assert same(dict(plain.router.state_dict()), dict(watched.router.state_dict()))
+    assert [line["psnr"] for line in scores.metrics] == [line["psnr"] for line in same_scores.metrics]
 
 
-def test_nothing_is_rendered_for_nobody(tmp_path, scene) -> None:
-    trainer = Trainer(TrainConfig(out=tmp_path, steps=4, cells=(), rays=64, samples=8, evaluations=1), scene)
-    training = watch(trainer, port=0)
+def test_nothing_is_rendered_for_nobody(scene) -> None:
+    state = build(TrainConfig(steps=4, cells=(), rays=64, samples=(8,), evaluations=1), scene)
+    training = watch(state, Scores(None), port=0)
     asked = []
-    trainer.renderer.image = lambda *args, **options: asked.append(args)
-    trainer.on_step = training.on_step
-    trainer.advance()
+    state.renderer.image = lambda *args, **options: asked.append(args)
+    train(state, [training])
     training.viewer.close()
-    assert trainer.step == 4 and not asked
+    assert state.step == 4 and not asked
 
 
 @pytest.mark.parametrize(

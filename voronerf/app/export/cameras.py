@@ -33,7 +33,7 @@ def export_cameras(run: Run, path: Path | str, *, to_files: bool = False) -> int
         OSError: When the file cannot be written.
 
     Examples:
-        >>> from voronerf import Run
+        >>> from voronerf.app import Run
         >>> from voronerf.app.export import export_cameras
         >>> def count(run: Run) -> int:
         ...     return export_cameras(run, "capture/transforms.json", to_files=True)

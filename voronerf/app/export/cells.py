@@ -42,7 +42,7 @@ def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None, to_fi
         OSError: The file cannot be written.
 
     Examples:
-        >>> from voronerf import Run
+        >>> from voronerf.app import Run
         >>> from voronerf.app.export import export_cells
         >>> def names(run: Run) -> list:
         ...     return list(export_cells(run, "cells.glb").geometry)  # cell_0000, cell_0001, ...

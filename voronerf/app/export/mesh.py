@@ -80,7 +80,7 @@ def export_mesh(
         OSError: The file cannot be written.
 
     Examples:
-        >>> from voronerf import Run
+        >>> from voronerf.app import Run
         >>> from voronerf.app.export import export_mesh
         >>> def volume(run: Run) -> float:
         ...     return export_mesh(run, "scene.glb", resolution=128).volume

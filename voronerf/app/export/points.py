@@ -40,7 +40,7 @@ def export_points(
         OSError: The file cannot be written.
 
     Examples:
-        >>> from voronerf import Run
+        >>> from voronerf.app import Run
         >>> from voronerf.app.export import export_points
         >>> def middle(run: Run) -> list:
         ...     return export_points(run, "scene.ply", count=10_000).vertices.mean(0).tolist()

@@ -135,7 +135,7 @@ def export_splats(
         OSError: The file cannot be written.
 
     Examples:
-        >>> from voronerf import Run
+        >>> from voronerf.app import Run
         >>> from voronerf.app.export import export_splats
         >>> def likeness(run: Run) -> float:
         ...     return export_splats(run, "scene.ply")[1]["after"]

@@ -44,7 +44,7 @@ def export_video(
         OSError: The file cannot be written.
 
     Examples:
-        >>> from voronerf import Run
+        >>> from voronerf.app import Run
         >>> from voronerf.app.export import export_video
         >>> def turn(run: Run) -> None:
         ...     export_video(run, "turntable.mp4", frames=96)
