@@ -15,12 +15,12 @@ from pathlib import Path
 
 import torch
 from harness import metadata
+from turns import Training
 
 from voronerf import Run, open_run, town
 from voronerf.app.evaluate.panels import contact_sheet, picture_of_colour, save_picture
 from voronerf.app.scenes import Scene, city_scene
 from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.trainer import Trainer
 from voronerf.nerf.rays import intersect_box
 
 RESULT = Path(__file__).parent / "results" / "editing.json"
@@ -42,11 +42,8 @@ def keep(name: str, values: list, **extra: object) -> None:
 def train(out: Path, scene: Scene, seconds: float, seed: int, **options: object) -> Run:
     """A run of so many seconds of processor time; what is there is opened."""
     if not (out / "summary.json").is_file():
-        config = TrainConfig(
-            out=out, budget=seconds, seed=seed, evaluations=1, eval_views=1, final_views=1, panels=0, lpips=Path("off"),
-            **options,
-        )  # fmt: skip
-        Trainer(config, scene, clock=time.process_time, on_event=print).run()
+        config = TrainConfig(out=out, budget=seconds, seed=seed, evaluations=1, eval_views=1, **options)
+        Training(config, scene, clock=time.process_time, on_event=print).run()
     return open_run(out, scene=scene)
 
 

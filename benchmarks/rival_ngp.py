@@ -26,9 +26,9 @@ from torch import Tensor, nn
 from voronerf.app.evaluate.metrics import psnr, ssim
 from voronerf.app.evaluate.scores import ViewScore, mean_scores, view_numbers
 from voronerf.app.scenes import Scene
-from voronerf.app.train.batches import RayBatches
-from voronerf.app.train.networks import pixel_at_the_middle
-from voronerf.app.train.renderers import make_contraction
+from voronerf.app.train import TrainConfig
+from voronerf.app.train.build import make_batches
+from voronerf.app.train.defaults import make_contraction, pixel_at_the_middle
 from voronerf.nerf.cameras import Rays
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.sampling import stratified_depths
@@ -183,7 +183,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 class Rival:
-    """Trains the rival on a scene; takes turns with a ``Trainer``, and is evaluated as it is.
+    """Trains the rival on a scene; takes turns with a ``turns.Training``, and is evaluated as it is.
 
     A scene without a box is contracted, as with ``--contraction sphere``, and has no occupancy grid.
 
@@ -213,7 +213,7 @@ class Rival:
         self.config, self.scene, self.budget, self.clock, self.on_event = config, scene, budget, clock, on_event
         self.evaluations, self.eval_views = evaluations, eval_views
         self.generator = torch.Generator().manual_seed(seed)
-        self.batches = RayBatches(scene, torch.device("cpu"))
+        self.batches = make_batches(TrainConfig(), scene)
         self.contraction = make_contraction(scene) if scene.box is None else None
         if scene.box is not None:
             self.low, self.size = scene.box[0], scene.box[1] - scene.box[0]

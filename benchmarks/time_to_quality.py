@@ -28,19 +28,18 @@ import torch
 import tyro
 from harness import metadata
 from rival_ngp import Rival, RivalConfig
-from turns import take_turns
+from turns import Training, take_turns
 
 from voronerf.app.cli.main import EXPECTED
 from voronerf.app.evaluate.plots import plot_curves
 from voronerf.app.files import write_text
 from voronerf.app.scenes import Scene, load_scene
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.trainer import Trainer
 
 #: The first word of the side that is the rival.
 RIVAL = "ngp"
 #: Settings of `voronerf train` that this benchmark gives to all sides.
-GIVEN = ("data", "downscale", "out", "resume", "seed", "steps", "budget", "evaluations", "eval_views", "final_views")
+GIVEN = ("data", "downscale", "out", "seed", "steps", "budget", "evaluations", "eval_views")
 #: The PSNRs in dB whose times are printed.
 QUALITIES = (26, 28, 30, 32)
 
@@ -109,7 +108,7 @@ def parse_side(text: str, common: str) -> tuple[str, TrainConfig | RivalConfig]:
 
 def make_training(
     name: str, config: TrainConfig | RivalConfig, options: Options, scene: Scene, seed: int, out: Path
-) -> Trainer | Rival:
+) -> Training | Rival:
     """The training of one side with one seed."""
     clock = cpu_seconds if options.clock == "cpu" else time.perf_counter
     say: Callable[[str], None] = lambda line: print(f"{name:14} {line}", flush=True)  # noqa: E731
@@ -125,12 +124,8 @@ def make_training(
         budget=options.budget,
         evaluations=options.evaluations,
         eval_views=options.eval_views,
-        final_views=options.eval_views,
-        evaluation_share=0.0,
-        lpips=Path("off"),
-        checkpoint_every=1e9,
     )
-    return Trainer(config, scene, on_event=say, clock=clock)
+    return Training(config, scene, on_event=say, clock=clock)
 
 
 def compare(options: Options, folder: Path) -> dict[str, Any]:
@@ -147,9 +142,11 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
     take_turns(trainings.values(), budget=options.budget, turn=options.turn)
     results = []
     for (name, seed), training in trainings.items():
-        summary, curve = training.run(), training.metrics
-        config = training.config
-        settings = json.loads(config.to_json()) if isinstance(config, TrainConfig) else dataclasses.asdict(config)
+        summary = training.run()
+        if isinstance(training, Training):
+            curve, settings = training.scores.metrics, training.state.config.to_values()
+        else:
+            curve, settings = training.metrics, dataclasses.asdict(training.config)
         settings |= {"data": Path(options.data).name, "out": None}  # paths of a machine mean nothing elsewhere
         results.append(
             {

@@ -3,23 +3,91 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, TypeVar
 
-from voronerf.app.train.config import ConfigError
-from voronerf.app.train.trainer import TrainingError
+from voronerf.app.scenes import Scene
+from voronerf.app.train import (
+    Callback,
+    Checkpoints,
+    ConfigError,
+    Divergence,
+    Scores,
+    TrainConfig,
+    TrainingError,
+    build,
+    last_checkpoint,
+    load,
+    train,
+)
 
 
-class Training(Protocol):
-    """A training that can take turns, such as ``voronerf.app.train.trainer.Trainer``."""
+class TakesTurns(Protocol):
+    """A training that can take turns, such as :class:`Training`."""
 
-    seconds: float
+    @property
+    def seconds(self) -> float:
+        """Of training so far."""
 
     def advance(self, until: float) -> Any:
         """Trains until ``until`` training seconds or the end of the budget, whichever comes first."""
 
 
-T = TypeVar("T", bound=Training)
+class Training:
+    """A training as of `voronerf train`, in parts, which writes checkpoints only when told to and at the end.
+
+    Args:
+        config: its settings; ``out`` is the run directory.
+        scene: the scene.
+        clock: counts seconds.
+        on_event: called with a line for what happens.
+        resume: go on from the last checkpoint.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        scene: Scene,
+        *,
+        clock: Callable[[], float] = time.perf_counter,
+        on_event: Callable[[str], None] | None = None,
+        resume: bool = False,
+    ) -> None:
+        if config.out is None:
+            raise ValueError("Training: config.out must name the run directory, got None")
+        self.out, self.clock = config.out, clock
+        self.state = build(config, scene, on_event=on_event)
+        if resume:
+            load(self.state, last_checkpoint(self.out))
+        self.scores, self.checkpoints = Scores(self.out, clock=clock), Checkpoints(self.out, math.inf)
+        self.callbacks: list[Callback] = [Divergence(self.out), self.checkpoints, self.scores]
+        for callback in self.callbacks:
+            callback.on_start(self.state)
+
+    @property
+    def seconds(self) -> float:
+        """Of training so far."""
+        return self.state.seconds
+
+    def advance(self, until: float = math.inf) -> None:
+        """Trains until ``until`` training seconds or the end of the budget, whichever comes first."""
+        train(self.state, self.callbacks, until=until, clock=self.clock)
+
+    def save(self) -> None:
+        """Writes a checkpoint."""
+        self.checkpoints.save(self.state)
+        self.checkpoints.writer.wait()
+
+    def run(self) -> dict[str, Any]:
+        """Trains to the end, scores and saves; returns the summary."""
+        self.advance()
+        for callback in self.callbacks:
+            callback.on_end(self.state)
+        return self.scores.summary
+
+
+T = TypeVar("T", bound=TakesTurns)
 
 
 def take_turns(
@@ -30,7 +98,7 @@ def take_turns(
     stops: Callable[[T], Sequence[float]] = lambda training: (),
     on_stop: Callable[[T, float], None] = lambda training, second: None,
     after_turn: Callable[[T], None] = lambda training: None,
-    on_failure: Callable[[T, TrainingError], None] | None = None,
+    on_failure: Callable[[T, Exception], None] | None = None,
 ) -> None:
     """Trains all of them for the same time; the time of the callbacks does not count.
 
@@ -45,7 +113,7 @@ def take_turns(
 
     Raises:
         ConfigError: When ``turn`` is not positive.
-        TrainingError: When a training fails and there is no ``on_failure``.
+        TrainingError, ValueError: When a training fails and there is no ``on_failure``.
     """
     if not turn > 0:
         raise ConfigError(f"--turn must be positive, got {turn}")
@@ -64,7 +132,7 @@ def take_turns(
                     training.advance(stop)
                     on_stop(training, stop)
                 training.advance(done)
-            except TrainingError as error:
+            except (TrainingError, ValueError) as error:
                 if on_failure is None:
                     raise
                 trainings.remove(training)

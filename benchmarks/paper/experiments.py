@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from paper.runs import AS_PUBLISHED, Run, Settings, Variant, default_scenes, make_run, open_scene
-from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.networks import count_parameters, resolve_config
+from voronerf.app.train import TrainConfig
+from voronerf.app.train.build import count_parameters
+from voronerf.app.train.defaults import resolve
 
 FIELDS = {"nerf": "NeRF", "mipnerf": "mip-NeRF"}
 SAMPLINGS = ("stratified", "hierarchical")
@@ -123,9 +124,8 @@ def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant
                 if sampling == "stratified":
                     changes = {"cells": (settings.cells,), "width": 64, "centres": "uniform"}
                     networks.append(Variant(uniform_name(settings.cells), changes))
-                else:  # two passes share the samples of one
-                    half = settings.samples // 2
-                    extra |= {"sampling": sampling, "samples": half, "fine_samples": settings.samples - half}
+                else:
+                    extra["sampling"] = sampling
                 found += [Variant(row_name(field, sampling, v.name), {**v.changes, **extra}) for v in networks]
         return found
 
@@ -144,13 +144,12 @@ def _published(variant: str, scene: str) -> Scores | None:
 
 
 def _kilo_variants(settings: Settings, scene: str) -> list[Variant]:
-    # More samples a batch, so that 512 of them are there after a few steps; the same for all.
-    common = {"field": "kilonerf", "reservoir_batches": 100}
+    common = {"field": "kilonerf"}
     uniform = {**common, "cells": (512,), "centres": "uniform"}
     # The inherited grid is split when the Voronoi cells are for the first time.
-    first_split = TrainConfig(field="kilonerf", cells=(16, 16)).splits[:1]
+    first_split = (TrainConfig(field="kilonerf", cells=(16, 16)).plan[0].at,)
     return [
-        Variant(KILO_START, {**uniform, "split_at_steps": (KILO_FIRST_STEPS,)}),
+        Variant(KILO_START, {**uniform, "split_at": (KILO_FIRST_STEPS,)}),
         Variant(KILO_LATE, {**uniform, "split_at": first_split}),
         Variant(KILO_CELLS, {**common, "cells": (16, 16)}),
     ]
@@ -173,7 +172,7 @@ def _split_name(at: float) -> str:
 
 
 def _early_late_variants(settings: Settings, scene: str) -> list[Variant]:
-    usual = TrainConfig(cells=(settings.cells,)).splits
+    usual = (TrainConfig(cells=(settings.cells,)).plan[0].at,)
     times = [(_split_name(at), {} if (at,) == usual else {"split_at": (at,)}) for at in SPLIT_TIMES]
     return _changed(*times)(settings, scene)
 
@@ -182,7 +181,7 @@ def _cell_count_variants(settings: Settings, scene: str) -> list[Variant]:
     """Different numbers of cells, of one width, and of one number of parameters in total."""
     levels: list[tuple[int, ...]] = [(), *((count,) for count in COUNTS), (4, 4)]
     reference = TrainConfig(**{"data": scene, **AS_PUBLISHED, "cells": (PUBLISHED_CELLS,)})
-    total = count_parameters(resolve_config(reference, open_scene(scene, settings)))
+    total = count_parameters(resolve(reference, open_scene(scene, settings)))
     own = [Variant(levels_name(cells), {"cells": cells}) for cells in levels]
     # 12 cells are what the others are matched with: one training is both
     matched = [{"cells": cells} | ({} if cells == (PUBLISHED_CELLS,) else {"parameters": total}) for cells in levels]

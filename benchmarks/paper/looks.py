@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from turns import Training
 
 from paper.slices import slice_density, slice_points
 from voronerf.app.evaluate.metrics import psnr
 from voronerf.app.evaluate.scores import render_view
 from voronerf.app.files import write_bytes
 from voronerf.app.scenes import Scene
-from voronerf.app.train.trainer import Trainer
+from voronerf.app.train import State
 
 VERSION = 1  # of what a look holds; those of another version are not used
 #: Fraction of the run after the first split at which inherited and random networks are compared.
@@ -28,14 +29,13 @@ QUARTERS = (0.25, 0.5, 0.75)
 SLICE = 96  # points on each side of a slice
 
 
-def stops(trainer: Trainer) -> list[tuple[str, float]]:
+def stops(training: Training) -> list[tuple[str, float]]:
     """Names and training seconds of a run's looks, the end left out."""
-    budget = float(trainer.config.budget or 0.0)
+    config = training.state.config
     found = {f"at-{100 * at:02.0f}": at for at in QUARTERS}
-    if trainer.plan:
-        first = trainer.plan[0].at / (budget if trainer.config.split_unit == "seconds" else 1.0)
-        if trainer.config.split_unit != "steps" and first + AFTER < 1:
-            found |= {"before": first, "after": first + AFTER}
+    if config.plan and config.plan[0].at + AFTER < 1:
+        found |= {"before": config.plan[0].at, "after": config.plan[0].at + AFTER}
+    budget = config.budget or 0.0
     return sorted(((name, at * budget) for name, at in found.items()), key=lambda item: item[1])
 
 
@@ -44,30 +44,31 @@ def held_out_view(scene: Scene) -> int:
     return len(scene.test) // 3
 
 
-def reached(trainer: Trainer, second: float) -> None:
-    """Writes the looks of a trainer that are due at a number of training seconds."""
-    names = [name for name, at in stops(trainer) if at == second]
-    if "after" in names and trainer.level == 0:
+def reached(training: Training, second: float) -> None:
+    """Writes the looks of a training that are due at a number of training seconds."""
+    names = [name for name, at in stops(training) if at == second]
+    if "after" in names and training.state.strategy.splits == 0:
         # Steps may be longer than the time between the two stops; this one makes the split.
-        trainer.advance(math.nextafter(trainer.seconds, math.inf))
+        training.advance(math.nextafter(training.seconds, math.inf))
     for name in names:
-        look(trainer, second, name)
+        look(training, second, name)
 
 
 @torch.no_grad()
-def look(trainer: Trainer, second: float, name: str = "end") -> None:
-    """Writes a look of a trainer as it is; ``second`` is when it was due."""
+def look(training: Training, second: float, name: str = "end") -> None:
+    """Writes a look of a training as it is; ``second`` is when it was due."""
     data = io.BytesIO()
-    np.savez_compressed(data, **picture(trainer), at=second, seconds=trainer.seconds, step=trainer.step)
-    write_bytes(trainer.out / "looks" / f"{name}.npz", data.getvalue())
+    np.savez_compressed(data, **picture(training.state), at=second, seconds=training.seconds, step=training.state.step)
+    write_bytes(training.out / "looks" / f"{name}.npz", data.getvalue())
 
 
-def picture(trainer: Trainer) -> dict[str, Any]:
+def picture(state: State) -> dict[str, Any]:
     """The arrays of a look."""
-    scene, router = trainer.scene, trainer.router
+    scene, router = state.scene, state.router
     view = held_out_view(scene)
-    image = render_view(trainer.renderer, scene, view)
-    cells = router.diagram.locate(image.heaviest.reshape(-1, 3), backend=trainer.config.backend)
+    with state.averaged():
+        image = render_view(state.renderer, scene, view)
+    cells = router.diagram.locate(image.heaviest.reshape(-1, 3), backend=state.config.backend)
     found = {
         "colour": (image.colour.clamp(0, 1) * 255).round().to(torch.uint8),
         "opacity": (image.opacity.clamp(0, 1) * 255).round().to(torch.uint8),
@@ -75,7 +76,7 @@ def picture(trainer: Trainer) -> dict[str, Any]:
         "truth": (scene.test.truth(view, scene.background_colour()) * 255).round().to(torch.uint8),
     }
     points = slice_points(scene, size=SLICE)
-    found["density"] = slice_density(router, points, cones=trainer.renderer.cones).half()
+    found["density"] = slice_density(router, points, cones=state.config.field_type.cones).half()
     found["slice_cells"] = router.diagram.locate(points.reshape(-1, 3)).reshape(SLICE, SLICE).int()
     score = psnr(found["colour"].float() / 255, found["truth"].float() / 255)
     return {name: value.cpu().numpy() for name, value in found.items()} | {

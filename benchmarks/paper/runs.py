@@ -18,22 +18,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from turns import take_turns
+from turns import Training, take_turns
 
 from paper import looks
+from voronerf.app.evaluate.lpips import find_lpips
 from voronerf.app.evaluate.scores import evaluate, mean_scores
 from voronerf.app.files import write_text
 from voronerf.app.scenes import BUILTIN, BUILTIN_SIZE, Scene, load_scene
+from voronerf.app.train import ConfigError, TrainConfig
 from voronerf.app.train.checkpoint import checkpoint_paths
-from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.run_directory import read_metrics
-from voronerf.app.train.trainer import Trainer, TrainingError
+from voronerf.diagram.reservoir import SampleReservoir
+from voronerf.nerf.samplers import SAMPLERS
+from voronerf.nerf.split import RESERVOIR
 
 Row = dict[str, Any]
 PUBLISHED_SIZE = 400
 #: The method as published.
 AS_PUBLISHED = {"field": "nerf", "occupancy": False, "contraction": "none", "average": 0.0, "centres": "balanced"}
-AS_PUBLISHED |= {"evaluation_share": 0.0}  # equal times of training
+#: Latest batches that kept samples come from, where not as in `voronerf train`: 512 cells need samples of few steps.
+BATCHES = {"kilonerf": 100}
 #: Settings and the least that they may be; a table with two passes needs a sample in each.
 LEAST = {"downscale": 1, "seeds": 1, "rays": 1, "samples": 2, "evaluations": 1, "eval_views": 1, "cells": 2}
 
@@ -153,12 +156,14 @@ def _loaded(source: str, downscale: int) -> Scene:
 
 def make_run(variant: Variant, scene: str, seed: int, settings: Settings) -> Run:
     """The training that a variant stands for, with the directory that its settings and the scene's name give it."""
-    sizes = ("budget", "evaluations", "eval_views", "final_views", "rays", "samples", "backend")
-    values = {name: getattr(settings, name) for name in sizes}
-    values |= {"seed": seed, "data": scene_source(scene), "downscale": factor(scene, settings), "checkpoint_every": 1e9}
-    config = TrainConfig(**{**values, **AS_PUBLISHED, **variant.changes})
-    short = Path(scene).name
-    text = json.dumps({**json.loads(config.to_json()), "data": short, "looks": looks.VERSION}, sort_keys=True)
+    values = {name: getattr(settings, name) for name in ("budget", "evaluations", "eval_views", "rays", "backend")}
+    values |= {"seed": seed, "data": scene_source(scene), "downscale": factor(scene, settings)}
+    values |= {**AS_PUBLISHED, **variant.changes}
+    passes = SAMPLERS[values.get("sampling", "stratified")].passes  # several share the samples of one
+    first = settings.samples // passes
+    config = TrainConfig(**values, samples=(*[first] * (passes - 1), settings.samples - first * (passes - 1)))
+    short, more = Path(scene).name, {"final_views": settings.final_views, "looks": looks.VERSION}
+    text = json.dumps({**config.to_values(), "data": short, **more}, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
     out = settings.out / "runs" / f"{short}-{seed}-{digest}"
     return Run(variant, scene, seed, replace(config, out=out))
@@ -180,54 +185,51 @@ def train_missing(runs: Sequence[Run], settings: Settings, say: Callable[[str], 
 
 def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Callable[[str], None] = print) -> None:
     """Trains runs of one scene in turns, from their checkpoints if there are any, and writes their results."""
-    trainers: dict[Path, Trainer] = {}
+    trainings: dict[Path, Training] = {}
     names = {run.folder: f"{run.variant.name:28}" for run in group}
     for run in group:
-        config = replace(run.config, resume=bool(checkpoint_paths(run.folder)))
-        trainer = Trainer(config, scene, on_event=lambda line, name=names[run.folder]: say(f"{name} {line}"))
-        if trainer.lpips is None and not trainers:
-            say(trainer.lpips_source)
-        trainers[run.folder] = trainer
+        resume, name = bool(checkpoint_paths(run.folder)), names[run.folder]
+        training = Training(run.config, scene, on_event=lambda line, name=name: say(f"{name} {line}"), resume=resume)
+        batches = BATCHES.get(run.config.field)
+        if batches is not None and not resume:
+            training.state.strategy.reservoir = SampleReservoir(RESERVOIR, batches)
+        trainings[run.folder] = training
+    lpips, source = find_lpips(None, group[0].config.data, scene.test.cameras.smallest[::-1])
+    if lpips is None:
+        say(source)
 
-    def failed(trainer: Trainer, error: TrainingError) -> None:
+    def failed(training: Training, error: Exception) -> None:
         """Keeps why a training failed in place of its result."""
-        message = str(error).removeprefix(f"{trainer.out}: ")
-        say(f"{names[trainer.out]} failed: {message}")
-        write_text(trainer.out / "result.json", json.dumps({"failed": message, "psnr": None}, indent=1) + "\n")
-        del trainers[trainer.out]
+        message = str(error).removeprefix(f"{training.out}: ").removeprefix("SplitStrategy: ")
+        say(f"{names[training.out]} failed: {message}")
+        write_text(training.out / "result.json", json.dumps({"failed": message, "psnr": None}, indent=1) + "\n")
+        del trainings[training.out]
 
     take_turns(
-        trainers.values(),
+        trainings.values(),
         budget=settings.budget,
         turn=settings.turn,
-        stops=lambda trainer: [second for _, second in looks.stops(trainer)],
+        stops=lambda training: [second for _, second in looks.stops(training)],
         on_stop=looks.reached,
-        after_turn=lambda trainer: trainer.save(),
+        after_turn=lambda training: training.save(),
         on_failure=failed,
     )
-    for folder in list(trainers):
-        trainer = trainers.pop(folder)
-        summary = trainer.run()
-        looks.look(trainer, settings.budget)
-        cameras = scene.test.cameras
+    for folder in list(trainings):
+        training = trainings.pop(folder)
+        summary, state = training.run(), training.state
+        looks.look(training, settings.budget)
+        with state.averaged():
+            scores = evaluate(state.renderer, scene, views=settings.final_views, lpips=lpips)
         row: Row = {
             **summary,
-            "lr": trainer.config.lr,
-            "size": [cameras.height, cameras.width],
-            "curve": curve(trainer),
+            **mean_scores(scores),
+            "views": len(scores),
+            "lr": state.config.lr,
+            "size": [scene.test.cameras.height, scene.test.cameras.width],
+            "curve": training.scores.metrics,
             "looks": looks.numbers(folder),
         }
         write_text(folder / "result.json", json.dumps(row, indent=1) + "\n")
-
-
-def curve(trainer: Trainer) -> list[Row]:
-    """The evaluations of a finished training, the last one by the views of those on the way."""
-    found = read_metrics(trainer.out)
-    config, count = trainer.config, len(trainer.scene.test)
-    if min(config.final_views or count, count) != min(config.eval_views, count):
-        found[-1] |= mean_scores(evaluate(trainer.renderer, trainer.scene, views=config.eval_views))
-        found[-1]["views"] = config.eval_views
-    return found
 
 
 def results(runs: Sequence[Run]) -> list[Row]:

@@ -1,6 +1,7 @@
 """benchmarks/paper.py: trainings in turns, and the files of tiny experiments."""
 
 import contextlib
+import functools
 import itertools
 import json
 import math
@@ -20,9 +21,9 @@ from paper.report import ABOUT
 from PIL import Image
 
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.train import networks, trainer
-from voronerf.app.train.config import ConfigError
-from voronerf.app.train.trainer import Trainer, TrainingError
+from voronerf.app.train import ConfigError, TrainingError
+from voronerf.app.train.build import count_parameters, solve_width
+from voronerf.app.train.defaults import resolve
 
 TINY = {"scene": ("builtin",), "downscale": 20, "budget": 0.25, "seeds": 1, "rays": 48, "samples": 8}
 TINY |= {"evaluations": 2, "eval_views": 1, "final_views": 1, "turn": 0.1, "cells": 4}
@@ -33,8 +34,8 @@ def steady_clock(monkeypatch):
     """A step takes ten milliseconds however busy the machine is, so that every run splits and ends where it should."""
     ticks = itertools.count()
     clock = SimpleNamespace(perf_counter=lambda: 0.0101 * next(ticks), time=time.time)
-    for module in (trainer, nested):
-        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(nested, "time", clock)
+    monkeypatch.setattr(runs, "Training", functools.partial(turns.Training, clock=clock.perf_counter))
 
 
 @pytest.fixture
@@ -117,7 +118,7 @@ def test_experiments_write_their_files_and_are_not_run_again(settings, capsys, m
     def refuse(*_, **__):
         raise AssertionError("must not be trained again")
 
-    monkeypatch.setattr(runs, "Trainer", refuse)
+    monkeypatch.setattr(runs, "Training", refuse)
     paper.repeat(settings, ("initialisation", "density", "ghosting"))  # the same trainings
     assert read_json(settings.out / "initialisation.json")["results"] == stored["results"]
     assert read_json(settings.out / "ghosting.json")["results"] == stored["results"]
@@ -132,19 +133,24 @@ def one(settings, seed=0, scene="builtin", **changes):
 
 
 def test_an_interrupted_training_goes_on(settings, monkeypatch):
-    made, save, saved = one(settings), Trainer.save, []
+    made, save, saved = one(settings), turns.Training.save, []
 
     def write(self):
         save(self)
-        saved.append(self.step)
+        saved.append(self.state.step)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
-        patched.setattr(Trainer, "save", write)
+        patched.setattr(turns.Training, "save", write)
         runs.train_missing([made], settings)
     assert not made.result.exists() and not runs.results([made])
-    began, advance = [], Trainer.advance
-    monkeypatch.setattr(Trainer, "advance", lambda self, *args: (began.append(self.step), advance(self, *args))[1])
+    began, advance = [], turns.Training.advance
+
+    def note(self, *until):
+        began.append(self.state.step)
+        advance(self, *until)
+
+    monkeypatch.setattr(turns.Training, "advance", note)
     runs.train_missing([made, made], settings)
     assert began[0] == saved[0] > 0
     (row,) = runs.results([made])
@@ -161,7 +167,7 @@ def test_a_curve_is_of_the_same_views_throughout(settings):
 
 
 def test_failures_of_a_training_are_told(settings):
-    variant = runs.Variant("too many", {"cells": (5000,), "split_at_steps": (2,)})
+    variant = runs.Variant("too many", {"cells": (5000,), "split_at": (2,)})
     failing, other, said = runs.make_run(variant, "builtin", 0, settings), one(settings), []
     runs.train_missing([other, failing], settings, said.append)
     assert any("too many" in line and "failed: more cells than samples" in line for line in said)
@@ -197,7 +203,7 @@ def test_sizes_and_scenes(tmp_path, monkeypatch):
 def test_both_sides_have_the_same_settings(settings):
     """Variants differ in what is compared: no side has rays, samples, a rate or a schedule of its own."""
     compared = {"cells", "width", "parameters", "centres", "init"}
-    compared |= {"assignment", "split_at", "split_at_steps"}
+    compared |= {"assignment", "split_at"}
     for name, experiment in EXPERIMENTS.items():
         groups = {}
         for variant in experiment.variants(settings, "builtin"):
@@ -215,7 +221,9 @@ def test_matched_parameters(settings):
     scene, counts = runs.open_scene("builtin", settings), {}
     for name in ("12 cells", "4 cells, matched", "32 cells, matched", "one network, matched"):
         run = runs.make_run(runs.Variant(name, variants[name]), "builtin", 0, settings)
-        counts[name] = networks.count_parameters(networks.resolve_config(run.config, scene))
+        config = resolve(run.config, scene)
+        width = None if config.parameters is None else solve_width(config, config.parameters)
+        counts[name] = count_parameters(config, width)
     assert all(0.9 * counts["12 cells"] < count <= counts["12 cells"] for count in counts.values())
 
 
