@@ -19,13 +19,15 @@ SOURCES := $(shell find csrc -type f) setup.py pyproject.toml
 
 PAPER_ARGS ?= --out runs/paper-small --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
 
-.PHONY: demo test bench paper docs check cuda-check arm-check isa-check gpu-check emulate-cuda sanitize attack clean
+.PHONY: demo test test-all bench paper docs check cuda-check arm-check isa-check gpu-check emulate-cuda sanitize attack clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
 
-test: $(VENV)/.built
-	@OMP_NUM_THREADS=$(THREADS) $(BIN)/pytest -q -n $(JOBS) --dist worksteal $(if $(REQUIRE),--require $(REQUIRE)) $(TEST_ARGS)
+# A few minutes. test-all has the long parts too, which are marked slow.
+test: CHOICE := -m "not slow"
+test test-all: $(VENV)/.built
+	@OMP_NUM_THREADS=$(THREADS) $(BIN)/pytest -q -n $(JOBS) --dist worksteal $(CHOICE) $(if $(REQUIRE),--require $(REQUIRE)) $(TEST_ARGS)
 
 # A few minutes; for figures to keep, run the scripts with --json and the settings they document.
 bench: $(VENV)/.built
@@ -89,7 +91,7 @@ clean:
 	rm -rf $(VENV) build dist *.egg-info voronerf/ops/_core/_C.*.so .mypy_cache .pytest_cache .ruff_cache
 
 # What is more than `make demo` needs: Warp, pycolmap, viser, mypy, a browser's driver, ...
-test bench paper check docs emulate-cuda sanitize attack $(addprefix isa-check-,$(ISAS)): $(VENV)/.tools
+test test-all bench paper check docs emulate-cuda sanitize attack $(addprefix isa-check-,$(ISAS)): $(VENV)/.tools
 
 $(VENV)/.installed: requirements.txt
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -2,7 +2,6 @@
 
 python benchmarks/table.py benchmarks/results/throughput.json                    the rows that docs/performance.md shows
 python benchmarks/table.py benchmarks/results/throughput.json --rows '^routed_mlp/'   any others
-python benchmarks/table.py benchmarks/results/throughput*.json                   the rows of several machines
 python benchmarks/table.py benchmarks/results/foreign_fields.json --foreign      times faster than the loop over masks
 """
 
@@ -101,21 +100,6 @@ def markdown(rows: list[Row]) -> list[str]:
     return found
 
 
-def machines_markdown(machines: dict[str, list[Row]]) -> list[str]:
-    """Rows of several machines, native backend: of each its time, its share of the limit, and how often it is faster
-    than the best alternative."""
-    tables = [{key(row): row for row in rows} for rows in machines.values()]
-    found = [f"| | dtype | | {' | '.join(machines)} |", "|---" * (3 + len(machines)) + "|"]
-    for row in {name: row for table in reversed(tables) for name, row in table.items()}.values():
-        cells = [f"`{row['op']}` {row['case']}", row["dtype"], row["direction"].replace("+", " + ")]
-        for table in tables:
-            # The last cells of its own table: ms, limit, alternative, ms, x.
-            own = markdown([table[key(row)]])[-1].strip("| ").split(" | ")[3:] if key(row) in table else None
-            cells.append("-" if own is None else f"{own[0]} ms, {own[1]}, {own[4]} x")
-        found.append(f"| {' | '.join(cells)} |")
-    return found
-
-
 def foreign_markdown(rows: list[Row]) -> list[str]:
     """Rows of fields of other codebases: how many times faster than the loop over masks each way is."""
     known = ("fuse=True", "fused", "masks behind one encoding", "one module")
@@ -136,7 +120,7 @@ def foreign_markdown(rows: list[Row]) -> list[str]:
 def main(arguments: list[str] | None = None) -> None:
     """Prints what was asked for."""
     parser = Parser(description=(__doc__ or "").split("\n\n")[0], allow_abbrev=False)
-    parser.add_argument("files", type=Path, nargs="+", metavar="file")
+    parser.add_argument("file", type=Path)
     parser.add_argument(
         "--rows", action="append", metavar="REGEX", help="rows whose op/case/dtype/direction it occurs in"
     )
@@ -146,21 +130,14 @@ def main(arguments: list[str] | None = None) -> None:
         patterns = [re.compile(text) for text in options.rows or SHOWN]
     except re.error as error:
         fail(f"--rows must be a regular expression, got {options.rows!r}: {error}")
-    outcomes = [load(file) for file in options.files]
-    outcome, native = outcomes[0], native_rows(outcomes[0])
-    if len(outcomes) > 1:
-        machines: dict[str, list[Row]] = {}
-        for one in outcomes:
-            chosen = [row for row in native_rows(one) if any(pattern.search(key(row)) for pattern in patterns)]
-            machines.setdefault(one["metadata"]["machine"], []).extend(chosen)
-        print("\n".join(machines_markdown(machines)))
-        return
+    outcome = load(options.file)
+    native = native_rows(outcome)
     if options.foreign:
         print("\n".join(foreign_markdown([row for row in native if row["op"] == "foreign"])))
         return
     rows = [row for row in native if any(pattern.search(key(row)) for pattern in patterns)]
     if not rows:
-        fail(f"{options.files[0]} has no such row of the native backend")
+        fail(f"{options.file} has no such row of the native backend")
     described = outcome["metadata"]
     limits = ", ".join(f"{name} {value:g}" for name, value in described["peaks"].items())
     print(

@@ -45,7 +45,7 @@ from ops.case import Case, Contender, NotApplicable, Work, dtype_name
 from voronerf.app.files import write_text
 from voronerf.ops._core import backends
 
-OPTIONAL = {"scipy": "scipy", "faiss": "faiss-cpu", "warp": "warp-lang"}
+OPTIONAL = {"scipy": "scipy", "warp": "warp-lang"}
 """Packages that are used where they are installed, and what to install."""
 LIMITS = {"ours": 0.8, "alternative": 0.5}
 QUICK_LIMITS = {"ours": 0.3, "alternative": 0.15}
@@ -247,16 +247,6 @@ def _milliseconds(timing: Timing | None) -> float | None:
     return None if timing is None else timing.median_ms
 
 
-def cold_starts(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """For each op the seconds that its first call on Warp took beyond an ordinary one: compiling, or loading."""
-    found: dict[str, float] = {}
-    for row in rows:
-        if row["backend"] == "warp":
-            extra = (row["first_call_ms"] - row["median_ms"]) * 1e-3
-            found[row["op"]] = max(extra, found.get(row["op"], 0.0))
-    return {op: round(seconds, 2) for op, seconds in found.items()}
-
-
 HEADER = (
     f"{'op':17} {'case':28} {'dtype':8} {'direction':16} {'backend':9} {'median':>10} {'iqr':>8} {'ns/sample':>10}"
     f" {'throughput':>15} {'of peak':>8} {'x best':>7} {'error':>8}"
@@ -317,11 +307,6 @@ def main(arguments: list[str] | None = None) -> None:
             print("\n".join(lines(row, last=row is rows[-1])), flush=True)
         if rows and (rows[0]["other_load"] or 0.0) > DISTURBED:
             progress(f"    disturbed: other processes kept {rows[0]['other_load']:.1f} cores busy during this row")
-    cold = cold_starts(bench.rows)
-    if cold:
-        listed = ", ".join(f"{op} {seconds:.1f}" for op, seconds in cold.items())
-        where = "the cache that is there" if options.quick else "an empty cache"
-        print(f"\nfirst calls on Warp, seconds, with {where}: {listed}")
     if options.json is not None:
         description = metadata(
             benchmark="throughput",
@@ -334,7 +319,6 @@ def main(arguments: list[str] | None = None) -> None:
             installed=found,
             missing=missing,
             warp_cache="as it was" if options.quick else "empty",
-            warp_cold_start=cold,
         )
         write_text(options.json, json.dumps({"metadata": description, "results": bench.rows}, indent=1) + "\n")
 

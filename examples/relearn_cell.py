@@ -24,7 +24,7 @@ def main() -> None:
     field = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 3))
     router = VoronoiRouter(field, torch.rand(8, 3) * 2 - 1, coords="first3", fuse=True, way="fused")
     optimizer = torch.optim.Adam(router.parameters(), lr=3e-3)
-    fit(router, optimizer, colour, 200)
+    fit(router, optimizer, colour, 100)
 
     # the scene changes in cell 5: its colours are inverted there
     points = torch.rand(20_000, 3) * 2 - 1
@@ -36,7 +36,7 @@ def main() -> None:
     with torch.no_grad():
         before, parameters = router(points), [p.clone() for p in router.parameters()]
     router.freeze([cell for cell in range(router.num_cells) if cell != 5])
-    fit(router, optimizer, changed, 200)
+    fit(router, optimizer, changed, 100)
 
     with torch.no_grad():
         after = router(points)

@@ -15,7 +15,8 @@ from unittest import mock
 import pytest
 import torch
 
-from voronerf.nerf import Hierarchical, Occupancy, Proposal, Renderer, Space, Stratified
+from voronerf.app import train
+from voronerf.nerf import Hierarchical, Occupancy, Renderer, Space, Stratified
 
 
 def refuses(message, call, *args, error=ValueError, **options):
@@ -108,6 +109,26 @@ def read_json(path):
     return json.loads(path.read_text())
 
 
+def trained(config, scene, *, stop_at=None, resume=False, on_event=None, callbacks=(), **options):
+    """Trains into ``config.out`` as `voronerf train` does, without a display; returns the summary.
+
+    ``stop_at`` is the step after which the training is asked to stop; other options are those of ``run``.
+    """
+    state = train.build(config, scene, on_event=on_event)
+    if resume:
+        train.load(state, train.last_checkpoint(config.out))
+
+    class Stop(train.Callback):
+        def after_step(self, state):
+            if state.step == stop_at:
+                state.stop()
+
+    scores = train.Scores(config.out)
+    callbacks = [train.Divergence(config.out), train.Checkpoints(config.out), scores, Stop(), *callbacks]
+    train.run(state, callbacks, **options)
+    return scores.summary
+
+
 def render_image(field, cameras, index, *, samples, occupancy=None, **given):
     """The image of one field."""
     return renderer_of({"field": field}, samples=samples, occupancy=occupancy).image(cameras, index, **given)
@@ -118,8 +139,6 @@ def renderer_of(fields, *, samples, fine_samples=0, occupancy=None, picture_samp
     given = {"space": Space(**space), "backend": backend}
     if occupancy is not None:
         sampler = Occupancy(occupancy, samples, picture_samples=picture_samples, **given)
-    elif "proposal" in fields:
-        sampler = Proposal(samples, fine_samples, **given)
     else:
         sampler = Hierarchical(samples, fine_samples, **given) if fine_samples else Stratified(samples, **given)
     return Renderer(fields, sampler, backend=backend)

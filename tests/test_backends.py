@@ -124,6 +124,7 @@ assert not backends.describe()["native"]["available"]
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.slow
 def test_an_old_warp_is_refused() -> None:
     code = """
 import sys, types
@@ -139,6 +140,7 @@ assert reason.startswith("NVIDIA Warp 1.9.2 is too old; install it with `pip ins
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stale", ["", "module.interface = 0"])
 def test_a_compiled_module_of_another_version_is_refused(stale: str) -> None:
     code = f"""
@@ -200,6 +202,7 @@ def test_auto_runs_networks_natively_on_every_device(monkeypatch: pytest.MonkeyP
         assert choose(op, "auto", "cuda", None, torch.float64) == "reference"
 
 
+@pytest.mark.slow
 def test_a_source_folder_that_is_not_installed_says_so() -> None:
     """As on a machine that has the sources alone: no finder of an editable install, no ``voronerf.kernels``."""
     code = f"""

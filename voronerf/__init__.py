@@ -25,7 +25,6 @@ except ModuleNotFoundError as error:
         sys.exit(f"voronerf: error: {line}")
     raise ImportError(line) from None
 
-from voronerf.app.run import Run, open_run
 from voronerf.diagram import (
     Balance,
     SampleReservoir,
@@ -69,7 +68,6 @@ __all__ = [
     "Layer",
     "NeRF",
     "OccupancyGrid",
-    "Run",
     "SampleReservoir",
     "Split",
     "VoronoiDiagram",
@@ -86,7 +84,6 @@ __all__ = [
     "locate_cell",
     "march_rays",
     "nearest_centre",
-    "open_run",
     "resample",
     "routed_mlp",
     "spherical_harmonics",

@@ -142,21 +142,10 @@ def _tree_lookup(centres: Tensor) -> Lookup:
     return lambda points: tree.query(points.numpy(), workers=torch.get_num_threads())[1]
 
 
-def _faiss_lookup(centres: Tensor) -> Lookup:
-    faiss = optional("faiss")
-    if centres.dtype != torch.float32:
-        raise NotApplicable("faiss takes float32")
-    faiss.omp_set_num_threads(torch.get_num_threads())
-    index = faiss.IndexFlatL2(3)
-    index.add(_host(centres).numpy())
-    return lambda points: index.search(points.numpy(), 1)[1][:, 0]
-
-
 LOOKUPS: dict[str, Callable[[Tensor], Lookup]] = {
     "torch addmm + argmin": _torch_lookup,
     "numpy": _numpy_lookup,
     "scipy cKDTree": _tree_lookup,
-    "faiss flat": _faiss_lookup,
 }
 
 
@@ -221,10 +210,9 @@ def _locate_work(n: int, shape: tuple[int, int], device: torch.device) -> Work:
                 wrong += _wrong_cells(points[0].cpu()[rows], levels[1][parent], leaves[rows] - parent * inner)
         return wrong
 
-    names = ("torch addmm + argmin", "faiss flat")
     return Work(
         ours,
-        {f"masks, {name}": by_masks(LOOKUPS[name]) for name in names},
+        {"masks, torch addmm + argmin": by_masks(_torch_lookup)},
         error,
         tolerance=0.01 * n,
         amount=float(FLOPS) * n * (outer + inner),

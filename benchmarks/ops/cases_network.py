@@ -57,10 +57,6 @@ ROUTE_ROWS: tuple[tuple[str, int, int, torch.dtype, str], ...] = (
     ("mlp32", BASE, 4096, FULL, FORWARD),
     *[("nerf64", BASE, 16, FULL, direction) for direction in (FORWARD, BACKWARD)],
 )
-SEPARATE_ROWS = (
-    *[("w64d4", BASE, 16, FULL, direction) for direction in (FORWARD, BACKWARD)],
-    ("mlp32", BASE, 256, FULL, FORWARD),
-)
 ROUTE_QUICK = {("w64d4", BASE, 16, FULL, FORWARD), ("w64d4", 1 << 14, 16, FULL, FORWARD)}
 
 # (layer, n, k)
@@ -93,13 +89,9 @@ def cases() -> list[Case]:
         found.append(Case("grouped_mlp", name, dtype, direction, n, k, work, isa="avx2"))
     for row in ROUTE_ROWS:
         net, n, k, dtype, direction = row
-        work = functools.partial(route_work, *row, TOLERANCE[dtype, direction], False)
+        work = functools.partial(route_work, *row, TOLERANCE[dtype, direction])
         shown = BOTH if (net, n, k, dtype) == ("w64d4", BASE, 16, FULL) else ("native",)
         found.append(Case("routed_mlp", f"{net} n={n} k={k}", dtype, direction, n, k, work, shown, row in ROUTE_QUICK))
-    for row in SEPARATE_ROWS:
-        net, n, k, dtype, direction = row
-        work = functools.partial(route_work, *row, TOLERANCE[dtype, direction], True)
-        found.append(Case("routed_mlp", f"{net} n={n} k={k} separate", dtype, direction, n, k, work))
     return found
 
 

@@ -1,8 +1,7 @@
 """Cases of routed_mlp, the whole route: positions in any order to outputs in the same order. n samples, k cells.
 
-A case named "separate" composes the operations instead. The alternatives are written in torch: look up the cell
-by the fastest way that is installed, then either sort and loop over the cells, or loop over boolean masks, as Mega-NeRF
-does. All of them encode the positions themselves.
+The alternatives are written in torch: look up the cell by the fastest way that is installed, then either sort and loop
+over the cells, or loop over boolean masks, as Mega-NeRF does. All of them encode the positions themselves.
 """
 
 from __future__ import annotations
@@ -30,10 +29,9 @@ def route_work(
     dtype: torch.dtype,
     direction: str,
     tolerance: float,
-    separate: bool,
     device: torch.device,
 ) -> Work:
-    """The case of a network from ``NETS``, in one operation or in separate ones."""
+    """The case of a network from ``NETS``."""
     net, centres = NETS[name], uniform_points(k, 1000, device)
     batch, price = make_batch(net, n, k, dtype, direction, device, centres=centres), cost(net)
     training = direction == BACKWARD
@@ -54,7 +52,7 @@ def route_work(
         alternatives[f"torch masks{suffix}"] = functools.partial(masked_loop, batch, find, kind)
     cells = ops.nearest_centre(batch.positions[0], centres)
     return Work(
-        functools.partial(composed if separate else ours, batch, centres),
+        functools.partial(ours, batch, centres),
         alternatives,
         network_error(batch, cells),
         tolerance,
@@ -79,30 +77,6 @@ def ours(batch: Batch, centres: Tensor, backend: str) -> Contender:
             backend=backend,
         )
         return out
-
-    return Contender(with_gradients(batch, forward, batch.parameters))
-
-
-def composed(batch: Batch, centres: Tensor, backend: str) -> Contender:
-    """locate, sort, permute, grouped_mlp, and back to the order of the positions."""
-
-    def forward(call: int) -> Tensor:
-        positions = batch.positions[call % len(batch.positions)]
-        order, offsets = ops.cell_sort(
-            ops.nearest_centre(positions, centres, backend=backend), batch.k, backend=backend
-        )
-        index = batch.direction_index
-        out = ops.grouped_mlp(
-            positions[order],
-            offsets,
-            batch.weights,
-            batch.biases,
-            layers=batch.net,
-            directions=batch.directions,
-            direction_index=None if index is None else index[order],
-            backend=backend,
-        )
-        return torch.empty_like(out).index_copy(0, order.long(), out)
 
     return Contender(with_gradients(batch, forward, batch.parameters))
 

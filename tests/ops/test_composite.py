@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
-from composite_cases import dense, evaluate, leaves_of, scene
+from composite_cases import dense, evaluate, scene
 from helpers import all_pairs
-from op_cases import FLOATS, HALVES, need, offsets_of, strided
+from op_cases import FLOATS, need, offsets_of, strided
 from tolerances import assert_as_exact
 
 from voronerf.ops import Composite, composite
@@ -226,14 +226,3 @@ def test_gradients_of_some_outputs(backend, parts):
         exact = evaluate(given, torch.float64, "reference", parts)
         for found, right in zip(evaluate(given, torch.float32, backend, parts), exact):
             torch.testing.assert_close(found.double(), right, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("dtype", HALVES)
-def test_half_storage(backend, dtype):
-    cast, leaves = leaves_of(dense(3, 20), dtype)
-    result = composite(**cast, backend=backend)
-    gradients = torch.autograd.grad(sum(part.float().sum() for part in result), leaves)
-    assert all(tensor.dtype == dtype for tensor in (*result, *gradients))
-    wide = {name: None if tensor is None else tensor.float() for name, tensor in cast.items()}
-    for part, want in zip(result, composite(**wide, backend=backend)):
-        torch.testing.assert_close(part.float(), want, rtol=torch.finfo(dtype).eps, atol=1e-6)

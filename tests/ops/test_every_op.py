@@ -16,6 +16,7 @@ import pytest
 import torch
 from helpers import on_any_number_of_threads
 from op_cases import need, refused, strided
+from tolerances import assert_as_exact
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map_only
@@ -39,22 +40,31 @@ RUNS = [
 ]
 NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "adam")
 """Ops that check their tensors in ways of their own."""
+SINGLE = ("balance_centres", "cell_sort", "march_rays", "pixel_rays")
+"""Ops without floating-point numbers, or with those of one size alone."""
 
 
 def rows(runs):
     """A test of a name, a backend and a device."""
-    return pytest.mark.parametrize(
-        ("name", "backend", "device"), runs, indirect=["device"], ids=["-".join(run) for run in runs]
-    )
+    ids = ["-".join(getattr(run, "values", run)) for run in runs]
+    return pytest.mark.parametrize(("name", "backend", "device"), runs, indirect=["device"], ids=ids)
 
 
 every_op = rows(RUNS)
+# Each op compiles in its first kind; opcheck traces the custom ops of the others.
+first_kinds = rows(
+    [
+        run if run[1] == "native" else pytest.param(*run, marks=pytest.mark.slow)
+        for run in RUNS
+        if run[0].partition(", ")[2] == next(iter(CASES[run[0].partition(",")[0]].kinds))
+    ]
+)
 smooth_op = rows([run for run in RUNS if CASES[run[0].partition(",")[0]].differentiable])
 natively = dict.fromkeys(name for name, backend, _ in RUNS if backend == "native")
 native_op = pytest.mark.parametrize("name", list(natively))
 
 
-def prepare(name, backend, device):
+def prepare(name, backend, device, dtype=torch.float32):
     """The op as a function of its tensors, and a maker of those by their number."""
     op, _, kind = name.partition(", ")
     case = CASES[op]
@@ -65,7 +75,7 @@ def prepare(name, backend, device):
         return tensor.to(device).detach().requires_grad_(tensor.is_floating_point())
 
     def make(n):
-        given = tree_map_only(Tensor, ready, case.make(Draw(n, **case.kinds[kind]), n))
+        given = tree_map_only(Tensor, ready, case.make(Draw(n, dtype=dtype, **case.kinds[kind]), n))
         rest.update({name: value for name, value in given.items() if not holds_tensors(value)})
         return {name: value for name, value in given.items() if holds_tensors(value)}
 
@@ -95,11 +105,10 @@ def assert_close(found, expected):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5)
 
 
-@every_op
+@first_kinds
 def test_compiles_for_any_size(device, backend, name):
-    op, _, kind = name.partition(", ")
-    if backend == "reference" and not (CASES[op].compiles and kind == next(iter(CASES[op].kinds))):
-        pytest.skip("is not compiled whole, or as the op's first kind is")
+    if backend == "reference" and not CASES[name.partition(", ")[0]].compiles:
+        pytest.skip("is not compiled whole")
     torch.compiler.reset()
     run, tensors = prepare(name, backend, device)
     # The reference consists of torch's own operations, whose gradients are torch's to trace.
@@ -141,6 +150,19 @@ def test_any_size_gives_what_the_reference_gives(device, backend, name):
         given = tensors(n)
         expected = results(functools.partial(run, backend="reference"), given)
         assert_close(results(run, given), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64], ids=str)
+@rows([run for run in RUNS if run[1] != "reference" and run[0].partition(",")[0] not in SINGLE])
+def test_dtypes(device, backend, name, dtype):
+    """Values and gradients have the dtypes of the reference's, and are as close to those of float64."""
+    need(name.partition(", ")[0], backend, device, dtype)
+    run, tensors = prepare(name, backend, device, dtype)
+    given = tensors(65)
+    wide = tree_map_only(Tensor, lambda tensor: tensor.double() if tensor.is_floating_point() else tensor, given)
+    plain, exact = (results(functools.partial(run, backend="reference"), inputs) for inputs in (given, wide))
+    for part, same, right in zip(results(run, given), plain, exact, strict=True):
+        assert_as_exact(part, same, right) if same.is_floating_point() else torch.testing.assert_close(part, right)
 
 
 @smooth_op

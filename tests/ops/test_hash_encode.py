@@ -260,16 +260,3 @@ def test_third_derivatives(backend):
     found = third(lambda *arguments: hash_encode(*arguments, backend=backend), torch.float32)
     for a, b, c in zip(found, third(reference, torch.float32), third(reference, torch.float64), strict=True):
         assert (a - c).norm() <= 2 * (b - c).norm() + 1e-5 * c.norm()
-
-
-@pytest.mark.native
-def test_only_what_is_asked_for_is_computed():
-    grid = GRIDS["both"]
-    x, table = points(30, grid).requires_grad_(), features(grid).requires_grad_()
-    encoded = hash_encode(x, table, grid, backend="native")
-    (of_x,) = torch.autograd.grad(encoded.sum(), x, retain_graph=True)
-    (of_table,) = torch.autograd.grad(encoded.sum(), table)
-    assert of_x.shape == x.shape and of_table.shape == table.shape
-    x.requires_grad_(False)
-    hash_encode(x, table, grid, backend="native").sum().backward()
-    assert x.grad is None and torch.equal(table.grad, of_table)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers import on_any_number_of_threads
-from op_cases import need, offsets_of, refused
+from op_cases import offsets_of, refused
 
 from voronerf import MLP, HashGrid, Layer
 from voronerf.ops import grouped_mlp, hash_encode, nearest_centre, routed_mlp
@@ -132,23 +132,6 @@ def test_second_derivatives(device, backend, own):
 
     for a, b in zip(eikonal(torch.float32, backend), eikonal(torch.float64, "reference"), strict=True):
         assert (a.double() - b).norm() <= 1e-4 * b.norm()
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64])
-@pytest.mark.op("grouped_mlp")
-def test_dtypes(device, backend, dtype):
-    need("grouped_mlp", backend, device, dtype)
-    grid, offsets = GRIDS["plain"], offsets_of(COUNTS, device)
-    x, rays, index = inputs(sum(COUNTS), device)
-    weights, biases, features = network(grid, False, device, dtype)
-    given = {"layers": table_of(grid), "direction_index": index}
-    found = grouped_mlp(x, offsets, weights, biases, features=features, directions=rays, backend=backend, **given)
-    wide = [[t.double() for t in part] for part in (weights, biases)]
-    more = {"features": features.double(), "directions": rays.double(), "backend": "reference"}
-    exact = grouped_mlp(x.double(), offsets, *wide, **more, **given)
-    assert found.dtype == dtype
-    size = {torch.bfloat16: 3e-2, torch.float16: 4e-3, torch.float64: 1e-5}[dtype]
-    assert (found.double() - exact).abs().max() <= size * exact.abs().max()
 
 
 def test_errors():

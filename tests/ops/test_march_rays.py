@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads
 from op_cases import need, refusals
 from torch import Tensor
 
@@ -172,15 +171,6 @@ def test_rays_of_no_length_and_of_no_numbers_have_no_samples(device, backend):
     found = march(given, 8, device, backend)
     assert found.ray_offsets[:6].tolist() == [0] * 6 and found.ray_offsets[6] > 0
     assert found.stop.tolist() == [8] * 6
-
-
-@pytest.mark.native
-def test_instruction_sets_and_threads_agree(isa):
-    given, uniforms = case(300, (9, 8, 7)), torch.rand(300, 70)
-    expected = march(given, 70, torch.device("cpu"), "reference", uniforms=uniforms, most=9)
-    run = lambda: march(given, 70, torch.device("cpu"), "native", uniforms=uniforms, most=9)  # noqa: E731
-    on_any_number_of_threads(run)
-    same(run(), expected)
 
 
 def test_refuses_what_makes_no_sense():

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import FLOATS, need, offsets_of, refused
+from op_cases import offsets_of, refused
 from tolerances import assert_as_exact
 
 from voronerf.ops import RenderLoss, composite, render_loss
@@ -54,20 +54,6 @@ def test_is_activations_composite_and_squared_error(device, backend, counts, out
     plain = evaluate(device, given, torch.float32, "reference")
     for found, same, right in zip(evaluate(device, given, torch.float32, backend), plain, exact):
         assert_as_exact(found, same, right)
-
-
-@pytest.mark.parametrize("dtype", FLOATS)
-def test_dtypes(device, backend, dtype):
-    need("render_loss", backend, device, dtype)
-    given = rays([5, 0, 40])
-    given = (given[0].to(dtype).double(), *given[1:])
-    wide = torch.promote_types(dtype, torch.float32)
-    *found, gradient = evaluate(device, given, dtype, backend)
-    *exact, right = evaluate(device, given, torch.float64, None)
-    assert all(part.dtype == wide for part in found) and gradient.dtype == dtype
-    for part, expected in zip(found, exact):
-        assert_as_exact(part, expected.to(wide), expected)
-    assert_as_exact(gradient, right.to(dtype), right)
 
 
 def test_backgrounds(device, backend):

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import torch.nn.functional as F
-from convention_harness import RAYS, Case, one, uniform
+from convention_harness import Case, one, uniform
 from convention_listed import pair
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
@@ -95,76 +94,6 @@ class Checkpointed(nn.Module):
         return self.out(checkpoint(self.block, x, use_reentrant=False))
 
 
-class Rgbs(NamedTuple):
-    rgb: Tensor
-    sigma: Tensor
-    extras: Any = None
-
-
-class Named(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc = nn.Linear(7, 4)
-
-    def forward(self, x: Tensor) -> Rgbs:
-        h = self.fc(x)
-        return Rgbs(h[..., :3].sigmoid(), h[..., 3].exp(), [x[..., :3], None])
-
-
-@dataclass
-class Query:
-    points: Tensor
-    features: dict[str, Tensor]
-    flags: tuple[bool, str] = (True, "x")
-
-
-class TakesContainers(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc = nn.Linear(10, 2)
-
-    def forward(self, query: Query, views: list[Tensor], options: dict[str, Any] | None = None) -> Query:
-        h = self.fc(torch.cat([query.points, query.features["f"], *views], -1))
-        return Query(h, {"both": h * 2 if options and options["double"] else h}, query.flags)
-
-
-class PerRay(nn.Module):
-    """A latent code for each ray, or object, that modulates the features of its samples."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.fc, self.film, self.out = nn.Linear(3, 8), nn.Linear(5, 16), nn.Linear(8, 2)
-
-    def forward(self, x: Tensor, z: Tensor) -> Tensor:
-        gamma, beta = self.film(z).chunk(2, -1)
-        if x.dim() == 3 and z.dim() == 2:
-            gamma, beta = gamma[:, None], beta[:, None]
-        return self.out(F.relu(self.fc(x) * gamma + beta))
-
-
-class Evaluations(nn.Module):
-    """Several evaluations of a network for each sample, as for normals by finite differences."""
-
-    def __init__(self, way: str) -> None:
-        super().__init__()
-        self.way = way
-        self.sdf = nn.Sequential(nn.Linear(3, 8), nn.Softplus(), nn.Linear(8, 1))
-        self.register_buffer("steps", 0.1 * torch.eye(3))
-
-    def forward(self, x: Tensor) -> Tensor:
-        if self.way == "interleaved":
-            around = (x[:, None] + self.steps).view(-1, 3)
-            return self.sdf(around).view(-1, 3) - self.sdf(x)
-        if self.way == "one after the other":
-            parts = self.sdf(torch.cat([x, *(x + step for step in self.steps)], 0)).chunk(4, 0)
-        elif self.way == "repeated":
-            parts = self.sdf(x.repeat(4, 1) + torch.cat([torch.zeros(1, 3), self.steps]).repeat_interleave(len(x), 0))
-            parts = parts.view(4, -1, 1)
-        else:
-            parts = self.sdf(torch.stack([x, *(x + step for step in self.steps)]))
-        return torch.cat([part - parts[0] for part in parts[1:]], -1)
-
-
 class RowOrder(nn.Module):
     """Samples taken apart and put together again inside forward."""
 
@@ -179,10 +108,6 @@ class RowOrder(nn.Module):
             out = x.new_zeros(len(x), 3)
             out[inside] = self.net(x[inside])
             return out
-        if self.way == "chunks":
-            return torch.cat([self.net(part) for part in x.split(8)])
-        if self.way == "loop":
-            return torch.stack([self.net(row) for row in x])
         order = x[:, 3].argsort()
         return self.net(x[order])[order.argsort()]
 
@@ -233,15 +158,6 @@ class Truncated(nn.Module):
         return {"sigma": TruncExp.apply(h[..., 0]), "rgb": torch.sigmoid(h[..., 1:])}
 
 
-def query(lead: tuple[int, ...]) -> Any:
-    args = Query(uniform(lead), {"f": uniform(lead)}), [uniform(lead, 1), uniform(lead)]
-    return args, {"options": {"double": True}}
-
-
-def points_of(query: Query, *_: Any, **__: Any) -> Tensor:
-    return query.points
-
-
 CALLS = [
     Case("table", lambda: NeRF(width=10, depth=3, skips=(1,)), pair, options={}, way="fused"),
     Case("heads", Heads),
@@ -249,19 +165,8 @@ CALLS = [
     Case("control flow, far", ControlFlow, lambda lead: ((uniform(lead, 7), "far"), {"extra": uniform(lead, 8)})),
     Case("branches", Branches, one(3)),
     Case("normals inside", Normals, one(3)),
-    Case("evaluations, interleaved", lambda: Evaluations("interleaved"), one(3)),
-    *(
-        Case(f"evaluations, {way}", lambda way=way: Evaluations(way), one(3), way="cell by cell")
-        for way in ("one after the other", "repeated", "stacked")
-    ),
-    *(
-        Case(f"row order, {way}", lambda way=way: RowOrder(way), way="cell by cell")
-        for way in ("box", "chunks", "loop", "sorted")
-    ),
+    *(Case(f"row order, {way}", lambda way=way: RowOrder(way), way="cell by cell") for way in ("box", "sorted")),
     Case("scripted", Scripted, way="cell by cell"),
     Case("truncated exponential", Truncated, fuses=True),
     Case("checkpointed", Checkpointed, way="cell by cell"),
-    Case("named tuple", Named, lead=RAYS, fuses=True),
-    Case("containers", TakesContainers, query, points_of, options={"coords": points_of}, fuses=True),
-    Case("code per ray", PerRay, lambda lead: ((uniform(lead), uniform(lead[:1], 5)), {}), lead=RAYS),
 ]

@@ -103,21 +103,6 @@ class RawWeights(nn.Module):
         return torch.einsum("nd,dc->nc", h, self.v) + self.c[None, :]
 
 
-class ReadsWeights(nn.Module):
-    """Weights and sizes read from the layers themselves."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.a, self.b, self.c = nn.Linear(4, 6), nn.Linear(6, 6, bias=False), nn.Linear(9, 2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        split = self.a.weight.shape[1]
-        assert self.a.weight.dim() == 2 and self.c.in_features == 9 and self.b.bias is None
-        h = F.relu(F.linear(x[..., :split].to(self.a.weight.dtype), self.a.weight, self.a.bias))
-        h = F.relu(h @ self.b.weight.t())
-        return self.c(torch.cat([h, x[..., split:]], -1))
-
-
 class Tied(nn.Module):
     """One layer used twice, and two layers with one weight."""
 
@@ -144,14 +129,10 @@ class LatentCode(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         if self.way == "expand":
             code = self.code.expand(x.shape[0], -1)
-        elif self.way == "repeat":
-            code = self.code.repeat(len(x), 1)
         elif self.way == "index":
             code = self.table[(x[:, 0] > 0).long() + 2]
         elif self.way == "row":
             code = self.table[3].expand(len(x), 4)
-        elif self.way == "ones":
-            code = torch.ones((*x.shape[:-1], 4), dtype=x.dtype) * self.table.mean(dim=0)
         else:
             code = self.table.mean(dim=0).expand(len(x), 4)
         return self.fc(torch.cat([x, code], -1))
@@ -172,19 +153,6 @@ class Lookup(nn.Module):
         return self.fc(torch.cat([x, code], -1))
 
 
-class LowRank(nn.Module):
-    """LoRA: a weight computed from parameters."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.base, self.out = nn.Linear(7, 8), nn.Linear(8, 3)
-        self.a, self.b = nn.Parameter(torch.randn(2, 7)), nn.Parameter(torch.randn(8, 2))
-        self.base.weight.requires_grad_(False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.out(F.relu(F.linear(x, self.base.weight + 0.5 * self.b @ self.a, self.base.bias)))
-
-
 class Convolution(nn.Module):
     """A convolution over features: no sample sees another, and no grouped version."""
 
@@ -195,32 +163,6 @@ class Convolution(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         assert x.shape[0] > 0, "called without rows"
         return self.fc(self.conv(x[:, None]).flatten(1))
-
-
-class SeveralInputs(nn.Module):
-    """Layers that read different features of a sample, and a layer before and after its activation."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.a, self.b, self.c = nn.Linear(3, 8), nn.Linear(10, 6), nn.Linear(10, 2)
-
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        h = F.relu(self.a(x[..., :3]))
-        raw = self.b(torch.cat([h, x[..., 3:5]], -1))
-        return self.c(torch.cat([F.relu(raw), x[..., 5:], raw[..., 1:3]], -1)), torch.sigmoid(raw[..., 2:5])
-
-
-class FourierFeatures(nn.Module):
-    """Random frequencies in a buffer (Tancik et al. 2020), the same in every module."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("frequencies", torch.randn(3, 4, generator=torch.Generator().manual_seed(0)))
-        self.net = nn.Sequential(nn.Linear(8, 8), nn.ReLU(), nn.Linear(8, 3))
-
-    def forward(self, x: Tensor) -> Tensor:
-        waves = x @ self.frequencies
-        return self.net(torch.cat([waves.sin(), waves.cos()], -1))
 
 
 def images(lead: tuple[int, ...]) -> Any:
@@ -236,20 +178,12 @@ LAYERS = [
     Case("weight_norm by parametrization", parametrized, one(3), by_parameters=False),
     Case("weight_norm that fuses", normed, fuses=True, by_parameters=False),
     Case("layer norm", lambda: Residual(lambda: nn.LayerNorm(8))),
-    Case("rms norm", lambda: Residual(lambda: nn.RMSNorm(8))),
     Case("raw weights, transposed", lambda: RawWeights("transposed"), way="cell by cell"),
     Case("raw weights, linear", lambda: RawWeights("linear"), fuses=True),
     *(Case(f"raw weights, {way}", lambda way=way: RawWeights(way)) for way in ("matmul", "einsum")),
-    Case("reads its weights", ReadsWeights),
     Case("tied", Tied),
-    *(
-        Case(f"latent code, {way}", lambda way=way: LatentCode(way))
-        for way in ("expand", "repeat", "index", "row", "mean", "ones")
-    ),
+    *(Case(f"latent code, {way}", lambda way=way: LatentCode(way)) for way in ("expand", "index", "row", "mean")),
     Case("embedding", Lookup, images),
     Case("embedding's average", Lookup),
-    Case("low rank", LowRank, fuses=True),
-    Case("fourier features", FourierFeatures, one(3), fuses=True),
-    Case("several inputs", SeveralInputs, fuses=True),
     Case("convolution", Convolution, way="cell by cell"),
 ]

@@ -41,8 +41,6 @@ from voronerf import VoronoiDiagram, VoronoiRouter
 CASES = [*LISTED, *LAYERS, *CALLS, *ARGUMENTS, *RULES, *ENCODERS]
 CASES += [case.fused() for case in CASES if case.fuses]
 every_case = pytest.mark.parametrize("case", CASES, ids=str)
-#: Without those that differ in one step of one module.
-every_module = pytest.mark.parametrize("case", [c for c in CASES if not c.name.startswith("step ")], ids=str)
 
 
 @pytest.fixture
@@ -128,21 +126,7 @@ def test_few_samples_and_none(case: Case, centres: Tensor) -> None:
         assert all(not gradient.any() for gradient in gradients(router, scalar(none), inputs).values())
 
 
-@every_module
-def test_cells_come_out_as_they_went_in(case: Case, centres: Tensor) -> None:
-    modules = case.modules()
-    router = routed(case, modules, centres)
-    args, kwargs, _ = prepared(case, torch.float32)
-    for index in (0, K - 1):
-        cell, module = router.cell(index), modules[index]
-        assert type(cell) is type(module)
-        assert [n for n, _ in cell.named_parameters()] == [n for n, _ in module.named_parameters()]
-        close(cell.state_dict(), module.state_dict(), rtol=0, atol=0)
-        assert [p.requires_grad for p in cell.parameters()] == [p.requires_grad for p in module.parameters()]
-        close(tensors(case.call(cell, args, kwargs)), tensors(case.call(module, args, kwargs)), rtol=1e-5, atol=1e-6)
-
-
-@every_module
+@pytest.mark.parametrize("case", [*LISTED, *ENCODERS], ids=str)
 def test_subdivision_and_state_change_nothing(case: Case, centres: Tensor) -> None:
     modules = case.modules()
     router = routed(case, modules, centres)

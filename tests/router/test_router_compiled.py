@@ -53,8 +53,7 @@ def step(model: Any, x: Tensor) -> list[Tensor]:
     return [result.detach(), *torch.autograd.grad(result.square().sum(), [x, *parameters], allow_unused=True)]
 
 
-@pytest.mark.parametrize("gives", ["dict", "tuple", "one"])
-@pytest.mark.parametrize("shape", [(60,), (9, 7)])
+@pytest.mark.parametrize(("gives", "shape"), [("dict", (9, 7)), ("tuple", (60,)), ("one", (60,))])
 def test_a_model_compiles_as_one_graph(gives: str, shape: tuple[int, ...]) -> None:
     torch.manual_seed(0)
     model, x = Model(gives), uniform(shape).requires_grad_()
@@ -93,7 +92,7 @@ def test_a_model_is_exported() -> None:
     assert any("routed" in str(node.target) for node in program.graph.nodes)
 
 
-@pytest.mark.parametrize("options", [{"fuse": False}, {"way": "grouped"}, {}])
+@pytest.mark.parametrize("options", [{"fuse": False}, {}])
 def test_what_is_in_the_way_of_one_graph_is_said(options: Any) -> None:
     model, x = Model(**options), uniform((60,))
     if options:

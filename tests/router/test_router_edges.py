@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import threading
-import time
 from typing import Any
 
 import pytest
@@ -143,62 +142,6 @@ def test_coords_of_a_field_with_a_table(rule: str) -> None:
 # Arguments ------------------------------------------------------------------------------------------------------------
 
 
-class Options(dict):
-    """A dict whose items are attributes, as many codebases have them."""
-
-    def __getattr__(self, name: str) -> Any:
-        return self[name]
-
-
-class WithOptions(nn.Module):
-    """As BARF's field, which takes its options first."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = network()
-
-    def forward(self, options: Options, x: Tensor) -> Tensor:
-        return self.net(x) * options.scale.by + options.get("shift", 0.0)
-
-
-def test_options_stay_what_they_are() -> None:
-    module, x = WithOptions(), samples()
-    router = VoronoiRouter(module, centres(), coords="first3")
-    options = Options(scale=Options(by=2.0), names=["a", "b"])
-    for _ in range(3):
-        close(router(options, x), module(options, x))
-    rows = Options(scale=Options(by=3.0), shift=torch.rand(40, 1))
-    for _ in range(3):
-        close(router(rows, x), module(rows, x))
-
-
-class Modes(nn.Module):
-    """Modes that are grouped, run cell by cell, and mix samples."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = network()
-
-    def forward(self, x: Tensor, mode: Any) -> Tensor:
-        h = self.net(x)
-        if mode in ("read", 1):
-            return h * (2.0 if float(h.max()) > 1e9 else 1.0)
-        return h - h.mean(0) if mode in ("mix", 2) else h
-
-
-@pytest.mark.parametrize("modes", [("plain", "read", "mix"), (0, 1, 2)])
-@pytest.mark.filterwarnings("ignore:.*runs cell by cell")
-def test_what_one_mode_is_says_nothing_of_the_others(modes: tuple[Any, ...]) -> None:
-    module, x = Modes(), samples()
-    router = VoronoiRouter(module, centres(), coords="first3")
-    plain, read, mix = modes
-    close(router(x, read), module(x, read))
-    with pytest.raises(TypeError, match="treat samples one by one"):
-        router(x, mix)
-    close(router(x, plain), module(x, plain))
-    assert "grouped" in router.explain() and "cell by cell" in router.explain()
-
-
 class NamesCoords(nn.Module):
     def __init__(self) -> None:
         super().__init__()
@@ -259,36 +202,6 @@ def test_state_that_is_loaded_in_inference_mode() -> None:
             close(router(x), expected)
     with torch.inference_mode():
         close(VoronoiRouter(other.cell(0), centres(), coords="first3")(x), other.cell(0)(x))
-
-
-def test_calls_from_several_threads() -> None:
-    """Another call begins while one is under way and ends after it; then all is as it was."""
-    inside, go_on = threading.Event(), threading.Event()
-
-    class Slow(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.net = network()
-
-        def forward(self, x: Tensor) -> Tensor:
-            inside.set()
-            go_on.wait(30)
-            return torch.utils.checkpoint.checkpoint(self.net, x, use_reentrant=False)
-
-    slow, x = Slow(), samples()
-    routers = [VoronoiRouter(slow, centres(), coords="first3"), VoronoiRouter(slow, centres(3), coords="first3")]
-    found: dict[int, Tensor] = {}
-    threads = [threading.Thread(target=lambda i=i: found.update({i: routers[i](x)})) for i in range(2)]
-    threads[0].start()
-    assert inside.wait(30)
-    threads[1].start()
-    time.sleep(0.2)  # for the second to come to where it waits, or would not
-    go_on.set()
-    for thread in threads:
-        thread.join(20)
-    for i in range(2):
-        close(found[i], slow(x))
-        assert all(isinstance(p, nn.Parameter) for p in routers[i].module.net[0]._parameters.values())
 
 
 def test_networks_traced_in_two_threads_leave_custom_functions_as_they_were() -> None:

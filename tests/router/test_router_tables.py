@@ -82,18 +82,6 @@ def test_planes_and_lines_are_those_of_grid_sample(padding: str, align: bool, n:
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("padding", ["zeros", "border"])
-def test_planes_have_second_derivatives(padding: str) -> None:
-    router = _router(Factors(padding_mode=padding, align_corners=True), 3).double()
-    x = (torch.rand(12, 3).double() * 2 - 1).requires_grad_()
-    names, values = zip(*router.named_parameters())
-
-    def call(x: Tensor, *parameters: Tensor) -> Tensor:
-        return torch.func.functional_call(router, dict(zip(names, parameters)), (x,))
-
-    torch.autograd.gradgradcheck(call, (x, *values))
-
-
 def test_indices_outside_of_a_table_are_refused() -> None:
     router = _router(Corners(), 3)
     x = torch.rand(40, 3)

@@ -77,7 +77,7 @@ def test_reading_beside_calls(last: nn.Module, way: str) -> None:
     threads = [threading.Thread(target=call, args=(i,)) for i in range(2)]
     for thread in threads:
         thread.start()
-    until, reads = time.monotonic() + 2, 0
+    until, reads = time.monotonic() + 0.5, 0
     while time.monotonic() < until or reads < 30:
         for name, read in READERS.items():
             reads += 1
@@ -153,10 +153,9 @@ def keeps(net: Any) -> None:
     net.kept, net.calls = net.weight, net.calls + 1
 
 
-def test_attributes_are_of_one_run_and_kept_parameters_are_said() -> None:
+def test_attributes_are_of_one_run() -> None:
     router, x = VoronoiRouter(Itself(keeps), CENTRES, coords="first3"), uniform((60,))
-    with pytest.warns(UserWarning, match="Itself.forward keeps a parameter as `kept`, which is of that call alone"):
-        found = router(x)
+    found = router(x)
     torch.testing.assert_close(found, masked_loop(router, router.diagram.locate(x), [x])[0][0])
     assert router.module.calls == 0 and not hasattr(router.module, "kept")
 

@@ -179,14 +179,6 @@ def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
 # Cells ----------------------------------------------------------------------------------------------------------------
 
 
-def test_cells_take_what_fits_them(generator: torch.Generator) -> None:
-    centres, modules = uniform(generator, 4, 3), [SkipNet() for _ in range(4)]
-    router = VoronoiRouter.from_modules(modules, centres, coords="first3")
-    router.load_cell(2, modules[0])
-    for a, b in zip(router.cell(2).parameters(), modules[0].parameters(), strict=True):
-        assert torch.equal(a, b)
-
-
 # Modes and wrappers ---------------------------------------------------------------------------------------------------
 
 

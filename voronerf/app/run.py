@@ -1,11 +1,11 @@
-"""Opens a trained run from its directory, to render it and to score it."""
+"""A trained run, opened from its directory to be rendered and scored."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -13,23 +13,35 @@ from torch import Tensor
 from voronerf.app.evaluate.lpips import Lpips, find_lpips
 from voronerf.app.evaluate.scores import score_views
 from voronerf.app.files import json_text, read_json, write_text
+from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene, load_scene
+from voronerf.app.train.build import check_device, make_picture_grid, make_renderer, make_routers
 from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.config_checks import check_device
-from voronerf.app.train.networks import check_shapes, make_routers, parameter_groups, restore_routers
-from voronerf.app.train.renderers import make_picture_grid, make_renderer, through_grid
-from voronerf.app.train.run_directory import TOWN, check_folders, check_stored_paths
-from voronerf.app.train.state import stored_values
+from voronerf.app.train.resume import check_shapes, load_averages, restore_routers, stored_values
+from voronerf.app.train.run_directory import check_folders, check_stored_paths
 from voronerf.diagram import VoronoiDiagram
-from voronerf.nerf.average import load_averages
+from voronerf.nerf.adam import parameter_groups
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.occupancy import OccupancyGrid
-from voronerf.nerf.renderer import RenderedImage, Renderer, render_camera
-from voronerf.router import VoronoiRouter
+from voronerf.nerf.renderer import RenderedImage, Renderer
+from voronerf.nerf.samplers import Occupancy
 
 #: File of a run's crop: the lowest and the highest corner.
 CROP = "crop.json"
+
+
+class HasCells(Protocol):
+    """A field with cells, such as a router."""
+
+    @property
+    def diagram(self) -> VoronoiDiagram:
+        """The cells."""
+        ...
+
+    def assign(self, positions: Tensor) -> Tensor:
+        """The cells int32 [n] of positions [n, 3]."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -40,11 +52,11 @@ class Run:
         path: Its directory.
         config: The settings it was trained with; ``data`` and ``downscale`` are those of ``scene``.
         scene: Images and cameras, and the space that the field fills.
-        routers: The networks by name: "field", whose colours count, and "coarse" or "proposal" where it has them.
+        router: The cells of the field.
         renderer: How rays become colours.
 
     Examples:
-        >>> from voronerf import Run
+        >>> from voronerf.app import Run
         >>> from voronerf.nerf import turntable_cameras
         >>> def turntable(run: Run, frames: int) -> list:  # such as a viewer's
         ...     cameras = turntable_cameras(run.scene.train.cameras, frames)
@@ -54,13 +66,8 @@ class Run:
     path: Path
     config: TrainConfig
     scene: Scene
-    routers: dict[str, VoronoiRouter]
+    router: HasCells
     renderer: Renderer
-
-    @property
-    def router(self) -> VoronoiRouter:
-        """The router of the field."""
-        return self.routers["field"]
 
     @property
     def diagram(self) -> VoronoiDiagram:
@@ -161,16 +168,14 @@ def open_run(
     data: str | Path | None = None,
     downscale: int | None = None,
     allow_outside: bool = False,
-    samples: int | None = None,
-    fine_samples: int | None = None,
+    samples: tuple[int, ...] | None = None,
     occupancy: bool = False,
     device: str = "cpu",
     backend: str = "auto",
 ) -> Run:
-    """Opens a run that ``voronerf train`` or :class:`voronerf.app.train.trainer.Trainer` has written.
+    """Opens a run that ``voronerf train`` has written.
 
-    On the CPU the networks are pages of the checkpoint. The system reads them when they are needed, and drops them when
-    memory gets short, so that networks may be larger than the memory.
+    On the CPU the networks are pages of the checkpoint's file: the system reads them when they are needed.
 
     Args:
         path: The run directory.
@@ -179,8 +184,7 @@ def open_run(
             ``VORONERF_DATA``, since a run may be another person's.
         downscale: Factor on the images; None for that of the training.
         allow_outside: Also read images that lie outside of the scene folder.
-        samples: Samples per ray in the first pass; None for those of the training.
-        fine_samples: Samples per ray in the second pass; None for those of the training.
+        samples: Samples per ray of each pass; None for those of the training.
         occupancy: Skip empty space, found by evaluating the field once. A run trained with occupancy always uses its
             own grid, because its field has learnt nothing about empty space.
         device: Torch device.
@@ -193,30 +197,29 @@ def open_run(
         SceneError: If the scene cannot be read.
 
     Examples:
-        >>> import tempfile, voronerf  # a tiny run of the built-in scene, trained and opened again
+        >>> import tempfile  # a tiny run of the built-in scene, trained and opened again
         >>> from pathlib import Path
+        >>> from voronerf.app import open_run
         >>> from voronerf.app.scenes import builtin_scene
-        >>> from voronerf.app.train.config import TrainConfig
-        >>> from voronerf.app.train.trainer import Trainer
+        >>> from voronerf.app.train import Checkpoints, Scores, TrainConfig, build, run
         >>> folder = tempfile.TemporaryDirectory()
+        >>> out = Path(folder.name)
         >>> scene = builtin_scene(16, train_views=4, test_views=2)
-        >>> config = TrainConfig(out=Path(folder.name), steps=20, cells=(4,), width=8, depth=1, rays=64)
-        >>> summary = Trainer(config, scene).run()
-        >>> run = voronerf.open_run(folder.name, scene=scene)
-        >>> run.diagram.num_cells
+        >>> state = build(TrainConfig(steps=20, cells=(4,), width=8, depth=1, rays=64), scene)
+        >>> run(state, [Checkpoints(out), scores := Scores(out)])
+        >>> opened = open_run(out, scene=scene)
+        >>> opened.diagram.num_cells
         4
-        >>> picture = run.render(0)
+        >>> picture = opened.render(0)
         >>> picture.colour.shape, picture.depth.shape
         (torch.Size([16, 16, 3]), torch.Size([16, 16]))
-        >>> run.evaluate()["psnr"] == summary["psnr"]
+        >>> opened.evaluate()["psnr"] == scores.summary["psnr"]
         True
         >>> folder.cleanup()
     """
     path = Path(path)
     check_device(device)
     check_folders(path)
-    if (path / TOWN).is_file():
-        raise ConfigError(f"{path}: is a run made of several runs, which voronerf.town.open_run opens")
     checkpoint = last_checkpoint(path, keep=_shows)
     config, _ = stored_values(checkpoint)
     if scene is None and data is None:
@@ -224,7 +227,8 @@ def open_run(
     check_shapes(config, checkpoint)
     routers = make_routers(config, device)
     restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
-    load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)
+    dense, tables = parameter_groups(routers, config.field_type.sparse_parameters)
+    load_averages([*dense, *tables], checkpoint)
     for router in routers.values():
         router.backend = backend
         router.eval()
@@ -233,14 +237,19 @@ def open_run(
         data=config.data if data is None else str(data),
         downscale=config.downscale if downscale is None else downscale,
     )
-    scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
-    renderer = make_renderer(config, scene, routers, samples=samples, fine_samples=fine_samples, backend=backend)
-    state = checkpoint.group("occupancy")
-    grid = None
+    if scene is None:
+        reading = {**config.reading, "allow_outside": allow_outside}
+        scene = load_scene(config.data, **reading)
+    renderer = make_renderer(config, scene, routers, samples=samples, backend=backend)
+    state, grid = checkpoint.group("occupancy"), None
     if state:
-        grid = OccupancyGrid.from_state(state, contraction=renderer.contraction, device=renderer.device)
+        contraction = renderer.sampler.space.contraction
+        grid = OccupancyGrid.from_state(state, contraction=contraction, device=renderer.device)
     elif occupancy:
         grid = make_picture_grid(config, scene, renderer)
     if grid is not None:
-        renderer.sampler = through_grid(renderer.sampler, grid, picture_samples=samples)
-    return Run(path, config, scene, routers, renderer)
+        sampler, chosen = renderer.sampler, None if samples is None else samples[0]
+        renderer.sampler = Occupancy(
+            grid, sampler.samples, picture_samples=chosen, space=sampler.space, backend=sampler.backend
+        )
+    return Run(path, config, scene, routers["field"], renderer)

@@ -10,7 +10,6 @@ machine. For ten thousand samples a GPU would not help. Coordinates are in scene
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +20,7 @@ from voronerf.diagram.voronoi import VoronoiDiagram
 _STEPS = 200  # of Lloyd's iteration at most
 _TOLERANCE = 1e-5  # it ends when a step lowers the energy by less than this part of it
 
-METHODS = ("published", "centroidal")
+CENTRES = ("balanced", "random", "uniform", "centroidal")
 
 
 @dataclass(frozen=True)
@@ -91,36 +90,28 @@ def balance(
     importance: Tensor,
     k: int,
     *,
-    method: str = "published",
+    centres: str = "balanced",
     steps: int = 500,
-    alpha: float = 0.05,
-    neighbours: int = 8,
-    init: str | None = None,
     generator: torch.Generator | None = None,
     backend: str = "auto",
 ) -> Balance:
     """Places k centres so that their Voronoi cells hold equal importance.
 
-    The method "published" draws the first centres and repeats, `steps` times, for all centres i at once,
+    Balanced centres begin as random ones and make `steps` updates, of all centres i at once,
 
-        v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i,
+        v_i <- v_i + 0.05 * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i,
 
-    where N(i) are its `neighbours` closest centres (all others if there are fewer), and `norm_i` is the largest W of i
-    and N(i). Light cells move towards heavy neighbours, and heavy cells away from light ones.
+    where N(i) are the 8 closest centres (all others if there are fewer), and `norm_i` is the largest W of i and N(i).
+    Light cells move towards heavy neighbours, and heavy cells away from light ones.
 
     Args:
         points: floating [m, 3], finite.
         importance: floating [m], finite, >= 0, not all 0.
         k: number of cells, 1 <= k <= number of distinct points.
-        method: "published", or "centroidal": centres are the centroids of their cells, weighted by importance, which
-            makes compact cells of unequal importance (Du, Faber and Gunzburger 1999).
-        steps: number of updates; 0 keeps the first centres.
-        alpha: step size, no unit.
-        neighbours: size of N(i), >= 1.
-        init: the first centres. "random": distinct samples, all equally likely (as in the paper; default of
-            "published"). "weighted": distinct samples drawn one by one with probability proportional to importance
-            (default of
-            "centroidal"). "uniform": `uniform_centres` over the bounding box of the samples.
+        centres: "balanced", as published; "centroidal": the centroids of their cells, weighted by importance, which
+            makes compact cells of unequal importance (Du, Faber and Gunzburger 1999); or, not moved, "random":
+            distinct samples, all equally likely, or "uniform": `uniform_centres` over the bounding box of the samples.
+        steps: number of updates of balanced centres.
         generator: CPU generator of the draws; None for torch's global one.
         backend: of the ops, see `voronerf.ops._core.backends`.
 
@@ -141,13 +132,10 @@ def balance(
         True
     """
     check_samples("balance", points, importance)
-    _check_choice("method", method, METHODS)
-    init = init or ("random" if method == "published" else "weighted")
-    _check_choice("init", init, ("random", "weighted", "uniform"))
-    if k < 1:
-        raise ValueError(f"balance: k must be at least 1, got {k}")
-    if steps < 0 or neighbours < 1:
-        raise ValueError(f"balance: steps must be >= 0 and neighbours >= 1, got {steps} and {neighbours}")
+    if centres not in CENTRES:
+        raise ValueError(f"balance: centres must be one of {', '.join(CENTRES)}, got {centres!r}")
+    if k < 1 or steps < 0:
+        raise ValueError(f"balance: k must be at least 1 and steps at least 0, got {k} and {steps}")
     total = float(importance.double().sum())
     if not 0.0 < total < float("inf"):
         raise ValueError(f"balance: importance must have a positive finite sum, got {total}")
@@ -158,17 +146,16 @@ def balance(
     def weigh(centres: Tensor) -> Tensor:
         return cell_weights(ops.nearest_centre(samples, centres, backend=backend), masses, k)
 
-    centres = first_centres(samples, masses, k, init=init, generator=generator)
-    before = after = weigh(centres)
-    if method == "centroidal":
-        centres = lloyd(samples, masses, centres, backend=backend)
-        after = weigh(centres)
-    elif k > 1:
-        settings: dict[str, Any] = {"steps": steps, "alpha": alpha, "neighbours": neighbours, "backend": backend}
-        centres, after = ops.balance_centres(samples, masses, centres, **settings)
+    found = first_centres(samples, masses, k, centres, generator)
+    before = after = weigh(found)
+    if centres == "centroidal":
+        found = lloyd(samples, masses, found, backend=backend)
+        after = weigh(found)
+    elif centres == "balanced" and k > 1:
+        found, after = ops.balance_centres(samples, masses, found, steps=steps, backend=backend)
     device = points.device
     return Balance(
-        centres=centres.to(device),
+        centres=found.to(device),
         before=before.to(device),
         after=after.to(device),
         imbalance_before=imbalance(before),
@@ -176,18 +163,18 @@ def balance(
     )
 
 
-def first_centres(samples: Tensor, masses: Tensor, k: int, *, init: str, generator: torch.Generator | None) -> Tensor:
-    """float32 [k, 3] first centres from CPU samples float32 [m, 3] and masses [m]; see `init` of `balance`."""
+def first_centres(samples: Tensor, masses: Tensor, k: int, centres: str, generator: torch.Generator | None) -> Tensor:
+    """float32 [k, 3] first centres from CPU samples float32 [m, 3] of masses [m], which centroidal ones follow."""
     distinct, member = torch.unique(samples, dim=0, return_inverse=True)
     if k > distinct.shape[0]:
         raise ValueError(f"balance: k must be at most the number of distinct samples, {distinct.shape[0]}, got {k}")
-    if init == "uniform":
+    if centres == "uniform":
         return uniform_centres(torch.stack([samples.amin(0), samples.amax(0)]), k)
     # Sorting exponential variates divided by the weights draws without replacement in proportion to the weights
     # (Efraimidis and Spirakis 2006). Of several samples in one place only the first counts, because two centres in one
     # place would make an empty cell.
     keys = torch.empty(samples.shape[0], dtype=torch.float64).exponential_(generator=generator)
-    order = torch.argsort(keys / masses if init == "weighted" else keys, stable=True)
+    order = torch.argsort(keys / masses if centres == "centroidal" else keys, stable=True)
     place = torch.full((distinct.shape[0],), samples.shape[0], dtype=torch.int64)
     place.scatter_reduce_(0, member[order], torch.arange(samples.shape[0]), "amin")
     return samples[order[place.sort().values[:k]]]
@@ -254,20 +241,10 @@ def uniform_centres(box: Tensor, k: int) -> Tensor:
 def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
     """Centres that are the centroids of their Voronoi cells, so that cells are compact.
 
-    The centres v_i lower the energy E = sum_j m_j min_i |x_j - v_i|^2 of samples x_j of mass m_j by Lloyd's iteration:
-    samples go to the nearest centre, and centres to the centroids of their samples (Du, Faber and Gunzburger 1999,
-    "Centroidal Voronoi tessellations: applications and algorithms", section 5; with masses, section 2). A centre
-    without mass in its cell is moved to the sample with the largest share `m_j |x_j - v|^2` of the energy; it
-    stays where it is if that is 0.
-
-    Args:
-        samples: float32 [m, 3] on the CPU.
-        masses: float64 [m], >= 0, not all 0.
-        centres: float32 [k, 3], k >= 1.
-        backend: backend of `nearest_centre`.
-
-    Returns:
-        Centres float32 [k, 3].
+    They lower the energy E = sum_j m_j min_i |x_j - v_i|^2 of samples x_j of mass m_j by Lloyd's iteration: samples go
+    to the nearest centre, and centres to the centroids of their samples (Du, Faber and Gunzburger 1999, section 5; with
+    masses, section 2). A centre without mass in its cell is moved to the sample with the largest share
+    `m_j |x_j - v|^2` of the energy; it stays where it is if that is 0.
     """
     k = centres.shape[0]
     precise, energy = samples.double(), float("inf")
@@ -288,11 +265,6 @@ def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "a
                 costs = torch.minimum(costs, masses * (precise - precise[worst]).square().sum(1))
         centres = moved.float()
     return centres
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"balance: {name} must be one of {', '.join(choices)}, got {value!r}")
 
 
 def check_samples(op: str, points: Tensor, importance: Tensor) -> None:

@@ -10,10 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.diagram.balance import Balance, balance, cell_weights, check_samples
+from voronerf.diagram.balance import CENTRES, Balance, balance, cell_weights, check_samples
 from voronerf.diagram.voronoi import VoronoiDiagram
-
-CENTRES = ("balanced", "random", "uniform", "centroidal")
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ def split_diagram(
     centres: str = "balanced",
     generator: torch.Generator | None = None,
     backend: str = "auto",
-    **options: Any,
+    steps: int = 500,
 ) -> Split:
     """Splits cells into k each, every cell by the samples that lie in it.
 
@@ -65,13 +63,11 @@ def split_diagram(
         cells: "all"; "worst", the one cell with the largest accumulated importance among those that hold enough
             samples; or the numbers of the cells to split.
         min_samples: number of distinct samples that a cell needs to be split.
-        centres: "balanced": moved by `balance`; "random": samples drawn at random and not moved; "uniform":
-            `uniform_centres` over the bounding box of the samples in the cell, not moved (some may lie outside the cell
-            and have no samples); "centroidal": the centroids of their cells, weighted by importance. "random" and
-            "uniform" are ablations of the paper.
+        centres: "balanced", "centroidal", "random" or "uniform", see `balance`. Some of the uniform ones may lie
+            outside of their cell and have no samples. "random" and "uniform" are ablations of the paper.
         generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
         backend: of the cell queries, see `voronerf.ops._core.backends`.
-        **options: arguments of `balance` for "balanced" and "centroidal": method, steps, alpha, neighbours, init.
+        steps: of `balance`.
 
     Returns:
         The split. Cells that are too small stay leaves; `balances` has the cells that were split.
@@ -117,21 +113,11 @@ def split_diagram(
         accumulated = cell_weights(leaves, importance, diagram.num_cells)
         chosen = [max(chosen, key=lambda cell: float(accumulated[cell]))]
 
-    if centres == "centroidal":
-        options["method"] = "centroidal"
-    elif centres != "balanced":
-        options = {"method": "published", "steps": 0, "init": centres}
     balances: dict[int, Balance] = {}
     for cell in chosen if k > 1 else []:
         inside = leaves == cell
-        balances[cell] = balance(
-            points[inside],
-            importance[inside],
-            k,
-            generator=generator,
-            backend=backend,
-            **options,
-        )
+        given = points[inside], importance[inside], k
+        balances[cell] = balance(*given, centres=centres, steps=steps, generator=generator, backend=backend)
     refined, parents = diagram.refine({cell: result.diagram() for cell, result in balances.items()})
     return Split(refined if balances else diagram, parents, balances)
 
@@ -157,13 +143,8 @@ def finer_diagram(
 ) -> tuple[VoronoiDiagram, Tensor]:
     """The diagram that ``VoronoiRouter.subdivide`` was asked for, and the parents of its cells.
 
-    Args:
-        present: The router's diagram.
-        finer: A finer one, or a number of children.
-        parents: int64 [new cells], or None for those that hold the new centres.
-        points: [m, 3], with a number of children.
-        weights: [m], with a number of children.
-        split: Options of :func:`split_diagram`, ``backend`` and ``generator`` among them.
+    With a number of children for ``finer`` come points [m, 3], their weights [m] and options of :func:`split_diagram`;
+    a diagram has parents int64 [new cells], or None for those that hold the new centres.
 
     Raises:
         ValueError: For parents that do not fit, or points and weights that are missing or too many.

@@ -12,7 +12,7 @@ Coordinates are in scene units, in the world frame of the query points.
 
 import itertools
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -254,45 +254,6 @@ class VoronoiDiagram(nn.Module):
             tables.append(graft.centres.to(device))
             rows, nodes = rows + graft.centres.shape[0], nodes + graft.child_offsets.shape[0] - 1
         return VoronoiDiagram._from_tables(torch.cat(tables), torch.cat(offsets_all), torch.cat(links)), parents
-
-    @classmethod
-    def join(cls, diagrams: Sequence["VoronoiDiagram"]) -> "VoronoiDiagram":
-        """The diagram of all centres of the first levels; below them each keeps the levels that it has.
-
-        Leaves are numbered diagram after diagram.
-
-        Args:
-            diagrams: at least one, on one device.
-
-        Raises:
-            ValueError: no diagram.
-
-        Examples:
-            >>> import torch
-            >>> from voronerf import VoronoiDiagram
-            >>> left = VoronoiDiagram(torch.zeros(1, 3))
-            >>> right = VoronoiDiagram(torch.tensor([[2.0, 0, 0], [3.0, 0, 0]]))
-            >>> VoronoiDiagram.join([left, right]).locate(torch.tensor([[0.9, 0, 0], [2.6, 0, 0]]))
-            tensor([0, 2], dtype=torch.int32)
-        """
-        if not diagrams:
-            raise ValueError("VoronoiDiagram.join: diagrams must hold at least one, got none")
-        roots, inner, root_rows, inner_rows, ends = [], [], [], [], []
-        nodes, leaves = 0, 0
-        for diagram in diagrams:
-            child, first = diagram.child, int(diagram.child_offsets[1])
-            # A root's own number, 0, is none of the links.
-            links = torch.where(child < 0, child - leaves, child + nodes)
-            roots.append(diagram.centres[:first])
-            inner.append(diagram.centres[first:])
-            root_rows.append(links[:first])
-            inner_rows.append(links[first:])
-            ends.append(diagram.child_offsets[1:].diff())
-            nodes, leaves = nodes + diagram.child_offsets.shape[0] - 2, leaves + diagram.num_cells
-        centres = torch.cat((*roots, *inner))
-        counts = torch.cat((torch.tensor([sum(map(len, roots))], device=centres.device), *ends))
-        offsets = torch.cat((counts.new_zeros(1), counts.cumsum(0))).to(torch.int32)
-        return cls._from_tables(centres, offsets, torch.cat((*root_rows, *inner_rows)))
 
     def part(self, cells: Tensor) -> "VoronoiDiagram":
         """The diagram of some of the cells. A point that lies in one of them is located in it again.

@@ -1,25 +1,25 @@
-"""The pieces of a radiance-field training, each usable alone: cameras, samplers, rendering, the loss, the cells."""
+"""The pieces of a radiance-field training, each usable alone: cameras, samplers, rendering, the loss, splits."""
 
+from voronerf.nerf.adam import Adam
+from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.cameras import Cameras, Rays, focus_point, orbit_cameras, turntable_cameras
-from voronerf.nerf.cells import Cells, SplitRule
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
+from voronerf.nerf.loss import Batch, RayLoss, RenderOutput
 from voronerf.nerf.marching import RayColours, render_until_opaque
 from voronerf.nerf.occupancy import OccupancyGrid
-from voronerf.nerf.ray_loss import Batch, RayLoss, RenderOutput
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import RenderedImage, Renderer, render_rays
-from voronerf.nerf.samplers import SAMPLERS, Hierarchical, Occupancy, Proposal, Stratified
+from voronerf.nerf.samplers import SAMPLERS, Hierarchical, Occupancy, Sampler, Stratified
 from voronerf.nerf.sampling import stratified_depths
-from voronerf.nerf.schedule import PlannedSplit
-from voronerf.nerf.step import Step
+from voronerf.nerf.split import PlannedSplit, SplitDone, SplitStrategy
 from voronerf.nerf.volume import Rendered, Samples, Space
 
 __all__ = [
     "SAMPLERS",
+    "Adam",
     "Batch",
     "Cameras",
-    "Cells",
     "Contraction",
     "Field",
     "Hierarchical",
@@ -27,7 +27,7 @@ __all__ = [
     "OccupancyGrid",
     "Perspective",
     "PlannedSplit",
-    "Proposal",
+    "RayBatches",
     "RayColours",
     "RayLoss",
     "Rays",
@@ -35,10 +35,11 @@ __all__ = [
     "Rendered",
     "RenderedImage",
     "Renderer",
+    "Sampler",
     "Samples",
     "Space",
-    "SplitRule",
-    "Step",
+    "SplitDone",
+    "SplitStrategy",
     "Stratified",
     "focus_point",
     "intersect_box",

@@ -6,7 +6,7 @@ r rays, h x w pixels. Units as in `voronerf.nerf.volume`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,11 +17,8 @@ from voronerf.nerf.field import Field
 from voronerf.nerf.marching import RayColours, render_until_opaque
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
-from voronerf.nerf.samplers import Occupancy, Stratified
+from voronerf.nerf.samplers import Occupancy, Sampler, Stratified
 from voronerf.nerf.volume import Rendered, Samples, per_ray, render_samples
-
-if TYPE_CHECKING:
-    from voronerf.app.scenes import Scene
 
 
 class RenderedImage(NamedTuple):
@@ -78,7 +75,7 @@ class Renderer:
         (torch.Size([40]), torch.Size([80]))
     """
 
-    def __init__(self, fields: Mapping[str, Field], sampler: Stratified, *, backend: str = "auto") -> None:
+    def __init__(self, fields: Mapping[str, Field], sampler: Sampler, *, backend: str = "auto") -> None:
         wanted = sampler.networks(sampler.space.cones)
         if set(fields) != set(wanted):
             raise ValueError(f"Renderer: fields must be {' and '.join(wanted)}, got {sorted(fields)}")
@@ -221,29 +218,13 @@ class Renderer:
         )
 
 
-def render_camera(
-    renderer: Renderer, scene: Scene, cameras: Cameras, index: int, *, heaviest: bool = True
-) -> RenderedImage:
-    """What one of several cameras sees of a scene, on its background, without randomness; on the renderer's device."""
-    device = renderer.device
-    return renderer.train(False).image(
-        cameras.to(device),
-        index,
-        near=scene.near,
-        far=scene.far,
-        box=None if scene.box is None else scene.box.to(device),
-        background=scene.background_colour(device),
-        heaviest=heaviest,
-    )
-
-
 def render_rays(
     field: Field,
     rays: Rays,
     near: Tensor | float,
     far: Tensor | float,
     *,
-    samples: int | Stratified,
+    samples: int | Sampler,
     background: Tensor | None = None,
     jitter: bool = False,
     generator: torch.Generator | None = None,

@@ -5,18 +5,20 @@ r rays, m samples of all rays (packed), s samples a ray. All samplers give `Samp
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from voronerf.nerf.cameras import Rays
+from voronerf.nerf.contraction import Contraction
+from voronerf.nerf.field import Field
 from voronerf.nerf.occupancy import OccupancyGrid, draw_seed
 from voronerf.nerf.sampling import (
     blurred_weights,
     colour_loss,
-    interlevel_loss,
     strata_uniforms,
     stratified_depths,
     stratified_edges,
@@ -25,40 +27,62 @@ from voronerf.nerf.sampling import (
 from voronerf.nerf.volume import Rendered, Samples, Space
 from voronerf.ops.resample import resample
 
+if TYPE_CHECKING:
+    from voronerf.nerf.loss import RenderOutput
+
 #: Share of the first pass in the loss if one network is evaluated in two passes (mip-NeRF, section 3.2).
 COARSE_SHARE = 0.1
 #: One in so many strata is left while an occupancy grid settles.
 SETTLING_PART = 4
+#: In a contracted sphere, the first steps of a training, in which the grid learns nothing. A young field is thin
+#: everywhere: a grid would take it for empty, and what is emptied no longer learns.
+SETTLING_STEPS = 400
+#: Steps between evaluations of random voxels of the occupancy grid, the share of all that are evaluated, and how many
+#: at most: as many as a few steps have samples.
+REVISIT_EVERY, REVISITED, MOST_REVISITED = 16, 1 / 8, 32_768
+#: The factor on what a voxel remembers for each sample of a batch in it.
+DECAY = 0.8
+#: Samples of a ray of a picture, for each of training: those are at random places, and meet all of a stratum in time.
+#: At most so many: of the 256 of a long training, twice as many would make no picture more than 0.05 dB better.
+PICTURE_SAMPLES, MOST_PICTURE_SAMPLES = 2, 384
 #: Renders samples through one of the networks of a cell, given by its name.
 Look = Callable[[str, Samples], Rendered]
 
 
-class Stratified:
-    """One sample in each of s strata of a ray (NeRF, section 4), and what all samplers have in common.
+class Sampler:
+    """Where along rays a field is asked, and what becomes of that between the steps of a training.
+
+    A subclass defines :meth:`sample`. One with several passes defines :meth:`draw` and :meth:`loss_before` too, and
+    one that learns from a training the two methods of steps.
 
     Attributes:
-        passes: How often a ray is sampled, each time with a number of samples of its own. Several territories need a
-            single pass.
-        skips: Whether an occupancy grid can leave out samples.
-        whole: The networks of densities, which have a single cell however many the field has.
-
-    Args:
+        passes: How often a ray is sampled, each time with a number of samples of its own.
         samples: s, of the first pass.
         space: How the field sees the scene.
         backend: Of the ops.
 
+    Args:
+        samples: s, of the first pass, at least 1.
+        space: How the field sees the scene; None for the world, with even spacing.
+        backend: Of the ops.
+
+    Raises:
+        ValueError: For fewer samples than 1.
+
     Examples:
         >>> import torch
-        >>> from voronerf.nerf import Rays, Stratified
-        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
-        >>> samples = Stratified(8).sample(rays, torch.ones(5), torch.full((5,), 3.0))
-        >>> samples.positions.shape, samples.ray_offsets
-        (torch.Size([40, 3]), tensor([ 0,  8, 16, 24, 32, 40], dtype=torch.int32))
+        >>> from voronerf.nerf import Rays, Sampler, render_rays
+        >>> class Middle(Sampler):  # one sample in the middle of each ray
+        ...     def sample(self, rays, near, far, *, jitter=False, generator=None):
+        ...         return self.space.samples(rays, (near + far)[:, None] / 2, torch.stack((near, far), 1))
+        >>> def fog(positions, directions, ray_index):
+        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+        >>> rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
+        >>> render_rays(fog, rays, 0.0, 2.0, samples=Middle(1)).depth
+        tensor([1.])
     """
 
     passes: ClassVar[int] = 1
-    skips: ClassVar[bool] = True
-    whole: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, samples: int, *, space: Space | None = None, backend: str = "auto") -> None:
         if samples < 1:
@@ -67,7 +91,7 @@ class Stratified:
 
     @staticmethod
     def networks(cones: bool) -> tuple[str, ...]:
-        """The names of a cell's networks; "field" gives the colours. Names that are there depend on cones or points."""
+        """The names of a cell's networks; "field" gives the colours."""
         return ("field",)
 
     def sample(
@@ -88,14 +112,7 @@ class Stratified:
             jitter: Random samples, for training; else the same each time.
             generator: Of the jitter.
         """
-        space = self.space
-        given: dict[str, Any] = {"jitter": jitter, "spacing": space.spacing, "generator": generator}
-        if space.cones:
-            edges = stratified_edges(near, far, self.samples, **given)
-            depths = (edges[:, 1:] + edges[:, :-1]) / 2
-        else:
-            depths, _, edges = stratified_depths(near, far, self.samples, **given)
-        return space.samples(rays, depths, edges)
+        raise NotImplementedError
 
     def draw(
         self,
@@ -107,7 +124,7 @@ class Stratified:
         jitter: bool = False,
         generator: torch.Generator | None = None,
     ) -> tuple[Samples, tuple[Rendered, ...]]:
-        """The samples of the last pass, and what the passes before have seen; other arguments as in :meth:`sample`.
+        """The samples of the last pass, and what the passes before have rendered; other arguments as in :meth:`sample`.
 
         Args:
             look: Renders the samples of a pass before.
@@ -129,9 +146,60 @@ class Stratified:
         """
         raise NotImplementedError
 
+    def step_pre_backward(self, field: Field, step: int, generator: torch.Generator) -> None:
+        """Called before a training step draws its rays.
 
-class Occupancy(Stratified):
-    """`Stratified` without the samples in empty cells of a grid: rays have as many as are left.
+        Args:
+            field: The field that learns.
+            step: The number of the step, from 0.
+            generator: Of random choices.
+        """
+
+    def step_post_backward(self, output: RenderOutput) -> None:
+        """Called after the loss of a step was computed.
+
+        Args:
+            output: What :class:`voronerf.nerf.RayLoss` gave.
+        """
+
+
+class Stratified(Sampler):
+    """One sample in each of s strata of a ray (NeRF, section 4).
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import Rays, Stratified
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> samples = Stratified(8).sample(rays, torch.ones(5), torch.full((5,), 3.0))
+        >>> samples.positions.shape, samples.ray_offsets
+        (torch.Size([40, 3]), tensor([ 0,  8, 16, 24, 32, 40], dtype=torch.int32))
+    """
+
+    def sample(
+        self,
+        rays: Rays,
+        near: Tensor,
+        far: Tensor,
+        *,
+        jitter: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> Samples:
+        """See :meth:`Sampler.sample`."""
+        space = self.space
+        given: dict[str, Any] = {"jitter": jitter, "spacing": space.spacing, "generator": generator}
+        if space.cones:
+            edges = stratified_edges(near, far, self.samples, **given)
+            depths = (edges[:, 1:] + edges[:, :-1]) / 2
+        else:
+            depths, _, edges = stratified_depths(near, far, self.samples, **given)
+        return space.samples(rays, depths, edges)
+
+
+class Occupancy(Sampler):
+    """`Stratified` without the samples in empty voxels of a grid: rays have as many as are left.
+
+    In a training the grid learns from the samples of each step. At every `REVISIT_EVERY` th step the field is evaluated
+    in random voxels, so that what was wrongly found empty comes back.
 
     Attributes:
         grid: Which space is empty; all space outside its box is.
@@ -141,9 +209,10 @@ class Occupancy(Stratified):
     Args:
         grid: Can be set at any time. With a contraction it is in contracted space.
         samples: s, strata of a ray.
-        picture_samples: Strata of a ray of a picture; None for as many. A picture is walked to the first surface
-            alone, so that more of them cost little.
+        picture_samples: Strata of a ray of a picture; None for `PICTURE_SAMPLES` as many. A picture is walked to the
+            first surface alone, so that more of them cost little.
         space: How the field sees the scene.
+        empty: bool [v], voxels that stay empty in a training; None for none.
         backend: Of the ops.
 
     Raises:
@@ -169,13 +238,55 @@ class Occupancy(Stratified):
         *,
         picture_samples: int | None = None,
         space: Space | None = None,
+        empty: Tensor | None = None,
         backend: str = "auto",
     ) -> None:
         super().__init__(samples, space=space, backend=backend)
         if self.space.cones or (grid.contraction is None) != (self.space.contraction is None):
             raise ValueError("Occupancy: grid must be of points, and in the space of the contraction")
-        self.grid, self.picture_samples = grid, picture_samples or samples
+        self.grid, self.empty = grid, empty
+        self.picture_samples = picture_samples or max(min(PICTURE_SAMPLES * samples, MOST_PICTURE_SAMPLES), samples)
         self.settling = False
+        self._leave_empty()
+
+    def _leave_empty(self) -> None:
+        if self.empty is not None:
+            self.grid.density.view(-1)[self.empty] = 0
+            self.grid.occupied.view(-1)[self.empty] = False
+
+    def step_pre_backward(self, field: Field, step: int, generator: torch.Generator) -> None:
+        """Evaluates random voxels; see :meth:`Sampler.step_pre_backward`."""
+        self.settling = isinstance(self.grid.contraction, Contraction) and step < SETTLING_STEPS
+        if self.settling or step % REVISIT_EVERY:
+            return
+        every = self.grid.occupied.numel()
+        count = min(max(1, int(every * REVISITED)), MOST_REVISITED)
+        voxels = torch.randint(every, (count,), generator=generator, device=generator.device)
+        with evaluating(field):
+            voxels = voxels.to(self.grid.occupied.device)
+            self.grid.update(field, voxels, decay=1.0, generator=generator, backend=self.backend)
+        self._leave_empty()
+
+    def step_post_backward(self, output: RenderOutput) -> None:
+        """Teaches the grid what the samples of a step found; see :meth:`Sampler.step_post_backward`."""
+        if not self.settling:
+            samples = output.samples
+            found = samples.positions, output.density, samples.deltas, output.weights
+            self.grid.observe(*found, decay=DECAY, backend=self.backend)
+
+    def fill_holes(self, field: Field, seed: int) -> None:
+        """After the last step, occupies voxels that were emptied in the middle of surfaces; see `OccupancyGrid`.
+
+        In a contracted sphere alone: objects in a box and forward-facing scenes gain nothing by it.
+
+        Args:
+            field: The field that was trained.
+            seed: Of the points at which it is asked.
+        """
+        if isinstance(self.grid.contraction, Contraction):
+            with evaluating(field):
+                self.grid.fill_holes(field, generator=torch.Generator().manual_seed(seed))
+            self._leave_empty()
 
     def sample(
         self,
@@ -217,7 +328,7 @@ class Occupancy(Stratified):
         if self.settling and not picture:
             samples = max(1, samples // SETTLING_PART)
         walk: dict[str, Any] = {"seed": seed, "start": start, "most": most, "backend": self.backend}
-        if seed is not None and start is None and not _on_host(near):  # a training step waits for no device
+        if seed is not None and start is None and not near.is_cpu:  # a training step waits for no device
             walk["capacity"] = max(1, len(near) * samples)
         found = self.grid.march(rays, near, far, samples, spacing=self.space.spacing, **walk)
         rows = found.ray_offsets[-1:] if "capacity" in walk else None
@@ -244,7 +355,6 @@ class Hierarchical(Stratified):
     """
 
     passes = 2
-    skips = False
 
     def __init__(self, samples: int, fine_samples: int, *, space: Space | None = None, backend: str = "auto") -> None:
         super().__init__(samples, space=space, backend=backend)
@@ -271,72 +381,36 @@ class Hierarchical(Stratified):
         """Samples again where the coarse pass has seen something; as in `Stratified.draw`."""
         first = self.sample(rays, near, far, jitter=jitter, generator=generator)
         before = look(self.first, first)
-        return self.space.samples(rays, *self.again(before, jitter, generator)), (before,)
-
-    def again(self, before: Rendered, jitter: bool, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """Depths and edges of the second pass."""
-        if self.space.cones:
-            return self.intervals(before, jitter, generator)
-        depths, weights = (before.samples.by_ray(x.detach()) for x in (before.samples.depths, before.weights))
-        edges, count = before.samples.edges, self.fine_samples
+        edges, weights, count = first.edges, first.by_ray(before.weights.detach()), self.fine_samples
         assert edges is not None
-        uniforms = strata_uniforms(len(depths), count, depths, jitter, generator)
-        return union_depths(depths, edges, weights, count, uniforms=uniforms, backend=self.backend)
-
-    def intervals(self, before: Rendered, jitter: bool, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """New intervals where a pass has found something, and a sample in each."""
-        wide, count = before.samples.edges, self.fine_samples
-        assert wide is not None
-        weights = blurred_weights(before.samples.by_ray(before.weights.detach()))
-        uniforms = strata_uniforms(len(wide), count + 1, wide, jitter, generator)
-        edges = resample(weights, wide, count + 1, uniforms=uniforms, backend=self.backend)
-        if self.space.cones or not jitter:
-            return (edges[:, 1:] + edges[:, :-1]) / 2, edges
-        device = edges.device if generator is None else generator.device
-        inside = torch.rand(len(wide), count, device=device, dtype=edges.dtype, generator=generator).to(edges.device)
-        return torch.lerp(edges[:, :-1], edges[:, 1:], inside), edges
+        if self.space.cones:
+            uniforms = strata_uniforms(len(edges), count + 1, edges, jitter, generator)
+            blurred = blurred_weights(weights)
+            edges = resample(blurred, edges, count + 1, uniforms=uniforms, backend=self.backend)
+            depths = (edges[:, 1:] + edges[:, :-1]) / 2
+        else:
+            depths = first.by_ray(first.depths.detach())
+            uniforms = strata_uniforms(len(depths), count, depths, jitter, generator)
+            depths, edges = union_depths(depths, edges, weights, count, uniforms=uniforms, backend=self.backend)
+        return self.space.samples(rays, depths, edges), (before,)
 
     def loss_before(self, before: Rendered, last: Rendered, target: Tensor) -> Tensor:
         """Loss of the colours of the coarse pass, []."""
         return (COARSE_SHARE if self.space.cones else 1.0) * colour_loss(before.colour, target)
 
 
-class Proposal(Hierarchical):
-    """A density network "proposal" says where the field is asked, and learns where that finds something.
-
-    Its colours are not used (Barron et al. 2022, "Mip-NeRF 360", section 3, with one round).
-
-    Examples:
-        >>> from voronerf.nerf import Proposal
-        >>> Proposal(32, 32).first
-        'proposal'
-    """
-
-    whole: ClassVar[tuple[str, ...]] = ("proposal",)
-
-    @staticmethod
-    def networks(cones: bool) -> tuple[str, ...]:
-        """Names of the networks: the field, and the one that proposes."""
-        return ("field", "proposal")
-
-    def again(self, before: Rendered, jitter: bool, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """Depths and edges of the second pass: the new intervals alone."""
-        return self.intervals(before, jitter, generator)
-
-    def loss_before(self, before: Rendered, last: Rendered, target: Tensor) -> Tensor:
-        """The `interlevel_loss` of the proposed weights and those of the field, []."""
-        assert last.samples.edges is not None and before.samples.edges is not None
-        seen, proposed = (each.samples.by_ray(each.weights) for each in (last, before))
-        return interlevel_loss(last.samples.edges, seen, before.samples.edges, proposed)
+#: By the names of ``--sampling``. `Occupancy` takes the place of `Stratified` where there is a grid.
+SAMPLERS: dict[str, type[Stratified]] = {"stratified": Stratified, "hierarchical": Hierarchical}
 
 
-def _on_host(tensor: Tensor) -> bool:
-    return tensor.is_cpu
-
-
-#: By the names of ``--sampling``. An `Occupancy` takes the place of a sampler that ``skips``, where there is a grid.
-SAMPLERS: dict[str, type[Stratified]] = {
-    "stratified": Stratified,
-    "hierarchical": Hierarchical,
-    "proposal": Proposal,
-}
+@contextmanager
+def evaluating(field: Field) -> Iterator[None]:
+    """Puts a field into evaluation mode, as long as the context lasts."""
+    training = isinstance(field, nn.Module) and field.training
+    if isinstance(field, nn.Module):
+        field.eval()
+    try:
+        yield
+    finally:
+        if isinstance(field, nn.Module):
+            field.train(training)

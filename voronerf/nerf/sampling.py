@@ -155,28 +155,6 @@ def colour_loss(colour: Tensor, target: Tensor) -> Tensor:
     return (colour - target).square().mean()
 
 
-def interlevel_loss(edges: Tensor, weights: Tensor, found: Tensor, bounds: Tensor) -> Tensor:
-    """The loss of a proposal (Barron et al. 2022, "Mip-NeRF 360", equation 13), the mean over rays.
-
-    It penalises weights of the field that exceed the sum of the proposal's weights over all intervals that overlap
-    them: such weights cannot come from the same density as the proposal.
-
-    Args:
-        edges: [r, s + 1], of the intervals of the field; no gradient.
-        weights: [r, s], of the field; no gradient.
-        found: [r, t + 1], edges of the intervals of the proposal.
-        bounds: [r, t], weights of the proposal.
-    """
-    edges, weights = edges.detach(), weights.detach()
-    total = torch.nn.functional.pad(bounds.cumsum(dim=1), (1, 0))
-    t = bounds.shape[1]
-    first = torch.searchsorted(found, edges[:, :-1].contiguous(), right=True).sub(1).clamp(0, t)
-    last = torch.searchsorted(found, edges[:, 1:].contiguous()).clamp(0, t)
-    bound = total.gather(1, torch.maximum(first, last)) - total.gather(1, first)
-    missed = (weights - bound).clamp_min(0)
-    return (missed.square() / (weights + 1e-7)).sum(dim=1).mean()
-
-
 def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:
     """Distance at a fraction of the way, exact at both ends."""
     if spacing == "linear":

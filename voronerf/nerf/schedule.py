@@ -1,77 +1,55 @@
-"""The planned splits of a run: when, which cells, and into how many."""
+"""What changes over a training: the learning rate and the rays of a step."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+import math
 
-SplitKind = Literal["all", "worst"]
-TimeUnit = Literal["fraction", "steps"]
-
-#: Default times as fractions of a run: of a single split, and of the first and last of several.
-ONLY, FIRST, LAST = 0.2, 0.15, 0.5
-
-
-@dataclass(frozen=True)
-class PlannedSplit:
-    """One split.
-
-    Attributes:
-        at: time, in the unit of the plan.
-        children: number of new cells for each cell that is split.
-        cells: "all" cells are split, or only the "worst", which has the largest accumulated error.
-        most: largest number of cells after the split, or None for no limit.
-
-    Examples:
-        >>> from voronerf.nerf import PlannedSplit
-        >>> PlannedSplit(at=0.2, children=16, cells="all").most is None
-        True
-    """
-
-    at: float
-    children: int
-    cells: SplitKind
-    most: int | None = None
+#: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
+#: which forgets in some thirty steps, would empty itself for good.
+WARMUP_STEPS = 100
+#: The fraction of the training that it rises for, at most.
+WARMUP = 0.02
+#: Learning rate at the end, as a fraction of that at the start.
+FINAL = 0.05
+#: The share of a step's samples that are to be left once empty space is known, if more rays can bring them, and the
+#: samples of a ray, in a box and in contracted space, beyond which it grows with them: these go with larger tables,
+#: which larger steps keep cheap.
+FILL, FILL_SAMPLES, CONTRACTED_FILL_SAMPLES = 0.25, 64, 128
 
 
-def default_times(count: int) -> tuple[float, ...]:
-    """Fractions of the run at which ``count`` splits are made: one at 0.2, several evenly spaced from 0.15 to 0.5."""
-    if count < 2:
-        return (ONLY,) * count
-    return tuple(FIRST + (LAST - FIRST) * i / (count - 1) for i in range(count))
-
-
-def plan_splits(
-    cells: Sequence[int], times: Sequence[float], kind: SplitKind = "all", max_cells: int | None = None
-) -> tuple[PlannedSplit, ...]:
-    """The splits of a run, in order.
+def learning_rate(lr: float, fraction: float, step: int, *, hold: float = 0.0) -> float:
+    """The learning rate of a step: a linear rise over `WARMUP` of the training, then ``lr``, then exponential decay.
 
     Args:
-        cells: children of a split, for each level.
-        times: one for each level; with ``max_cells`` those of the first and the last split.
-        kind: which cells are split below the first level.
-        max_cells: with kind "worst": after the first split, the worst cell is split into ``cells[-1]`` at evenly spaced
-            times until there are this many cells; the last split may have fewer children.
+        lr: The highest rate.
+        fraction: How much of the training is done, 0..1.
+        step: Steps done.
+        hold: Fraction of the training after which the rate falls, down to ``lr * FINAL`` at the end.
+
+    Examples:
+        >>> from voronerf.nerf.schedule import learning_rate
+        >>> learning_rate(0.02, 0.1, 500, hold=0.25), round(learning_rate(0.02, 1.0, 9000, hold=0.25), 6)
+        (0.02, 0.001)
     """
-    if max_cells is None:
-        return tuple(
-            PlannedSplit(at, k, kind if level else "all")
-            for level, (k, at) in enumerate(zip(cells, times, strict=True))
-        )
-    first, last = times
-    children = cells[-1]
-    count = -(-(max_cells - cells[0]) // (children - 1))
-    further = (
-        PlannedSplit(first + (last - first) * (i + 1) / count, children, "worst", max_cells) for i in range(count)
-    )
-    return (PlannedSplit(first, cells[0], "all"), *further)
+    rise = 1.0
+    if fraction < WARMUP and step < WARMUP_STEPS:
+        rise = 0.01 + 0.99 * max(fraction / WARMUP, step / WARMUP_STEPS)
+    fallen = max(0.0, fraction - hold) / (1 - hold)
+    return lr * rise * math.exp(math.log(FINAL) * fallen)
 
 
-def final_cells(plan: Sequence[PlannedSplit]) -> int:
-    """Cells after all splits of a plan, if every cell holds enough samples to be split."""
-    cells = 1
-    for split in plan:
-        cells = cells * split.children if split.cells == "all" else cells + split.children - 1
-        cells = cells if split.most is None else min(cells, split.most)
-    return cells
+def next_rays(now: int, found: int, *, rays: int, samples: int, growth: float, contracted: bool = False) -> int:
+    """Rays of the next step: the more of the samples are left out as empty, the more rays a step takes.
+
+    Args:
+        now: Rays of the last step.
+        found: Samples that it had in occupied space.
+        rays: Rays of the first step, and the fewest.
+        samples: Strata of a ray.
+        growth: The most rays, as a multiple of ``rays``.
+        contracted: Whether space is contracted.
+    """
+    most = CONTRACTED_FILL_SAMPLES if contracted else FILL_SAMPLES
+    share = FILL * max(samples / most, 1.0)
+    wanted = now * share * rays * samples / max(found, 1)
+    return int(min(max(wanted, rays), rays * growth))

@@ -63,18 +63,6 @@ class Samples(NamedTuple):
         inputs, index, depths, deltas = parts
         return Samples(inputs, index, self.ray_offsets, depths, deltas)
 
-    def of_rays(self, rays: Tensor) -> Samples:
-        """The samples of some rays, int64 [q] in ascending order, which become rays 0 to q - 1."""
-        counts = self.ray_offsets.diff()
-        kept = torch.zeros_like(counts, dtype=torch.bool).index_fill(0, rays, True)
-        rows = kept.index_select(0, self.ray_index).nonzero()[:, 0]
-        number = kept.cumsum(0, dtype=torch.int32) - 1
-        offsets = torch.nn.functional.pad(counts[rays].cumsum(0, dtype=torch.int32), (1, 0))
-        packed = (values.index_select(0, rows) for values in (self.inputs, self.ray_index, self.depths, self.deltas))
-        inputs, index, depths, deltas = packed
-        edges = None if self.edges is None else self.edges[rays]
-        return Samples(inputs, number.index_select(0, index), offsets, depths, deltas, edges)
-
     def part(self, rows: Tensor) -> Samples:
         """Some of the samples, bool [m]; all rays stay."""
         kept = torch.nn.functional.pad(rows.cumsum(0, dtype=torch.int32), (1, 0))

@@ -145,50 +145,22 @@ def plain_cell(routed: nn.Module, index: int) -> nn.Module:
     return plain
 
 
-@torch.no_grad()
-def join_cells(routed: nn.Module, modules: Sequence[nn.Module]) -> None:
-    """Gives a routed module the cells of several modules like it, one after the other.
-
-    Raises:
-        ValueError: Where names, shapes, or what cells share differ.
-    """
-    states = [module.state_dict(keep_vars=True) for module in modules]
-    stacked = [{id(parameter) for parameter in cell_parameters(module)} for module in modules]
-    own = routed.state_dict(keep_vars=True)
-    for number, (state, cells) in enumerate(zip(states, stacked, strict=True)):
-        for name in sorted(own.keys() | state.keys()):
-            mine, other = states[0].get(name), state.get(name)
-            rule = f"{_OP}.join: routers must be around modules of one kind, {name} of router {number}"
-            if mine is None or other is None:
-                raise ValueError(f"{rule} is {'new' if mine is None else 'missing'}")
-            if (id(mine) in stacked[0]) != (id(other) in cells):
-                raise ValueError(f"{rule} is {'shared' if id(mine) in stacked[0] else 'not shared'} by its cells")
-            first = 1 if id(other) in cells else 0
-            if mine.shape[first:] != other.shape[first:]:
-                came = list(other.shape[first:])
-                raise ValueError(f"{rule} must have shape {list(mine.shape[first:])}, got {came}")
-            if not first and not torch.equal(mine, other.to(mine)):
-                raise ValueError(f"{rule} is shared by its cells and has other values (router.Parts takes both)")
-    kept = {id(parameter) for parameter in cell_parameters(routed)}
-    for name, parameter in own.items():
-        if id(parameter) in kept:
-            _replace_values(parameter, torch.cat([state[name].detach().to(parameter) for state in states]))
-
-
-def renew_cells(routed: nn.Module, parents: Tensor, new: Tensor, fresh: dict[str, Tensor] | None = None) -> None:
-    """Replaces the cells of a routed module by copies of their parents.
+def renew_cells(
+    routed: nn.Module, parents: Tensor, fresh: dict[str, Tensor] | None = None, new: Tensor | None = None
+) -> None:
+    """Replaces the cells of a routed module by copies of their parents; parameters stay the same objects.
 
     Args:
-        routed: The module with stacked parameters; they stay the same objects.
+        routed: The module with stacked parameters.
         parents: int64 [new cells], the present cell whose values each new one gets.
-        new: bool [new cells], which of them get values of ``fresh`` instead.
-        fresh: Values [new cells, ...] by the parameter's name; None for copies alone.
+        fresh: Values [new cells, ...] by the parameter's name, which the cells of ``new`` get instead.
+        new: bool [new cells], with ``fresh``.
     """
     names = {id(p): name for name, p in routed.named_parameters()}
     for parameter in cell_parameters(routed):
         with torch.inference_mode(False):
-            # Without memory for values, as of a run that is being opened, an index would import torch's compiler.
+            # Without memory for values (meta), an index would import torch's compiler.
             values = parameter.detach().index_select(0, parents.to(parameter.device))
-            if fresh is not None:
+            if fresh is not None and new is not None:
                 values[new.to(values.device)] = fresh[names[id(parameter)]][new].to(values)
             _replace_values(parameter, values)

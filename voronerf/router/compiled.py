@@ -93,16 +93,7 @@ def structure_of(number: int, method: str, spec: Spec) -> Any:
 def _call(
     number: int, method: str, spec: str, positions: Tensor, tensors: list[Tensor], parameters: list[Tensor]
 ) -> list[Tensor]:
-    """The tensors that a call of a router returns.
-
-    Args:
-        number: Of the router.
-        method: The method.
-        spec: ``repr`` of the call's :func:`spec_of`.
-        positions: [..., 3], which decide the cells.
-        tensors: The tensors among the arguments.
-        parameters: In the place of the router's own.
-    """
+    """The tensors that a call of a router returns, with other parameters; ``spec`` is its ``repr``."""
     router, following = _ROUTERS[number], iter(tensors)
     args, kwargs = [], {}
     for name, _, *plain in ast.literal_eval(spec):

@@ -192,7 +192,8 @@ class Dispatch:
         for own, context in ((~still, contextlib.nullcontext()), (still, torch.no_grad())):
             rows.append(own.nonzero()[:, 0])
             if len(rows[-1]):
-                part = grouping.of_entries(rows[-1], cells[rows[-1]])
+                count, chosen = len(rows[-1]), cells[rows[-1]]
+                part = Grouping(chosen, count, grouping.k, grouping.device, grouping.backend, rows[-1])
                 with context:
                     found.append(self._run(plan, call, part))
         order, tensors = torch.cat(rows), []

@@ -32,16 +32,9 @@ class Double:
     """Copies of the parts of a module, which share its buffers and have registries of their own.
 
     Each run begins with the attributes that the module has, so what ``forward`` assigns is of that run alone.
-
-    Args:
-        module: The routed module.
-
-    Attributes:
-        keeps: The name of an attribute that a run has kept a parameter as, if any.
     """
 
     def __init__(self, module: nn.Module) -> None:
-        self.keeps = ""
         parts: dict[int, nn.Module] = {}
         _collect(module, parts)
         twins = {key: _twin(part) for key, part in parts.items()}
@@ -69,12 +62,7 @@ class Double:
             self._registries.append((twin, registry, set(registry)))
 
     def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any]) -> Any:
-        """A call with other tensors where the module's parameters are.
-
-        Args:
-            call: A call of the module.
-            rows: The rows of its arguments.
-            values: The tensors, by the id of the parameter; without one a parameter stays.
+        """A call with the rows of its arguments, and tensors by the id of the parameter in whose place they are.
 
         Raises:
             Forbidden: Where the method adds, removes or replaces parameters, or writes into them.
@@ -86,7 +74,7 @@ class Double:
             return own.run(rows)
         finally:
             self._check(call.name, placed, versions)
-            self._begin_again(placed)
+            self._begin_again()
 
     def _check(self, name: str, placed: list[tuple[dict[str, Any], str, Any]], versions: list[int]) -> None:
         """Raises Forbidden where a run has changed the parameters."""
@@ -100,13 +88,11 @@ class Double:
                 does = "replace parameters" if registry[own] is not value else "write into its parameters"
                 raise Forbidden(f"{_OP}: {name} must not {does}, but does so with {own!r}")
 
-    def _begin_again(self, placed: list[tuple[dict[str, Any], str, Any]]) -> None:
+    def _begin_again(self) -> None:
         """Gives the parts the attributes that they had before the run."""
         for twin, own in self._kept:
             now = vars(twin)
             if now.keys() != own.keys() or not all(map(operator.is_, now.values(), own.values())):
-                kept = {name for name in now if any(now[name] is value for _, _, value in placed)}
-                self.keeps = next(iter(kept), self.keeps)
                 now.clear()
                 now.update(own)
 

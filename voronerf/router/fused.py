@@ -28,12 +28,7 @@ from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiab
 
 
 class Taken:
-    """A parameter of a program: entries of a parameter of the module.
-
-    Args:
-        of: A node of the trace whose value it is, or a tensor.
-        codes: [o, i] or [w], the number of each entry among those of one cell.
-    """
+    """A parameter of a program: numbered entries of a parameter, [o, i] or [w], which is a tensor or a node's value."""
 
     def __init__(self, of: Any, codes: Tensor) -> None:
         self._of, self._shape, numbers = of, codes.shape, codes.flatten()
@@ -67,18 +62,13 @@ class Run:
 class Fused:
     """A call of the routed module as runs of programs, and the functions between them.
 
-    Args:
-        call: The call, which runs with the parameters of the first cell.
-        given: The rows of the arguments, for as many samples as ``rows_for`` gives.
-        assume: What ``any()`` and ``all()`` of samples give, by their code.
-
-    Raises:
-        Unfusable: Where nothing can be fused, or a step cannot be done again for other samples.
+    It is traced on given rows of the arguments, for as many samples as ``rows_for`` gives. Raises :class:`Unfusable`
+    where nothing can be fused, or a step cannot be done again for other samples.
     """
 
-    def __init__(self, call: Call, given: list[Tensor], assume: Mapping[str, bool] = {}) -> None:
+    def __init__(self, call: Call, given: list[Tensor]) -> None:
         self._module = call.module
-        trace = Trace(call, given, assume)
+        trace = Trace(call, given)
         self._n, self._inputs, self._shared, self._parameters = trace.n, trace.inputs, trace.shared, trace.parameters
         self.result, self._outputs = trace.result, trace.outputs
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]

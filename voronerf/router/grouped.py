@@ -385,7 +385,6 @@ class Loop:
     why: str = ""
     again: bool = False
     open: bool = False  # another batch may be carried out in a faster way
-    keeps: str = ""  # the attribute that the module kept a parameter as in the last call
     name: str = "cell by cell"
 
     def run(self, call: Call, grouping: Grouping) -> Results:
@@ -402,5 +401,4 @@ class Loop:
             values.append(double.run(call, part, {key: piece[cell] for key, piece in pieces.items()}))
         if not self.again:
             double.end()
-        self.keeps = double.keeps
         return Results.joined(values, counts, grouping)

@@ -76,10 +76,6 @@ class Grouping:
         pairs = enumerate(itertools.pairwise(self.offsets.tolist()))
         return [(cell, first, last) for cell, (first, last) in pairs if last > first]
 
-    def of_entries(self, rows: Tensor, cells: Tensor) -> Grouping:
-        """Samples int64 [m] in other cells, int32 [m], than their own."""
-        return Grouping(cells, len(rows), self.k, self.device, self.backend, rows)
-
     def parts(self, rows: int) -> list[Grouping]:
         """Sorted rows in parts of whole cells, at most ``rows`` each; a cell of more is cut into parts of its own."""
         if self.n <= rows:

@@ -27,16 +27,9 @@ def check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, 
 def move_state(
     optimizer: torch.optim.Optimizer, module: nn.Module, parents: Tensor, k: int, fresh: Tensor | None
 ) -> None:
-    """Gives every cell the state that an optimiser has for its parent among k cells, or zero to those of ``fresh``.
+    """Gives every cell the state of its parent among k cells, int64 [new cells], or zero to cells of ``fresh``, bool.
 
     The parameters have their new shapes already. A state that is not of cells begins anew.
-
-    Args:
-        optimizer: Holds parameters of the module.
-        module: The routed module.
-        parents: int64 [new cells].
-        k: Cells before.
-        fresh: bool [new cells], the cells with newly drawn parameters; None for none.
     """
     lost = False
     for parameter in cell_parameters(module):
@@ -82,14 +75,9 @@ def is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
 
 
 def watch_optimizers(module: nn.Module, line: str) -> Any:
-    """Has an optimiser raise at its next step if it holds state of other cells than a module has.
+    """Has an optimiser raise at its next step if it holds state of other cells than a module now has.
 
-    Args:
-        module: The routed module, whose parameters have their new shapes already.
-        line: What to write, for the message.
-
-    Returns:
-        A handle whose ``remove()`` ends it.
+    The message says to write ``line``. The handle's ``remove()`` ends the watch.
     """
     watched = {id(parameter): weakref.ref(parameter) for parameter in cell_parameters(module)}
 

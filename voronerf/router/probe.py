@@ -7,8 +7,8 @@ results and gradients are compared.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -32,19 +32,11 @@ Outcome = tuple[Results, list[Tensor]]  # and gradients
 
 @dataclass(frozen=True)
 class Options:
-    """What the user asked for.
+    """What the user asked for."""
 
-    Attributes:
-        fuse: Whether ``forward`` does the same in every call.
-        way: "fastest", or the way that is taken without measuring: "fused", "grouped" or "loop".
-        several: Whether methods besides ``forward`` are routed; then one that cannot be fused leaves the others fused.
-        assume: What ``any()`` and ``all()`` of samples give in a fused method, by their code.
-    """
-
-    fuse: bool
-    way: str
-    several: bool
-    assume: Mapping[str, bool] = field(default_factory=dict)
+    fuse: bool  # ``forward`` does the same in every call
+    way: str  # "fastest", or the way that is taken without measuring: "fused", "grouped" or "loop"
+    several: bool  # methods besides ``forward`` are routed; one that cannot be fused leaves the others fused
 
 
 class Probe:
@@ -91,13 +83,10 @@ class Probe:
                 why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
         else:
             return [Loop(why)], False
-        if loop.keeps:
-            says = f"{call.name} keeps a parameter as `{loop.keeps}`, which is of that call alone"
-            warn_once(f"keeps {call.method}", says)
         ways, is_open, unfused = list[Way](), False, ""
         if options.fuse and options.way in ("fastest", "fused"):
             try:
-                ways.append(self._fused(loop, expected, options.assume))
+                ways.append(self._fused(loop, expected))
             except Exception as error:
                 self._check_rows(loop)
                 why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
@@ -180,12 +169,12 @@ class Probe:
         except Exception:
             return False
 
-    def _fused(self, loop: Way, expected: Outcome, assume: Mapping[str, bool]) -> Way:
+    def _fused(self, loop: Way, expected: Outcome) -> Way:
         """The network as one operation; raises where something stands in the way."""
         with NoRandomness():
             module, given = self._made_of[0].module, self._call.arranged(self._entries)
             count = rows_for(module, given)
-            way = Fused(replace(self._call, module=module), [rows[:count] for rows in given], assume)
+            way = Fused(replace(self._call, module=module), [rows[:count] for rows in given])
         if not self._agrees(way, loop, expected):
             raise Unfusable("the traced network gives other results than its forward")
         return way

@@ -26,7 +26,6 @@ from voronerf.router.cells import (
     detach_results,
     draw_parameters,
     fill_cell,
-    join_cells,
     plain_cell,
     renew_cells,
     stack_parameters,
@@ -39,8 +38,6 @@ from voronerf.router.optimizers import check_optimizer, drop_state, freeze_cells
 from voronerf.router.probe import Options
 from voronerf.router.table import LayeredField, described_by_table, each_direction, parameters_of_table
 
-# Centres of a flat diagram beyond which it may look cells up by a grid of its own.
-_MANY = 256
 _NO_GRAPH = (
     "VoronoiRouter: a graph without breaks takes a router with fuse=True that has made such a call before, of tensors, "
     "numbers and strings, without frozen cells and autocast; its results are tensors, or tuples, lists and dicts of "
@@ -91,8 +88,6 @@ class VoronoiRouter(nn.Module):
             samples, also with ``fuse``.
         fuse: Promises that ``forward`` does the same in every call. Its network is traced once and runs as one
             operation, or is refused with the line that stands in the way.
-        assume: Promises what ``any()`` and ``all()`` of samples give where a fused ``forward`` asks, by the code or a
-            part of it: ``{"mask.any()": True}``.
         way: "fastest" measures the ways of a call on the first batch of its kind and, within a factor of four, its
             size. "fused", "grouped" and "loop" take that way, or the next in this order where it is not possible, and
             do not depend on timings.
@@ -135,7 +130,6 @@ class VoronoiRouter(nn.Module):
         methods: Sequence[str] = (),
         share: Sequence[str] = (),
         fuse: bool = False,
-        assume: Mapping[str, bool] | None = None,
         way: Literal["fastest", "fused", "grouped", "loop"] = "fastest",
         layout: Literal["rays", "flat"] = "rays",
         assignment: Assignment = "nearest",
@@ -158,7 +152,6 @@ class VoronoiRouter(nn.Module):
         self._watch: Any = None  # of optimisers that hold the state of other cells
         self.assignment, self.temperature = assignment, temperature
         self.backend, self.coords, self.fuse, self.way, self.layout = backend, coords, fuse, way, layout
-        self.assume = dict(assume or {})
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._layered = isinstance(module, LayeredField)
@@ -191,37 +184,6 @@ class VoronoiRouter(nn.Module):
             fill_cell(router.module, index, module, f"VoronoiRouter.from_modules: modules[{index}]")
         return router
 
-    @classmethod
-    @torch.no_grad()
-    def join(cls, *routers: VoronoiRouter) -> VoronoiRouter:
-        """One router with the cells of several around the same kind of module, with the options of the first.
-
-        Of several diagrams the nearest centre of the first levels decides; below it each keeps its levels. Modules that
-        differ, and those in other frames, are joined by :class:`voronerf.router.Parts`.
-
-        Args:
-            *routers: At least one.
-
-        Raises:
-            ValueError: No router, or modules that differ in parameters' names or shapes, or in what cells share.
-
-        Examples:
-            >>> import torch
-            >>> from voronerf import VoronoiRouter
-            >>> whole = VoronoiRouter(torch.nn.Linear(3, 1), torch.rand(8, 3), coords="first3")
-            >>> halves = whole.part(torch.arange(4)), whole.part(torch.arange(4, 8))
-            >>> joined, points = VoronoiRouter.join(*halves), torch.rand(100, 3)
-            >>> torch.allclose(joined(points), whole(points))
-            True
-        """
-        if not routers:
-            raise ValueError("VoronoiRouter.join: routers must hold at least one, got none")
-        joined = copy.deepcopy(routers[0])
-        join_cells(joined.module, [router.module for router in routers])
-        joined.diagram = VoronoiDiagram.join([router.diagram for router in routers]).to(joined.diagram.centres.device)
-        joined._set_frozen(torch.cat([router.frozen.to(joined.diagram.centres.device) for router in routers]))
-        return joined
-
     @torch.no_grad()
     def part(self, cells: Sequence[int] | Tensor) -> VoronoiRouter:
         """A router with some of the cells, and a copy of what all cells share; it gives the same results in them.
@@ -239,20 +201,11 @@ class VoronoiRouter(nn.Module):
             >>> router.part([2, 5]).module.weight.shape
             torch.Size([2, 1, 3])
         """
-        taken = torch.as_tensor(cells, dtype=torch.int64, device=self.diagram.centres.device)
-        return self.with_cells(self.diagram.part(taken), taken)
-
-    def with_cells(self, diagram: VoronoiDiagram, parents: Tensor) -> VoronoiRouter:
-        """A copy with the cells of another diagram, each of which has the parameters of one of this router's.
-
-        Args:
-            diagram: c cells.
-            parents: int64 [c], numbers of this router's cells.
-        """
+        chosen = torch.as_tensor(cells, dtype=torch.int64, device=self.diagram.centres.device)
         taken = copy.deepcopy(self)
-        renew_cells(taken.module, parents, torch.zeros(len(parents), dtype=torch.bool))
-        taken.diagram = diagram
-        taken._set_frozen(self.frozen[parents])
+        taken.diagram = self.diagram.part(chosen)
+        renew_cells(taken.module, chosen)
+        taken._set_frozen(self.frozen[chosen])
         return taken
 
     # Cells ------------------------------------------------------------------------------------------------------------
@@ -403,7 +356,7 @@ class VoronoiRouter(nn.Module):
         # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
         new = torch.bincount(parents, minlength=k)[parents] > 1
         fresh = None if inherit else draw_parameters(plain_cell(self.module, 0), len(new), self.generator)
-        renew_cells(self.module, parents, new, fresh)
+        renew_cells(self.module, parents, fresh, new)
         self.diagram = copy.deepcopy(finer).to(self.diagram.centres.device)
         if self.frozen_cells is not None:
             self._set_frozen(self.frozen_cells[parents.to(self.frozen_cells.device)])
@@ -460,8 +413,7 @@ class VoronoiRouter(nn.Module):
             diagram, k = VoronoiDiagram.from_state(state_dict, f"{prefix}diagram."), self.num_cells
             self.diagram = diagram.to(self.diagram.centres.device)
             if diagram.num_cells != k:
-                parents = torch.zeros(diagram.num_cells, dtype=torch.int64)
-                renew_cells(self.module, parents, parents > 0)
+                renew_cells(self.module, torch.zeros(diagram.num_cells, dtype=torch.int64))
                 self._set_frozen(None)
                 self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
@@ -644,7 +596,7 @@ class VoronoiRouter(nn.Module):
         )
         call = Call(module, method, layout, [*names, *kwargs], args, kwargs)
         grouping = self._group(method, positions)
-        options = Options(self.fuse, self.way, bool(self.methods), self.assume)
+        options = Options(self.fuse, self.way, bool(self.methods))
         return self._dispatch.evaluate(call, grouping, options, self.frozen_cells).restored(layout)
 
     def _group(self, method: str, positions: Tensor) -> Grouping:
@@ -666,12 +618,11 @@ class VoronoiRouter(nn.Module):
         return grouping
 
     def _where(self, positions: Tensor, coords: Tensor | None) -> dict[str, Any]:
-        """What tells ``routed_mlp`` the cells: themselves if drawn or of many centres, or the diagram's tables."""
+        """What tells ``routed_mlp`` the cells: themselves if they are drawn, or the diagram's tables."""
         diagram = self.diagram
         if self.num_cells == 1:
             return {}
-        drawn = self.assignment == "stochastic" and self.training
-        if drawn or (diagram.depth == 1 and self.num_cells > _MANY):
+        if self.assignment == "stochastic" and self.training:
             return {"cells": self.assign((positions[:, :3] if coords is None else coords).detach())}
         tables = {"centres": diagram.centres, "coords": coords}
         if diagram.depth == 1:

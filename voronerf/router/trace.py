@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import operator
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 from unittest import mock
 
@@ -28,8 +28,7 @@ CONSTANTS, CELLS, SAMPLES = range(3)  # what a value depends on: the latter of t
 _PATCHES = threading.RLock()  # one thread at a time changes what torch calls for a custom function
 _PRIMES = (37, 31, 29, 23)  # numbers of samples of a trace, see `rows_for`
 _LIKE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
-_VERDICTS = find("any all", torch, torch.Tensor)
-_TOTALS = find("sum", torch, torch.Tensor)
+_TOTALS = find("any all sum", torch, torch.Tensor)  # a number that may not be used, but for a gradient
 
 
 def differentiable(value: Tensor) -> Tensor:
@@ -54,22 +53,16 @@ class Trace(TorchFunctionMode):
     The ``meta`` of a node has its ``value``, what it depends on (``on``), its ``line`` in the module, whether gradients
     were on (``grad``), and whether it is its first argument, written to (``inplace``).
 
-    Args:
-        call: The call, which runs with the parameters of the first cell.
-        given: The rows of the arguments, for ``self.rows`` samples.
-        assume: What ``any()`` and ``all()`` of samples give, by their code or a part of it.
-
-    Raises:
-        Unfusable: For a step that cannot be done again for other samples.
+    The rows of the arguments are given for ``self.rows`` samples. Raises :class:`Unfusable` for a step that cannot be
+    done again for other samples.
     """
 
-    def __init__(self, call: Call, given: list[Tensor], assume: Mapping[str, bool] = {}) -> None:
+    def __init__(self, call: Call, given: list[Tensor]) -> None:
         super().__init__()
         module = call.module
         single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for p in cell_parameters(module)}
         self._of_cells = set(map(id, single.values()))
         self._places = {id(single.get(id(p), p)): i for i, (_, _, p) in enumerate(owned_parameters(module))}
-        self._assume = assume
         self.graph = fx.Graph()
         self.parameters: dict[fx.Node, int] = {}  # with their place among ``owned_parameters``
         self._running = False
@@ -100,8 +93,7 @@ class Trace(TorchFunctionMode):
                     f"which has no row for each of {self.rows} samples: it mixes or selects them; keep a row for each, "
                     "as torch.where does"
                 )
-                # These may be promised, or what a gradient is taken of.
-                if value.dim() or node.target not in _VERDICTS | _TOTALS:
+                if value.dim() or node.target not in _TOTALS:
                     raise Unfusable(node.meta["mixes"])
         return node
 
@@ -145,7 +137,10 @@ class Trace(TorchFunctionMode):
         if used and func in RANDOM and not idle:
             raise Unfusable(f"{name_of(func)} draws random numbers{line}; pass them as an argument")
         if used and not found and result is not None:
-            return self._read(node, result, line)
+            name = "the truth of a tensor" if isinstance(result, bool) else name_of(node.target)
+            raise Unfusable(
+                f"{name} is read{line}, so the path of the module depends on values; write it with torch.where"
+            )
         for source in used:
             if "mixes" in source.meta and func is not torch.autograd.grad:
                 raise Unfusable(source.meta["mixes"])
@@ -176,20 +171,6 @@ class Trace(TorchFunctionMode):
                     for user in [user for user in source.users if user is not new]:
                         user.replace_input_with(source, new)
                     new.meta.update(source.meta, results=[new], inplace=False, grad=True, line=node.meta["line"])
-
-    def _read(self, node: fx.Node, result: Any, line: str) -> Any:
-        """A value that is read: one that a promise gives, or what depends on parameters alone."""
-        source = node.all_input_nodes[0]
-        if isinstance(result, bool) and source.target in _VERDICTS:
-            for code, promised in self._assume.items():
-                if code in line:
-                    self.graph.erase_node(node)
-                    return promised
-        name = "the truth of a tensor" if isinstance(result, bool) else name_of(node.target)
-        raise Unfusable(
-            f"{name} is read{line}, so the path of the module depends on values; write it with torch.where, or promise "
-            "what it gives by assume={code: True}"
-        )
 
 
 @contextlib.contextmanager

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -22,16 +23,16 @@ from voronerf.app.run import Run
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import write_scene
 from voronerf.app.scenes.scene import Split
+from voronerf.app.train.build import LEAST_OPACITY, PICTURE_POINTS, PICTURE_RESOLUTION, make_picture_grid
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.renderers import LEAST_OPACITY, PICTURE_POINTS, PICTURE_RESOLUTION, make_picture_grid
-from voronerf.app.train.run_directory import TOWN
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.occupancy import OccupancyGrid
+from voronerf.router import VoronoiRouter
 from voronerf.town.geometry import Similarity, Solid
 from voronerf.town.parts import Network, Part, Parts
-from voronerf.town.run import write_parts
+from voronerf.town.run import TOWN, write_parts
 
 #: The most voxels of the grid of a run that was made of others; it has larger ones where it would have more.
 MOST_VOXELS = 1 << 22
@@ -70,7 +71,7 @@ class Source:
             raise ConfigError(f"{name}: --contraction ndc cannot be joined or cut: it belongs to one camera")
         if isinstance(field, Parts):
             return cls(name, config, scene, field, grid)
-        network = Network(run.router, replace(config, sampling="stratified"))
+        network = Network(cast(VoronoiRouter, run.router), replace(config, sampling="stratified"))
         if contraction is not None:
             return cls(name, config, scene, Parts([Part([network], contraction=contraction)]), None)
         region = []
@@ -199,14 +200,14 @@ def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_
 def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Scene) -> TrainConfig:
     """The settings of a run of parts: those of the first, with strata as short as in any source."""
     first = sources[0].config
-    samples = int(first.samples or 64)
+    samples = (first.samples or (64,))[0]
     if scene.box is not None:
         diagonal = float((scene.box[1] - scene.box[0]).norm())
         for source, frame in zip(sources, frames, strict=True):
             assert source.scene.box is not None
             own = float((source.scene.box[1] - source.scene.box[0]).norm()) * frame.scale
-            samples = max(samples, math.ceil(int(source.config.samples or 64) * diagonal / own - 1e-6))
-    return replace(first, sampling="stratified", samples=min(samples, 32_000), resume=False, out=None)
+            samples = max(samples, math.ceil((source.config.samples or (64,))[0] * diagonal / own - 1e-6))
+    return replace(first, sampling="stratified", samples=(min(samples, 32_000),), out=None)
 
 
 def _join_scenes(sources: Sequence[Source], frames: Sequence[Similarity]) -> Scene:
@@ -383,7 +384,7 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
     before = source.scene.box
     if before is not None:  # strata stay as long as they were
         share = float((grid.box[1] - grid.box[0]).norm() / (before[1] - before[0]).norm())
-        config = replace(config, samples=max(16, math.ceil(int(config.samples or 64) * share - 1e-6)))
+        config = replace(config, samples=(max(16, math.ceil((config.samples or (64,))[0] * share - 1e-6)),))
     config = _settings([replace(source, config=config, scene=scene)], [Similarity()], scene)
     return Source(source.name, config, scene, parts, grid)
 
@@ -441,7 +442,7 @@ def _trimmed(grid: OccupancyGrid, parts: Parts, full: Tensor) -> OccupancyGrid |
 
 def _found_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
     """What is empty in a box of a run that has no grid, by asking the field in every voxel."""
-    threshold = -math.log1p(-LEAST_OPACITY) * int(source.config.samples or 64) / float((box[1] - box[0]).norm())
+    threshold = -math.log1p(-LEAST_OPACITY) * (source.config.samples or (64,))[0] / float((box[1] - box[0]).norm())
     grid = OccupancyGrid(box, PICTURE_RESOLUTION, threshold=threshold)
     generator = torch.Generator().manual_seed(0)
     for points in range(PICTURE_POINTS):

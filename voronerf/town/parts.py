@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from voronerf import ops
+from voronerf.app.train.build import as_field
 from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.renderers import as_field
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.contraction import Contraction
 from voronerf.router import VoronoiRouter

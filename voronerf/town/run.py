@@ -19,6 +19,7 @@ from torch import Tensor
 from voronerf.app.run import Run
 from voronerf.app.scenes import Scene, load_scene
 from voronerf.app.scenes.record import placed, read_scene
+from voronerf.app.train.build import check_device, make_routers
 from voronerf.app.train.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -28,20 +29,21 @@ from voronerf.app.train.checkpoint import (
     save_checkpoint,
 )
 from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.config_checks import check_device
-from voronerf.app.train.networks import check_shapes, make_routers, parameter_groups, restore_routers
-from voronerf.app.train.renderers import through_grid
-from voronerf.app.train.run_directory import TOWN, check_folders, check_stored_paths
+from voronerf.app.train.resume import check_shapes, load_averages, restore_routers
+from voronerf.app.train.run_directory import check_folders, check_stored_paths
 from voronerf.diagram import VoronoiDiagram
-from voronerf.nerf.average import load_averages
+from voronerf.nerf.adam import parameter_groups
 from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.renderer import Renderer
-from voronerf.nerf.samplers import Stratified
+from voronerf.nerf.samplers import Occupancy, Sampler, Stratified
 from voronerf.nerf.volume import Space
 from voronerf.router import VoronoiRouter
 from voronerf.town.geometry import Similarity, Solid
 from voronerf.town.parts import Network, Part, Parts
+
+#: The file by which the directory of a run of several parts is told.
+TOWN = "town.json"
 
 
 def is_town(run: Path) -> bool:
@@ -106,7 +108,8 @@ def open_network(path: Path, device: torch.device | str, backend: str) -> Networ
     check_shapes(config, checkpoint)
     routers = make_routers(config, device)
     restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
-    load_averages([p for group in parameter_groups(routers, config) for p in group], checkpoint)
+    dense, tables = parameter_groups(routers, config.field_type.sparse_parameters)
+    load_averages([*dense, *tables], checkpoint)
     router: VoronoiRouter = routers["field"].eval()
     router.backend = backend
     return Network(router, config)
@@ -151,7 +154,7 @@ def open_run(
     data: str | Path | None = None,
     downscale: int | None = None,
     allow_outside: bool = False,
-    samples: int | None = None,
+    samples: tuple[int, ...] | None = None,
     device: str = "cpu",
     backend: str = "auto",
 ) -> Run:
@@ -163,7 +166,7 @@ def open_run(
         data: Scene folder of the first run; None for that of its training.
         downscale: Factor on the images; None for that of the training.
         allow_outside: Also read images that lie outside of the scene folder.
-        samples: Samples per ray; None for those of the run.
+        samples: Samples per ray, one number; None for those of the run.
         device: Torch device.
         backend: Backend of the operations.
 
@@ -184,14 +187,18 @@ def open_run(
         data=config.data if data is None else str(data),
         downscale=config.downscale if downscale is None else downscale,
     )
-    scene = load_scene(config.data, allow_outside=allow_outside, **config.reading) if scene is None else scene
+    reading = {**config.reading, "allow_outside": allow_outside}
+    scene = load_scene(config.data, **reading) if scene is None else scene
     scene = _in_place(scene, read_scene(path / "scene.json"))
     parts = open_parts(path, checkpoint, device, backend)
     space = Space(None, scene.spacing, False, None)
-    sampler: Stratified = Stratified(samples or int(config.samples or 64), space=space, backend=backend)
+    (count,) = samples or config.samples or (64,)
+    sampler: Sampler = Stratified(count, space=space, backend=backend)
     if state := checkpoint.group("occupancy"):
-        sampler = through_grid(sampler, OccupancyGrid.from_state(state, device=device), picture_samples=samples)
-    return Run(path, config, scene, {"field": parts}, Renderer({"field": parts}, sampler, backend=backend))  # type: ignore[dict-item]
+        picture = None if samples is None else count
+        grid = OccupancyGrid.from_state(state, device=device)
+        sampler = Occupancy(grid, count, picture_samples=picture, space=space, backend=backend)
+    return Run(path, config, scene, parts, Renderer({"field": parts}, sampler, backend=backend))
 
 
 def _in_place(read: Scene, known: Scene) -> Scene:

@@ -88,3 +88,11 @@ def test_info_lists_the_extras(capsys, monkeypatch):
     said = capsys.readouterr().out
     assert "what is not there: no no_such_module; pip install 'voronerf[imaginary]'" in said
     assert all(f"extra {name}" in said for name in info.EXTRAS)
+
+
+def test_what_the_demo_installs_is_what_the_package_needs():
+    project = (ROOT / "pyproject.toml").read_text()
+    lists = (re.search(rf"\n{name} = \[(.*?)\]", project, re.DOTALL)[1] for name in ("requires", "dependencies"))
+    needed = {name for found in lists for name in re.findall(r'"([a-z0-9-]+)', found)}
+    pinned = set(re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.txt").read_text(), re.MULTILINE))
+    assert pinned == needed | {"wheel"}

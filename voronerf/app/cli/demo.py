@@ -63,12 +63,11 @@ def demo(
             width=16,
             cells=levels,
             split_at=(0.1,) * len(levels),
-            samples=96,
+            samples=(96,),
             seed=seed,
             backend=backend,
             evaluations=1,
-            evaluation_share=0.0,  # all test views, beside the budget
-            panels=0,
+            eval_views=10**6,  # all of them, beside the budget
         )
         for name, levels in (("one", ()), ("cells", (cells,)))
     }
@@ -80,7 +79,7 @@ def demo(
         with held(out / name):
             _remove_run(out / name)
         say(f"{f'{cells} cells with a network of that size each' if config.cells else 'one network'}, {budget:g} s")
-        scores[name] = run_training(config, scene, quiet=True)
+        scores[name] = run_training(config, scene, panels=0, quiet=True)
         if not scores[name]["complete"]:
             return 130
         runs[name] = open_run(out / name, scene=scene, backend=backend)

@@ -18,7 +18,9 @@ from rich.progress import (
     track,
 )
 
-from voronerf.app.train.progress import Progress as TrainingProgress
+from voronerf.app.train.build import State
+from voronerf.app.train.callbacks import Scores
+from voronerf.app.train.loop import Callback
 
 LONGEST_LINE = 900
 
@@ -47,7 +49,7 @@ def one_line(text: str) -> str:
     return line if len(line) <= LONGEST_LINE else f"{line[:head]} ... {line[-tail:]}"
 
 
-class TrainingDisplay:
+class TrainingDisplay(Callback):
     """Shows step, stage, rays/s, loss, PSNR and the time left; the trainer's callbacks are its two methods.
 
     Its ``progress`` is the live line, which shows while it is entered.
@@ -78,18 +80,26 @@ class TrainingDisplay:
             escape(printable(label)), total=1.0, step=0, stage="", speed="", loss=0.0, psnr=""
         )
         self.loss = math.nan  # until the first is read
+        self.scores: Scores | None = None
 
-    def on_step(self, now: TrainingProgress) -> None:
+    def following(self, scores: Scores) -> TrainingDisplay:
+        """This display, which shows the last of these scores from now on."""
+        self.scores = scores
+        return self
+
+    def after_step(self, state: State) -> None:
         """Shows the state after a step; the loss is smoothed over about twenty steps."""
-        self.loss = now.loss if math.isnan(self.loss) else 0.95 * self.loss + 0.05 * now.loss
+        self.loss = state.loss if math.isnan(self.loss) else 0.95 * self.loss + 0.05 * state.loss
+        cells = state.router.num_cells
+        psnr = self.scores.metrics[-1].get("psnr") if self.scores is not None and self.scores.metrics else None
         self.progress.update(
             self.task,
-            completed=now.fraction,
-            step=now.step,
-            stage="coarse" if now.cells == 1 else f"{now.cells} cells",
-            speed=f"{now.rays_per_second / 1000:6.1f}",
+            completed=state.fraction,
+            step=state.step,
+            stage="coarse" if cells == 1 else f"{cells} cells",
+            speed=f"{state.rays_done / max(state.seconds, 1e-9) / 1000:6.1f}",
             loss=self.loss,
-            psnr="" if now.psnr is None else f"psnr {now.psnr:.2f} dB",
+            psnr="" if psnr is None else f"psnr {psnr:.2f} dB",
         )
 
     def on_event(self, line: str) -> None:

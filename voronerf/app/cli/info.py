@@ -13,7 +13,7 @@ from rich.table import Table
 
 from voronerf.app.cli.display import console, say
 from voronerf.app.run import open_run
-from voronerf.nerf import Step
+from voronerf.nerf import RayLoss
 from voronerf.ops._core import backends
 
 
@@ -43,8 +43,7 @@ def info(run: Path | None = None, /) -> int:
     """
     if run is not None:
         opened = open_run(run)
-        step = Step(opened.renderer, sightings=opened.config.sightings or 0.0)
-        for line in step.explain().splitlines():
+        for line in RayLoss(opened.renderer).explain().splitlines():
             say(line)
         return 0
     for name, value in backends.describe().items():

@@ -29,7 +29,7 @@ from voronerf.app.cli.town import cut, join, place
 from voronerf.app.cli.train import command_of, train
 from voronerf.app.cli.view import view
 from voronerf.app.train.config import ConfigError
-from voronerf.app.train.progress import TrainingError
+from voronerf.app.train.loop import TrainingError
 from voronerf.ops._core.backends import BackendUnavailable
 
 #: Errors that a user can cause; they are printed as one line. ValueError includes SceneError and CheckpointError.

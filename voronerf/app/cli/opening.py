@@ -14,7 +14,7 @@ from voronerf.app.run import Run, open_run, read_crop
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import read_scene
 from voronerf.app.train.config import ConfigError
-from voronerf.app.train.run_directory import TOWN
+from voronerf.town.run import TOWN
 from voronerf.town.run import open_run as open_parts
 
 #: What opens a run directory with a file of that name; others are those of a training.
@@ -34,10 +34,8 @@ class Opening:
     """Factor on the images, and on the frames of a camera path; default as in training, and 1 for a path."""
     allow_outside: bool = False
     """Also read images that lie outside of the scene folder."""
-    samples: int | None = None
-    """Samples per ray in the first pass; default as in training."""
-    fine_samples: int | None = None
-    """Samples per ray in the second pass; default as in training."""
+    samples: tuple[int, ...] | None = None
+    """Samples per ray of each pass; default as in training."""
     occupancy: bool = False
     """Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses its own grid."""
     device: str = "cpu"
@@ -53,7 +51,7 @@ class Opening:
 
     def open(self, run: Path, *, scene: Scene | None = None) -> Run:
         """Opens a run of any kind."""
-        check_counts(samples=self.samples, fine_samples=self.fine_samples, downscale=self.downscale)
+        check_counts(samples=None if self.samples is None else min(self.samples), downscale=self.downscale)
         opener = next((opener for file, opener in OPENERS.items() if (run / file).is_file()), open_run)
         kept = inspect.signature(opener).parameters
         return opener(run, scene=scene, **{name: value for name, value in vars(self).items() if name in kept})

@@ -10,7 +10,7 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -18,16 +18,19 @@ from typing import Annotated, Any
 
 import tyro
 
-from voronerf.app.cli.board import Board
 from voronerf.app.cli.display import TrainingDisplay, console, say
 from voronerf.app.cli.view import import_viewer
+from voronerf.app.evaluate.lpips import find_lpips
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.run import open_run
 from voronerf.app.scenes import Scene, SceneError, load_scene
+from voronerf.app.train.build import State, build, check_device
+from voronerf.app.train.callbacks import CHECKPOINT_EVERY, Checkpoints, Divergence, Scores, TensorBoard
+from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.config_checks import check_device, why_no_occupancy
-from voronerf.app.train.networks import resolve_config
-from voronerf.app.train.progress import Progress
+from voronerf.app.train.defaults import why_no_occupancy
+from voronerf.app.train.loop import Callback, run
+from voronerf.app.train.resume import load
 from voronerf.app.train.run_directory import (
     check_stored_paths,
     choose_directory,
@@ -38,10 +41,6 @@ from voronerf.app.train.run_directory import (
     stored_config,
     write_curve,
 )
-from voronerf.app.train.trainer import Trainer
-
-#: Makes a `voronerf.app.viewer.Training`, which shows a trainer.
-Watch = Callable[[Trainer], Any]
 
 #: Bytes of a picture's name without its end, which most file systems take.
 LONGEST_NAME = 255 - len(".png")
@@ -60,7 +59,11 @@ WHAT_TO_TRY = """This trains the built-in scene for 480 s, into runs/. Ctrl-C st
 def train(
     config: TrainConfig,
     *,
+    resume: bool = False,
     file: Annotated[Path | None, tyro.conf.arg(name="config")] = None,
+    checkpoint_every: float = CHECKPOINT_EVERY,
+    panels: int = 4,
+    tensorboard: bool = False,
     view: bool = False,
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -72,41 +75,48 @@ def train(
 
     Args:
         config: The settings.
+        resume: Continue the run in --out from its last checkpoint.
         file: JSON of settings by their names, such as the config.json of a run; options that are given come first.
+        checkpoint_every: Seconds of training between checkpoints, which are written while it goes on.
+        panels: Test views drawn as panels at the end: truth, render, error, depth, cells.
+        tensorboard: Also write loss, speed, cells and scores for TensorBoard, into the folder tensorboard of the run.
         view: Show the training in a browser, and its result until Ctrl-C.
         host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
         port: Port that --view listens at; 0 is any that is free.
         explain: Only say how a training step is computed, and what keeps it from a faster way.
     """
     check_device(config.device)
+    if panels < 0 or not checkpoint_every > 0:
+        name, value = ("panels", panels) if panels < 0 else ("checkpoint-every", checkpoint_every)
+        raise ConfigError(f"--{name} must be {'0 or more' if panels < 0 else 'positive'}, got {value}")
     if view:
         import_viewer().check_address(host, port)
-    scene = load_scene(config.data, allow_outside=config.allow_outside, **config.reading)
+    scene = load_scene(config.data, **config.reading)
     if explain:
-        unused = replace(config, out=config.out or Path("runs"), resume=config.resume and config.out is not None)
-        for line in Trainer(unused, scene).learner.explain().splitlines():
+        for line in build(config, scene).ray_loss.explain().splitlines():
             say(line)
         return 0
-    chosen = choose_directory(config, scene)
+    chosen = choose_directory(config, scene, resume=resume)
     assert chosen.out is not None
     with contextlib.ExitStack() as stack:
         if config.out is None:
             stack.callback(_remove_empty, chosen.out)
+        viewers: list[Any] = []
 
-        def watch(trainer: Trainer) -> Any:
-            watched = import_viewer().watch(trainer, host=host, port=port)
+        def watch(state: State, scores: Scores) -> Callback:
+            watched = import_viewer().watch(state, scores, host=host, port=port)
             stack.callback(watched.viewer.close)
             say(watched.viewer.audience)
             viewers.append(watched.viewer)
             return watched
 
-        viewers: list[Any] = []
-        summary = run_training(chosen, scene, watch=watch if view else None)
+        options: dict[str, Any] = {"checkpoint_every": checkpoint_every, "panels": panels, "tensorboard": tensorboard}
+        summary = run_training(chosen, scene, resume=resume, watch=watch if view else None, **options)
         for viewer in viewers:
             if summary["complete"]:
                 say(f"{viewer.address} shows the run until Ctrl-C")
-                run = open_run(chosen.out, scene=scene, backend=config.backend)
-                viewer.show(import_viewer().Subject.of(run), read_curve(chosen.out))
+                opened = open_run(chosen.out, scene=scene, backend=config.backend)
+                viewer.show(import_viewer().Subject.of(opened), read_curve(chosen.out))
                 with contextlib.suppress(KeyboardInterrupt):
                     viewer.serve()
     return 0 if summary["complete"] else 130
@@ -118,7 +128,15 @@ def _remove_empty(folder: Path) -> None:
 
 
 def run_training(
-    config: TrainConfig, scene: Scene, *, watch: Watch | None = None, quiet: bool = False
+    config: TrainConfig,
+    scene: Scene,
+    *,
+    resume: bool = False,
+    checkpoint_every: float = CHECKPOINT_EVERY,
+    panels: int = 4,
+    tensorboard: bool = False,
+    watch: Callable[[State, Scores], Callback] | None = None,
+    quiet: bool = False,
 ) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
 
@@ -127,61 +145,47 @@ def run_training(
     Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the step in hand: the checkpoint and the summary are written,
     the pictures are not. A second one ends the process at once.
     """
-    assert config.out is not None
+    out = config.out
+    assert out is not None
     longest = max(scene.test.names, key=lambda name: len(os.fsencode(name)))
-    if config.panels and len(os.fsencode(longest)) > LONGEST_NAME:
+    if panels and len(os.fsencode(longest)) > LONGEST_NAME:
         raise ConfigError(f"--panels must be 0 with image names of more than {LONGEST_NAME} bytes, got {longest}")
-    with held(config.out):
-        return _train_and_draw(config, config.out, scene, watch, quiet)
-
-
-def _train_and_draw(config: TrainConfig, out: Path, scene: Scene, watch: Watch | None, quiet: bool) -> dict[str, Any]:
-    with contextlib.ExitStack() as stack:
+    with held(out):
         display = TrainingDisplay(console, scene.name, quiet=quiet)
         with display.progress:
             for note in scene.notes:
                 display.on_event(f"{scene.name}: {note}")
-            trainer = Trainer(config, scene, on_step=display.on_step, on_event=display.on_event)
-            if trainer.lpips is None:
-                display.on_event(trainer.lpips_source)
-            if config.occupancy and trainer.occupancy is None:
-                resolved = resolve_config(config, scene)
-                bare = resolved.contraction == "none"
-                other = "a scene without a box" if bare else "a contraction, unless by --occupancy-resolution 64"
-                obstacle = why_no_occupancy(resolved) or other
+            state = build(config, scene, on_event=display.on_event)
+            if resume:
+                load(state, last_checkpoint(out))
+            lpips, source = find_lpips(config.lpips, config.data, scene.test.cameras.smallest[::-1])
+            if lpips is None:
+                display.on_event(source)
+            if config.occupancy and not state.config.occupancy:
+                obstacle = why_no_occupancy(state.config) or "a scene without a box"
                 display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
-            watched = None
-            board = Board(out / "tensorboard", trainer) if config.tensorboard else None
-            if watch is not None:
-                watched = watch(trainer)
-                stack.callback(watched.close)
-
-            def on_step(now: Progress) -> None:
-                display.on_step(now)
-                if watched is not None:
-                    watched.on_step(now)
-                if board is not None:
-                    board.on_step(now)
-
-            trainer.on_step = on_step
-            summary = _train(trainer)
-            if board is not None:
-                board.close()
-        if not summary["complete"]:
+            checkpoints, scores = Checkpoints(out, checkpoint_every), Scores(out, lpips)
+            callbacks: list[Callback] = [Divergence(out), checkpoints, scores, display.following(scores)]
+            if tensorboard:
+                callbacks.append(TensorBoard(out / "tensorboard", scores))
+            watched = None if watch is None else watch(state, scores)
+            callbacks += [] if watched is None else [watched]
+            _run(state, callbacks, checkpoints)
+        if not scores.summary["complete"]:
             again = f" --data {shlex.quote(config.data)}" if is_outside(out, config.data) else ""
             say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}{again}")
-            return summary
-        if config.panels:
-            with trainer.averaged():
-                write_panels(trainer.renderer, trainer.diagram, scene, out / "images", views=config.panels)
+            return scores.summary
+        if panels:
+            with state.averaged():
+                write_panels(state.renderer, state.router.diagram, scene, out / "images", views=panels)
         write_curve(out)
         if not quiet:
             say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")
-        return summary
+        return scores.summary
 
 
-def _train(trainer: Trainer) -> dict[str, Any]:
-    """Runs a trainer that the signals of ``STOPPING`` stop; returns the summary."""
+def _run(state: State, callbacks: Sequence[Callback], checkpoints: Checkpoints) -> None:
+    """Runs a training that the signals of ``STOPPING`` stop."""
     # One that is ignored stays so, as under nohup or where a shell started it in the background.
     before = {number: signal.getsignal(number) for number in STOPPING}
     before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
@@ -191,15 +195,15 @@ def _train(trainer: Trainer) -> dict[str, Any]:
             signal.signal(number, handler)
 
     def stop(number: int, frame: FrameType | None) -> None:
-        trainer.request_stop()
+        state.stop()
         restore()
 
     for number in before:
         signal.signal(number, stop)
     try:
-        return trainer.run()
+        run(state, callbacks)
     except SceneError:  # of images on disk that were cut short: what was learnt stays
-        trainer.save()
+        checkpoints.on_end(state)
         raise
     finally:
         restore()
@@ -231,7 +235,7 @@ def command_of(args: list[str]) -> Callable[..., int]:
     # A given --steps replaces a stored budget and the other way round; the number that is set here is replaced in turn.
     length = {name for name in ("budget", "steps") if given(name)}
     if length == {"steps"} and stored.budget is not None:
-        stored = replace(stored, budget=None, steps=sys.maxsize)
+        stored = replace(stored, budget=None, steps=2**53 - 1)
     elif length == {"budget"} and stored.steps is not None:
         stored = replace(stored, budget=sys.float_info.max, steps=None)
 

@@ -11,8 +11,9 @@ import torch
 
 from voronerf.app.evaluate.lpips import Lpips
 from voronerf.app.evaluate.metrics import psnr, ssim
+from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene
-from voronerf.nerf.renderer import RenderedImage, Renderer, render_camera
+from voronerf.nerf.renderer import RenderedImage, Renderer
 
 
 @dataclass(frozen=True)

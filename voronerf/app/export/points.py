@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from voronerf.app.export.space import VIEWS, box_of, check_export, placed, views_of, write_geometry
+from voronerf.app.export.space import VIEWS, box_of, check_export, placed, spread_around, views_of, write_geometry
 from voronerf.app.run import Run
 from voronerf.app.train.config import ConfigError
 
@@ -54,7 +53,6 @@ def export_points(
 
 def _surface(run: Run, count: int, box: Tensor | None) -> Any:
     import trimesh
-    from scipy.spatial import cKDTree
 
     if count < 1:
         raise ConfigError(f"--count must be at least 1, got {count}")
@@ -74,10 +72,7 @@ def _surface(run: Run, count: int, box: Tensor | None) -> Any:
         raise ConfigError(f"{run.path}: the training views show no surface in the box")
     chosen = torch.randperm(len(found), generator=torch.Generator().manual_seed(0))[:count]
     found, colour, toward = found[chosen], torch.cat(colours)[chosen], torch.cat(towards)[chosen]
-    _, near = cKDTree(found.numpy()).query(found.numpy(), k=min(NEIGHBOURS, len(found)))
-    around = found[torch.from_numpy(np.asarray(near)).view(len(found), -1)]
-    spread = around - around.mean(1, keepdim=True)
-    normals = torch.linalg.eigh(spread.mT @ spread)[1][..., 0]
+    normals = spread_around(found, NEIGHBOURS)[0][..., 0]
     normals = torch.where((normals * toward).sum(-1, keepdim=True) < 0, -normals, normals)
     return trimesh.Trimesh(
         found.numpy(),

@@ -189,6 +189,16 @@ def views_of(run: Run, cameras: Cameras, most: int, track: Track = in_silence) -
     return views
 
 
+def spread_around(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """How the nearest points [n, 3] of each lie: axes [n, 3, 3], least spread first, and distances [n, count]."""
+    from scipy.spatial import cKDTree
+
+    apart, near = cKDTree(points.numpy()).query(points.numpy(), k=min(count, len(points)))
+    around = points[torch.from_numpy(near).view(len(points), -1)]
+    offsets = around - around.mean(1, keepdim=True)
+    return torch.linalg.eigh(offsets.mT @ offsets)[1], torch.from_numpy(apart).float().view(len(points), -1)
+
+
 def hidden_and_seen(points: Tensor, views: list[View], side: float) -> tuple[Tensor, Tensor]:
     """Which of the points [n, 3] lie behind a surface in every view that has them, and which before one in some view.
 

@@ -14,12 +14,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from voronerf.app.export.space import Track, View, check_export, in_silence, views_of
+from voronerf.app.export.space import Track, View, check_export, in_silence, spread_around, views_of
 from voronerf.app.files import write_bytes
 from voronerf.app.render.paths import quaternions, rotations
 from voronerf.app.run import Run
@@ -168,8 +167,6 @@ def _small(cameras: Cameras) -> Cameras:
 
 def _first(views: list[View], count: int, run: Run) -> Splats:
     """Flat Gaussians at random points of the views, as wide as they are apart."""
-    from scipy.spatial import cKDTree
-
     points = torch.cat([view.surface.reshape(-1, 3) for view in views])
     colours = torch.cat([view.colour.reshape(-1, 3) for view in views])
     shown = points.isfinite().all(-1).nonzero()[:, 0]
@@ -180,12 +177,9 @@ def _first(views: list[View], count: int, run: Run) -> Splats:
         raise ConfigError(f"{run.path}: the training views show no surface")
     chosen = shown[torch.randperm(len(shown), generator=torch.Generator().manual_seed(0))[:count]]
     points = points[chosen].contiguous()
-    apart, near = cKDTree(points.numpy()).query(points.numpy(), k=min(NEIGHBOURS, len(points)))
-    around = points[torch.from_numpy(near)]
-    spread = around - around.mean(1, keepdim=True)
-    axes = torch.linalg.eigh(spread.mT @ spread)[1]  # the normal comes first
+    axes, apart = spread_around(points, NEIGHBOURS)  # the normal comes first
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]
-    width = torch.from_numpy(np.asarray(apart)).float()[:, 1 : CLOSE + 1].mean(-1).clamp_min(1e-7)
+    width = apart[:, 1 : CLOSE + 1].mean(-1).clamp_min(1e-7)
     scales = width[:, None] * torch.tensor((THIN, 1.0, 1.0))
     harmonics = torch.zeros(len(points), 4, 3)
     harmonics[:, 0] = (colours[chosen] - 0.5) / SH_0

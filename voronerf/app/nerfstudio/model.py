@@ -17,10 +17,11 @@ from torch import Tensor, nn
 
 from voronerf.app.evaluate.panels import palette
 from voronerf.app.nerfstudio.scene import scene_of, seen_from_inside
+from voronerf.app.train.build import make_grid, make_renderer, make_routers
 from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.networks import make_routers, parameter_groups, resolve_config
-from voronerf.app.train.renderers import make_grid, make_renderer
-from voronerf.nerf import Batch, Cells, Rays, RenderOutput, Step, intersect_box
+from voronerf.app.train.defaults import resolve
+from voronerf.nerf import Batch, RayLoss, Rays, RenderOutput, SplitStrategy, intersect_box
+from voronerf.nerf.adam import parameter_groups
 
 
 @dataclasses.dataclass
@@ -43,13 +44,9 @@ class VoronerfModelConfig(ModelConfig):
     """When to split, as fractions of max_num_iterations, one per level; default: 0.2, or evenly spaced from 0.15 to
     0.5."""
     sampling: str = "stratified"
-    """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something;
-    or proposal, where a small density network places the samples."""
-    samples: int | None = None
-    """Samples per ray of the first pass; default: by the cameras where empty space is skipped, else 64, and 32 for two
-    passes."""
-    fine_samples: int = 32
-    """Samples per ray of the second pass."""
+    """Samples along a ray: stratified in one pass, or hierarchical, with a second where the first found something."""
+    samples: tuple[int, ...] | None = None
+    """Samples per ray of each pass; default: by the cameras where empty space is skipped, else 64, or 32 and 32."""
     contraction: Literal["auto", "none", "sphere"] = "auto"
     """Only the scene box (none), or all of space, with what is outside of a sphere mapped into a shell (sphere); auto
     is the box if all cameras stand outside of it."""
@@ -71,7 +68,6 @@ class VoronerfModelConfig(ModelConfig):
             split_at=self.split_at,
             sampling=self.sampling,
             samples=self.samples,
-            fine_samples=self.fine_samples,
             contraction="sphere" if contracted else "none",
             occupancy=self.occupancy,
         )
@@ -93,21 +89,18 @@ class VoronerfModel(Model):
         auto = self.config.contraction == "auto"
         contracted = seen_from_inside(cameras, box) if auto else self.config.contraction == "sphere"
         self.scene = scene_of(cameras, box, contracted=contracted)
-        self.settings = resolve_config(self.config.train_config(contracted=contracted), self.scene)
+        self.settings = resolve(self.config.train_config(contracted=contracted), self.scene)
         self.bounds = None if self.scene.box is None else self.scene.box.to(device)
         background = metadata.get("background")
         self.background = None if background is None else background.to(device)
         self.routers = make_routers(self.settings, device)
         self.networks = nn.ModuleDict(self.routers)  # whose parameters torch finds
         grid = make_grid(self.settings, self.scene, device) if self.settings.occupancy else None
-        self.renderer = make_renderer(self.settings, self.scene, self.routers, occupancy=grid)
-        self.learner = Step(self.renderer)
-        self.cells = Cells(
-            self.renderer,
-            self.routers,
-            self.settings.planned_splits,
-            self.settings.split_rule,
-            generator=torch.Generator().manual_seed(self.settings.seed),
+        self.renderer = make_renderer(self.settings, self.scene, self.routers, grid=grid)
+        self.ray_loss = RayLoss(self.renderer)
+        self.generator = torch.Generator().manual_seed(self.settings.seed)
+        self.strategy = SplitStrategy(
+            self.routers, self.settings.plan, centres=self.settings.centres, generator=self.generator
         )
         self._found: RenderOutput | None = None
 
@@ -118,7 +111,7 @@ class VoronerfModel(Model):
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """The networks, "fields", and the tables of hash grids, "tables", if there are any."""
-        dense, tables = parameter_groups(self.routers, self.settings)
+        dense, tables = parameter_groups(self.routers, self.settings.field_type.sparse_parameters)
         return {"fields": dense, "tables": tables} if tables else {"fields": dense}
 
     # --- training --------------------------------------------------------------------------------------------------
@@ -130,34 +123,26 @@ class VoronerfModel(Model):
         steps, optimizer = trainer.config.max_num_iterations, optimizers.optimizers["fields"]
 
         def before(step: int) -> None:
-            if self.cells.is_due(step / steps, step):
-                self._split(step, optimizer)
-            self.cells.revisit(step)
+            done = self.strategy.step_pre_backward(optimizer, step / steps, step)
+            if done is not None and not done.split.balances:
+                kept = len(done.points)
+                CONSOLE.log(f"voronerf: no cell split at step {step}, none holds enough of the {kept} samples")
+            elif done is not None:  # parameters stay the same objects, with other shapes
+                CONSOLE.log(f"voronerf: {self.num_cells} cells at step {step}")
+            self.renderer.sampler.step_pre_backward(self.renderer.field, step, self.generator)
             if not self.routers["field"].training:  # since the cells were looked at again, or a picture was made
                 self.renderer.train()
 
         def after(step: int) -> None:
             found, self._found = self._found, None
             assert found is not None
-            self.cells.observe(found)
-            if self.cells.planned is not None:
-                self.cells.reservoir.add(found.samples.positions, found.importance())
+            self.renderer.sampler.step_post_backward(found)
+            self.strategy.step_post_backward(found)
 
         return [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before, update_every_num_iters=1),
             TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after, update_every_num_iters=1),
         ]
-
-    def _split(self, step: int, optimizer: torch.optim.Optimizer) -> None:
-        """Splits the cells by the kept samples; parameters stay the same objects, with other shapes."""
-        split, kept = self.cells.find_split(), len(self.cells.reservoir)
-        self.cells.splits += 1
-        self.cells.empty_reservoir()
-        if split is None or not split.balances:
-            CONSOLE.log(f"voronerf: no cell split at step {step}, none holds enough of the {kept} samples")
-            return
-        self.cells.divide(split, optimizer)
-        CONSOLE.log(f"voronerf: {self.num_cells} cells at step {step}")
 
     # --- rays ------------------------------------------------------------------------------------------------------
 
@@ -221,7 +206,7 @@ class VoronerfModel(Model):
             rays, near, far = outputs["rays"]
             background = self.background if batch["image"].shape[-1] == 3 else torch.rand_like(rays.origins)
             target = self._truth(batch, background)
-            outputs["found"] = self._found = self.learner.run(Batch(rays, near, far, target, background))
+            outputs["found"] = self._found = self.ray_loss(Batch(rays, near, far, target, background))
         found: RenderOutput = outputs["found"]
         return found
 
@@ -267,15 +252,13 @@ class VoronerfModel(Model):
         """What nerfstudio's checkpoints hold beside the parameters and the diagram."""
         grid = self.renderer.occupancy
         return {
-            "splits": self.cells.splits,
-            "reservoir": self.cells.reservoir.state_dict(),
+            "strategy": self.strategy.state_dict(),
             "occupancy": None if grid is None else grid.state_dict(),
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Goes on from :meth:`get_extra_state`; the cells follow from the parameters."""
-        self.cells.splits = state["splits"]
-        self.cells.reservoir.load_state_dict(state["reservoir"])
+        self.strategy.load_state_dict(state["strategy"])
         if self.renderer.occupancy is not None and state["occupancy"] is not None:
             self.renderer.occupancy.load_state_dict(state["occupancy"])
 

@@ -6,8 +6,8 @@ The object sits at the origin, cameras look at it from about 4 units away, and t
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -16,7 +16,7 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import read_images
 from voronerf.app.scenes.photographs import Reading, distinct_names
 from voronerf.app.scenes.scene import Scene, Split
-from voronerf.app.scenes.transforms import Frame, Listed, capture_scene, focal_length, has_lens, number, read_transforms
+from voronerf.app.scenes.transforms import Frame, capture_scene, focal_length, has_lens, number, read_transforms
 from voronerf.nerf.cameras import Cameras
 
 log = logging.getLogger(__name__)
@@ -50,14 +50,13 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
             f"{folder}: has transforms_train.json but neither transforms_test.json nor transforms_val.json"
         )
     entries, train_frames = read_transforms(train_file, reading.allow_outside)
-    test_entries, test_frames = read_transforms(test_file, reading.allow_outside)
+    _, test_frames = read_transforms(test_file, reading.allow_outside)
 
-    if has_lens(entries, train_frames) or has_lens(test_entries, test_frames):
-        files = ((train_file, entries, train_frames), (test_file, test_entries, test_frames))
+    if has_lens((*train_frames, *test_frames)):
         if "near" in entries or "far" in entries:
             log.warning("%s: near and far are not used, since the scene of a capture is moved and scaled", train_file)
-        listed = [Listed(path, of_file, frame) for path, of_file, frames in files for frame in frames]
-        return capture_scene(folder, listed, torch.arange(len(listed)) >= len(train_frames), reading)
+        frames = [*train_frames, *test_frames]
+        return capture_scene(folder, entries, frames, torch.arange(len(frames)) >= len(train_frames), reading)
 
     if reading.kind not in ("auto", "object"):
         raise SceneError(f"{train_file}: --kind must be auto or object for a Blender scene, got {reading.kind}")
@@ -70,8 +69,8 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     paths = [frame.path for frame in (*train_frames, *test_frames)]
     images, sizes, on_disk = read_images(paths, downscale, keep=reading.images, name=folder.resolve().name)
     count = len(train_frames)
-    train = _split(entries, train_file, train_frames, images[:count], sizes[:count], downscale, on_disk)
-    test = _split(test_entries, test_file, test_frames, images[count:], sizes[count:], downscale, on_disk)
+    train = _split(train_frames, images[:count], sizes[:count], downscale, on_disk)
+    test = _split(test_frames, images[count:], sizes[count:], downscale, on_disk)
     box = carve_box(train.cameras, train.images[..., 3], near, far) if images.shape[-1] == 4 else None
     return Scene(
         folder.resolve().name,
@@ -86,18 +85,10 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     )
 
 
-def _split(
-    entries: dict[str, Any],
-    path: Path,
-    frames: list[Frame],
-    images: torch.Tensor,
-    sizes: torch.Tensor,
-    downscale: int,
-    on_disk: bool,
-) -> Split:
-    intrinsics = []
-    for width, height in sizes.tolist():
-        focal = focal_length(entries, "camera_angle_x", width, path)
+def _split(frames: Sequence[Frame], images: torch.Tensor, sizes: torch.Tensor, downscale: int, on_disk: bool) -> Split:
+    path, intrinsics = frames[0].source, []
+    for frame, (width, height) in zip(frames, sizes.tolist()):
+        focal = focal_length(frame.values, "camera_angle_x", width, path)
         if focal is None:
             raise SceneError(f"{path}: camera_angle_x must be an angle between 0 and pi, got None")
         intrinsics.append((focal, focal, width / 2, height / 2))

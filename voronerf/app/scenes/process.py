@@ -152,23 +152,22 @@ def process(
     _match(stages, [path.name for path in files], settings, shared)
     models: list[Model] = []
     for name in ("global", "incremental"):
-        # The other mapper has its say if the first one's model is not good.
-        if mapper == name or (mapper == "auto" and not (models and _is_good(models[0], len(files)))):
+        good = bool(models) and not models[0].faults and models[0].placed >= GOOD_SHARE * len(files)
+        if mapper == name or (mapper == "auto" and not good):
             model = _map(stages, name)
             say(f"{name} mapping: {_described(model, len(files))}")
             models += [model] if model is not None else []
     if not models:
         raise SceneError(f"{source}: COLMAP finds no model: the images must overlap, be sharp and differ in place")
     best = max(models, key=lambda model: (not model.faults, model.placed, -model.error))
-    rest = "; ".join(best.faults)
-    if best.placed < LEAST_SHARE * len(files) and not rest:
-        rest = "less than half of the images have a camera"
-    if rest:
+    faults = best.faults or ["less than half of the images have a camera"] * (best.placed < LEAST_SHARE * len(files))
+    if faults:
         raise SceneError(
-            f"{out}: no sound model of {len(files)} images: {rest}. Try --matching exhaustive, --max-features 8192, "
-            f"another --camera-model, or more images; {work} has what was found"
+            f"{out}: no sound model of {len(files)} images: {'; '.join(faults)}. Try --matching exhaustive, "
+            f"--max-features 8192, another --camera-model, or more images; {work} has what was found"
         )
-    _write_reduced(files, out)
+    for factor in (2, 4):
+        _write_reduced(files, out / f"images_{factor}", factor)
     shown = [
         Shot(
             f"images/{each.name}", torch.from_numpy(each.pose), each.camera.lens, each.camera.width, each.camera.height
@@ -177,10 +176,7 @@ def process(
     ]
     with contextlib.suppress(SceneError):  # for a lens that only COLMAP has
         write_transforms(out / "transforms.json", shown)
-    (out / "sparse").mkdir(exist_ok=True)
-    part = out / "sparse" / ".0"
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
+    part = _emptied(out / "sparse" / ".0")
     for name in FILES:
         shutil.copyfile(best.folder / f"{name}.bin", part / f"{name}.bin")
     os.replace(part, out / "sparse" / "0")
@@ -214,9 +210,7 @@ def _gather(source: Path, out: Path, frames: int) -> None:
 
     COLMAP's lists of pairs separate names by spaces: names have `_` in their place.
     """
-    part = out / ".images"
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
+    part = _emptied(out / ".images")
     try:
         if source.is_dir():
             for path in listed_images(source):
@@ -259,9 +253,6 @@ def _take_frames(video: Path, folder: Path, count: int) -> None:
         raise SceneError(f"{video}: ffmpeg cannot read it: {reason:.200}")
 
 
-# Stages ---------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Stages:
     """What all stages work on."""
@@ -270,11 +261,6 @@ class Stages:
     work: Path  # the folder of what the stages leave
     images: Path  # the folder of the images
     progress: Progress  # as of :func:`process`
-
-    @property
-    def database(self) -> Path:
-        """Features and matches of all images."""
-        return self.work / "database.db"
 
     def in_parts(self, name: str, items: Sequence[Item], size: int, work: Callable[[Sequence[Item]], None]) -> None:
         """Does the work of a stage in parts, so that it can be shown and stopped; COLMAP passes over what is done.
@@ -299,7 +285,7 @@ def _told(stage: str) -> Iterator[None]:
 
 def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: bool) -> None:
     """Finds the features of the images, and matches them."""
-    colmap, database = stages.colmap, stages.database
+    colmap, database = stages.colmap, stages.work / "database.db"
     extraction = colmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = settings.max_features
     reader = colmap.ImageReaderOptions(camera_model=settings.camera_model)
@@ -386,19 +372,17 @@ def _map(stages: Stages, name: str) -> Model | None:
     """The largest model of a mapper, or None if it finds none."""
     colmap, folder = stages.colmap, stages.work / name
     if not folder.is_dir():
-        part = stages.work / f".{name}"
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir()
+        part = _emptied(stages.work / f".{name}")
         errors: list[Exception] = []
 
         def find() -> None:
             try:
                 if name == "global":
                     options = colmap.GlobalPipelineOptions(random_seed=0)
-                    colmap.global_mapping(stages.database, stages.images, part, options)
+                    colmap.global_mapping(stages.work / "database.db", stages.images, part, options)
                 else:
                     options = colmap.IncrementalPipelineOptions(random_seed=0)
-                    colmap.incremental_mapping(stages.database, stages.images, part, options)
+                    colmap.incremental_mapping(stages.work / "database.db", stages.images, part, options)
             except Exception as error:
                 errors.append(error)
 
@@ -428,10 +412,6 @@ def _map(stages: Stages, name: str) -> Model | None:
     return Model(largest, name, model.images, len(origins) - lost, error, faults)
 
 
-def _is_good(model: Model, images: int) -> bool:
-    return not model.faults and model.placed >= GOOD_SHARE * images
-
-
 def _described(model: Model | None, images: int) -> str:
     if model is None:
         return "no model"
@@ -439,21 +419,20 @@ def _described(model: Model | None, images: int) -> str:
     return f"{model.placed} of {images} images, points off by {model.error:.2f} pixels{rest}"
 
 
-# Files ----------------------------------------------------------------------------------------------------------------
+def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
+    """Writes the images reduced by area, unless they are there or would be too small."""
+    if folder.is_dir() or max(max(read_header(path, 1).size) for path in files) // factor < LEAST_SIDE:
+        return
+    part = _emptied(folder.with_name(f".{folder.name}"))
+    for path in files:
+        with Image.open(path) as image:
+            quality = {} if path.suffix.lower() == ".png" else {"quality": 95}
+            image.reduce(factor).save(part / path.name, **quality)
+    os.replace(part, folder)
 
 
-def _write_reduced(files: Sequence[Path], out: Path) -> None:
-    """Writes `images_2` and `images_4`, reduced by area."""
-    longest = max(max(read_header(path, 1).size) for path in files)
-    for factor in (2, 4):
-        folder = out / f"images_{factor}"
-        if longest // factor < LEAST_SIDE or folder.is_dir():
-            continue
-        part = out / f".images_{factor}"
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir()
-        for path in files:
-            with Image.open(path) as image:
-                quality = {} if path.suffix.lower() == ".png" else {"quality": 95}
-                image.reduce(factor).save(part / path.name, **quality)
-        os.replace(part, folder)
+def _emptied(folder: Path) -> Path:
+    """A new folder in the place of what an earlier process left."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder

@@ -54,19 +54,19 @@ def placed(scene: Scene, known: Scene) -> Scene:
     if scene.background != known.background:
         ours, theirs = (each.background or "none" for each in (known, scene))
         raise SceneError(f"{scene.name}: background must be that of {known.name}, {ours}, got {theirs}")
-    splits = {"train": scene.train, "test": scene.test}
+    train, test = scene.train, scene.test
     if known.transform is not None and scene.transform is not None:
         move = known.transform @ torch.linalg.inv(scene.transform)
         if not torch.allclose(move, torch.eye(4, dtype=move.dtype), atol=1e-6):
             scale = float(torch.linalg.det(move[:3, :3]).abs()) ** (1 / 3)
-            for name, part in splits.items():
-                seen = part.sightings
-                seen = None if seen is None else seen._replace(distances=scale * seen.distances)
-                splits[name] = replace(part, cameras=part.cameras.moved(move), sightings=seen)
+            train, test = (replace(part, cameras=part.cameras.moved(move)) for part in (train, test))
+            if train.sightings is not None:
+                seen = train.sightings
+                train = replace(train, sightings=seen._replace(distances=scale * seen.distances))
     elif known.transform is not None or scene.transform is not None:
         which = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
         raise SceneError(f"{scene.name}: must be in the frame of {known.name}, got one that is {which} (--normalise)")
-    return replace(known, name=scene.name, notes=scene.notes, **splits)
+    return replace(known, name=scene.name, notes=scene.notes, train=train, test=test)
 
 
 def read_scene(path: Path) -> Scene:

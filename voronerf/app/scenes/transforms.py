@@ -11,7 +11,6 @@ import math
 import os
 import posixpath
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,62 +42,59 @@ DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's d
 UNSUPPORTED = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
 
 
-@dataclass(frozen=True)
-class Frame:
-    """One image of a transforms file: its path, its pose float64 [4, 4], its entries, and the path of its mask."""
+class Frame(NamedTuple):
+    """One image of a transforms file: its path, its pose float64 [4, 4], the file that lists it, the entries of that
+    file where the frame has no others, and the path of its mask."""
 
     path: Path
     pose: Tensor
-    entries: dict[str, Any]
+    source: Path
+    values: dict[str, Any]
     mask: Path | None = None
-
-
-def _read(path: Path) -> Any:
-    try:
-        return read_json(path)
-    except ValueError as error:
-        raise SceneError(str(error)) from None
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, Any], list[Frame]]:
     """Reads a transforms file and finds its images.
 
-    Images that are listed but missing are left out, with one line in the log (logger `voronerf.app.scenes.transforms`,
-    level WARNING) that says how many.
+    Images that are listed but missing are left out, with a warning that says how many.
 
     Args:
         path: the JSON file.
         allow_outside: also take images that lie outside of its folder.
 
     Returns:
-        (the file's top-level entries, the frames whose image exists, in the file's order).
+        (the file's entries, the frames whose image exists, in the file's order).
 
     Raises:
         SceneError: the file does not parse, has no frames, no image of any frame exists, one lies outside of the
             folder, or a matrix is not a pose.
     """
-    entries = _read(path)
+    try:
+        entries = read_json(path)
+    except ValueError as error:
+        raise SceneError(str(error)) from None
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}") from None
     frames = entries.get("frames") if isinstance(entries, dict) else None
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path}: has no frames")
-
+    shared = _named_distortion(entries, path)
     found = []
     for position, frame in enumerate(frames):
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or "\0" in name:
             raise SceneError(f"{path}: frame {position} has no file_path")
-        pose = pose_of(frame.get("transform_matrix"), f"{path}: frame {position} ({name})")
-        image = _find_image(path.parent, name, allow_outside, f"{path}: frame {position} ({name})")
+        where = f"{path}: frame {position} ({name})"
+        pose = pose_of(frame.get("transform_matrix"), where)
+        image = _find_image(path.parent, name, allow_outside, where)
         if image is not None:
-            found.append(Frame(image, pose, frame, _mask(path, frame, allow_outside, f"frame {position} ({name})")))
+            mask = _mask(path.parent, frame.get("mask_path"), allow_outside, where)
+            found.append(Frame(image, pose, path, {**shared, **_named_distortion(frame, path)}, mask))
     if not found:
         raise SceneError(
             f"{path}: none of its {len(frames)} images exists, the first is {path.parent / frames[0]['file_path']}"
         )
-    if len(found) < len(frames):
-        missing = len(frames) - len(found)
+    if missing := len(frames) - len(found):
         log.warning("%s: %d of %d listed images are missing and are skipped", path, missing, len(frames))
     return entries, found
 
@@ -165,17 +161,16 @@ def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Pat
     return None
 
 
-def _mask(path: Path, entries: dict[str, Any], allow_outside: bool, where: str) -> Path | None:
+def _mask(folder: Path, name: object, allow_outside: bool, where: str) -> Path | None:
     """The mask of a frame; None without one."""
-    name = entries.get("mask_path")
     if name is None:
         return None
     if not isinstance(name, str) or "\0" in name:
-        raise SceneError(f"{path}: {where}: mask_path must be a file name, got {name!r:.60}")
-    mask = path.parent / name.replace("\\", "/")
-    _check_inside(mask, path.parent, allow_outside, f"{path}: {where}: mask_path")
+        raise SceneError(f"{where}: mask_path must be a file name, got {name!r:.60}")
+    mask = folder / name.replace("\\", "/")
+    _check_inside(mask, folder, allow_outside, f"{where}: mask_path")
     if not mask.is_file():
-        raise SceneError(f"{path}: {where}: its mask {mask} does not exist")
+        raise SceneError(f"{where}: its mask {mask} does not exist")
     return mask
 
 
@@ -230,11 +225,8 @@ def load_transforms(folder: Path, reading: Reading) -> Scene:
     if len(frames) < 2:
         raise SceneError(f"{path}: one image is too few, one is held out for testing")
     declared = _declared_split(path, entries, frames)
-    if declared is None:
-        held_out = hold_out(len(frames))
-    else:
-        frames, held_out = declared
-    return capture_scene(folder, [Listed(path, entries, frame) for frame in frames], held_out, reading)
+    frames, held_out = (frames, hold_out(len(frames))) if declared is None else declared
+    return capture_scene(folder, entries, frames, held_out, reading)
 
 
 def _declared_split(path: Path, entries: dict[str, Any], frames: list[Frame]) -> tuple[list[Frame], Tensor] | None:
@@ -261,7 +253,7 @@ def _declared_split(path: Path, entries: dict[str, Any], frames: list[Frame]) ->
         raise SceneError(f"{path}: train_filenames and the images for testing must differ, both have {both[0]}")
     if unused := len(every - train - test - validation):
         log.warning("%s: %d images are in none of %s and are left out", path, unused, ", ".join(SPLITS))
-    names = [_plain(frame.entries["file_path"]) for frame in frames]
+    names = [_plain(frame.values["file_path"]) for frame in frames]
     chosen = [(frame, name in test) for frame, name in zip(frames, names) if name in train | test]
     held_out = torch.tensor([held for _, held in chosen], dtype=torch.bool)
     for part, there in (("training", bool((~held_out).any())), ("testing", bool(held_out.any()))):
@@ -275,55 +267,50 @@ def _plain(name: str) -> str:
     return posixpath.normpath(name.replace("\\", "/"))
 
 
-class Listed(NamedTuple):
-    """A frame, the file that lists it, and the entries of that file, which the frame may override."""
-
-    path: Path
-    entries: dict[str, Any]
-    frame: Frame
-
-
-def has_lens(entries: dict[str, Any], frames: Sequence[Frame]) -> bool:
+def has_lens(frames: Sequence[Frame]) -> bool:
     """Whether a transforms file describes lenses as captures do; Blender's files give the field of view alone."""
-    return any(given.get(key) is not None for given in (entries, *(f.entries for f in frames)) for key in LENS)
+    return any(frame.values.get(key) is not None for frame in frames for key in LENS)
 
 
-def capture_scene(folder: Path, listed: Sequence[Listed], held_out: Tensor, reading: Reading) -> Scene:
+def capture_scene(
+    folder: Path, entries: dict[str, Any], frames: Sequence[Frame], held_out: Tensor, reading: Reading
+) -> Scene:
     """Makes the scene of a capture from its frames, see `load_transforms`.
 
     Args:
         folder: of the scene.
-        listed: its c images.
+        entries: of the file, or of the first.
+        frames: its c images.
         held_out: bool [c], the test views.
         reading: how it is read.
 
     Raises:
         SceneError: as `load_transforms`.
     """
-    path, entries, _ = listed[0]
-    notes = [f"{path.name} of {len(listed)} images"]
-    if any(entry.frame.entries.get("depth_file_path") is not None for entry in listed):
+    path = frames[0].source
+    notes = [f"{path.name} of {len(frames)} images"]
+    if any(frame.values.get("depth_file_path") is not None for frame in frames):
         notes.append("its depth images are not used")
     applied = entries.get("applied_transform")
     transform = None if applied is None else pose_of(applied, str(path), "applied_transform")
-    views = [_view(*entry, reading.downscale or 1) for entry in listed]
+    views = [_view(frame, reading.downscale or 1) for frame in frames]
     factor = reading.downscale or least_factor(max(max(view.size) for view in views))
     return photograph_scene(folder, Photographs(path, views, held_out, factor, tuple(notes), transform), reading)
 
 
-def _view(path: Path, entries: dict[str, Any], frame: Frame, downscale: int) -> View:
-    values = {**_named_distortion(entries, path), **_named_distortion(frame.entries, path)}
-    model = FISHEYE if _is_fisheye(values, path) else PERSPECTIVE
-    size = read_header(frame.path, downscale).size
-    given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
-    coefficients = tuple(given.get(key, 0.0) for key in COEFFICIENTS[model])
-    lens = Lens(_intrinsics(values, size, path, frame), coefficients, model)
-    return View(frame.path, frame.pose, lens, size, frame.mask)
-
-
-def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame: Frame) -> tuple[float, ...]:
-    """(fx, fy, cx, cy) in pixels."""
-    width, height = size
+def _view(frame: Frame, downscale: int) -> View:
+    """The view of a frame, with its lens; checks that all of its model is used."""
+    values, path = frame.values, frame.source
+    model = values.get("camera_model", "OPENCV")
+    if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS:
+        names = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
+        raise SceneError(f"{path}: camera model {model!s:.60} is not supported, only {names}")
+    fisheye = model in FISHEYE_MODELS or bool(values.get("is_fisheye"))
+    refused = ("p1", "p2", *UNSUPPORTED[1:]) if fisheye else UNSUPPORTED
+    if used := [key for key in refused if number(values, key, path)]:
+        known = "k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, k3, p1, p2"
+        raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only {known}")
+    width, height = size = read_header(frame.path, downscale).size
     for key, actual in (("w", width), ("h", height)):
         stated = number(values, key, path, positive=True)
         if stated is not None and abs(stated - actual) >= 1:  # exporters that scale images may write fractions
@@ -334,10 +321,12 @@ def _intrinsics(values: dict[str, Any], size: tuple[int, int], path: Path, frame
     )
     if fx is None and fy is None:
         raise SceneError(f"{path}: has no focal length (fl_x or camera_angle_x)")
-    fx, fy = fx or fy, fy or fx
     cx, cy = number(values, "cx", path), number(values, "cy", path)
-    assert fx is not None and fy is not None
-    return fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    intrinsics = (fx or fy or 0, fy or fx or 0, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+    given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
+    kind = FISHEYE if fisheye else PERSPECTIVE
+    lens = Lens(intrinsics, tuple(given.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
+    return View(frame.path, frame.pose, lens, size, frame.mask)
 
 
 def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -348,21 +337,6 @@ def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
     if not isinstance(given, list) or len(given) != len(DISTORTION):
         raise SceneError(f"{path}: distortion_params must be six numbers, {', '.join(DISTORTION)}, got {given!r:.60}")
     return {**entries, **dict(zip(DISTORTION, given))}
-
-
-def _is_fisheye(values: dict[str, Any], path: Path) -> bool:
-    """Whether a camera is a fisheye; checks that its model is known and all of it is used."""
-    model = values.get("camera_model", "OPENCV")
-    if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS:
-        names = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
-        raise SceneError(f"{path}: camera model {model!s:.60} is not supported, only {names}")
-    fisheye = model in FISHEYE_MODELS or bool(values.get("is_fisheye"))
-    refused = ("p1", "p2", *UNSUPPORTED[1:]) if fisheye else UNSUPPORTED
-    used = [key for key in refused if number(values, key, path)]
-    if used:
-        known = "k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, k3, p1, p2"
-        raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only {known}")
-    return fisheye
 
 
 class Shot(NamedTuple):

@@ -1,1 +1,28 @@
-"""The whole method as a training run: configuration, batches, trainer, splits, checkpoints, evaluation, pictures."""
+"""A training: settings, a state made by one function, one loop, and callbacks beside it."""
+
+from voronerf.app.train.build import State, build
+from voronerf.app.train.callbacks import Checkpoints, Divergence, Scores, TensorBoard
+from voronerf.app.train.checkpoint import Checkpoint, CheckpointError, last_checkpoint
+from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.loop import Callback, TrainingError, run, train
+from voronerf.app.train.resume import load, snapshot
+
+__all__ = [
+    "Callback",
+    "Checkpoint",
+    "CheckpointError",
+    "Checkpoints",
+    "ConfigError",
+    "Divergence",
+    "Scores",
+    "State",
+    "TensorBoard",
+    "TrainConfig",
+    "TrainingError",
+    "build",
+    "last_checkpoint",
+    "load",
+    "run",
+    "snapshot",
+    "train",
+]

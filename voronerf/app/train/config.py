@@ -1,46 +1,43 @@
-"""The configuration of a training run: one dataclass, checked once, stored beside the results as JSON."""
+"""The settings of a training: checked once, stored beside the results as JSON. Defaults that depend on the scene are
+filled in by :mod:`voronerf.app.train.defaults`."""
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import itertools
 import json
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from voronerf.app.files import parse_json
-from voronerf.app.train.config_checks import (
-    NETWORK_SETTINGS,
-    ConfigError,
-    check_config,
-    check_field,
-    check_sampling,
-    parse_option,
-)
 from voronerf.app.train.schema import check_types
-from voronerf.nerf.cells import SplitRule
 from voronerf.nerf.fields import FIELDS, FieldType
 from voronerf.nerf.samplers import SAMPLERS
-from voronerf.nerf.schedule import PlannedSplit, TimeUnit, default_times, final_cells, plan_splits
+from voronerf.nerf.split import RESERVOIR, PlannedSplit, final_cells, plan_splits
+from voronerf.ops._core.backends import BACKENDS
+
+#: Settings that are options of a field where its class has an option of that name.
+NETWORK_SETTINGS = ("width", "depth")
+
+
+class ConfigError(Exception):
+    """A setting that cannot be used. The message names the setting, the rule and the value.
+
+    It is not a ValueError, because the parser of the command line would catch that and print a long explanation.
+    """
 
 
 @dataclass(frozen=True)
-class TrainConfig:
-    """Settings of a training run.
-
-    Examples:
-        >>> from voronerf.app.train.config import TrainConfig
-        >>> config = TrainConfig(data="builtin", steps=1000, cells=(4, 4), width=32)
-        >>> config.final_cells
-        16
-        >>> TrainConfig.from_json(config.to_json()) == config
-        True
-    """
+class SceneSettings:
+    """What is learnt."""
 
     data: str = "builtin"
-    """Scene folder (--format says which there are), or a built-in scene: "builtin", "builtin-rich"
-    with hundreds of solids, or "builtin-city:4x4", a city of so many
-    blocks."""
+    """Scene folder (--format says which there are), or a built-in scene: "builtin", "builtin-rich" with hundreds of
+    solids, or "builtin-city:4x4", a city of so many blocks."""
     format: Literal["auto", "blender", "colmap", "transforms", "llff"] = "auto"
     """What is read of a scene folder; auto is the first of them that it holds, in this order."""
     kind: Literal["auto", "object", "forward", "inside-out", "unbounded"] = "auto"
@@ -55,25 +52,33 @@ class TrainConfig:
     images: Literal["auto", "memory", "disk"] = "auto"
     """Keep the images of a scene folder or city in memory, or on disk: decoded once into a file of the cache
     (VORONERF_CACHE, or voronerf in the user's caches), from which the pixels of each step are read. auto is on disk for
-    what does not fit into memory, and with several processes."""
+    what does not fit into memory."""
     allow_outside: bool = False
     """Also read images that lie outside of the scene folder, which it may name by .., an absolute path or a link."""
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Where, how long, and by what."""
+
     out: Path | None = None
     """Run directory, which must not hold a run unless --resume is given; default: runs/SCENE, or the first free
     runs/SCENE-N."""
-    resume: bool = False
-    """Continue the run in --out from its last checkpoint."""
     seed: int = 0
     """Seed of every random choice."""
     device: str = "cpu"
     """Torch device, such as cpu or cuda:0."""
     backend: str = "auto"
     """Backend of the operations: auto, native, warp or reference (see `voronerf info`)."""
-
     budget: float | None = None
     """Time in seconds for training and evaluation; default 480, unless --steps is given."""
     steps: int | None = None
     """Number of training steps, instead of a time."""
+
+
+@dataclass(frozen=True)
+class FieldSettings:
+    """The network of a cell."""
 
     field: str = "hashgrid"
     """Kind of network: hashgrid (small networks on a hash grid that the cells share), nerf (as published), mipnerf
@@ -89,22 +94,20 @@ class TrainConfig:
     """Hidden layers before the heads; default 1, nerf and mipnerf 4, kilonerf 2."""
     parameters: int | None = None
     """Upper limit for the number of parameters of all final cells together; --width becomes the largest that fits."""
-    cell_tables: bool = False
-    """Each cell has all parameters of its network for itself: with hashgrid a table of features too, which the cells
-    share otherwise."""
+
+
+@dataclass(frozen=True)
+class CellSettings:
+    """The Voronoi diagram."""
 
     cells: tuple[int, ...] = (16,)
     """Cells per level: `16` is 16 cells, `16 16` splits each of them into 16 again, no number is one network."""
     split_at: tuple[float, ...] | None = None
-    """When to split, as fractions of the run, one per level; default: 0.2, or evenly spaced from 0.15 to 0.5."""
-    split_at_steps: tuple[int, ...] | None = None
-    """When to split, in training steps."""
-    split: Literal["all", "worst"] = "all"
-    """On the levels below the first: split every cell, or only the one with the largest accumulated error."""
+    """When to split, one time for each level: below 1 a fraction of the run, from 1 on a number of steps; default: 0.2,
+    or evenly spaced from 0.15 to 0.5. With --max-cells those of the first and of the last split."""
     max_cells: int | None = None
-    """With --split worst: split the worst cell again and again until there are this many cells. The first split makes
-    the first number of --cells, each later one divides the worst cell into the last number; the splits are evenly
-    spaced between the two times of --split-at."""
+    """Below the first level, split the cell with the largest accumulated error alone, again and again until there are
+    this many cells. The first split makes the first number of --cells, each later one divides a cell into the last."""
     centres: Literal["balanced", "random", "uniform", "centroidal"] = "centroidal"
     """Centres of the new cells: balanced by importance (as published), drawn from the samples, a regular grid, or
     centroids of their cells, which makes cells compact."""
@@ -112,39 +115,25 @@ class TrainConfig:
     """New cells start as copies of their parent, or from random parameters."""
     assignment: Literal["nearest", "stochastic"] = "nearest"
     """A sample goes to the nearest cell, or, while training, to one drawn by its distances to the centres."""
-    temperature: float = 0.05
-    """Temperature of the stochastic assignment, in scene units."""
-    reservoir: int = 10_000
-    """Samples kept for the next split."""
-    reservoir_batches: int = 500
-    """Number of latest batches that the kept samples come from; each gives the same number, its heaviest."""
-    min_cell_samples: int = 64
-    """A cell with fewer kept samples is not split further."""
+
+
+@dataclass(frozen=True)
+class SamplingSettings:
+    """Rays and where they are sampled."""
 
     rays: int = 512
-    """Rays per training step; where empty space is skipped, of the first steps."""
-    ray_growth: float | None = None
-    """Where empty space is skipped, few samples of a ray are left. A step then takes more rays, up to this multiple of
-    --rays, so that it has a quarter of the samples of the first steps, or in a box half with 128 samples a ray, and so
-    on, elsewhere with 256; 1 is off. Default 8 for hashgrid, else 1."""
+    """Rays per training step; where empty space is skipped, of the first steps: hashgrid takes up to eight times as
+    many when few samples of a ray are left."""
     sampling: str = "stratified"
-    """Samples along a ray: stratified in one pass; hierarchical, with a second pass where the first found something
-    (nerf: a coarse and a fine network); or proposal, where a small density network places the samples."""
-    samples: int | None = None
-    """Samples per ray of the first pass, one in each stratum; default 32 for two passes, for one 64. Where empty space
-    is skipped 128, or 256 in a training of at least 150 seconds; for an object more for larger images: 64 at 100 pixels
-    across it, 128 at 400."""
-    fine_samples: int = 32
-    """Samples per ray of the second pass; the fine network of nerf evaluates those of the first pass too."""
-    sightings: float | None = None
-    """Factor of a loss on light that does not come from where the points of a sparse model were seen (Deng et al. 2022,
+    """Samples along a ray: stratified in one pass, or hierarchical, with a second pass where the first found something
+    (nerf: a coarse and a fine network)."""
+    samples: tuple[int, ...] | None = None
+    """Samples per ray of each pass; default 32 and 32 for two passes, for one 64. Where empty space is skipped 128, or
+    256 in a training of at least 150 seconds; for an object more for larger images: 64 at 100 pixels across it, 128 at
+    400."""
+    sparse_depth: float | None = None
+    """Factor of a loss on light that does not come from where the points of a sparse model are (Deng et al. 2022,
     "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points."""
-    appearance: bool = False
-    """Give each training picture a gain for each channel, for exposure and white balance that differ. The field has the
-    average look of all pictures, and held-out pictures are scored as it shows them. For opaque pictures."""
-    refine_cameras: bool = False
-    """Let the poses and focal lengths of the training cameras learn with the field, where a step is one operation.
-    Held-out cameras stay as they were read."""
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
     """Space as the networks see it: unchanged; with all points outside a sphere mapped into a shell of twice its
     radius; or in normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for
@@ -152,64 +141,58 @@ class TrainConfig:
     occupancy: bool = True
     """Skip samples in empty space, in training and in pictures, wherever that works: for points in a single pass, in a
     scene with a box or with a contraction."""
-    occupancy_resolution: int | None = None
-    """Cells of the occupancy grid along each axis; default 64 in a box, and 128 with a contraction."""
+
+
+@dataclass(frozen=True)
+class OptimiserSettings:
+    """How the networks learn."""
+
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
     """Products of the networks while training: float32, bfloat16, or float16 with a scaled loss. Sums, parameters and
     moments are float32. A CPU multiplies in float32 and rounds only the outputs of the networks."""
-    cuda_graph: bool = False
-    """On CUDA: capture a whole step in a graph and replay it; captured again after each split. Empty
-    space is not skipped then."""
     lr: float | None = None
     """Learning rate of Adam at the start; default: 0.02 up to width 64, in inverse proportion to the width beyond."""
-    lr_hold: float | None = None
-    """Fraction of the run for which the learning rate stays at --lr before it falls; default 0.25 for hashgrid, else
-    0."""
-    lr_final: float = 0.05
-    """Learning rate at the end, as a fraction of --lr; the decay is exponential."""
     average: float = 0.98
     """Decay per step of the averaged weights, which evaluations and pictures use; 0 is off. It is smaller in the first
     steps. Training goes on with the weights themselves."""
-    background: Literal["random", "white"] = "random"
-    """Colour behind images with an alpha channel while training: random for every ray, or white as in evaluation."""
+
+
+@dataclass(frozen=True)
+class OutputSettings:
+    """What is measured on the way."""
 
     evaluations: int = 8
     """Evaluations during the run, evenly spaced; the last one is at the end."""
-    eval_views: int = 20
-    """Test views of an evaluation during training, evenly spread; the final evaluation uses --final-views."""
-    final_views: int | None = None
-    """Test views of the final evaluation; default all, or as many as --evaluation-share allows."""
-    evaluation_share: float = 0.1
-    """Share of --budget for evaluations, half of it for the final one. Where that is too short for all their views,
-    evenly spread ones are scored. 0: evaluations take the time that they need, beside the budget."""
-    checkpoint_every: float = 30.0
-    """Seconds of training between checkpoints, which are written while it goes on."""
-    keep_checkpoints: int = 3
-    """How many checkpoints are kept. If the last one is damaged, the one before takes its place."""
-    panels: int = 4
-    """Test views drawn as panels at the end: truth, render, error, depth, cells."""
-    tensorboard: bool = False
-    """Also write loss, speed, cells and scores for TensorBoard, into the folder tensorboard of the run."""
+    eval_views: int | None = None
+    """Test views of every evaluation, evenly spread, in time of their own beside --budget; default: at most 20 on the
+    way and all at the end, as many as a tenth of the budget allows."""
     lpips: Path | None = None
     """LPIPS weights for the final evaluation, a file or folder, or "off"; default: VORONERF_LPIPS, the folder lpips of
     VORONERF_DATA or beside the scene, the installed lpips package."""
 
+
+@dataclass(frozen=True)
+class TrainConfig(
+    OutputSettings, OptimiserSettings, SamplingSettings, CellSettings, FieldSettings, RunSettings, SceneSettings
+):
+    """All settings of a training.
+
+    Raises:
+        ConfigError: For a setting that is out of range; names it, the rule and the value.
+
+    Examples:
+        >>> from voronerf.app.train import TrainConfig
+        >>> config = TrainConfig(data="builtin", steps=1000, cells=(4, 4), width=32)
+        >>> config.final_cells
+        16
+        >>> TrainConfig.from_json(config.to_json()) == config
+        True
+    """
+
     def __post_init__(self) -> None:
         if self.budget is None and self.steps is None:
             object.__setattr__(self, "budget", 480.0)
-        check_sampling(self)
-        if self.samples is None and SAMPLERS[self.sampling].passes > 1:
-            object.__setattr__(self, "samples", 32)
-        check_field(self)
-        for name in ("width", "depth"):
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, self.field_type.options.get(name))
-        for name in ("ray_growth", "lr_hold"):
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, getattr(self.field_type, name))
-        if self.lr is None and self.parameters is None:
-            object.__setattr__(self, "lr", self.field_type.learning_rate(self.network_options))
-        check_config(self, CHOICES)
+        check_config(self)
 
     @property
     def field_type(self) -> FieldType:
@@ -218,8 +201,8 @@ class TrainConfig:
 
     @property
     def reading(self) -> dict[str, Any]:
-        """The settings that are arguments of ``load_scene``, but for ``allow_outside``."""
-        return {name: getattr(self, name) for name in ("downscale", "format", "kind", "normalise", "images")}
+        """The settings that are arguments of ``load_scene``."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(SceneSettings)[1:]}
 
     @property
     def network_options(self) -> dict[str, Any]:
@@ -229,46 +212,14 @@ class TrainConfig:
         return given | dict(parse_option(text) for text in self.field_options)
 
     @property
-    def router_options(self) -> dict[str, Any]:
-        """Further arguments of the router around the field."""
-        options = dict(self.field_type.router_options)
-        if self.cell_tables:
-            options.pop("share")
-        return options
-
-    @property
-    def split_unit(self) -> TimeUnit:
-        """What the times of the splits count."""
-        return "fraction" if self.split_at_steps is None else "steps"
-
-    @property
-    def splits(self) -> tuple[float, ...]:
-        """When each level is split, in ``split_unit``; with ``max_cells`` the times of the first and the last split."""
-        for times in (self.split_at, self.split_at_steps):
-            if times is not None:
-                return times
-        return default_times(len(self.cells) if self.max_cells is None else 2)
-
-    @property
-    def planned_splits(self) -> tuple[PlannedSplit, ...]:
+    def plan(self) -> tuple[PlannedSplit, ...]:
         """All splits of the run, in order."""
-        return plan_splits(self.cells, self.splits, self.split, self.max_cells)
+        return plan_splits(self.cells, self.split_at, self.max_cells)
 
     @property
     def final_cells(self) -> int:
         """Cells at the end, where every cell holds enough samples to be split."""
-        return final_cells(self.planned_splits)
-
-    @property
-    def split_rule(self) -> SplitRule:
-        """How the splits are made."""
-        return SplitRule(
-            centres=self.centres,
-            min_samples=self.min_cell_samples,
-            inherit=self.init == "inherit",
-            reservoir=self.reservoir,
-            batches=self.reservoir_batches,
-        )
+        return final_cells(self.plan)
 
     def to_values(self) -> dict[str, Any]:
         """The settings as values of JSON."""
@@ -310,22 +261,9 @@ PATHS = ("out", "lpips")
 #: Settings that may differ between a run and its continuation.
 RESUMABLE = frozenset(
     {
-        "data",
-        "allow_outside",
-        "images",
-        "out",
-        "resume",
-        "device",
-        "cuda_graph",
-        "backend",
-        "sightings",
-        "budget",
-        "steps",
-        "evaluations",
-        "eval_views",
-        "final_views",
+        *("data", "allow_outside", "images", "out", "device", "backend"),
+        *("sparse_depth", "budget", "steps", "evaluations", "eval_views", "lpips"),
     }
-    | {"checkpoint_every", "keep_checkpoints", "panels", "tensorboard", "lpips"}
 )
 
 
@@ -336,3 +274,85 @@ def differences(a: TrainConfig, b: TrainConfig) -> list[str]:
         for f in dataclasses.fields(TrainConfig)
         if f.name not in RESUMABLE and getattr(a, f.name) != getattr(b, f.name)
     ]
+
+
+def parse_option(text: str) -> tuple[str, Any]:
+    """Splits ``name=value`` into a name and a Python value; a value that is no Python literal is a string."""
+    name, _, value = text.partition("=")
+    try:
+        return name, ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        return name, value
+
+
+def either(names: Sequence[str]) -> str:
+    """``a, b or c``."""
+    return " or ".join((", ".join(names[:-1]), names[-1])) if len(names) > 1 else names[0]
+
+
+def check_config(config: TrainConfig) -> None:
+    """Raises ConfigError for the first setting that is out of range, or that the field or the sampler does not have."""
+
+    def need(ok: bool, name: str, rule: str) -> None:
+        if not ok:
+            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {getattr(config, name)!r}")
+
+    need(config.sampling in SAMPLERS, "sampling", f"be {either(list(SAMPLERS))}")
+    need(config.field in FIELDS, "field", f"be {either(list(FIELDS))}; voronerf.nerf.fields.register_field adds others")
+    if config.budget is not None and config.steps is not None:
+        raise ConfigError("give --budget SECONDS or --steps N, not both")
+    for name, words in CHOICES.items():
+        need(getattr(config, name) in words, name, f"be {either(words)}")
+    need(config.backend in ("auto", *BACKENDS), "backend", f"be auto, {', '.join(BACKENDS)}")
+    need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
+    need(config.steps is None or 1 <= config.steps < 2**53, "steps", "lie in 1..2^53 - 1")
+    for name in ("rays", "evaluations", "eval_views", "downscale", "parameters"):
+        value = getattr(config, name)
+        need(value is None or value >= 1, name, "be at least 1")
+    need(config.width is None or config.width >= 2, "width", "be at least 2")
+    need(config.depth is None or 1 <= config.depth <= 1000, "depth", "be at least 1 and at most 1000")
+    need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be positive")
+    need(0 <= config.average < 1, "average", "lie in [0, 1)")
+    need(0 <= config.seed < 2**63, "seed", "lie in 0..2^63 - 1")
+    factor = config.sparse_depth
+    need(factor is None or 0 <= factor < float("inf"), "sparse_depth", "be a factor of 0 or more")
+    passes = SAMPLERS[config.sampling].passes
+    if config.samples is not None:
+        count = "one number" if passes == 1 else f"{passes} numbers, one for each pass"
+        need(len(config.samples) == passes and min(config.samples) >= 1, "samples", f"be {count} of at least 1")
+    _check_field_options(config)
+    need(
+        all(2 <= k <= RESERVOIR for k in config.cells), "cells", f"lie in 2..{RESERVOIR} on every level (none for one)"
+    )
+    if config.max_cells is not None:
+        need(len(config.cells) in (1, 2), "max_cells", "come with one or two numbers of --cells")
+        need(config.max_cells > config.cells[0], "max_cells", f"exceed the {config.cells[0]} cells of the first split")
+    if config.split_at is not None:
+        levels = len(config.cells) if config.max_cells is None else 2
+        what = "level of --cells" if config.max_cells is None else "of the first and the last split"
+        need(len(config.split_at) == levels, "split_at", f"have {levels} times, one for each {what}")
+        rising = all(a < b for a, b in itertools.pairwise(config.split_at))
+        fractions = all(0 < at < 1 for at in config.split_at)
+        steps = all(1 <= at < (config.steps or float("inf")) for at in config.split_at)
+        end = "" if config.steps is None else f" below --steps {config.steps}"
+        need(rising and (fractions or steps), "split_at", f"be rising fractions of the run, or numbers of steps{end}")
+
+
+def _check_field_options(config: TrainConfig) -> None:
+    options = config.field_type.options
+    for name in NETWORK_SETTINGS:
+        given = getattr(config, name)
+        if name not in options and given is not None:
+            raise ConfigError(f"--{name.replace('_', '-')} must not come with --field {config.field}, got {given!r}")
+    own = [name for name in options if name not in NETWORK_SETTINGS]
+    for text in config.field_options:
+        if "=" not in text:
+            raise ConfigError(f"--field-options must be NAME=VALUE, got {text!r}")
+        name, value = parse_option(text)
+        if name in NETWORK_SETTINGS:
+            raise ConfigError(f"--field-options must not hold {name}, use --{name.replace('_', '-')}; got {text!r}")
+        if name not in own:
+            raise ConfigError(f"--field-options of {config.field} are {', '.join(own) or 'none'}; got {text!r}")
+        is_number = isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
+        if isinstance(options[name], (int, float)) and not (is_number or value is None):
+            raise ConfigError(f"--field-options must give {name} a finite number, got {text!r:.60}")

@@ -18,8 +18,6 @@ from voronerf.app.scenes import Scene, is_builtin
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
 
-#: File of a run that was made of several.
-TOWN = "town.json"
 #: The folders of a run, in which files are written.
 FOLDERS = ("camera_paths", "checkpoints", "images", "plots", "samples", "tensorboard")
 
@@ -61,7 +59,7 @@ def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None
             )
 
 
-def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
+def choose_directory(config: TrainConfig, scene: Scene, *, resume: bool = False) -> TrainConfig:
     """The configuration with ``out`` filled in and checked.
 
     Raises:
@@ -69,15 +67,13 @@ def choose_directory(config: TrainConfig, scene: Scene) -> TrainConfig:
     """
     out = config.out
     if out is None:
-        if config.resume:
+        if resume:
             raise ConfigError("--resume needs --out, the run directory to continue")
         names = (scene.name, *(f"{scene.name}-{i}" for i in range(2, 10_000)))
         out = next(folder for name in names if _made(folder := Path("runs") / name))
-    elif not config.resume and checkpoint_paths(out):
+    elif not resume and checkpoint_paths(out):
         raise ConfigError(f"--out must not hold a run already, got {out}: continue it with --resume or choose another")
-    elif (out / TOWN).is_file():
-        raise ConfigError(f"--out must be a run of a training: {out} was made of several runs, which are not trained")
-    elif config.resume and not checkpoint_paths(out):
+    elif resume and not checkpoint_paths(out):
         raise ConfigError(f"--resume needs a checkpoint in --out: there is nothing to resume in {out} yet")
     return replace(config, out=out)
 
@@ -128,7 +124,7 @@ def stored_config(run: Path) -> TrainConfig | None:
 
 
 def read_config(path: Path) -> TrainConfig:
-    """The settings in a file, for a training of another person; without directory, --resume and --allow-outside.
+    """The settings in a file, for a training of another person; without directory and --allow-outside.
 
     Raises:
         ConfigError: When the file is of another version, or text in it would be obeyed by a terminal.
@@ -138,7 +134,7 @@ def read_config(path: Path) -> TrainConfig:
     for name, value in vars(config).items():  # they are defaults, which the help prints
         if not "".join(map(str, value if isinstance(value, tuple) else (value,))).isprintable():
             raise ConfigError(f"{path}: {name} must be printable text, got {value!r:.60}")
-    return replace(config, out=None, resume=False, allow_outside=False)
+    return replace(config, out=None, allow_outside=False)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:

@@ -15,14 +15,14 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.app.evaluate.panels import picture_of_cells, picture_of_colour, picture_of_depth
-from voronerf.app.run import Run
+from voronerf.app.render.camera import render_camera
+from voronerf.app.run import HasCells, Run
 from voronerf.app.scenes import Scene
 from voronerf.app.viewer.cameras import crop_camera
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.field import Field
-from voronerf.nerf.renderer import RenderedImage, Renderer, render_camera
-from voronerf.router import VoronoiRouter
+from voronerf.nerf.renderer import RenderedImage, Renderer
 
 PANES = ("colour", "depth", "opacity", "cells")
 
@@ -60,7 +60,7 @@ class Subject:
     name: str
     folder: Path
     scene: Scene
-    router: VoronoiRouter
+    router: HasCells
     renderer: Renderer
     weights: Callable[[], AbstractContextManager[None]] = nullcontext
 
@@ -78,7 +78,7 @@ class Subject:
 class VisibleCells(nn.Module):
     """A field without the density of hidden cells, bool [k]."""
 
-    def __init__(self, field: Field, router: VoronoiRouter, hidden: Tensor) -> None:
+    def __init__(self, field: Field, router: HasCells, hidden: Tensor) -> None:
         super().__init__()
         self.field, self.router, self.hidden = field, router, hidden
 

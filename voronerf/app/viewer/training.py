@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
-from voronerf.app.train.progress import Progress
-from voronerf.app.train.trainer import Trainer
+from voronerf.app.train.build import State
+from voronerf.app.train.callbacks import Scores
+from voronerf.app.train.loop import Callback
 from voronerf.app.viewer.pictures import Subject
 from voronerf.app.viewer.viewer import Viewer
 
@@ -13,26 +15,28 @@ from voronerf.app.viewer.viewer import Viewer
 TELL = 1.0
 
 
-def watch(trainer: Trainer, *, host: str = "127.0.0.1", port: int = 8080) -> Training:
-    """A viewer of a training; its trainer calls :meth:`Training.on_step` after every step.
+def watch(state: State, scores: Scores, *, host: str = "127.0.0.1", port: int = 8080) -> Training:
+    """A viewer of a training, to be one of its callbacks.
 
     Args:
-        trainer: What is viewed.
+        state: What is viewed.
+        scores: Whose curve is shown.
         host: Address to listen at.
         port: To listen at; 0 is any that is free.
 
     Raises:
         ConfigError: The address cannot be listened at.
     """
-    return Training(Viewer(subject_of(trainer), host=host, port=port), trainer)
+    return Training(Viewer(subject_of(state, scores), host=host, port=port), state, scores)
 
 
-def subject_of(trainer: Trainer) -> Subject:
+def subject_of(state: State, scores: Scores) -> Subject:
     """What is viewed of a training: pictures have the averaged weights."""
-    return Subject(trainer.out.name, trainer.out, trainer.scene, trainer.router, trainer.renderer, trainer.averaged)
+    out = scores.out or Path()
+    return Subject(out.name, out, state.scene, state.router, state.renderer, state.averaged)
 
 
-class Training:
+class Training(Callback):
     """Shows a training in a viewer.
 
     Nothing is rendered while there is no browser, and the results of training are the same bit for bit with and without
@@ -40,16 +44,16 @@ class Training:
 
     Args:
         viewer: Shows it from now on.
-        trainer: What is viewed.
+        state: What is viewed.
+        scores: Whose curve is shown.
     """
 
-    def __init__(self, viewer: Viewer, trainer: Trainer) -> None:
-        self.viewer, self.trainer, self.cells = viewer, trainer, trainer.router.num_cells
+    def __init__(self, viewer: Viewer, state: State, scores: Scores) -> None:
+        self.viewer, self.state, self.scores, self.cells = viewer, state, scores, state.router.num_cells
         self.paused = False
         self.told_at = 0.0
-        self.now: Progress | None = None
-        if viewer.subject.router is not trainer.router:
-            viewer.show(subject_of(trainer))
+        if viewer.subject.router is not state.router:
+            viewer.show(subject_of(state, scores))
         gui = viewer.server.gui
         self.line = gui.add_markdown("", order=-3)
         self.button = gui.add_button("Pause", order=-2)
@@ -65,16 +69,16 @@ class Training:
 
     def stop(self) -> None:
         """Ends the training after the step in hand."""
-        self.trainer.request_stop()
+        self.state.stop()
         self.viewer.wake.set()
 
-    def on_step(self, now: Progress) -> None:
+    def after_step(self, state: State) -> None:
         """Shows the state after a step; returns when training shall go on."""
-        self.now, viewer = now, self.viewer
+        viewer, cells = self.viewer, state.router.num_cells
         if not viewer.clients and not self.paused:
             return
-        if now.cells != self.cells:  # after a split
-            self.cells = now.cells
+        if cells != self.cells:  # after a split
+            self.cells = cells
             for client in viewer.list_clients():
                 viewer.serve_client(client, client.on_diagram)
         if time.perf_counter() - self.told_at > TELL:
@@ -83,21 +87,20 @@ class Training:
         viewer.render_next()
         if self.paused:
             self.tell()
-            viewer.serve(lambda: not self.paused or self.trainer.stopped)
+            viewer.serve(lambda: not self.paused or state.stopped)
 
-    def close(self) -> None:
+    def on_end(self, state: State) -> None:
         """Takes the lines and the buttons away."""
         for part in (self.line, self.button, self.end):
             part.remove()
 
     def tell(self) -> None:
         """Writes the lines about the training, and its curve."""
-        self.told_at, now = time.perf_counter(), self.now
-        if now is None:
-            return
+        self.told_at, now, metrics = time.perf_counter(), self.state, self.scores.metrics
+        speed = now.rays_done / max(now.seconds, 1e-9) / 1000
         self.line.content = (
             f"step {now.step:,}, {now.seconds:.0f} s, {now.fraction:.0%}  \n"
-            f"{now.cells} cells, {now.rays_per_second / 1000:.1f} k rays/s  \n"
-            f"loss {now.loss:.5f}" + ("" if now.psnr is None else f", PSNR {now.psnr:.2f} dB")
+            f"{self.cells} cells, {speed:.1f} k rays/s  \n"
+            f"loss {now.loss:.5f}" + (f", PSNR {metrics[-1]['psnr']:.2f} dB" if metrics else "")
         )
-        self.viewer.show_curve([(line["seconds"], line["psnr"]) for line in self.trainer.metrics])
+        self.viewer.show_curve([(line["seconds"], line["psnr"]) for line in metrics])

@@ -1,0 +1,494 @@
+"""From settings and a scene to all that a training needs, in one state."""
+
+from __future__ import annotations
+
+import fnmatch
+import functools
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.app.scenes import Scene
+from voronerf.app.scenes.store import Pages
+from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.defaults import resolve, space_of, why_no_occupancy
+from voronerf.diagram import VoronoiDiagram
+from voronerf.nerf.adam import Adam
+from voronerf.nerf.batches import RayBatches
+from voronerf.nerf.field import DirectionPerSample, Field
+from voronerf.nerf.loss import RayLoss, RenderOutput
+from voronerf.nerf.occupancy import OccupancyGrid
+from voronerf.nerf.renderer import Renderer
+from voronerf.nerf.samplers import DECAY, SAMPLERS, Occupancy, Sampler
+from voronerf.nerf.schedule import learning_rate, next_rays
+from voronerf.nerf.split import SplitStrategy
+from voronerf.ops import Guard
+from voronerf.ops._core import backends
+from voronerf.ops._core.checks import physical_memory
+from voronerf.router import VoronoiRouter
+
+#: Temperature of the stochastic assignment, in scene units.
+TEMPERATURE = 0.05
+#: Voxels of the occupancy grid along each axis, of a box and of contracted space, which is all the world.
+RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
+#: A voxel is empty if a sample in it would take less of the light than this, were the voxel that dense throughout: for
+#: pictures of a field that was trained without a grid, and in training with one. Most of what a young field has spread
+#: through empty space lies between the two, and would keep a third of the samples.
+LEAST_OPACITY, TRAINING_OPACITY = 0.02, 0.05
+#: The same of a voxel of contracted space, for the light on its way through the whole voxel.
+CONTRACTED_OPACITY = 0.1
+#: How many samples in a row empty a new voxel: about thirty steps, until which the field has said nothing about most.
+#: In contracted space fewer: what stays there is fog before the cameras, which explains one view and spoils the others.
+PATIENCE, CONTRACTED_PATIENCE = 8, 4
+#: Of a grid made for pictures alone: voxels along each axis, and points evaluated in each.
+PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
+#: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
+SAMPLE_BYTES = 64
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A period of training on one diagram.
+
+    ``balance_before`` and ``balance_after`` are std(W / max W) over the new cells of a parent, and of these the median
+    over the parents that were split; None for the coarse stage.
+    """
+
+    cells: int
+    started_at_second: float
+    started_at_step: int
+    balance_before: float | None
+    balance_after: float | None
+    split_cells: int
+
+
+@dataclass
+class State:
+    """A training between two steps; :func:`build` makes it, :func:`voronerf.app.train.train` moves it on.
+
+    Attributes:
+        config: The settings, with every default filled in.
+        scene: The scene.
+        routers: The networks by name; "field" gives the colours.
+        renderer: Networks and sampler.
+        ray_loss: From a batch of rays to a loss.
+        optimizer: Of all networks.
+        strategy: When and how cells split.
+        batches: Of rays.
+        generator: Of random choices on the host.
+        draws: Of random choices on the device; the same on a CPU.
+        scaler: Of the loss in float16.
+        guard: Of steps whose loss or gradients are not finite.
+        on_event: Called with a line of text for what happens; None for nobody.
+        step: Steps done.
+        seconds: Training time.
+        scoring: Seconds of evaluations so far that count towards the budget.
+        reserved: Seconds of the budget for the last evaluation.
+        rays: Of the next step.
+        rays_done: Of all steps.
+        loss: Of the last step that the host has read.
+        skipped_in_a_row: Steps that the guard has left out since the last good one.
+        stages: Periods of training, one more than splits.
+        stopped: Whether somebody asked to end the training.
+    """
+
+    config: TrainConfig
+    scene: Scene
+    routers: dict[str, VoronoiRouter]
+    renderer: Renderer
+    ray_loss: RayLoss
+    optimizer: Adam
+    strategy: SplitStrategy
+    batches: RayBatches
+    generator: torch.Generator
+    draws: torch.Generator
+    scaler: torch.amp.GradScaler
+    guard: Guard
+    rays: int
+    on_event: Callable[[str], None] | None = None
+    step: int = 0
+    seconds: float = 0.0
+    scoring: float = 0.0
+    reserved: float = 0.0
+    rays_done: int = 0
+    loss: float = math.nan
+    skipped_in_a_row: int = 0
+    stages: list[Stage] = field(default_factory=lambda: [Stage(1, 0.0, 0, None, None, 0)])
+    stopped: bool = False
+
+    @property
+    def device(self) -> torch.device:
+        """Of the networks."""
+        return torch.device(self.config.device)
+
+    @property
+    def router(self) -> VoronoiRouter:
+        """The router whose colours count."""
+        return self.routers["field"]
+
+    @property
+    def sampler(self) -> Sampler:
+        """Where along rays the networks are asked."""
+        return self.renderer.sampler
+
+    @property
+    def fraction(self) -> float:
+        """How much of the training is done, 0..1."""
+        if self.config.steps is not None:
+            return min(1.0, self.step / self.config.steps)
+        training = float(self.config.budget or 1.0) - self.scoring - self.reserved
+        return min(1.0, self.seconds / max(training, 1e-9))
+
+    @property
+    def skipped(self) -> int:
+        """Steps that were left out, since a loss or gradients were not finite; waits for the device."""
+        return int(self.guard.skipped)
+
+    @property
+    def parameter_count(self) -> int:
+        """Parameters of all networks of all cells."""
+        return sum(p.numel() for router in self.routers.values() for p in router.parameters())
+
+    @property
+    def thread_deterministic(self) -> bool:
+        """Whether native ops compute all networks: then steps are the same bits on any number of threads."""
+        chosen = backends.chosen("routed_mlp", self.device, torch.float32, backend=self.config.backend)
+        native = self.device.type == "cpu" and chosen == "native"
+        return native and all(router.by_table for router in self.routers.values())
+
+    def learning_rate(self) -> float:
+        """Of the next step."""
+        hold = self.config.field_type.lr_hold
+        return learning_rate(float(self.config.lr or 0), self.fraction, self.step, hold=hold)
+
+    def averaged(self) -> AbstractContextManager[None]:
+        """A context in which the networks have their averaged weights, for pictures; not for training."""
+        return self.optimizer.averaged()
+
+    def read(self, output: RenderOutput) -> None:
+        """Reads loss, guard and number of samples of a step, which waits for the device; finds the rays of the next."""
+        rows = [] if output.samples.rows is None else [output.samples.rows[0].float()]
+        found = torch.stack([output.loss.detach().float(), self.guard.in_a_row, *rows]).tolist()
+        self.loss, self.skipped_in_a_row = found[0], int(found[1])
+        if isinstance(self.sampler, Occupancy):
+            samples = int(found[2]) if rows else len(output.weights)
+            self.rays = next_rays(
+                self.rays,
+                samples,
+                rays=self.config.rays,
+                samples=self.sampler.samples,
+                growth=self.config.field_type.ray_growth,
+                contracted=self.config.contraction != "none",
+            )
+
+    def count_scores(self, seconds: float, reserved: float) -> None:
+        """Takes seconds of an evaluation from the budget, and reserves some of it for the last one."""
+        self.scoring, self.reserved = self.scoring + seconds, reserved
+
+    def stop(self) -> None:
+        """Ends the training after the step or the view in hand, with a checkpoint, as Ctrl-C does."""
+        self.stopped = True
+
+    def say(self, line: str) -> None:
+        """Calls ``on_event``, if set."""
+        if self.on_event is not None:
+            self.on_event(line)
+
+
+def build(config: TrainConfig, scene: Scene, *, on_event: Callable[[str], None] | None = None) -> State:
+    """All that a training needs, before its first step.
+
+    Args:
+        config: The settings.
+        scene: The scene that ``config.data`` names.
+        on_event: Called with a line of text for each split, evaluation and checkpoint.
+
+    Raises:
+        ConfigError: For settings that do not fit the scene, or networks that do not fit into memory.
+        BackendUnavailable: For a backend that cannot train.
+
+    Examples:
+        >>> from voronerf.app.scenes import load_scene
+        >>> from voronerf.app.train import TrainConfig, build, train
+        >>> scene = load_scene("builtin", downscale=10)
+        >>> state = build(TrainConfig(steps=3, cells=(4,), split_at=(1,), rays=64), scene)
+        >>> train(state)
+        >>> state.step, state.router.num_cells
+        (3, 4)
+    """
+    config = resolve(config, scene)
+    if config.parameters is not None:
+        config = replace(config, width=solve_width(config, config.parameters))
+        if config.lr is None:
+            config = replace(config, lr=config.field_type.learning_rate(config.network_options))
+    check_memory(config)
+    device = torch.device(config.device)
+    check_backend(config, device)
+    generator = torch.Generator().manual_seed(config.seed)
+    # Random numbers are drawn on the device that uses them, so that the host need not wait.
+    draws = generator if device.type == "cpu" else torch.Generator(device).manual_seed(config.seed)
+    batches = make_batches(config, scene)
+    routers = make_routers(config)
+    for router in routers.values():
+        router.generator = draws
+    renderer = make_renderer(
+        config, scene, routers, grid=make_grid(config, scene, device) if config.occupancy else None
+    )
+    optimizer = Adam.of(
+        routers,
+        lr=float(config.lr or 0),
+        views=len(scene.train),
+        sparse=config.field_type.sparse_parameters,
+        average=config.average,
+        backend=config.backend,
+    )
+    strategy = SplitStrategy(
+        routers,
+        config.plan,
+        centres=config.centres,
+        inherit=config.init == "inherit",
+        generator=generator,
+        backend=config.backend,
+    )
+    return State(
+        config=config,
+        scene=scene,
+        routers=routers,
+        renderer=renderer,
+        ray_loss=RayLoss(renderer, sparse_depth=config.sparse_depth or 0.0),
+        optimizer=optimizer,
+        strategy=strategy,
+        batches=batches,
+        generator=generator,
+        draws=draws,
+        scaler=torch.amp.GradScaler(device.type, enabled=config.precision == "fp16"),
+        guard=Guard.on(device),
+        rays=config.rays,
+        on_event=on_event,
+    )
+
+
+def make_batches(config: TrainConfig, scene: Scene, views: Tensor | None = None) -> RayBatches:
+    """Batches of rays of the training views of a scene; ``views`` int64 for some of them alone."""
+    train, device = scene.train, torch.device(config.device)
+    images = train.images if train.on_disk else train.images.to(device)
+    return RayBatches(
+        train.cameras,
+        images,
+        near=scene.near,
+        far=scene.far,
+        box=scene.box,
+        background=scene.background_colour(),
+        masks=train.masks,
+        sparse=train.sightings if config.sparse_depth else None,
+        views=views,
+        cones=config.field_type.cones,
+        fetch=Pages(images).fetch if train.on_disk else None,
+        device=device,
+        backend=config.backend,
+    )
+
+
+def make_routers(config: TrainConfig, device: torch.device | str | None = None) -> dict[str, VoronoiRouter]:
+    """A router of one cell around each network, for the coarse stage; the seed alone decides its parameters."""
+    kind = config.field_type
+    names = SAMPLERS[config.sampling].networks(kind.cones)
+    with torch.random.fork_rng():  # of GPUs as well: manual_seed reaches them
+        torch.manual_seed(config.seed)
+        networks = {name: kind.build(config.network_options) for name in names}
+    return {
+        name: VoronoiRouter(
+            network,
+            VoronoiDiagram(torch.zeros(1, 3)),
+            coords="first3",
+            assignment=config.assignment,
+            temperature=TEMPERATURE,
+            backend=config.backend,
+            way="fused",  # a run is resumed bit for bit, so nothing depends on timings
+            **kind.router_options,
+        ).to(config.device if device is None else device)
+        for name, network in networks.items()
+    }
+
+
+def make_renderer(
+    config: TrainConfig,
+    scene: Scene,
+    routers: Mapping[str, VoronoiRouter],
+    *,
+    grid: OccupancyGrid | None = None,
+    samples: tuple[int, ...] | None = None,
+    backend: str | None = None,
+) -> Renderer:
+    """The renderer that a configuration asks for.
+
+    Args:
+        config: The settings, resolved.
+        scene: Whose space is sampled.
+        routers: The networks by name.
+        grid: Of what is empty; None to take every sample.
+        samples: Samples per ray of each pass, in pictures too; None for those of the configuration.
+        backend: Of the operations; None for that of the configuration.
+
+    Raises:
+        ConfigError: For a contraction that the scene does not allow.
+    """
+    device, backend = next(routers["field"].parameters()).device, backend or config.backend
+    space, counts = space_of(config, scene, device), samples or config.samples or ()
+    sampler: Sampler
+    if grid is None:
+        sampler = SAMPLERS[config.sampling](*counts, space=space, backend=backend)
+    else:
+        picture = None if samples is None else samples[0]
+        sampler = Occupancy(grid, counts[0], picture_samples=picture, space=space, backend=backend)
+    return Renderer({name: as_field(router) for name, router in routers.items()}, sampler, backend=backend)
+
+
+def as_field(router: VoronoiRouter) -> Field:
+    """A router as the renderer asks it: with one direction for each ray, or for each sample where it takes no other."""
+    takes_rays = "ray_index" in inspect.signature(router.module.forward).parameters
+    return router if takes_rays else DirectionPerSample(router)
+
+
+def make_grid(
+    config: TrainConfig,
+    scene: Scene,
+    device: torch.device | str = "cpu",
+    resolution: int | None = None,
+    least_opacity: float = TRAINING_OPACITY,
+) -> OccupancyGrid:
+    """A grid over the scene's box, or over the cube of its contraction, that is occupied everywhere.
+
+    A voxel is empty below the density with which an average stratum, the box's diagonal divided by the samples of a
+    ray, takes ``least_opacity`` of the light; in contracted space, with which the voxel takes `CONTRACTED_OPACITY`.
+
+    Raises:
+        ConfigError: When the scene has no box and is not contracted.
+    """
+    contraction, samples = space_of(config, scene, device).contraction, (config.samples or (0,))[0]
+    if contraction is not None:
+        box, size, patience = contraction.cube, resolution or CONTRACTED_RESOLUTION, CONTRACTED_PATIENCE
+        threshold = -math.log1p(-CONTRACTED_OPACITY) * size / float(box[1, 0] - box[0, 0])
+    elif scene.box is not None:
+        box, size, patience = scene.box, resolution or RESOLUTION, PATIENCE
+        threshold = -math.log1p(-least_opacity) * samples / float((box[1] - box[0]).norm())
+    else:
+        raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
+    remembered = DECAY**-patience
+    return OccupancyGrid(box, size, threshold=threshold, remembered=remembered, contraction=contraction, device=device)
+
+
+def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> OccupancyGrid:
+    """The occupancy grid of a field that was trained without one, made by asking the field in every voxel.
+
+    Raises:
+        ConfigError: As `make_grid`, or when the run's sampling has no use for a grid.
+    """
+    obstacle = why_no_occupancy(config)
+    if obstacle is not None:
+        raise ConfigError(f"--occupancy does not work with {obstacle}")
+    grid = make_grid(config, scene, renderer.device, PICTURE_RESOLUTION, LEAST_OPACITY)
+    generator = torch.Generator().manual_seed(0)
+    for points in range(PICTURE_POINTS):
+        grid.update(renderer.field, decay=float(points > 0), generator=generator, backend=renderer.backend)
+    return grid
+
+
+def parameter_shapes(config: TrainConfig) -> dict[str, tuple[torch.Size, bool]]:
+    """The shape of each parameter of a network, and whether all cells share it; without memory for any of them."""
+    make, share = functools.partial(config.field_type.build, config.network_options), config.field_type.router_options
+    network: nn.Module
+    try:
+        with torch.device("meta"):
+            network = make()
+    except RuntimeError:  # a field that computes numbers where it is made
+        with torch.random.fork_rng(devices=[]):  # draws nothing from the caller's random numbers
+            network = make()
+    return {
+        key: (parameter.shape, any(fnmatch.fnmatchcase(key, pattern) for pattern in share.get("share", ())))
+        for key, parameter in network.named_parameters()
+    }
+
+
+def count_parameters(config: TrainConfig, width: int | None = None) -> int:
+    """Parameters of all networks of all final cells, with another width than the configured one where given."""
+    if width is not None:
+        config = replace(config, width=width)
+    shapes, cells = parameter_shapes(config).values(), config.final_cells
+    each = sum((1 if shared else cells) * shape.numel() for shape, shared in shapes)
+    return each * len(SAMPLERS[config.sampling].networks(config.field_type.cones))
+
+
+def solve_width(config: TrainConfig, total: int) -> int:
+    """The largest width with which all networks of all final cells have at most ``total`` parameters together.
+
+    Raises:
+        ConfigError: When a width of 2 has more, or the field has no width.
+    """
+    if "width" not in config.field_type.options:
+        raise ConfigError(f"--parameters needs a field with an option width, {config.field} has none")
+    _check_fits(config, f"--parameters {total}", _parameter_bytes(config) * total)
+    low, high = 2, 4
+    if count_parameters(config, low) > total:
+        least = count_parameters(config, low)
+        raise ConfigError(f"--parameters must be at least {least} for {config.final_cells} cells, got {total}")
+    while count_parameters(config, high) <= total:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if count_parameters(config, middle) <= total else (low, middle)
+    return low
+
+
+def check_backend(config: TrainConfig, device: torch.device) -> None:
+    """Looks up every op of a step: a backend that cannot train should say so before anything is written.
+
+    Raises:
+        BackendUnavailable: Names the op.
+    """
+    ops = ["pixel_rays", "nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", "adam"]
+    if config.occupancy:
+        ops += ["march_rays", "observe_occupancy", "forward_with_tape", "render_loss_gradient"]
+        ops += ["sighting_gradient"] if config.sparse_depth else []
+    ops += ["resample"] if SAMPLERS[config.sampling].passes > 1 else []
+    for op in ops:
+        backends.resolve(op, backend=config.backend, device=device, dtype=torch.float32)
+    backends.resolve("cell_sort", backend=config.backend, device=device, dtype=torch.int32)
+
+
+def check_memory(config: TrainConfig) -> None:
+    """Raises ConfigError, with the sizes, for what does not fit into the machine."""
+    samples = sum(config.samples or ())
+    _check_fits(config, f"--rays {config.rays} with {samples} samples", SAMPLE_BYTES * config.rays * samples)
+    width = "" if config.width is None else f" of --width {config.width}"
+    name = f"--field {config.field}{width} with {config.final_cells} cells"
+    _check_fits(config, name, _parameter_bytes(config) * count_parameters(config))
+
+
+def _parameter_bytes(config: TrainConfig) -> int:
+    """Of a parameter, its gradient, Adam's two moments and its average."""
+    return 20 if config.average else 16
+
+
+def _check_fits(config: TrainConfig, name: str, needed: int) -> None:
+    device = torch.device(config.device)
+    there = torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else physical_memory()
+    if needed > there:
+        needed = min(needed, 2**100)  # which a float holds
+        raise ConfigError(f"{name} needs {needed / 2**30:.1f} GiB of memory or more, there are {there / 2**30:.1f}")
+
+
+def check_device(name: str) -> None:
+    """Raises ConfigError unless ``name`` is a torch device that is present."""
+    try:
+        if torch.device(name).type not in ("cpu", "cuda"):
+            raise ConfigError(f"--device must be cpu or cuda, got {name!r}")
+        float(torch.zeros((), device=name))
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"--device must name a device that is present, got {name!r}: {reason}") from None

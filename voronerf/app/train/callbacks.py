@@ -1,0 +1,327 @@
+"""What goes on beside a training: checkpoints, scores, a check that it goes well, TensorBoard."""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.utils import get_total_norm
+
+from voronerf.app.evaluate.lpips import Lpips
+from voronerf.app.evaluate.scores import ViewScore, evaluate, mean_scores, view_numbers
+from voronerf.app.files import json_text, write_bytes, write_text
+from voronerf.app.scenes import Scene
+from voronerf.app.scenes.record import write_scene
+from voronerf.app.train.build import State
+from voronerf.app.train.checkpoint import CheckpointWriter, checkpoint_paths
+from voronerf.app.train.config import TrainConfig
+from voronerf.app.train.loop import Callback, TrainingError
+from voronerf.app.train.resume import snapshot
+from voronerf.app.train.run_directory import read_metrics
+from voronerf.nerf.split import MIN_SAMPLES, SplitDone
+
+#: Seconds of training between checkpoints, and how many are kept.
+CHECKPOINT_EVERY, KEPT = 30.0, 3
+#: Share of the budget for evaluations, half of it for the final one; and the most views of one on the way.
+SHARE, VIEWS = 0.1, 20
+#: Entries of the last evaluation that summary.json repeats.
+FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views")
+#: Skipped steps in a row after which waiting is of no use.
+PATIENCE = 10
+#: Decibels below the best evaluation so far that are a collapse.
+COLLAPSE = 5.0
+#: A run is compared with pictures of one colour from its middle on, and from this step.
+SETTLED = 100
+
+
+class Checkpoints(Callback):
+    """Writes a checkpoint now and then, beside the training, and at the end; and the samples of each split.
+
+    Args:
+        out: The run directory.
+        every: Seconds of training between two checkpoints.
+    """
+
+    def __init__(self, out: Path, every: float = CHECKPOINT_EVERY) -> None:
+        self.out, self.every = out, every
+        self.writer = CheckpointWriter(out, KEPT)
+        self.saved_at, self.described = 0.0, False
+
+    def on_start(self, state: State) -> None:
+        """Counts from the state's time on."""
+        self.saved_at = state.seconds
+
+    def after_split(self, state: State, done: SplitDone) -> None:
+        """Writes the samples that decided a split, and says what it made."""
+        kept, stage = io.BytesIO(), state.stages[-1]  # benchmarks/balance.py reads them
+        np.savez(kept, points=done.points.cpu().numpy(), importance=done.importance.cpu().numpy())
+        write_bytes(self.out / "samples" / f"level-{state.strategy.splits}.npz", kept.getvalue())
+        when = f"at {state.seconds:.0f} s, step {state.step}"
+        if stage.split_cells:
+            state.say(
+                f"{stage.cells} cells {when}, imbalance of their importance {stage.balance_before:.3f} -> "
+                f"{stage.balance_after:.4f}"
+            )
+        else:
+            state.say(f"no cell split {when}: none holds {MIN_SAMPLES} of the {len(done.points)} samples kept")
+
+    def after_step(self, state: State) -> None:
+        """Begins to write a checkpoint when it is time, unless one is being written."""
+        if state.seconds - self.saved_at >= self.every and not self.writer.busy:
+            self.save(state)
+
+    def on_end(self, state: State) -> None:
+        """Writes the last checkpoint, and waits for it."""
+        self.save(state)
+        self.writer.wait()
+
+    def save(self, state: State) -> None:
+        """Begins to write a checkpoint, after the one before.
+
+        Raises:
+            TrainingError: When parameters or moments are not finite; the last checkpoint stays as it was.
+            OSError: When the one before could not be written.
+        """
+        if not all_finite(state.optimizer):
+            raise diverged(self.out, "parameters or moments of Adam not finite", state.step)
+        if not self.described:  # not earlier: a run whose first step fails leaves nothing
+            write_text(self.out / "config.json", state.config.to_json())
+            write_scene(self.out / "scene.json", state.scene)
+            self.described = True
+        self.writer.write(snapshot(state))
+        self.saved_at = state.seconds
+
+
+class Divergence(Callback):
+    """Ends a training whose gradients stop being finite.
+
+    Args:
+        out: The run directory, for the message.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+
+    def after_step(self, state: State) -> None:
+        """Raises TrainingError after `PATIENCE` steps that were left out in a row."""
+        if state.skipped_in_a_row >= PATIENCE:
+            raise diverged(self.out, f"gradients of {state.skipped_in_a_row} steps in a row not finite", state.step)
+
+
+def diverged(out: Path, reason: str, step: int) -> TrainingError:
+    """The error of a training that cannot continue."""
+    kept = "the last checkpoint is as it was" if checkpoint_paths(out) else "there is no checkpoint"
+    return TrainingError(f"{out}: {reason} at step {step}, try a smaller --lr; {kept}")
+
+
+def all_finite(optimizer: torch.optim.Optimizer) -> bool:
+    """Whether all parameters of an optimiser and its moments are finite; reads all of them."""
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    moments = [entry for state in optimizer.state.values() for entry in state.values() if isinstance(entry, Tensor)]
+    return bool(get_total_norm([tensor.detach() for tensor in (*parameters, *moments)], math.inf).isfinite())
+
+
+class Scores(Callback):
+    """Scores test views at even times and at the end, into ``metrics.jsonl``, and writes ``summary.json``.
+
+    Without ``config.eval_views``, evaluations count towards ``config.budget``: they take a tenth of it, and where that
+    is too short, fewer views are scored or an evaluation on the way is left out.
+
+    Args:
+        out: The run directory; None to write nothing.
+        lpips: For the final evaluation; None for none.
+        clock: Counts seconds.
+
+    Attributes:
+        metrics: All evaluations, in order.
+        summary: What ``summary.json`` holds, after the end.
+    """
+
+    def __init__(
+        self, out: Path | None, lpips: Lpips | None = None, *, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
+        self.out, self.lpips, self.clock = out, lpips, clock
+        self.metrics: list[dict[str, Any]] = []
+        self.summary: dict[str, Any] = {}
+        self.done, self.view_seconds, self.one_colour = 0, 0.0, math.nan
+
+    def on_start(self, state: State) -> None:
+        """Goes on after the evaluations that a resumed run has made."""
+        if self.out is not None:
+            self.metrics = [line for line in read_metrics(self.out) if line["step"] <= state.step]
+        self.done = min(len(self.metrics), self._due(state))
+
+    def _due(self, state: State) -> int:
+        return int(state.fraction * state.config.evaluations + 1e-9)
+
+    def after_step(self, state: State) -> None:
+        """Scores test views when it is time."""
+        if self._due(state) > self.done and state.fraction < 1:
+            self.done = self._due(state)
+            self._evaluate(state, last=False)
+
+    def on_end(self, state: State) -> None:
+        """Scores the test views of a finished training, and writes the summary."""
+        if state.fraction >= 1:
+            state.stopped = False  # a stop that came in the last step has nothing to end
+            left = len(state.strategy.plan) - state.strategy.splits
+            if left:
+                state.say(f"Run ended before {left} of {len(state.strategy.plan)} planned splits.")
+            self._evaluate(state, last=True)
+        now = self.metrics[-1] if self.metrics else {}
+        self.summary = {
+            **{key: now.get(key) for key in FIGURES},
+            "complete": state.fraction >= 1 and not state.stopped,
+            "seconds": state.seconds,
+            "steps": state.step,
+            "rays_per_second": state.rays_done / max(state.seconds, 1e-9),
+            "parameters": state.parameter_count,
+            "cells": state.router.num_cells,
+            "splits_left": len(state.strategy.plan) - state.strategy.splits,
+            "skipped_steps": state.skipped,
+            "width": state.config.width,
+            "stages": [asdict(stage) for stage in state.stages],
+        }
+        if self.out is not None:
+            write_text(self.out / "summary.json", json_text(self.summary, indent=2) + "\n")
+
+    def _evaluate(self, state: State, *, last: bool) -> None:
+        """Scores test views; where a stop is asked for meanwhile, not all of them, and without a trace."""
+        config, lpips = state.config, self.lpips if last else None
+        every = len(state.scene.test)
+        wanted = min(every, config.eval_views or (every if last else VIEWS))
+        counted = config.eval_views is None and config.budget is not None
+        if counted:
+            budget, probed = float(config.budget or 0), 0.0
+            if self.view_seconds == 0 or lpips is not None:
+                probed = self._score(state, 1, lpips, counted=not last)[1]
+            left = SHARE * budget - state.scoring - probed if last else SHARE / 2 * state.seconds - state.scoring
+            wanted = min(wanted, max(int(left / max(self.view_seconds, 1e-9)), int(last)))
+        scores = self._score(state, wanted, lpips, counted=counted and not last)[0] if wanted else []
+        if scores and not state.stopped:
+            self._record(state, scores)
+
+    def _score(self, state: State, views: int, lpips: Lpips | None, *, counted: bool) -> tuple[list[ViewScore], float]:
+        """Scores of test views, and the seconds that they took; counted, they and the last ones are of the budget."""
+        started = self.clock()
+        with state.averaged():
+            scores = evaluate(state.renderer, state.scene, views=views, lpips=lpips, stop=lambda: state.stopped)
+        passed = self.clock() - started
+        self.view_seconds = passed / max(len(scores), 1)
+        if counted:
+            budget = float(state.config.budget or 0)
+            last = min(self.view_seconds * len(state.scene.test), SHARE / 2 * budget)
+            state.count_scores(passed, last)
+        return scores, passed
+
+    def _record(self, state: State, scores: list[ViewScore]) -> None:
+        """Adds an evaluation to ``metrics.jsonl`` and says it, with what makes it poor."""
+        now = {
+            "step": state.step,
+            "seconds": round(state.seconds, 3),
+            "cells": state.router.num_cells,
+            "learning_rate": state.learning_rate(),
+            "views": len(scores),
+            **mean_scores(scores),
+        }
+        self.metrics = [line for line in self.metrics if line["step"] < state.step] + [now]
+        if self.out is not None:
+            write_text(self.out / "metrics.jsonl", "".join(json_text(line) + "\n" for line in self.metrics))
+        state.say(
+            f"{state.seconds:7.1f} s  step {state.step:6d}  {now['cells']:4d} cells  "
+            f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} view{'s' * (len(scores) != 1)})"
+        )
+        if math.isnan(self.one_colour):
+            self.one_colour = one_colour_psnr(state.scene)
+        settled = state.step >= SETTLED and state.fraction >= 0.5
+        poor = why_scores_are_poor(self.metrics, state.config, self.one_colour, settled=settled)
+        if poor is not None:
+            state.say(poor)
+
+
+def one_colour_psnr(scene: Scene, views: int = 5) -> float:
+    """PSNR in dB of test views that are painted in their mean colour."""
+    background = scene.background_colour()
+    pixels = torch.cat([scene.test.truth(i, background).reshape(-1, 3) for i in view_numbers(len(scene.test), views)])
+    return -10 * math.log10(max(float(pixels.var(0, correction=0).mean()), 1e-10))
+
+
+def why_scores_are_poor(
+    metrics: Sequence[Mapping[str, Any]], config: TrainConfig, one_colour: float, *, settled: bool
+) -> str | None:
+    """What is wrong with the last evaluation of a run and probably its cause, in a line; None if nothing is.
+
+    Args:
+        metrics: All evaluations.
+        config: The settings of the run.
+        one_colour: See :func:`one_colour_psnr`.
+        settled: Whether the run is so far that it must have learnt something.
+    """
+    *earlier, now = (math.nan if m["psnr"] is None else m["psnr"] for m in metrics)
+    best = max((psnr for psnr in earlier if math.isfinite(psnr)), default=-math.inf)
+    assert config.lr is not None
+    usual = config.field_type.learning_rate(config.network_options)
+    rate = usual if config.lr > usual else config.lr / 4
+    if best - now > COLLAPSE:
+        return f"psnr fell from {best:.2f} to {now:.2f} dB: the learning rate is probably too high, try --lr {rate:.2g}"
+    if settled and not now > one_colour:
+        other = "" if config.lr > usual else ", or cameras, near and far do not fit the images"
+        return (
+            f"nothing is learnt: psnr is {now:.2f} dB, where a single colour gives {one_colour:.2f}; the learning rate "
+            f"is probably too high, try --lr {rate:.2g}{other}"
+        )
+    return None
+
+
+class TensorBoard(Callback):
+    """Writes loss, speed, cells and scores for TensorBoard.
+
+    Args:
+        folder: Of the event files.
+        scores: Whose evaluations are written; comes before this one among the callbacks.
+
+    Raises:
+        ImportError: TensorBoard is not installed.
+    """
+
+    EVERY = 10  # steps between two losses
+
+    def __init__(self, folder: Path, scores: Scores) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            raise ImportError("--tensorboard needs tensorboard: pip install 'voronerf[tensorboard]'") from None
+        self._make, self.folder, self.scores, self.written = SummaryWriter, folder, scores, 0
+        self.writer: Any = None
+
+    def on_start(self, state: State) -> None:
+        """Opens the file; what an earlier part of the run has written of later steps is hidden."""
+        self.writer, self.written = self._make(str(self.folder), purge_step=state.step + 1), len(self.scores.metrics)
+
+    def after_step(self, state: State) -> None:
+        """Writes the state after a step, and the evaluations since the step before."""
+        if state.step % self.EVERY == 0:
+            speed = state.rays_done / max(state.seconds, 1e-9)
+            for name, value in (("loss", state.loss), ("rays_per_second", speed), ("cells", state.router.num_cells)):
+                self.writer.add_scalar(f"train/{name}", value, state.step)
+        self._write_scores()
+
+    def on_end(self, state: State) -> None:
+        """Writes the last evaluations, and ends the file."""
+        self._write_scores()
+        self.writer.close()
+
+    def _write_scores(self) -> None:
+        for line in self.scores.metrics[self.written :]:
+            for name in ("psnr", "ssim", "lpips", "learning_rate"):
+                if line.get(name) is not None:
+                    self.writer.add_scalar(f"test/{name}", line[name], line["step"])
+        self.written = len(self.scores.metrics)

@@ -1,0 +1,139 @@
+"""The loop of a training, and the interface of what goes on beside it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+
+import torch
+
+from voronerf.app.train.build import Stage, State
+from voronerf.nerf.samplers import Occupancy
+from voronerf.nerf.split import SplitDone
+from voronerf.ops._core import backends
+from voronerf.ops.adam.reference import judge
+
+#: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
+READ_EVERY = 50
+#: The dtype of autocast for each precision but float32.
+HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
+
+
+class TrainingError(RuntimeError):
+    """Training cannot continue; the message gives the reason and what is left on disk."""
+
+
+class Callback:
+    """What goes on beside a training: scores, checkpoints, progress. It keeps its own state.
+
+    Examples:
+        >>> from voronerf.app.train import Callback
+        >>> class Losses(Callback):
+        ...     def __init__(self):
+        ...         self.losses = []
+        ...     def after_step(self, state):
+        ...         self.losses.append(state.loss)
+    """
+
+    def on_start(self, state: State) -> None:
+        """Called before the first step of this process."""
+
+    def after_split(self, state: State, done: SplitDone) -> None:
+        """Called after cells were split, before the step that follows."""
+
+    def after_step(self, state: State) -> None:
+        """Called after each step."""
+
+    def on_end(self, state: State) -> None:
+        """Called when the training has ended, or was stopped."""
+
+
+def train(
+    state: State,
+    callbacks: Sequence[Callback] = (),
+    *,
+    until: float = math.inf,
+    clock: Callable[[], float] = time.perf_counter,
+) -> None:
+    """Trains until ``until`` training seconds, the end of the training, or ``state.stop()``, whichever comes first.
+
+    Calls in turns let several trainings share a machine, so that its noise affects all of them alike.
+
+    Args:
+        state: What :func:`voronerf.app.train.build` made.
+        callbacks: Called in their order.
+        until: Training seconds.
+        clock: Counts seconds.
+    """
+    config, strategy, sampler, optimizer = state.config, state.strategy, state.sampler, state.optimizer
+    half, alone = HALVES.get(config.precision), state.thread_deterministic
+    before = state.step
+    while state.fraction < 1 and state.seconds < until and not state.stopped:
+        started = clock()
+        with backends.torch_on_one_thread() if alone else nullcontext():
+            done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
+            if done is not None:
+                state.stages.append(stage_of(state, done))
+                if not strategy.inherit:
+                    optimizer.drop_averages()
+                for callback in callbacks:
+                    callback.after_split(state, done)
+            optimizer.set_learning_rate(state.learning_rate())
+            sampler.step_pre_backward(state.renderer.field, state.step, state.generator)
+            if not state.router.training:
+                state.renderer.train()
+            batch = state.batches.draw(state.rays, state.draws)
+            optimizer.zero_grad(set_to_none=True)
+            with nullcontext() if half is None else torch.autocast(state.device.type, half, cache_enabled=False):
+                output = state.ray_loss(batch, state.draws, backward=half is None)
+            if half is not None:
+                state.scaler.scale(output.loss).backward()
+            sampler.step_post_backward(output)
+            # Nothing is read on the host: the optimiser leaves out a step by what is found on the device.
+            if state.scaler.is_enabled():
+                judge(state.guard, output.loss.detach(), [])
+                state.scaler.step(optimizer)
+                state.scaler.update()
+            else:
+                optimizer.update(state.guard, output.loss.detach())
+            optimizer.after_step(state.step)
+            strategy.step_post_backward(output)
+        state.rays_done += len(batch.rays)
+        state.step += 1
+        if state.device.type == "cpu" or state.step % READ_EVERY == 0:
+            state.read(output)
+        state.seconds += clock() - started
+        for callback in callbacks:
+            callback.after_step(state)
+    if state.step > before and state.fraction >= 1 and isinstance(sampler, Occupancy):
+        started = clock()
+        with state.averaged():
+            sampler.fill_holes(state.renderer.field, config.seed)
+        state.seconds += clock() - started
+
+
+def run(state: State, callbacks: Sequence[Callback] = (), *, clock: Callable[[], float] = time.perf_counter) -> None:
+    """Trains to the end, from where a state is; calls ``on_start`` before and ``on_end`` after it.
+
+    Args:
+        state: What :func:`voronerf.app.train.build` made, and ``load`` may have moved on.
+        callbacks: Called in their order.
+        clock: Counts seconds.
+    """
+    for callback in callbacks:
+        callback.on_start(state)
+    train(state, callbacks, clock=clock)
+    for callback in callbacks:
+        callback.on_end(state)
+
+
+def stage_of(state: State, done: SplitDone) -> Stage:
+    """The period of training that a split begins."""
+    balances = list(done.split.balances.values())
+    before, after = (
+        float(torch.tensor([getattr(balance, name) for balance in balances]).median()) if balances else None
+        for name in ("imbalance_before", "imbalance_after")
+    )
+    return Stage(state.router.num_cells, state.seconds, state.step, before, after, len(balances))

@@ -1,0 +1,192 @@
+"""A training as a checkpoint: taken of a state, and loaded into a state of the same settings."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from voronerf.app.train.build import Stage, State, parameter_shapes
+from voronerf.app.train.checkpoint import Checkpoint, CheckpointError, load_optimizer_tensors, optimizer_tensors
+from voronerf.app.train.config import TrainConfig, differences
+from voronerf.app.train.schema import check_types
+from voronerf.diagram import VoronoiDiagram
+from voronerf.nerf.samplers import SAMPLERS, Occupancy
+from voronerf.ops import Guard
+from voronerf.router import VoronoiRouter
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a checkpoint keeps beside its tensors, by the names of a state."""
+
+    config: dict[str, Any]
+    step: int
+    seconds: float
+    scoring: float
+    reserved: float
+    rays: int
+    rays_done: int
+    stages: tuple[dict[str, Any], ...]
+    skipped: int
+    threads: int
+
+
+def snapshot(state: State) -> Checkpoint:
+    """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
+    names = ("step", "seconds", "scoring", "reserved", "rays", "rays_done", "skipped")
+    values = {name: getattr(state, name) for name in names}
+    values |= {"config": state.config.to_values(), "threads": torch.get_num_threads()}
+    values |= {"stages": [asdict(stage) for stage in state.stages]}
+    groups: dict[str, Mapping[str, Any]] = {group(name): r.state_dict() for name, r in state.routers.items()}
+    groups |= {"optimizer": optimizer_tensors(state.optimizer), "strategy": state.strategy.state_dict()}
+    groups |= {"generator": {"state": state.generator.get_state(), "draws": state.draws.get_state()}}
+    if isinstance(state.sampler, Occupancy):
+        groups["occupancy"] = state.sampler.grid.state_dict()
+    if state.scaler.is_enabled():
+        groups["scaler"] = state.scaler.state_dict()
+    tensors = {
+        f"{prefix}.{name}": torch.as_tensor(value).detach().to("cpu", copy=True).contiguous()  # training goes on
+        for prefix, entries in groups.items()
+        for name, value in entries.items()
+    }
+    return Checkpoint(tensors, values)
+
+
+def load(state: State, checkpoint: Checkpoint) -> None:
+    """Puts a state where the training was that wrote a checkpoint of its settings.
+
+    Args:
+        state: As :func:`voronerf.app.train.build` made it.
+        checkpoint: Of a training with the same settings, but for those that may differ.
+
+    Raises:
+        CheckpointError: When it is of another configuration, or something is missing or does not fit.
+    """
+    config, stored = stored_values(checkpoint)
+    different = differences(config, state.config)
+    if different:
+        raise CheckpointError(f"{checkpoint.source}: a checkpoint of another configuration: {'; '.join(different)}")
+    check_shapes(config, checkpoint)
+    restore_routers(state.routers, checkpoint)
+    try:
+        if stored.step and not checkpoint.group("optimizer"):
+            raise ValueError(f"no moments of the optimiser after {stored.step} steps")
+        load_optimizer_tensors(state.optimizer, checkpoint.group("optimizer"))
+        state.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
+        if isinstance(state.sampler, Occupancy):
+            state.sampler.grid.load_state_dict(checkpoint.group("occupancy"))
+        state.strategy.load_state_dict(checkpoint.group("strategy"))
+        generators = checkpoint.group("generator")
+        state.generator.set_state(generators["state"])
+        drawn = generators["draws"]
+        if state.draws is not state.generator and drawn.shape == state.draws.get_state().shape:
+            state.draws.set_state(drawn)  # else the run began on another kind of device
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
+    threads = torch.get_num_threads()
+    if stored.threads != threads and state.device.type == "cpu" and not state.thread_deterministic:
+        state.say(
+            f"not bit for bit: {checkpoint.source} was written on {stored.threads} threads, now there are {threads}"
+            ", and torch computes these networks"
+        )
+    state.step, state.seconds = stored.step, stored.seconds
+    state.scoring, state.reserved = stored.scoring, stored.reserved
+    state.rays, state.rays_done = stored.rays, stored.rays_done
+    state.stages = [Stage(**stage) for stage in stored.stages]
+    state.guard = Guard.on(state.device, stored.skipped)
+
+
+def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
+    """The settings of a checkpoint's training, and how far it is.
+
+    Raises:
+        CheckpointError: When a value is missing or of another type.
+    """
+    source, values = checkpoint.source, dict(checkpoint.values)
+    try:
+        if isinstance(values.get("stages"), list):
+            values["stages"] = tuple(values["stages"])
+        check_types(source, Stored, values)
+        for number, stage in enumerate(values["stages"]):
+            check_types(f"{source}: stage {number}", Stage, stage)
+        stored = Stored(**values)
+        times = [stored.seconds, stored.scoring, stored.reserved]
+        if not (stored.step >= 0 and all(0 <= each < math.inf for each in times) and stored.stages):
+            came = f"got {stored.step}, {times} and {len(stored.stages)}"
+            raise ValueError(f"{source}: step, times and stages must be counts, {came}")
+    except ValueError as error:
+        raise CheckpointError(str(error)) from None
+    config = TrainConfig.from_json(json.dumps(stored.config), source)
+    most = int(config.rays * config.field_type.ray_growth)
+    if not config.rays <= stored.rays <= most:
+        raise CheckpointError(f"{source}: rays must lie in {config.rays} to {most} by its settings, got {stored.rays}")
+    return config, stored
+
+
+def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
+    """Compares the networks of a configuration with those in a checkpoint, before memory is taken for either.
+
+    Raises:
+        CheckpointError: For a parameter that is missing, of another shape, or not for as many cells as there are.
+    """
+    for name in SAMPLERS[config.sampling].networks(config.field_type.cones):
+        tensors = checkpoint.group(group(name))
+        try:
+            diagram = VoronoiDiagram.from_state(tensors, "diagram.")
+        except (ValueError, TypeError) as error:
+            raise CheckpointError(f"{checkpoint.source}: {error}") from None
+        for key, (shape, shared) in parameter_shapes(config).items():
+            wanted = [*([] if shared else [diagram.num_cells]), *shape]
+            found = tensors.get(f"module.{key}")
+            if found is None or list(found.shape) != wanted:
+                came = "nothing" if found is None else list(found.shape)
+                raise CheckpointError(
+                    f"{checkpoint.source}: the checkpoint is of another architecture: {group(name)}.module.{key} "
+                    f"must have shape {wanted}, got {came}"
+                )
+
+
+def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint, *, assign: bool = False) -> None:
+    """Loads the cells of a checkpoint into routers; their number may differ.
+
+    Args:
+        routers: By name.
+        checkpoint: Of networks of the same architecture.
+        assign: Takes the checkpoint's tensors in place of copies of them, for routers on the CPU.
+
+    Raises:
+        CheckpointError: When the checkpoint's parameters are of another architecture.
+    """
+    for name, router in routers.items():
+        try:
+            router.load_state_dict(checkpoint.group(group(name)), assign=assign)
+        except RuntimeError as error:
+            line = str(error).splitlines()[-1]
+            raise CheckpointError(f"{checkpoint.source}: the checkpoint is of another architecture: {line}") from None
+
+
+def load_averages(parameters: list[torch.nn.Parameter], checkpoint: Checkpoint) -> None:
+    """Replaces weights, in the optimiser's order, by the averages that a checkpoint has of them.
+
+    Raises:
+        CheckpointError: When an average has another shape.
+    """
+    for index, parameter in enumerate(parameters):
+        name = f"optimizer.{index}.average"
+        average = checkpoint.tensors.get(name)
+        if average is None:
+            continue
+        if average.shape != parameter.shape:
+            wanted, came = list(parameter.shape), list(average.shape)
+            raise CheckpointError(f"{checkpoint.source}: {name} must have shape {wanted}, got {came}")
+        parameter.data = average.to(parameter)
+
+
+def group(name: str) -> str:
+    """The first word of the tensors of a network in a checkpoint."""
+    return "router" if name == "field" else f"router-{name}"

@@ -1,0 +1,145 @@
+"""Random batches of training rays with the colours of their pixels. r rays of a batch; colours are in 0..1."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from voronerf.nerf.cameras import Cameras, Rays
+from voronerf.nerf.loss import Batch
+from voronerf.nerf.occupancy import draw_seed
+from voronerf.nerf.rays import intersect_box
+from voronerf.ops.draw_pixels import Runs, draw_pixels
+
+#: Share of the rays that are drawn through points of a sparse model, where these are learnt from.
+SPARSE = 0.25
+
+
+class RayBatches:
+    """Draws rays uniformly from those pixels of pictures whose ray meets the box of the scene.
+
+    A ray that misses the box shows the background whatever the networks are, so there is nothing to learn from it.
+    Pixels that a mask leaves out are not drawn either.
+
+    Args:
+        cameras: c cameras.
+        images: uint8 [c, h, w, 3] opaque, or [c, h, w, 4] with straight alpha, on the device where pixels are drawn.
+        near: Distance along a ray at which the scene begins.
+        far: Distance along a ray at which it ends.
+        box: [2, 3] outside of which nothing is; None for none.
+        background: [3], the colour behind the scene; None for black.
+        random_background: Whether images with alpha lie over a colour that is drawn for each ray.
+        masks: bool [c, h, w], False for pixels that are not drawn; None for none.
+        sparse: int64 [s] pixels, numbered through all images, that show points of a sparse model, and float32 [s], the
+            distances of the points. A share of the rays, `SPARSE`, is drawn from them. None for none.
+        views: int64, the pictures to draw from; None for all.
+        cones: Whether the rays have radii.
+        fetch: Called with the pixels of a batch, int64 [r], before they are read, as for images on disk.
+        device: Where batches live; None for that of the images.
+        backend: Of the ops.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import RayBatches, orbit_cameras
+        >>> cameras = orbit_cameras(2, radius=2.0, elevation=0.0, width=4, height=3, focal=4.0)
+        >>> images = torch.zeros(2, 3, 4, 3, dtype=torch.uint8)
+        >>> rays = RayBatches(cameras, images, near=1.0, far=3.0)
+        >>> len(rays), rays.draw(5, torch.Generator().manual_seed(0)).target.shape
+        (24, torch.Size([5, 3]))
+    """
+
+    def __init__(
+        self,
+        cameras: Cameras,
+        images: Tensor,
+        *,
+        near: float,
+        far: float,
+        box: Tensor | None = None,
+        background: Tensor | None = None,
+        random_background: bool = True,
+        masks: Tensor | None = None,
+        sparse: tuple[Tensor, Tensor] | None = None,
+        views: Tensor | None = None,
+        cones: bool = False,
+        fetch: Callable[[Tensor], None] | None = None,
+        device: torch.device | str | None = None,
+        backend: str = "auto",
+    ) -> None:
+        self.place = images.device
+        self.device = torch.device(self.place if device is None else device)
+        self.cameras, self.images, self.near, self.far = cameras.to(self.place), images, float(near), float(far)
+        self.box, self.background = (None if each is None else each.to(self.place) for each in (box, background))
+        self.random_background = random_background and images.shape[-1] == 4
+        self.cones, self.fetch, self.backend = cones, fetch, backend
+        self.useful = self._useful_pixels(masks, views)
+        self.sparse = None
+        if sparse is not None:
+            pixels, distances = (tensor.to(self.place) for tensor in sparse)
+            if views is not None:
+                own = torch.isin(pixels // (cameras.width * cameras.height), views.to(self.place))
+                pixels, distances = pixels[own], distances[own]
+            self.sparse = (pixels, distances) if len(pixels) else None
+
+    def _useful_pixels(self, masks: Tensor | None, views: Tensor | None) -> Runs | None:
+        """The pixels to draw from; None when that is all of them."""
+        cameras = self.cameras
+        if self.box is None and masks is None and cameras.sizes is None and views is None:
+            return None
+        found = []
+        for image in range(len(cameras)) if views is None else views.tolist():
+            width, height = cameras.size(image)
+            chosen = torch.ones(height, width, dtype=torch.bool, device=self.place)
+            if masks is not None:
+                chosen &= masks[image, :height, :width].to(self.place)
+            if self.box is not None:
+                rays = cameras.image_rays(image, backend=self.backend)
+                _, _, hit = intersect_box(rays.origins, rays.directions, self.box, self.near, self.far)
+                chosen &= hit.reshape(height, width)
+            edges = torch.nn.functional.pad(chosen.to(torch.int8), (1, 1)).diff(dim=1)
+            row, column = (edges == 1).nonzero(as_tuple=True)
+            last = (edges == -1).nonzero(as_tuple=True)[1]
+            found.append(torch.stack(((image * cameras.height + row) * cameras.width + column, last - column)))
+        start, length = torch.cat(found, dim=1)
+        return Runs.of(start, length) if 0 < int(length.sum()) < self._pixels else None
+
+    @property
+    def _pixels(self) -> int:
+        return self.images.numel() // self.images.shape[-1]
+
+    def __len__(self) -> int:
+        """Number of rays to draw from."""
+        return self._pixels if self.useful is None else self.useful.total
+
+    def draw(self, count: int, generator: torch.Generator) -> Batch:
+        """A batch of ``count`` rays, drawn with replacement; the last ones through points of the sparse model."""
+        seed = draw_seed(self.place, generator)
+        index, uniforms = draw_pixels(seed, count, len(self), runs=self.useful, backend=self.backend)
+        depths = None
+        if self.sparse is not None and (several := int(SPARSE * count)):
+            pixels, distances = self.sparse
+            seed = draw_seed(self.place, generator)
+            chosen, _ = draw_pixels(seed, several, len(pixels), backend=self.backend)
+            index[count - several :] = pixels[chosen]
+            depths = distances[chosen].to(self.device)
+        if self.fetch is not None:
+            self.fetch(index)
+        background = uniforms if self.random_background else self.background
+        cameras = self.cameras
+        found = cameras.pixel_rays(
+            self.images,
+            index,
+            near=self.near,
+            far=self.far,
+            box=self.box,
+            background=background,
+            backend=self.backend,
+        )
+        radii = None
+        if self.cones:
+            radii = cameras.radii(found.directions, index // (cameras.width * cameras.height)).to(self.device)
+        origins, directions, near, far, colour = (tensor.to(self.device) for tensor in found)
+        background = None if background is None else background.to(self.device)
+        return Batch(Rays(origins, directions, radii), near, far, colour, background, depths)

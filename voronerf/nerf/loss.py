@@ -1,0 +1,228 @@
+"""The loss of a batch of rays, with gradients. r rays, m samples of all rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor
+
+from voronerf.nerf.cameras import Rays
+from voronerf.nerf.fields.radiance import activate_radiance
+from voronerf.nerf.occupancy import HIDDEN
+from voronerf.nerf.renderer import Renderer
+from voronerf.nerf.samplers import Hierarchical, Occupancy
+from voronerf.nerf.sampling import colour_loss
+from voronerf.nerf.volume import Samples, gradient_shares
+from voronerf.ops._core import backends
+from voronerf.ops.forward_with_tape import forward_with_tape
+from voronerf.ops.render_loss import render_loss_gradient
+from voronerf.ops.sighting_gradient import sighting_gradient
+from voronerf.ops.sighting_gradient.reference import seen_there, sighting_loss
+from voronerf.router import VoronoiRouter
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays [r], where they enter and leave the scene, and the colours to learn.
+
+    Attributes:
+        rays: Origins and unit directions; radii for cones.
+        near: [r], the depth at which each ray enters the scene.
+        far: [r], the depth at which it leaves the scene.
+        target: [r, 3], the colour of each ray's pixel over the background.
+        background: [3], or [r, 3] where it was drawn; None for black.
+        sparse_depths: [s], the distances of the points of a sparse model that the last s rays end at, or None.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import Batch, Rays
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> batch = Batch(rays, torch.ones(5), torch.full((5,), 3.0), torch.rand(5, 3), background=torch.ones(3))
+    """
+
+    rays: Rays
+    near: Tensor
+    far: Tensor
+    target: Tensor
+    background: Tensor | None = None
+    sparse_depths: Tensor | None = None
+
+
+class RenderOutput(NamedTuple):
+    """What :class:`RayLoss` gives. Only the loss has gradients.
+
+    Attributes:
+        loss: [].
+        error: [r], the squared error of the colour of each ray, summed over the channels.
+        weights: [m], contributions of the samples to their rays.
+        density: [m], per scene unit.
+        samples: Those of the last pass.
+        colour: [r, 3], as the field shows the rays.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF
+        >>> from voronerf.nerf import Batch, RayLoss, Rays, Renderer, Stratified
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> batch = Batch(rays, torch.ones(5), torch.full((5,), 3.0), torch.rand(5, 3))
+        >>> output = RayLoss(Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8)))(batch)
+        >>> output.loss.requires_grad, output.error.shape, output.importance().shape
+        (True, torch.Size([5]), torch.Size([40]))
+    """
+
+    loss: Tensor
+    error: Tensor
+    weights: Tensor
+    density: Tensor
+    samples: Samples
+    colour: Tensor
+
+    def importance(self) -> Tensor:
+        """[m]: the weight of each sample times the error of its ray (Elsner et al. 2023, section 3.1)."""
+        return self.weights * self.error.index_select(0, self.samples.ray_index)
+
+
+class RayLoss:
+    """The mean squared error of rays at random samples.
+
+    Where nothing keeps it from that (:meth:`why_not_fused`), networks, colours, loss and gradients are one operation
+    each way; else torch differentiates each pass along the rays.
+
+    Args:
+        renderer: Networks and sampler.
+        sparse_depth: Factor of the loss on light that does not come from where the points of a sparse model are
+            (Deng et al. 2022, "Depth-supervised NeRF"); 0 is off.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF, VoronoiRouter
+        >>> from voronerf.nerf import Batch, RayLoss, Rays, Renderer, Stratified
+        >>> router = VoronoiRouter(NeRF(width=16, depth=2), torch.zeros(1, 3))
+        >>> loss = RayLoss(Renderer({"field": router}, Stratified(8)))
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> output = loss(Batch(rays, torch.ones(5), torch.full((5,), 3.0), torch.rand(5, 3)), backward=True)
+        >>> router.module.colour.weight.grad is not None
+        True
+        >>> print(loss.explain())
+        samples: Stratified, 8 a ray
+        loss: networks, colours and loss are separate operations
+        not faster: empty space is not skipped
+    """
+
+    def __init__(self, renderer: Renderer, *, sparse_depth: float = 0.0) -> None:
+        self.renderer, self.sparse_depth = renderer, sparse_depth
+
+    def __call__(
+        self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False
+    ) -> RenderOutput:
+        """The loss of a batch, and what its samples have found.
+
+        Args:
+            batch: The rays.
+            generator: Of random samples.
+            backward: Whether gradients are added to those of the parameters at once, as ``loss.backward()`` does it,
+                in less time; the loss has none then.
+        """
+        run = self._fused if self.why_not_fused() is None else self._separate
+        return run(batch, generator, backward)
+
+    def why_not_fused(self) -> str | None:
+        """What keeps networks, colours, loss and gradients from being one operation; None if nothing does."""
+        field = self.renderer.field
+        if not isinstance(self.renderer.sampler, Occupancy):
+            return "empty space is not skipped"
+        if not isinstance(field, VoronoiRouter):
+            return f"the field is a {type(field).__name__}, no router"
+        if getattr(type(field.module), "activate", None) is not activate_radiance:
+            return f"{type(field.module).__name__} does not say what its outputs mean (activate = activate_radiance)"
+        if field.coords not in (None, "first3"):
+            return "other positions than those of the samples decide the cells"
+        return None if field.by_table else f"{type(field.module).__name__} does more than its layer table says"
+
+    def _fused(self, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:
+        renderer, depths = self.renderer, batch.sparse_depths if self.sparse_depth else None
+        field = cast(VoronoiRouter, renderer.field)
+        samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, jitter=True, generator=generator)
+        if depths is not None:
+            samples = samples.counted()
+        network = cast(Any, field.table_arguments(samples.inputs, batch.rays.directions, samples.ray_index))
+        outputs = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
+        scale = float(cast(Any, field.module).density_scale)
+        found, gradient = render_loss_gradient(
+            outputs.raw,
+            samples.deltas,
+            samples.ray_offsets,
+            batch.target,
+            background=batch.background,
+            density_scale=scale,
+            hidden=HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
+            backend=renderer.backend,
+        )
+        loss = found.loss
+        if depths is not None:
+            first = len(batch.rays) - len(depths)
+            begin, factor = int(samples.ray_offsets[first]), self.sparse_depth / len(depths)
+            density = found.density[begin:]
+            of_depth, slope = sighting_gradient(
+                density,
+                samples.depths[begin:],
+                samples.deltas[begin:],
+                found.weights[begin:],
+                samples.ray_offsets[first:],
+                depths,
+                backend=renderer.backend,
+            )
+            # The density is a softplus of the output, whose derivative is 1 - exp(-density / scale) times the scale.
+            gradient[begin:, 3] -= factor * scale * slope * torch.expm1(-density / scale)
+            loss = loss + factor * of_depth
+        shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
+        if shares is not None:
+            gradient = gradient * shares[:, None]
+        loss = outputs.learn(loss, gradient, backward=backward)
+        return RenderOutput(loss, found.error, found.weights, found.density, samples, found.colour)
+
+    def _separate(self, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:
+        given: dict[str, Any] = {"background": batch.background, "jitter": True, "generator": generator}
+        *before, last = self.renderer.render(batch.rays, batch.near, batch.far, **given)
+        loss, samples = colour_loss(last.colour, batch.target), last.samples
+        if self.sparse_depth and batch.sparse_depths is not None:
+            others = len(batch.rays) - len(batch.sparse_depths)
+            begin, end = (int(samples.ray_offsets[ray]) for ray in (others, -1))
+            depths, deltas, weights = (values[begin:end] for values in (samples.depths, samples.deltas, last.weights))
+            ray = samples.ray_index[begin:end].long() - others
+            there = weights * seen_there(depths, deltas, batch.sparse_depths[ray])
+            light = torch.zeros_like(batch.sparse_depths).index_add(0, ray, there)
+            loss = loss + self.sparse_depth * sighting_loss(light).mean()
+        for first in before:
+            loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
+        error = (last.colour.detach() - batch.target).square().sum(-1)
+        if backward:
+            loss.backward()
+            loss = loss.detach()
+        return RenderOutput(loss, error, last.weights.detach(), last.density.detach(), samples, last.colour.detach())
+
+    def explain(self) -> str:
+        """How a step is computed, and what keeps it from a faster way: some lines."""
+        renderer, sampler = self.renderer, self.renderer.sampler
+        counts = f"{sampler.samples}" + (f" and {sampler.fine_samples}" if isinstance(sampler, Hierarchical) else "")
+        lines = [f"samples: {type(sampler).__name__}, {counts} a ray"]
+        if isinstance(sampler, Occupancy):
+            lines[0] += f", of which {sampler.grid.share:.0%} of the grid are left"
+        obstacle = self.why_not_fused()
+        if obstacle is None:
+            device, dtype = renderer.device, torch.float32
+            chosen = backends.chosen("forward_with_tape", device, dtype, backend=renderer.backend)
+            lines.append(f"loss: networks, colours, loss and gradients in one operation, on the {chosen} backend")
+            if chosen != "native":
+                reason = backends.why_not("forward_with_tape", "native", device, dtype)
+                obstacle = reason or f"--backend {renderer.backend}"
+        else:
+            lines.append("loss: networks, colours and loss are separate operations")
+        if obstacle is not None:
+            lines.append(f"not faster: {obstacle}")
+        for name, field in renderer.fields.items():
+            if isinstance(field, VoronoiRouter) and not field.by_table:
+                lines.append(f"{name}: {field.explain()}")
+        return "\n".join(lines)
