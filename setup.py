@@ -1,8 +1,8 @@
 """Build of the compiled module ``voronerf.ops._core._C``; everything else is in pyproject.toml.
 
-The extension knows nothing of torch: C++17, the headers of Python and, where nvcc is found, CUDA. A build.ninja is
-written and run, so a build is parallel and redoes only what has changed, headers included. Files named ``*_isa.cpp``
-are compiled once for each instruction set (csrc/common/isa.h); the choice among them is made at run time.
+The extension knows nothing of torch: C++17, pybind11 and, where nvcc is found, CUDA. A build.ninja is written and run,
+so a build is parallel and redoes only what has changed, headers included. Files named ``*_isa.cpp`` are compiled once
+for each instruction set (csrc/common/isa.h); the choice among them is made at run time.
 
 Environment:
     CXX, CXXFLAGS                the C++ compiler and its flags (default c++, else g++, clang++ on Windows, where MSVC
@@ -44,6 +44,8 @@ LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
 # One of each major version, which runs on its minor ones. Without 100 and 120 a Blackwell GPU would compile the PTX of
 # 90 for minutes when a kernel is first used.
 DEFAULT_ARCHITECTURES = "75;80;90;100;120"
+BINDINGS = 2
+"""Compilations that share the files of csrc/bindings."""
 
 
 class NinjaBuildExt(build_ext):
@@ -54,7 +56,8 @@ class NinjaBuildExt(build_ext):
         build = build_folder()
         build.mkdir(parents=True, exist_ok=True)
         cuda = find_cuda()
-        write_if_changed(build / "bindings.cpp", bindings())
+        for name, text in bindings().items():
+            write_if_changed(build / name, text)
         write_if_changed(build / "build_info.h", build_info(cuda))
         module = build / Path(self.get_ext_filename(ext.name)).name
         write_if_changed(build / "build.ninja", ninja_file(module, cuda))
@@ -191,10 +194,12 @@ def toolkit_major(nvcc: Path) -> int:
     return int(found[1])
 
 
-def bindings() -> str:
-    """A file that includes those of csrc/bindings, whose headers take the compiler longer than themselves."""
+def bindings() -> dict[str, str]:
+    """Files that include those of csrc/bindings by turns: to read pybind11 takes the compiler longer than to compile
+    one of them."""
     files = sorted((SOURCES / "bindings").glob("*.cpp"))
-    return "".join(f'#include "{file.as_posix()}"\n' for file in files)
+    parts = {f"bindings_{part}.cpp": files[part::BINDINGS] for part in range(BINDINGS)}
+    return {name: "".join(f'#include "{file.as_posix()}"\n' for file in part) for name, part in parts.items()}
 
 
 def ninja_file(module: Path, cuda: Cuda) -> str:
@@ -202,7 +207,7 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     common = ["-std=c++17", "-O3", *([] if WINDOWS else ["-fPIC"]), "-fvisibility=hidden", "-Wall", "-Wextra", "-I."]
     # Without OpenMP its pragmas mean nothing, nor do the numbers of threads that stand in them.
     threads = ["-fopenmp"] if openmp() else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
-    includes = [f"-I{SOURCES}", f"-isystem{sysconfig.get_path('include')}"]
+    includes = [f"-I{SOURCES}", f"-isystem{pybind11_headers()}", f"-isystem{sysconfig.get_path('include')}"]
     # After CXXFLAGS: results are defined by separate roundings (csrc/geometry/nearest_centre_math.h), fused ones are
     # named, and NaN and infinity are distinguished from numbers. A root that may set errno is a call, which keeps its
     # loop from becoming vectors.
@@ -237,10 +242,11 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
             "  deps = gcc",
             "  description = $out",
         ]
-    objects = ["bindings.cpp.o"]
-    # Without loops to optimise, of which they have none.
+    objects = [f"{name}.o" for name in bindings()]
+    # First, because they take longest; half as long without loops to optimise, of which they have none.
     flags_of_bindings = join(["-O1", *(["-DVN_WITH_CUDA"] if cuda.nvcc is not None else [])])
-    lines += ["build bindings.cpp.o: cxx bindings.cpp", f"  flags = {flags_of_bindings}"]
+    for name in bindings():
+        lines += [f"build {name}.o: cxx {name}", f"  flags = {flags_of_bindings}"]
     for source in sorted(SOURCES.rglob("*.c*")):
         if source.parent.name == "bindings":
             continue
@@ -264,6 +270,20 @@ def compiler_rt() -> list[str]:
     asked = [*compiler(), "--rtlib=compiler-rt", "-print-libgcc-file-name"]
     found = Path(subprocess.run(asked, check=True, capture_output=True, text=True).stdout.strip())
     return [str(found)] if found.is_file() else []
+
+
+def pybind11_headers() -> str:
+    """Those of the package, or the ones that torch brings: a machine without a network may have no others."""
+    try:
+        import pybind11
+    except ImportError:
+        import importlib.util
+
+        torch = importlib.util.find_spec("torch")
+        if torch is None or torch.origin is None:
+            raise SystemExit("voronerf: pybind11 is missing; pip install pybind11") from None
+        return str(Path(torch.origin).parent / "include")
+    return str(pybind11.get_include())
 
 
 def stub_of(module: Path) -> str:

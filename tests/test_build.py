@@ -18,6 +18,7 @@ def build(monkeypatch):
     """The functions of setup.py, which is run without its last call."""
     if not (ROOT / "setup.py").is_file():
         pytest.skip("setup.py is not there: the tests are not in the source tree")
+    pytest.importorskip("pybind11")
     setuptools = pytest.importorskip("setuptools")
     monkeypatch.setattr(setuptools, "setup", lambda **_: None)
     monkeypatch.delenv("CXXFLAGS", raising=False)
@@ -55,6 +56,11 @@ def test_files_of_one_name_in_two_rooms_make_two_objects(build):
     lines = build["ninja_file"](Path("_C.so"), build["Cuda"]("built without CUDA")).splitlines()
     objects = [line.split(":")[0] for line in lines if line.startswith("build ")]
     assert "build geometry/cell_sort.cpp.o" in objects and len(objects) == len(set(objects))
+
+
+def test_every_binding_is_compiled_once(build):
+    included = "".join(build["bindings"]().values()).splitlines()
+    assert sorted(included) == [f'#include "{file}"' for file in sorted((ROOT / "csrc" / "bindings").glob("*.cpp"))]
 
 
 @pytest.mark.parametrize("given", ["", "-Ofast -march=native", "-ffast-math -ffp-contract=fast"])

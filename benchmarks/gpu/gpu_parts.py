@@ -70,6 +70,11 @@ def machine(out: Path) -> int:
             missing.append(f"the package {name} ({use})")
     if importlib.util.find_spec("ninja") is None and shutil.which("ninja") is None:
         missing.append("ninja (the build)")
+    if importlib.util.find_spec("pybind11") is None:
+        headers = Path(torch.__file__).parent / "include" / "pybind11"
+        print(f"pybind11: {'the headers in torch' if headers.exists() else 'none'}")
+        if not headers.exists():
+            missing.append("pybind11 (the build)")
     if not Path(sysconfig.get_path("include"), "Python.h").exists():
         missing.append(f"Python.h in {sysconfig.get_path('include')} (the build; a package such as python3-dev)")
     for program, places in (

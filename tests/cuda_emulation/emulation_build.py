@@ -95,10 +95,8 @@ def _build(out, sanitizer):
 
 def _for_python(path):
     """One file with everything that is written for Python: the compiler's time goes into pybind11's headers."""
-    bindings = ROOT / "csrc" / "bindings"
-    files = [file for file in sorted(bindings.glob("*.cpp")) if "VN_CUDA(" in file.read_text()]
-    files += [bindings / "bind.cpp", *(HERE / name for name in sorted(PYTHON))]
-    text = "".join(f'#include "{file}"\n' for file in files)
+    files = [file for file in sorted((ROOT / "csrc" / "bindings").glob("*.cpp")) if "VN_CUDA(" in file.read_text()]
+    text = "".join(f'#include "{file}"\n' for file in [*files, *(HERE / name for name in sorted(PYTHON))])
     _write(path, text)
     return path
 
