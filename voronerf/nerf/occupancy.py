@@ -9,6 +9,7 @@ which decays). Learning it from the samples of a batch, and emptying what is hid
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,6 +27,19 @@ from voronerf.ops.observe_occupancy.reference import cells_of
 from voronerf.ops.render_opaque import RaySums, render_opaque
 from voronerf.router import VoronoiRouter
 
+#: Voxels of a grid along each axis, of a box and of contracted space, which is all the world.
+RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
+#: A voxel is empty if a sample in it would take less of the light than this, were the voxel that dense throughout: in a
+#: training, and for pictures of a field that was trained without a grid. Most of what a young field has spread through
+#: empty space lies between the two, and would keep a third of the samples.
+TRAINING_OPACITY, PICTURE_OPACITY = 0.05, 0.02
+#: The same of a voxel of contracted space, for the light on its way through the whole voxel.
+CONTRACTED_OPACITY = 0.1
+#: How many samples in a row empty a new voxel: about thirty steps, until which the field has said nothing about most.
+#: In contracted space fewer: what stays there is fog before the cameras, which explains one view and spoils the others.
+PATIENCE, CONTRACTED_PATIENCE = 8, 4
+#: The factor in a training on what a voxel remembers for each sample of a batch in it.
+DECAY = 0.8
 CHUNK = 1 << 17  # points that a field evaluates at a time
 HIDDEN = 1e-3  # a sample is hidden if less than this share of the light reaches it
 # An empty cell is a hole if so many of the 27 around and in it are occupied, and so many random points in it are all
@@ -97,6 +111,51 @@ class OccupancyGrid:
         self._numbers = None if contraction is None else contraction.numbers.to(self.box)
         self.density = torch.full(shape, remembered * self.threshold, device=self.box.device)
         self.occupied = torch.ones(shape, dtype=torch.bool, device=self.box.device)
+
+    @classmethod
+    def for_training(
+        cls,
+        box: Tensor | None,
+        samples: int,
+        *,
+        contraction: Contraction | Perspective | None = None,
+        resolution: int | None = None,
+        opacity: float = TRAINING_OPACITY,
+        device: torch.device | str | None = None,
+    ) -> OccupancyGrid:
+        """A grid with the threshold and the memory of a training, over a box or over the cube of a contraction.
+
+        A voxel is empty below the density with which an average stratum, the box's diagonal divided by the samples of a
+        ray, takes ``opacity`` of the light; in contracted space, with which the voxel takes `CONTRACTED_OPACITY`.
+
+        Args:
+            box: [2, 3], of the scene; not used with a contraction.
+            samples: Strata of a ray.
+            contraction: Of the space that the field sees; None for that of the world.
+            resolution: Voxels along each axis; None for `RESOLUTION`, or `CONTRACTED_RESOLUTION`.
+            opacity: See above.
+            device: Of the grid; None for that of the box.
+
+        Raises:
+            ValueError: Neither a box nor a contraction.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import OccupancyGrid
+            >>> grid = OccupancyGrid.for_training(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 64)
+            >>> round(grid.threshold, 3), grid.occupied.shape
+            (0.948, torch.Size([64, 64, 64]))
+        """
+        if contraction is not None:
+            box, size, patience = contraction.cube, resolution or CONTRACTED_RESOLUTION, CONTRACTED_PATIENCE
+            threshold = -math.log1p(-CONTRACTED_OPACITY) * size / float(box[1, 0] - box[0, 0])
+        elif box is not None:
+            size, patience = resolution or RESOLUTION, PATIENCE
+            threshold = -math.log1p(-opacity) * samples / float((box[1] - box[0]).norm())
+        else:
+            raise ValueError("OccupancyGrid.for_training: box must be given without a contraction, got None")
+        remembered = DECAY**-patience
+        return cls(box, size, threshold=threshold, remembered=remembered, contraction=contraction, device=device)
 
     @property
     def share(self) -> float:

@@ -23,12 +23,12 @@ from voronerf.app.run import Run
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import write_scene
 from voronerf.app.scenes.scene import Split
-from voronerf.app.train.build import LEAST_OPACITY, PICTURE_POINTS, PICTURE_RESOLUTION, make_picture_grid
+from voronerf.app.train.build import PICTURE_POINTS, PICTURE_RESOLUTION, make_picture_grid
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
-from voronerf.nerf.occupancy import OccupancyGrid
+from voronerf.nerf.occupancy import PICTURE_OPACITY, OccupancyGrid
 from voronerf.router import VoronoiRouter
 from voronerf.town.geometry import Similarity, Solid
 from voronerf.town.parts import Network, Part, Parts
@@ -442,7 +442,7 @@ def _trimmed(grid: OccupancyGrid, parts: Parts, full: Tensor) -> OccupancyGrid |
 
 def _found_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
     """What is empty in a box of a run that has no grid, by asking the field in every voxel."""
-    threshold = -math.log1p(-LEAST_OPACITY) * (source.config.samples or (64,))[0] / float((box[1] - box[0]).norm())
+    threshold = -math.log1p(-PICTURE_OPACITY) * (source.config.samples or (64,))[0] / float((box[1] - box[0]).norm())
     grid = OccupancyGrid(box, PICTURE_RESOLUTION, threshold=threshold)
     generator = torch.Generator().manual_seed(0)
     for points in range(PICTURE_POINTS):

@@ -5,15 +5,17 @@ c images of h x w pixels. World units and axes as in `voronerf.nerf.cameras`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.store import check_mapped
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
+from voronerf.nerf.volume import Space
 
 #: An object on white; cameras that look the same way; that look outwards; that look at one place with surroundings.
 KINDS = ("object", "forward", "inside-out", "unbounded")
@@ -122,3 +124,71 @@ class Scene:
     def background_colour(self, device: torch.device | str = "cpu") -> Tensor | None:
         """The background as float32 [3] in 0..1, or None."""
         return None if self.background is None else torch.ones(3, device=device)
+
+    def space(self, contraction: str = "auto", *, cones: bool = False, device: torch.device | str = "cpu") -> Space:
+        """How a field sees the scene.
+
+        Args:
+            contraction: "none"; "sphere", that around the scene's box, or without one the scene's own, or that around
+                the origin and all cameras; "ndc" for cameras that face forward; or "auto", which is none for a scene
+                with a box, else ndc or sphere.
+            cones: Whether the field is asked about cones.
+            device: Of the tensors of the contraction.
+
+        Raises:
+            SceneError: For ndc without forward-facing cameras, or when all cameras are at the origin, so that there is
+                no sphere.
+        """
+        own, found = self.contraction, contraction
+        if contraction == "auto":
+            found = "none" if self.box is not None else "ndc" if isinstance(own, Perspective) else "sphere"
+        if found == "none":
+            return Space(None, self.spacing, cones)
+        if found == "ndc":
+            if not isinstance(own, Perspective):
+                raise SceneError(f"{self.name}: contraction ndc needs forward-facing cameras, the scene is {self.kind}")
+            return Space(replace(own, centre=own.centre.to(device), axes=own.axes.to(device)), self.spacing, cones)
+        if self.box is not None:
+            sphere = Contraction(self.box.mean(0).to(device), float((self.box[1] - self.box[0]).norm()) / 2)
+        elif own is not None:
+            sphere = Contraction(own.centre.to(device), own.near if isinstance(own, Perspective) else own.radius)
+        else:
+            radius = float(self.train.cameras.origins.norm(dim=-1).max())
+            if radius == 0:
+                raise SceneError(f"{self.name}: contraction sphere needs cameras in several places, all are in one")
+            sphere = Contraction(torch.zeros(3, device=device), radius)
+        return Space(sphere, self.spacing, cones, sphere.radius if self.kind == "unbounded" else None)
+
+    def cube(self, space: Space) -> tuple[tuple[float, ...], ...]:
+        """The corners of the space that networks see: a cube around the box, or that of a contraction.
+
+        In a box with unequal sides, the cells of a hash grid would be as much finer along the short ones, where the
+        images show nothing finer: in a city five times, at the cost of entries.
+
+        Raises:
+            SceneError: For a scene without a box that is not contracted.
+        """
+        if space.contraction is not None:
+            box = space.contraction.cube
+        elif self.box is not None:
+            middle, half = self.box.mean(0), (self.box[1] - self.box[0]).amax() / 2
+            box = torch.stack((middle - half, middle + half))
+        else:
+            raise SceneError(f"{self.name}: has no box, a field that covers space needs contraction sphere or auto")
+        return tuple(tuple(round(x, 6) for x in corner) for corner in box.tolist())
+
+    def pixel(self, space: Space) -> float:
+        """Width of a pixel of the training views at the middle of the scene: distance / focal length, in scene units.
+
+        In normalised device coordinates it is the same at all distances.
+        """
+        cameras = self.train.cameras
+        focal = float(cameras.intrinsics[:, :2].mean())
+        if isinstance(space.contraction, Perspective):
+            return 1 / (focal * max(space.contraction.slopes))
+        if self.kind in ("forward", "inside-out"):
+            return 2 / (1 / self.near + 1 / self.far) / focal
+        centre = torch.zeros(3) if self.contraction is None else self.contraction.centre
+        centre = centre if self.box is None else self.box.mean(0)
+        distance = float((cameras.origins - centre).norm(dim=-1).mean()) or self.near  # of a panorama from one place
+        return distance / focal

@@ -16,15 +16,15 @@ from torch import Tensor, nn
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.store import Pages
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.defaults import resolve, space_of, why_no_occupancy
+from voronerf.app.train.defaults import resolve, why_no_occupancy
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.field import DirectionPerSample, Field
 from voronerf.nerf.loss import RayLoss, RenderOutput
-from voronerf.nerf.occupancy import OccupancyGrid
+from voronerf.nerf.occupancy import PICTURE_OPACITY, TRAINING_OPACITY, OccupancyGrid
 from voronerf.nerf.renderer import Renderer
-from voronerf.nerf.samplers import DECAY, SAMPLERS, Occupancy, Sampler
+from voronerf.nerf.samplers import SAMPLERS, Occupancy, Sampler
 from voronerf.nerf.schedule import learning_rate, next_rays
 from voronerf.nerf.split import SplitStrategy
 from voronerf.ops import Guard
@@ -34,17 +34,6 @@ from voronerf.router import VoronoiRouter
 
 #: Temperature of the stochastic assignment, in scene units.
 TEMPERATURE = 0.05
-#: Voxels of the occupancy grid along each axis, of a box and of contracted space, which is all the world.
-RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
-#: A voxel is empty if a sample in it would take less of the light than this, were the voxel that dense throughout: for
-#: pictures of a field that was trained without a grid, and in training with one. Most of what a young field has spread
-#: through empty space lies between the two, and would keep a third of the samples.
-LEAST_OPACITY, TRAINING_OPACITY = 0.02, 0.05
-#: The same of a voxel of contracted space, for the light on its way through the whole voxel.
-CONTRACTED_OPACITY = 0.1
-#: How many samples in a row empty a new voxel: about thirty steps, until which the field has said nothing about most.
-#: In contracted space fewer: what stays there is fog before the cameras, which explains one view and spoils the others.
-PATIENCE, CONTRACTED_PATIENCE = 8, 4
 #: Of a grid made for pictures alone: voxels along each axis, and points evaluated in each.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
@@ -336,10 +325,11 @@ def make_renderer(
         backend: Of the operations; None for that of the configuration.
 
     Raises:
-        ConfigError: For a contraction that the scene does not allow.
+        SceneError: For a contraction that the scene does not allow.
     """
     device, backend = next(routers["field"].parameters()).device, backend or config.backend
-    space, counts = space_of(config, scene, device), samples or config.samples or ()
+    space = scene.space(config.contraction, cones=config.field_type.cones, device=device)
+    counts = samples or config.samples or ()
     sampler: Sampler
     if grid is None:
         sampler = SAMPLERS[config.sampling](*counts, space=space, backend=backend)
@@ -360,27 +350,18 @@ def make_grid(
     scene: Scene,
     device: torch.device | str = "cpu",
     resolution: int | None = None,
-    least_opacity: float = TRAINING_OPACITY,
+    opacity: float = TRAINING_OPACITY,
 ) -> OccupancyGrid:
     """A grid over the scene's box, or over the cube of its contraction, that is occupied everywhere.
-
-    A voxel is empty below the density with which an average stratum, the box's diagonal divided by the samples of a
-    ray, takes ``least_opacity`` of the light; in contracted space, with which the voxel takes `CONTRACTED_OPACITY`.
 
     Raises:
         ConfigError: When the scene has no box and is not contracted.
     """
-    contraction, samples = space_of(config, scene, device).contraction, (config.samples or (0,))[0]
-    if contraction is not None:
-        box, size, patience = contraction.cube, resolution or CONTRACTED_RESOLUTION, CONTRACTED_PATIENCE
-        threshold = -math.log1p(-CONTRACTED_OPACITY) * size / float(box[1, 0] - box[0, 0])
-    elif scene.box is not None:
-        box, size, patience = scene.box, resolution or RESOLUTION, PATIENCE
-        threshold = -math.log1p(-least_opacity) * samples / float((box[1] - box[0]).norm())
-    else:
+    contraction = scene.space(config.contraction, device=device).contraction
+    if contraction is None and scene.box is None:
         raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
-    remembered = DECAY**-patience
-    return OccupancyGrid(box, size, threshold=threshold, remembered=remembered, contraction=contraction, device=device)
+    samples, given = (config.samples or (0,))[0], {"resolution": resolution, "opacity": opacity, "device": device}
+    return OccupancyGrid.for_training(scene.box, samples, contraction=contraction, **given)  # type: ignore[arg-type]
 
 
 def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> OccupancyGrid:
@@ -392,7 +373,7 @@ def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> 
     obstacle = why_no_occupancy(config)
     if obstacle is not None:
         raise ConfigError(f"--occupancy does not work with {obstacle}")
-    grid = make_grid(config, scene, renderer.device, PICTURE_RESOLUTION, LEAST_OPACITY)
+    grid = make_grid(config, scene, renderer.device, PICTURE_RESOLUTION, PICTURE_OPACITY)
     generator = torch.Generator().manual_seed(0)
     for points in range(PICTURE_POINTS):
         grid.update(renderer.field, decay=float(points > 0), generator=generator, backend=renderer.backend)
