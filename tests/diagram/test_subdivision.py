@@ -101,12 +101,6 @@ def test_options_reach_the_balancing_and_depth_grows():
     assert imbalance(deeper.balances[1].after) == deeper.balances[1].imbalance_after
 
 
-def test_same_generator_same_split():
-    points, importance = three_clouds()
-    first, second = (split_diagram(ROOT, points, importance, 8, generator=seeded(1), steps=20) for _ in "ab")
-    assert torch.equal(first.diagram.centres, second.diagram.centres)
-
-
 def test_bad_input_gets_one_clear_line():
     points, importance = three_clouds((2, 2, 2))
     for arguments, message in (

@@ -19,21 +19,10 @@ def draw_cell(
 ) -> Tensor:
     """A leaf for every point, drawn at random by its distances to the centres, level by level.
 
-    On each level the first centre is drawn up to which the probabilities sum to at least 1 - u, where u is the uniform
-    number of the point for that level. A point that is not finite, or whose squared distances overflow, goes to the
-    first centre on every level. Distances to all centres of the tree are taken once; at each level those of other
-    diagrams have no mass.
-
-    Args:
-        points: float32 or float64 [n, 3].
-        centres: [m, 3], finite.
-        child_offsets: int32 [g + 1], and
-        child: int32 [m]: the tree, as in `ops.locate_cell`.
-        uniforms: [n, levels of the tree], in 0 to 1; other values are clamped, and NaN counts as 0.
-        temperature: above 0, finite, in scene units.
-
-    Returns:
-        leaf int32 [n].
+    On each level the first centre is drawn up to which the probabilities sum to at least 1 - u, u being the uniform
+    number of the point for that level: uniforms [n, levels], in 0 to 1 (NaN counts as 0). A point that is not finite,
+    or whose squared distances overflow, goes to the first centre on every level. Points are float32 or float64 [n, 3], the
+    tree is as in `ops.locate_cell`, the temperature is positive and finite, in scene units. Leaves are int32 [n].
     """
     # Neither 0 nor infinite in float32: the nearest centre's mass is 1 at any temperature.
     temperature = min(max(temperature, 1e-37), 3e38)

@@ -13,17 +13,10 @@ from torch import Tensor
 
 @torch.no_grad()
 def select_heaviest(points: Tensor, importance: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The samples of largest importance, heaviest first; no device value is read on the host.
+    """The `count` samples of largest importance, heaviest first, of float32 [n, 3] and [n]: at most n of them.
 
-    A sample counts if its importance is positive and finite and its point is finite.
-
-    Args:
-        points: float32 [n, 3].
-        importance: float32 [n].
-        count: at least 1.
-
-    Returns:
-        (points [q, 3], importance [q]) with q = min(count, n); the last rows are 0 if fewer samples count.
+    A sample counts if its importance is positive and finite and its point is finite; the last rows are 0 if fewer
+    count. No device value is read on the host.
     """
     # What is finite differs from itself by 0, the rest by NaN: less than half the time of isfinite and all.
     x, y, z = points.unbind(1)
@@ -44,7 +37,7 @@ class SampleReservoir:
 
     Attributes:
         capacity: number of samples asked for.
-        batches: number of batches that share it.
+        batches: number of batches that share it: those of one epoch, or of the time between two subdivisions.
         quota: samples kept of each batch.
 
     Examples:
@@ -61,16 +54,7 @@ class SampleReservoir:
     """
 
     def __init__(self, capacity: int = 10_000, batches: int = 100, *, device: torch.device | str = "cpu") -> None:
-        """Makes an empty reservoir.
-
-        Args:
-            capacity: samples to keep in all, >= 1.
-            batches: batches that share the capacity, >= 1: those of one epoch, or of the time between two subdivisions.
-            device: where the samples are held.
-
-        Raises:
-            ValueError: capacity or batches below 1.
-        """
+        """Makes an empty reservoir for so many samples of so many batches, both at least 1, or raises ValueError."""
         if capacity < 1 or batches < 1:
             raise ValueError(f"SampleReservoir: capacity and batches must be at least 1, got {capacity} and {batches}")
         self.capacity, self.batches = capacity, batches
@@ -84,7 +68,7 @@ class SampleReservoir:
 
         Args:
             points: floating [..., 3], scene units.
-            importance: floating [...], the leading shape of `points`; any scale, since only ratios count.
+            importance: floating [...]; any scale, since only ratios count.
 
         Raises:
             ValueError: shapes that do not match.

@@ -316,12 +316,7 @@ class VoronoiDiagram(nn.Module):
 
 
 def _check_centres(centres: Tensor) -> None:
-    """Checks a table of centres [any number, 3].
-
-    Raises:
-        ValueError: a wrong shape, or a value that is not finite.
-        TypeError: not a floating-point tensor.
-    """
+    """Raises ValueError or TypeError unless centres are floating and finite, [any number, 3]."""
     if not isinstance(centres, Tensor) or not centres.is_floating_point():
         got = centres.dtype if isinstance(centres, Tensor) else type(centres).__name__
         raise TypeError(f"VoronoiDiagram: centres must be a floating-point tensor, got {got}")
