@@ -21,8 +21,8 @@ def draw_cell(
 
     On each level the first centre is drawn up to which the probabilities sum to at least 1 - u, u being the uniform
     number of the point for that level: uniforms [n, levels], in 0 to 1 (NaN counts as 0). A point that is not finite,
-    or whose squared distances overflow, goes to the first centre on every level. Points are float32 or float64 [n, 3], the
-    tree is as in `ops.locate_cell`, the temperature is positive and finite, in scene units. Leaves are int32 [n].
+    or whose squared distances overflow, goes to the first centre on every level. Points are float32 or float64 [n, 3],
+    the tree is as in `ops.locate_cell`, the temperature is positive and finite, in scene units. Leaves are int32 [n].
     """
     # Neither 0 nor infinite in float32: the nearest centre's mass is 1 at any temperature.
     temperature = min(max(temperature, 1e-37), 3e38)

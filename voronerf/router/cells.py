@@ -29,7 +29,7 @@ def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
 
 
 def detach_results(module: nn.Module, memo: dict[int, Any]) -> None:
-    """Has ``copy.deepcopy`` take copies without a graph of the results that a module keeps."""
+    """Adds detached copies of the results that a module keeps to the memo of ``copy.deepcopy``."""
     for part in module.modules():
         for value in vars(part).values():
             if isinstance(value, Tensor) and not value.is_leaf:
@@ -62,7 +62,7 @@ def _refusal(part: nn.Module) -> str:
 
 
 def stack_parameters(module: nn.Module, k: int, share: Sequence[str]) -> None:
-    """Gives every parameter of a module k equal entries, in place, but for those that the patterns ``share`` name."""
+    """Stacks every parameter of a module k times, in place, but for those that the patterns ``share`` name."""
     named = list(module.named_parameters(remove_duplicate=False))
     for pattern in share:
         if not any(fnmatch.fnmatchcase(name, pattern) for name, _ in named):

@@ -41,7 +41,7 @@ def number_of(router: nn.Module) -> int:
 
 
 def graph_of(result: Any, layout: Layout) -> Graph | None:
-    """What a call returns that gave this as its module saw it; None for other than tensors in tuples, lists, dicts."""
+    """The graph of a call with this result, or None unless it holds tensors in tuples, lists and dicts only."""
     found, count = tensors_of(result), itertools.count()
     structure, lead = _structure(result, count), 1 if layout.flat else len(layout.lead)
     if structure is None or next(count) != len(found):
@@ -50,7 +50,7 @@ def graph_of(result: Any, layout: Layout) -> Graph | None:
 
 
 def spec_of(args: Any, kwargs: Any) -> Spec | None:
-    """What a call is like apart from its tensors; None where an argument is no tensor, number, string or None."""
+    """A call without its tensors, or None if an argument is no tensor, number, string or None."""
     spec: list[Any] = []
     for name, value in [*[(None, value) for value in args], *kwargs.items()]:
         if isinstance(value, Tensor):
@@ -151,7 +151,7 @@ _routed_backward.register_fake(
 
 @contextlib.contextmanager
 def _recorded() -> Iterator[None]:
-    """Has autograd record inside of an operation, which PyTorch runs below it."""
+    """Lets autograd record inside of an operation, which PyTorch runs below it."""
     keys = (torch._C.DispatchKey.AutogradFunctionality, torch._C.DispatchKey.ADInplaceOrView)
     with contextlib.ExitStack() as stack:
         for key in keys:

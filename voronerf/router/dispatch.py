@@ -60,7 +60,7 @@ class CallPlan:
     wait: int = 0
 
     def postpone(self) -> None:
-        """Has the next calls run cell by cell, twice as many each time."""
+        """Runs the next calls cell by cell, twice as many each time."""
         self.skip, self.wait = self.wait, 2 * self.wait or 1
 
 
@@ -132,7 +132,7 @@ class Dispatch:
         return plan
 
     def _choose(self, plan: CallPlan, call: Call, grouping: Grouping) -> tuple[Way, str]:
-        """The way of a call, and what there is to say about it."""
+        """The way of a call, and why."""
         n, k = call.layout.n, grouping.k
         ways = [way for way in plan.ways if k > 1 or not isinstance(way, Grouped)]
         if plan.skip:
@@ -216,7 +216,7 @@ class Dispatch:
 
 
 def _kind_of(call: Call, device: torch.device, fused: bool) -> Any:
-    """What tells kinds of calls apart: types and sizes of the arguments but for the number of samples, and modes.
+    """The key of a plan: modes, and types and sizes of the arguments but for the number of samples.
 
     Numbers count by their value only where they would go into a fused network.
     """

@@ -104,7 +104,7 @@ class Double:
         return placed
 
     def own_buffers(self) -> None:
-        """Has the double write into buffers of its own."""
+        """Gives the double buffers of its own."""
         for part in self.module.modules():
             part._buffers = {name: None if b is None else b.clone() for name, b in part._buffers.items()}
 
@@ -124,7 +124,7 @@ def _collect(module: nn.Module, parts: dict[int, nn.Module]) -> None:
 
 
 def _twin(part: nn.Module) -> nn.Module:
-    """An empty object in the place of a part; the part itself where it has nothing that changes."""
+    """An empty object for a part, or the part itself if it holds nothing that changes."""
     empty = not (part._parameters or part._modules or part._buffers)
     if (empty and type(part).__module__.startswith(_LAYERS)) or isinstance(part, torch.jit.ScriptModule):
         return part
@@ -133,7 +133,7 @@ def _twin(part: nn.Module) -> nn.Module:
 
 
 def _versions(placed: list[tuple[dict[str, Any], str, Any]]) -> list[int]:
-    """How often each tensor was written into; a loop over cells asks some hundred times a call."""
+    """The version counter of each tensor; a loop over cells reads it some hundred times a call."""
     try:
         return [value._version for _, _, value in placed]
     except RuntimeError:  # of those of inference mode nobody knows

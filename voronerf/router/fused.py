@@ -27,7 +27,7 @@ from voronerf.router.lower import Entries, Lowering, NotAStep
 from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiable
 
 
-class Taken:
+class ParameterEntries:
     """A parameter of a program: numbered entries of a parameter, [o, i] or [w], which is a tensor or a node's value."""
 
     def __init__(self, of: Any, codes: Tensor) -> None:
@@ -55,7 +55,7 @@ class Run:
 
     program: Program
     inputs: list[Any] = field(default_factory=list)  # nodes, or values of earlier runs
-    parameters: list[Taken] = field(default_factory=list)
+    parameters: list[ParameterEntries] = field(default_factory=list)
     outputs: list[Any] = field(default_factory=list)
 
 
@@ -123,7 +123,7 @@ class Fused:
                 self._entries.pop(value, None)
 
     def _at(self, node: fx.Node) -> int:
-        """The first run before which a value is there."""
+        """The first run that can read a value."""
         if node in self._ready:
             return self._ready[node]
         lowering, found = self._lowering, [0]
@@ -183,7 +183,7 @@ class Fused:
             self._entries[value] = known_as
 
     def _needed(self) -> set[fx.Node]:
-        """The nodes that PyTorch computes; notes what they and the results read of steps, and the steps for that."""
+        """The nodes that PyTorch computes; collects the steps whose values they and the results read."""
         needed: set[fx.Node] = set()
         lowering, steps = self._lowering, self._lowering.builder.steps
         self._made: dict[fx.Node, Columns] = {}
@@ -224,7 +224,7 @@ class Fused:
         return self._lowering.operand(turned[0] & ((1 << 32) - 1))
 
     def _only_moves(self, node: fx.Node) -> bool:
-        """Whether a value is made of what PyTorch makes without any step."""
+        """Whether a value only rearranges values of PyTorch."""
         lowering = self._lowering
         numbers = lowering.order(self._entries[node].codes)[1].tolist()
         return all(lowering.columns[i][0] in lowering.sources for i in numbers)
@@ -310,7 +310,7 @@ class Fused:
 
 
 def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outputs: list[Any]) -> Run:
-    """Some steps of all as a program of their own."""
+    """A program of some of the steps, with numbers of its own."""
     b, run = Builder(), Run(Program((), (), (), ()), outputs=outputs)
     values: dict[int, int] = {}
     parameters: dict[int, int] = {}
@@ -318,7 +318,7 @@ def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outp
     def parameter(index: int) -> int:
         if index not in parameters:
             parameters[index] = b.parameter(*lowering.builder.parameters[index])
-            run.parameters.append(Taken(*lowering.parameters[index]))
+            run.parameters.append(ParameterEntries(*lowering.parameters[index]))
         return parameters[index]
 
     def columns(c: Columns) -> Columns:

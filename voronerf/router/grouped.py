@@ -35,7 +35,7 @@ _RULES: dict[Any, Rule] = {}
 
 
 def find(names: str, *places: Any) -> frozenset[Any]:
-    """The functions of these names in modules or classes, as far as they are there."""
+    """The functions of these names that modules or classes have."""
     found = (getattr(place, name, None) for place in places for name in names.split())
     return frozenset(function for function in found if function is not None)
 
@@ -86,7 +86,7 @@ def without_randomness(func: Any, args: Any, kwargs: Any) -> Any:
 
 
 def register(function: Any, rule: Rule) -> None:
-    """Says how a function that meets parameters runs for all cells at once.
+    """Registers how a function that takes parameters runs for all cells at once.
 
     Without a rule, a call of a module that uses the function is a loop over cells.
 
@@ -158,7 +158,7 @@ class PerCell(torch.Tensor):
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
-        """Refuses what did not pass through the mode."""
+        """Raises TypeError for functions outside of a routed call."""
         raise TypeError(
             f"VoronoiRouter: {func} met the parameters of all cells outside of a routed call; call the router, or take "
             "one cell's module with cell(i)"
@@ -202,7 +202,7 @@ def writes_in_place(function: Any) -> bool:
 
 
 def user_line() -> str:
-    """Where the routed module is just now: file, line and code; empty where no code of its own is on the stack."""
+    """File, line and code of the routed module on the stack, or an empty text."""
     frame, inside = inspect.currentframe(), False
     while frame is not None:
         file = frame.f_code.co_filename
@@ -255,7 +255,7 @@ class GroupedRun(TorchFunctionMode):
     # Marks ------------------------------------------------------------------------------------------------------------
 
     def mark(self, tensor: Tensor, tag: str = "") -> Tensor:
-        """Notes that a tensor depends on the samples; ``tag`` is "any" or "all" for such a reduction of them."""
+        """Marks a tensor as dependent on samples; ``tag`` is "any" or "all" for such a reduction of them."""
         setattr(tensor, _MARK, (self._token, tag))
         self.widest = max(self.widest, tensor.numel() * tensor.element_size())
         return tensor
@@ -293,7 +293,7 @@ class GroupedRun(TorchFunctionMode):
         return result
 
     def _check_read(self, func: Any, result: Any, source: Tensor) -> None:
-        """Refuses values of samples on the host, which a loop over cells would read for each cell alone."""
+        """Raises for values of samples read on the host, which a loop over cells reads for each cell alone."""
         if result is None or isinstance(result, (str, torch.dtype, torch.device, torch.Size)):
             return
         # If no sample of all has a property, then no sample of any cell has it; if all have, all of each cell have.
@@ -319,11 +319,11 @@ class GroupedRun(TorchFunctionMode):
 
 
 class Way(Protocol):
-    """How the calls of a kind are carried out.
+    """One way to run a call.
 
     Attributes:
         name: "fused", "grouped" or "cell by cell".
-        why: What stands in the way of a faster one; empty for nothing.
+        why: Why no faster one runs, or empty.
     """
 
     name: str

@@ -190,7 +190,7 @@ def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
 
 @functools.cache
 def keep_freed_memory() -> Any:
-    """Has the C library keep what a step frees, so that the next one does not wait for the same pages again.
+    """Lets the C library keep freed memory, so that the next step does not wait for the same pages again.
 
     Gives the compiled module, or None where there is none: then it is left as it is.
     """
@@ -221,7 +221,7 @@ def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
 
 
 class _Cells(torch.autograd.Function):
-    """The tensors of cells, whose gradients are put together in memory of :func:`empty_like`."""
+    """The tensors of cells; their gradients are joined in memory of :func:`empty_like`."""
 
     @staticmethod
     def forward(stacked: Tensor) -> tuple[Tensor, ...]:

@@ -125,13 +125,13 @@ class Layout:
     shared: frozenset[str]  # names of the arguments that are the same for all samples
     flat: bool = False  # the module sees [n, f]
 
-    @property
+    @functools.cached_property
     def n(self) -> int:
         """Samples."""
         return math.prod(self.lead)
 
     def kind(self, name: str, tensor: Tensor, nested: bool) -> str:
-        """What a tensor has an entry for: each sample, each ray, or neither.
+        """Whether a tensor has an entry for each sample, for each ray, or is shared.
 
         Raises ValueError for one that fits two readings, or nothing and is not ``nested``, inside an object.
         """
@@ -243,7 +243,7 @@ class Call:
         return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
 
     def shared(self) -> list[Tensor]:
-        """The arguments that are the same for all samples, once it is known which they are."""
+        """The tensors that are the same for all samples; known after :meth:`changed`."""
         found: list[Tensor] = []
 
         def note(name: str, value: Any, nested: bool) -> Any:

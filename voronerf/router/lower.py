@@ -1,6 +1,6 @@
 """Functions of PyTorch as steps of a program.
 
-A function of the trace runs once on a few samples, and what it calls of ATen is taken down. A tensor that depends on
+A function of the trace runs once on a few samples, and what it calls of ATen is recorded. A tensor that depends on
 samples has a code for each of its entries, the number of its sample and of its column; what only moves entries (views,
 ``cat``, ``permute``) runs on the codes. A parameter has the number of the entry. Entries of one sample that are
 computed from others become a value of the program.
@@ -322,11 +322,11 @@ class Lowering:
 
 
 class _Recording(TorchDispatchMode):
-    """Takes down what a function calls of ATen."""
+    """Records the ATen functions that a function calls."""
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        """To be skipped by torch.compile is the default, and imports it at the first call, which takes a second."""
+        """The default, True, imports torch.compile at the first call, which takes a second."""
         return False
 
     def __init__(self, lowering: Lowering) -> None:
@@ -461,7 +461,7 @@ class _Recording(TorchDispatchMode):
         return Entries(numbers.reshape(moved).movedim(0, at).contiguous())
 
     def _copied(self, target: Tensor, source: Any) -> Entries:
-        """What a tensor becomes that another is written into."""
+        """The entries of a tensor after another is written into it."""
         before = self.entries(target)
         if before is None or before.of is not None:
             raise NotAStep("a write into a parameter or a constant")
@@ -550,7 +550,7 @@ class _Recording(TorchDispatchMode):
         return self._placed(made, places, result.shape)
 
     def _summed(self, tensor: Tensor, dims: Any, result: Tensor) -> Entries:
-        """Sums over entries of a sample, for which those of one sum are put next to each other."""
+        """Sums over entries of a sample; those of one sum are first put next to each other."""
         dims = [dims] if isinstance(dims, int) else dims or range(tensor.dim())
         dims = [d % tensor.dim() for d in dims]
         kept = [d for d in range(tensor.dim()) if d not in dims]

@@ -50,7 +50,7 @@ def move_state(
 
 
 def drop_state(optimizer: torch.optim.Optimizer) -> None:
-    """Lets an optimiser begin anew where its state has the shapes of other cells than the parameters have."""
+    """Resets the state of an optimiser where its shapes are not those of the parameters."""
     for group in optimizer.param_groups:
         for parameter in group["params"]:
             if is_stale(optimizer, parameter):
@@ -75,7 +75,7 @@ def is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
 
 
 def watch_optimizers(module: nn.Module, line: str) -> Any:
-    """Has an optimiser raise at its next step if it holds state of other cells than a module now has.
+    """Makes an optimiser raise at its next step if it holds state of other cells than a module now has.
 
     The message says to write ``line``. The handle's ``remove()`` ends the watch.
     """
@@ -105,7 +105,7 @@ _HELD: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = {}
 
 
 def freeze_cells(module: nn.Module, frozen: Tensor | None) -> None:
-    """Has every optimiser leave some cells of a routed module as they are, bool [k], or none.
+    """Makes every optimiser leave some cells of a routed module as they are, bool [k]; None for no cells.
 
     A stacked parameter is one tensor to an optimiser, which moves all of its cells: by weight decay and momentum also
     those without a gradient. What it changed in frozen cells is therefore put back after its step; an optimiser with

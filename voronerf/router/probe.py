@@ -229,7 +229,7 @@ def check_rays(call: Call) -> None:
 
 
 def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
-    """What the first cell's module returns for a few samples, seen as rays and as the router shows them."""
+    """What the first cell's module returns for a few samples as rays, and as the router passes them."""
     found: list[Tensor] = []
 
     def first(tensor: Tensor, kind: str) -> Tensor:

@@ -367,7 +367,7 @@ class VoronoiRouter(nn.Module):
         return parents
 
     def _watch_optimizers(self, line: str) -> None:
-        """Has an optimiser with the state of other cells raise at its next step, and say which ``line`` to write."""
+        """Makes an optimiser with the state of other cells raise at its next step, with the ``line`` to write."""
         if self._watch is not None:
             self._watch.remove()
         self._watch = watch_optimizers(self.module, line)
@@ -581,7 +581,7 @@ class VoronoiRouter(nn.Module):
     _route_uncompiled = not_compiled(_route_as_it_is, _NO_GRAPH)
 
     def _call(self, module: nn.Module, method: str, positions: Tensor, args: Any, kwargs: dict[str, Any]) -> Any:
-        """What a method gives with the parameters of a module, the router's own or a double of it."""
+        """Arranges the arguments, evaluates them by the router's module or a double of it, and restores results."""
         known = argument_names(getattr(module, method))
         names = [*known[: len(args)], *map(str, range(len(known), len(args)))]
 
@@ -618,7 +618,7 @@ class VoronoiRouter(nn.Module):
         return grouping
 
     def _where(self, positions: Tensor, coords: Tensor | None) -> dict[str, Any]:
-        """What tells ``routed_mlp`` the cells: themselves if they are drawn, or the diagram's tables."""
+        """Arguments of ``routed_mlp``: the cells if they are drawn, else the diagram's tables."""
         diagram = self.diagram
         if self.num_cells == 1:
             return {}

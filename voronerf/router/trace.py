@@ -1,7 +1,7 @@
 """One call of a module as a graph of functions.
 
 The number of samples is one that no other size is a multiple of. Every function that PyTorch's function modes see is
-taken down with the line that called it, and so is every custom function of autograd.
+recorded with the line that called it, and so is every custom function of autograd.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def rows_for(module: nn.Module, given: list[Tensor], primes: tuple[int, ...] = _
 
 
 class Trace(TorchFunctionMode):
-    """Takes down the functions that the routed module calls with its first cell's parameters.
+    """Records the functions that the routed module calls with its first cell's parameters.
 
     The ``meta`` of a node has its ``value``, what it depends on (``on``), its ``line`` in the module, whether gradients
     were on (``grad``), and whether it is its first argument, written to (``inplace``).
@@ -112,10 +112,10 @@ class Trace(TorchFunctionMode):
         return value
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return self.follow(func, args, kwargs or {})
+        return self.record(func, args, kwargs or {})
 
-    def follow(self, func: Any, args: Any, kwargs: Any) -> Any:
-        """Calls a function and takes it down."""
+    def record(self, func: Any, args: Any, kwargs: Any) -> Any:
+        """Calls a function and records it."""
         if self._running or func in METADATA:
             return func(*args, **kwargs)
         line, operands = user_line(), tensors_of((args, kwargs))
@@ -158,7 +158,7 @@ class Trace(TorchFunctionMode):
         return result
 
     def _part_from_gradients(self) -> None:
-        """Has what a gradient is taken by be a tensor between runs, and what follows be computed from it."""
+        """Makes what a gradient is taken by a tensor between runs, from which what follows is computed."""
         for node in list(self.graph.nodes):
             if node.target is not torch.autograd.grad:
                 continue
@@ -183,7 +183,7 @@ def _custom_functions(trace: Trace) -> Iterator[None]:
 
         def apply(cls: Any, *args: Any, **kwargs: Any) -> Any:
             function = super(base, cls).apply
-            return function(*args, **kwargs) if threading.get_ident() != here else trace.follow(function, args, kwargs)
+            return function(*args, **kwargs) if threading.get_ident() != here else trace.record(function, args, kwargs)
 
         with mock.patch.object(base, "apply", classmethod(apply)):
             yield
