@@ -17,7 +17,8 @@ import torch
 from harness import metadata
 from turns import Training
 
-from voronerf import Run, open_run, town
+from voronerf import town
+from voronerf.app import Run, open_run
 from voronerf.app.evaluate.panels import contact_sheet, picture_of_colour, save_picture
 from voronerf.app.scenes import Scene, city_scene
 from voronerf.app.train.config import TrainConfig

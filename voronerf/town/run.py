@@ -214,5 +214,5 @@ def _in_place(read: Scene, known: Scene) -> Scene:
         if names not in (own.names, tuple(f"0-{each}" for each in own.names)):
             return placed(read, known)
         cameras = replace(own.cameras, poses=recorded.cameras.poses[: len(own)].to(own.cameras.poses))
-        splits[name] = replace(own, cameras=cameras, names=names, sightings=None)
+        splits[name] = replace(own, cameras=cameras, names=names, sparse_depth=None)
     return replace(known, **splits)

@@ -9,18 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import refuses
+from helpers import refuses, trained
 from PIL import Image
 from scene_files import rewrite, write_capture, write_colmap, write_images, write_llff
 
-from voronerf import open_run
+from voronerf.app import open_run
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.scenes import SceneError, load_scene, photographs
-from voronerf.app.train.batches import RayBatches
-from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.networks import make_routers, resolve_config
-from voronerf.app.train.renderers import make_contraction, make_renderer
-from voronerf.app.train.trainer import Trainer
+from voronerf.app.train import ConfigError, TrainConfig
+from voronerf.app.train.build import make_batches, make_renderer, make_routers
+from voronerf.app.train.defaults import make_contraction, resolve
 from voronerf.nerf.cameras import Cameras, orbit_cameras
 
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
@@ -87,27 +85,28 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     write_both(tmp_path, [(48, 40) if index % 2 else (32, 56) for index in range(COUNT)])
     scene = load_scene(tmp_path, downscale=4)
     points = torch.from_numpy(POINTS) @ scene.transform[:3, :3].T + scene.transform[:3, 3]
-    config = resolve_config(TrainConfig(), scene)
+    config = resolve(TrainConfig(), scene)
     space = make_renderer(config, scene, make_routers(config, "cpu")).sampler.space
-    assert (config.sightings, space.full_gradient) == (0.003, 1.0)
-    assert (config.occupancy, config.occupancy_resolution, config.samples) == (True, 128, 256)
-    assert resolve_config(TrainConfig(budget=60), scene).samples == 128
-    batch = RayBatches(scene, torch.device("cpu"), sightings=True).draw(400, torch.Generator().manual_seed(0))
-    assert len(batch.rays) == 400 and len(batch.seen) == 100
+    assert (config.sparse_depth, space.full_gradient) == (0.003, 1.0)
+    assert config.occupancy and config.samples == (256,)
+    assert resolve(TrainConfig(budget=60), scene).samples == (128,)
+    batch = make_batches(config, scene).draw(400, torch.Generator().manual_seed(0))
+    assert len(batch.rays) == 400 and len(batch.sparse_depths) == 100
     rays = batch.rays[300:]
-    apart = torch.cdist(rays.origins + batch.seen[:, None] * rays.directions, points.float()).amin(1)
-    assert bool((apart <= 0.75 * batch.seen / scene.train.cameras.intrinsics[:, :2].min()).all())  # within their pixel
+    depths = batch.sparse_depths
+    apart = torch.cdist(rays.origins + depths[:, None] * rays.directions, points.float()).amin(1)
+    assert bool((apart <= 0.75 * depths / scene.train.cameras.intrinsics[:, :2].min()).all())  # within their pixel
     seen = sum(
         int(((places >= 0) & (places < torch.tensor(cameras.size(index)))).all(-1).sum())
         for cameras in [scene.train.cameras]
         for index in range(len(cameras))
         for places, _ in [cameras.project(points.float(), index)]
     )
-    assert len(scene.train.sightings.pixels) == seen > 100
-    without = replace(scene, train=replace(scene.train, sightings=None))
-    assert resolve_config(TrainConfig(), without).sightings == 0
-    with pytest.raises(ConfigError, match="--sightings needs a COLMAP model with points"):
-        resolve_config(TrainConfig(sightings=0.1), without)
+    assert len(scene.train.sparse_depth.pixels) == seen > 100
+    without = replace(scene, train=replace(scene.train, sparse_depth=None))
+    assert resolve(TrainConfig(), without).sparse_depth == 0
+    with pytest.raises(ConfigError, match="--sparse-depth needs a COLMAP model with points"):
+        resolve(TrainConfig(sparse_depth=0.1), without)
 
 
 @pytest.mark.parametrize(("kind", "turn"), [("forward", 0.0), ("inside-out", 180.0), ("unbounded", 0.0)])
@@ -139,7 +138,7 @@ def test_images_of_different_sizes_train_and_are_scored_as_they_are(tmp_path):
         width, height = sizes[int(name)]
         assert cameras.size(index) == (width, height) and len(cameras.image_rays(index)) == width * height
         assert scene.train.truth(index, None).shape == (height, width, 3)
-    batches = RayBatches(scene, torch.device("cpu"))
+    batches = make_batches(TrainConfig(), scene)
     assert len(batches) == sum(w * h for number, (w, h) in enumerate(sizes) if number % 8)
     batch = batches.draw(500, torch.Generator().manual_seed(0))
     numbers = (batch.target * 255).round()
@@ -157,7 +156,7 @@ def test_masks_leave_pixels_out_of_training_and_scores(tmp_path):
     Image.fromarray(mask).save(tmp_path / "mask.png")
     rewrite(tmp_path, lambda contents: [frame.update(mask_path="mask.png") for frame in contents["frames"]])
     scene = load_scene(tmp_path)
-    assert len(RayBatches(scene, torch.device("cpu"))) == 7 * 60
+    assert len(make_batches(TrainConfig(), scene)) == 7 * 60
     assert torch.equal(scene.test.mask(0), torch.from_numpy(mask > 0))
     assert int(load_scene(tmp_path, downscale=4).train.masks[0].sum()) == 2  # a block with a black pixel is left out
     for change, reason in (
@@ -179,8 +178,8 @@ def test_the_corners_that_a_fisheye_does_not_reach_are_left_out(tmp_path):
     scene = load_scene(tmp_path)
     y, x = torch.meshgrid(torch.arange(20) - 9.5, torch.arange(20) - 9.5, indexing="ij")
     assert torch.equal(scene.train.masks[0], torch.hypot(x, y) < 7.3)
-    short = {"steps": 4, "cells": (), "width": 8, "rays": 32, "samples": 8, "evaluations": 1}
-    summary = Trainer(TrainConfig(out=tmp_path / "run", **short), scene).run()
+    short = {"steps": 4, "cells": (), "width": 8, "rays": 32, "samples": (8,), "evaluations": 1}
+    summary = trained(TrainConfig(out=tmp_path / "run", **short), scene)
     assert 0 < summary["psnr"] < 100 and 0 < summary["ssim"] < 1
 
 
@@ -234,7 +233,7 @@ def test_a_forward_facing_scene_fills_the_cube_of_its_contraction(tmp_path):
     write_llff(tmp_path, poses, SIZE, 20.0, (2.0, 6.0))
     for normalise in (True, False):
         scene = load_scene(tmp_path, normalise=normalise)
-        assert resolve_config(TrainConfig(), scene).contraction == "ndc"
+        assert resolve(TrainConfig(), scene).contraction == "ndc"
         space = make_contraction(scene, "ndc")
         places = []
         for index in range(7):
@@ -263,14 +262,13 @@ def test_a_folder_trains_is_scored_and_opened_again(tmp_path):
         contents["frames"][1]["mask_path"] = "mask.png"
 
     rewrite(tmp_path / "scene", change)
-    short = {"steps": 6, "cells": (2,), "split_at": (0.5,), "width": 8, "rays": 32, "samples": 8, "evaluations": 1}
+    short = {"steps": 6, "cells": (2,), "split_at": (0.5,), "width": 8, "rays": 32, "samples": (8,), "evaluations": 1}
     config = TrainConfig(str(tmp_path / "scene"), out=tmp_path / "run", kind="inside-out", normalise=False, **short)
     scene = load_scene(config.data, **config.reading)
-    trainer = Trainer(config, scene)
-    summary = trainer.run()
-    (path, *_) = write_panels(trainer.renderer, trainer.router.diagram, scene, tmp_path, views=2)
-    assert path.is_file()
+    summary = trained(config, scene)
     run = open_run(config.out, data=config.data)
+    (path, *_) = write_panels(run.renderer, run.diagram, scene, tmp_path, views=2)
+    assert path.is_file()
     assert run.scene.kind == "inside-out" and run.scene.near == scene.near
     assert run.evaluate()["psnr"] == pytest.approx(summary["psnr"])
     assert run.render(0).colour.shape == scene.test.truth(0, None).shape
@@ -286,7 +284,7 @@ def broken(path, at, layout, *values):
     ("damage", "reason"),
     [
         (lambda model: broken(model / "images.bin", 0, "<Q", 2**60), "images.bin: is cut short or broken: 11529215"),
-        (lambda model: broken(model / "images.bin", 8 + 64 + 7, "<Q", 2**40), "sightings do not fit into"),
+        (lambda model: broken(model / "images.bin", 8 + 64 + 7, "<Q", 2**40), "observations do not fit into"),
         (lambda model: broken(model / "points3D.bin", 0, "<Q", 10**6), "points3D.bin: is cut short or broken: 1000000"),
         (lambda model: broken(model / "images.bin", 12, "<d", np.nan), "image 08.jpg: its pose must be a unit"),
         (lambda model: broken(model / "cameras.bin", 12, "<i", 77), "camera 1 has model number 77"),

@@ -6,23 +6,20 @@ import json
 import os
 import shutil
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from helpers import refuses
+from helpers import refuses, same, trained
 from PIL import Image
 from scene_files import write_blender, write_images
 
 from voronerf.app.cli import main
 from voronerf.app.scenes import SceneError, builtin_scene, city_scene, images, load_scene, store
 from voronerf.app.scenes.images import read_images, read_masks
-from voronerf.app.train.batches import RayBatches
-from voronerf.app.train.checkpoint import last_checkpoint
-from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.networks import resolve_config
-from voronerf.app.train.trainer import Trainer
+from voronerf.app.train import TrainConfig, last_checkpoint
+from voronerf.app.train.build import make_batches
+from voronerf.nerf import RayBatches
 
 
 @pytest.fixture(autouse=True)
@@ -38,11 +35,8 @@ def folder(tmp_path):
 
 
 def train(scene, out):
-    config = TrainConfig(
-        out=out, steps=4, cells=(4,), split_at_steps=(2,), width=8, rays=64, panels=0, evaluations=1, lpips=Path("off")
-    )
-    trainer = Trainer(config, scene)
-    return trainer.run()["psnr"], [p.detach() for router in trainer.routers.values() for p in router.parameters()]
+    config = TrainConfig(out=out, steps=4, cells=(4,), split_at=(2,), width=8, rays=64, evaluations=1)
+    return trained(config, scene)["psnr"], last_checkpoint(out).tensors
 
 
 def test_training_from_disk_is_that_from_memory(folder, tmp_path, cache):
@@ -51,13 +45,11 @@ def test_training_from_disk_is_that_from_memory(folder, tmp_path, cache):
     for part in ("train", "test"):
         assert torch.equal(getattr(disk, part).images, getattr(memory, part).images)
     assert torch.equal(disk.box, memory.box)
-    draws = [RayBatches(s, torch.device("cpu")).draw(200, torch.Generator().manual_seed(1)) for s in (memory, disk)]
+    draws = [make_batches(TrainConfig(), s).draw(200, torch.Generator().manual_seed(1)) for s in (memory, disk)]
     assert torch.equal(draws[0].rays.directions, draws[1].rays.directions)
     assert torch.equal(draws[0].target, draws[1].target)
-    graph = TrainConfig(device="cuda", cuda_graph=True, occupancy=False)
-    refuses("--cuda-graph must be off with images on disk", resolve_config, graph, disk, error=ConfigError)
     (first, ours), (second, theirs) = train(memory, tmp_path / "a"), train(disk, tmp_path / "b")
-    assert first == second and all(torch.equal(a, b) for a, b in zip(ours, theirs))
+    assert first == second and same(ours, theirs)
     city = [city_scene(4, train_views=2, test_views=1, images=place) for place in ("memory", "cached", "disk")]
     assert [s.train.on_disk for s in city] == [False, False, True]
     assert all(torch.equal(s.train.images, city[0].train.images) for s in city)

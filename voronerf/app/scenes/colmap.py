@@ -1,6 +1,6 @@
 """Reads COLMAP's sparse models: `cameras`, `images` and `points3D`, binary or text.
 
-c images, n points, s sightings of points in images. COLMAP's poses are world to camera, with axes x right, y down, z
+c images, n points, s observations of points in images. COLMAP's poses are world to camera, with axes x right, y down, z
 forward; ours are camera to world with OpenGL's axes. Every count of a file is compared with the bytes that are left, so
 that a broken one costs no memory.
 
@@ -33,7 +33,7 @@ FILES = ("cameras", "images", "points3D")
 MOST_BYTES = 2**31
 #: Points that fewer images than this have seen are too uncertain to tell where the scene is.
 LEAST_SEEN = 3
-#: Numbers of points from here on are none: COLMAP writes the largest, 2^64 - 1, where a sighting is of no point.
+#: Numbers of points from here on are none: COLMAP writes the largest, 2^64 - 1, where an observation is of no point.
 NO_POINT = 2**63
 #: Share of the points of a view that may be wrong, at either end, and how many it needs.
 OUTLIERS, LEAST_POINTS = 0.01, 20
@@ -161,7 +161,7 @@ def _cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
         yield number, _camera(path, number, name, width, height, reader.values(f"<{len(parameters.split())}d"))
 
 
-SIGHTING = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 RawImage = tuple[str, int, tuple[float, ...], Array]
 
 
@@ -170,7 +170,7 @@ def _images(path: Path) -> Iterator[RawImage]:
     for _ in range(reader.count(64 + 1 + 8, "images")):
         _, *values, camera = reader.values("<I7dI")
         name = reader.name()
-        seen = reader.records(reader.count(SIGHTING.itemsize, "sightings"), SIGHTING)["point"]
+        seen = reader.records(reader.count(OBSERVATION.itemsize, "observations"), OBSERVATION)["point"]
         yield name, camera, tuple(values), seen[seen >= 0]
 
 
@@ -179,7 +179,7 @@ def _points(path: Path) -> Iterator[tuple[int, float, float, float, int]]:
     for _ in range(reader.count(43 + 8, "points")):
         number, x, y, z = reader.values("<Q3d")
         reader.at += 3 + 8  # colour and error
-        seen = reader.count(8, "sightings")
+        seen = reader.count(8, "observations")
         reader.at += 8 * seen
         yield number, x, y, z, seen
 

@@ -21,7 +21,7 @@ from voronerf.app.scenes.carving import carve_box
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import read_images, read_masks
 from voronerf.app.scenes.lenses import PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
-from voronerf.app.scenes.scene import Scene, Sightings, Split
+from voronerf.app.scenes.scene import Scene, SparseDepth, Split
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
 from voronerf.nerf.cameras import Cameras, focus_point
 from voronerf.nerf.contraction import Contraction, Perspective
@@ -164,7 +164,7 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
         Split(cameras[part], images[part], names[part], None if masks is None else masks[part], on_disk)
         for part in (slice(count), slice(count, None))
     ]
-    parts[0] = replace(parts[0], sightings=find_sightings(parts[0], views[:count], frame))
+    parts[0] = replace(parts[0], sparse_depth=find_depths(parts[0], views[:count], frame))
     faults = camera_faults(poses[:, :3, 3], bounds, ((view.lens, view.size[0]) for view in views))
     if lost := int(lost_cameras(poses[:, :3, 3]).sum()):
         faults.append(f"{lost} of {len(poses)} lie far from all others")
@@ -189,7 +189,7 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
     )
 
 
-def find_sightings(split: Split, views: Sequence[View], frame: Frame) -> Sightings | None:
+def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDepth | None:
     """Where the views of a split see their points: those that lie in the image, and where the mask counts."""
     pixels, distances = [], []
     for index, view in enumerate(views):
@@ -205,7 +205,7 @@ def find_sightings(split: Split, views: Sequence[View], frame: Frame) -> Sightin
         distances.append((points - split.cameras.origins[index]).norm(dim=-1))
     if not sum(map(len, pixels)):
         return None
-    return Sightings(torch.cat(pixels), torch.cat(distances))
+    return SparseDepth(torch.cat(pixels), torch.cat(distances))
 
 
 @dataclass(frozen=True)

@@ -60,9 +60,9 @@ def placed(scene: Scene, known: Scene) -> Scene:
         if not torch.allclose(move, torch.eye(4, dtype=move.dtype), atol=1e-6):
             scale = float(torch.linalg.det(move[:3, :3]).abs()) ** (1 / 3)
             train, test = (replace(part, cameras=part.cameras.moved(move)) for part in (train, test))
-            if train.sightings is not None:
-                seen = train.sightings
-                train = replace(train, sightings=seen._replace(distances=scale * seen.distances))
+            if train.sparse_depth is not None:
+                seen = train.sparse_depth
+                train = replace(train, sparse_depth=seen._replace(distances=scale * seen.distances))
     elif known.transform is not None or scene.transform is not None:
         which = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
         raise SceneError(f"{scene.name}: must be in the frame of {known.name}, got one that is {which} (--normalise)")

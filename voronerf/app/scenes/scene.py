@@ -21,7 +21,7 @@ from voronerf.nerf.volume import Space
 KINDS = ("object", "forward", "inside-out", "unbounded")
 
 
-class Sightings(NamedTuple):
+class SparseDepth(NamedTuple):
     """Where images show points that are known, and how far from the camera they are.
 
     Attributes:
@@ -44,7 +44,7 @@ class Split:
         names: of the images, for tables and file names.
         masks: bool [c, h, w], False for pixels that are neither trained nor scored, or None.
         on_disk: images and masks are mapped from files, since they may not fit into memory; they are not written to.
-        sightings: of the points of a sparse model, or None.
+        sparse_depth: of the points of a sparse model, or None.
 
     Examples:
         >>> from voronerf.app.scenes import load_scene
@@ -59,7 +59,7 @@ class Split:
     names: tuple[str, ...]
     masks: Tensor | None = None
     on_disk: bool = False
-    sightings: Sightings | None = None
+    sparse_depth: SparseDepth | None = None
 
     def __len__(self) -> int:
         return len(self.names)

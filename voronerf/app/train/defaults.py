@@ -40,7 +40,7 @@ def resolve(config: TrainConfig, scene: Scene) -> TrainConfig:
     pixel = scene.pixel(space)
     if config.occupancy and (why_no_occupancy(config) is not None or not (boxed or contracted)):
         config = replace(config, occupancy=False)
-    points = scene.train.sightings is not None
+    points = scene.train.sparse_depth is not None
     if config.sparse_depth and not points:
         raise ConfigError(f"--sparse-depth needs a COLMAP model with points, got {config.sparse_depth:g} without")
     if config.sparse_depth is None:
