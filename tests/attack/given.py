@@ -21,12 +21,12 @@ from scene_files import write_colmap, write_images, write_llff
 #: Options of a training of some steps.
 TINY = shlex.split(
     "--steps 16 --cells 3 --split-at 0.5 --width 8 --depth 2 --rays 64 --samples 8 --evaluations 2 --eval-views 1 "
-    "--final-views 1 --panels 0 --lpips off --reservoir 200 --reservoir-batches 8 --min-cell-samples 2"
+    "--lpips off"
 )
 #: A field of plain networks, and the default one with a smaller hash grid.
 FIELDS = {
     "nerf": shlex.split("--field nerf --no-occupancy"),
-    "hashgrid": shlex.split("--field-options log2_entries=10 levels=3 --occupancy-resolution 8"),
+    "hashgrid": shlex.split("--field-options log2_entries=10 levels=3"),
 }
 #: Of the cameras, which look at the middle from 4 units away.
 POSE = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1]]

@@ -13,7 +13,8 @@ from attempts import REFUSED, RIGHT, Failed
 from hostile import damaged, flipped, json_text, mutated
 
 from voronerf.app.scenes import SceneError, load_scene
-from voronerf.app.train.batches import RayBatches
+from voronerf.app.train.build import make_batches
+from voronerf.app.train.config import TrainConfig
 
 
 def harmed_store(rng: random.Random, folder: Path, given: Path) -> str:
@@ -80,7 +81,7 @@ def link(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
 def cut(rng: random.Random, store: Path, scene: Path, outside: Path) -> None:
     """The file becomes shorter while a training reads it: the next batch says so."""
     used = load_scene(scene, images="disk")
-    batches = RayBatches(used, torch.device("cpu"))
+    batches = make_batches(TrainConfig(device="cpu"), used)
     os.truncate(store / "pixels", rng.randrange((store / "pixels").stat().st_size))
     try:
         batches.draw(64, torch.Generator().manual_seed(0))
