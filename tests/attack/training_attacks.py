@@ -155,9 +155,7 @@ def memory(rng: random.Random, folder: Path) -> str:
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     limit = taken + rng.randrange(1 << 20, 1 << 29)
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    large = rng.choice(
-        ("--width 64", "--width 2000", "--rays 20000", "--samples 500", "--seed 1")
-    )
+    large = rng.choice(("--width 64", "--width 2000", "--rays 20000", "--samples 500", "--seed 1"))
     return judged("train", "--data", "blender", "--out", folder / "run", *TINY, *FIELDS["nerf"], *large.split())
 
 

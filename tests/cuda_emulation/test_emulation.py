@@ -54,7 +54,10 @@ def script(name, sanitizer, *arguments):
     return run([str(HERE / name), str(build(sanitizer)), *arguments], sanitizer).stdout
 
 
-@pytest.mark.parametrize(("bug", "sanitizer", "expected"), BUGS)
+@pytest.mark.parametrize(
+    ("bug", "sanitizer", "expected"),
+    [pytest.param(*row, marks=() if row[1] == "none" else pytest.mark.slow) for row in BUGS],
+)
 def test_finds(bug, sanitizer, expected):
     found = verdict(module(), bug, 1) if sanitizer == "none" else script("bugs.py", sanitizer, bug, "1")
     if expected in ("data race", "heap-buffer-overflow"):
@@ -70,6 +73,7 @@ def calls(tmp_path_factory):
     return str(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [["address"], ["thread"], ["address", "hostile"]], ids=" ".join)
 def test_kernels_touch_nothing_outside_and_race_with_nobody(given, calls):
     """On the arguments of the ops' cases, and on hostile ones whatever the offsets say."""
@@ -77,6 +81,7 @@ def test_kernels_touch_nothing_outside_and_race_with_nobody(given, calls):
     assert found.splitlines() == ["clean"], found
 
 
+@pytest.mark.slow
 def test_operations_pass_their_tests_on_the_emulated_device():
     """The tests of the operations themselves; ``make emulate-cuda`` takes more seeds."""
     command = ["-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--emulate-cuda", "1", "-W", "ignore"]
