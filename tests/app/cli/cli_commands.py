@@ -2,7 +2,7 @@
 
 TINY = (
     "--downscale 6 --steps 16 --cells 3 --split-at 0.5 --width 8 --depth 2 --rays 64 --samples 8 --evaluations 2 "
-    "--eval-views 2 --final-views 2 --panels 1"
+    "--eval-views 2 --panels 1"
 )
 
 
