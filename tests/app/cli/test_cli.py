@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from types import SimpleNamespace
+from functools import partial
 
 import imageio_ffmpeg
 import pytest
@@ -18,11 +18,12 @@ from helpers import read_json
 from PIL import Image
 
 from voronerf.app.cli import main
+from voronerf.app.cli.display import TrainingDisplay
 from voronerf.app.cli.main import COMMANDS
 from voronerf.app.render.paths import CameraPath, write_camera_path
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.checkpoint import load_checkpoint
-from voronerf.app.train.trainer import Trainer
+from voronerf.app.train.loop import run as run_steps
 from voronerf.nerf import orbit_cameras
 
 
@@ -149,7 +150,8 @@ def test_folders_with_brackets_and_spaces_are_told_as_they_are(run, tmp_path, ca
 def test_demo_compares_two_runs(tmp_path, capsys, monkeypatch, fails):
     # A step takes ten milliseconds however busy the machine is.
     ticks = itertools.count()
-    monkeypatch.setattr("voronerf.app.train.trainer.time", SimpleNamespace(perf_counter=lambda: 0.0101 * next(ticks)))
+    clock = partial(run_steps, clock=lambda: 0.0101 * next(ticks))
+    monkeypatch.setattr("voronerf.app.cli.train.run", clock)
     monkeypatch.setattr("voronerf.app.cli.demo.PICTURE", 32)
     monkeypatch.setattr("voronerf.app.cli.demo.FRAME", 16)
     monkeypatch.setattr("voronerf.app.cli.demo.FRAMES", 4)
@@ -187,7 +189,7 @@ def test_bad_input_is_one_line(run, tmp_path, fails):
     small = "--downscale 20 --out", out
     fails("there is no such folder", "train --data", tmp_path / "none", *small)
     fails("is not a scene", "train --data", tmp_path, *small)
-    fails("--cells must be at least 2", "train --cells 0", *small)
+    fails("--cells must lie in 2..10000 on every level", "train --cells 0", *small)
     fails("--device must name a device", "train --device gpu", *small)
     fails("must not hold a run already", "train --downscale 20 --out", run)
     fails("--resume needs a checkpoint in --out: there is nothing to resume in", "train --resume", *small)
@@ -225,14 +227,13 @@ def test_what_files_say_is_shown_and_not_obeyed(tmp_path, capsys, name, shown):
 
 
 def test_arguments_that_a_terminal_would_obey(fails):
-    fails("arguments must have no control characters, got \\x1b[2J", "train --balance \x1b[2J")
+    fails("arguments must have no control characters, got \\x1b[2J", "train --centres \x1b[2J")
 
 
 def test_a_failed_run_leaves_its_folder_usable(tmp_path, fails):
     train = "train --data builtin --out", tmp_path
-    many = TINY.replace("--cells 3", "--cells 400 --reservoir 400 --reservoir-batches 10")
-    fails("more cells than samples", *train, many)
-    (tmp_path / "checkpoints" / "last.safetensors").unlink()
+    fails("more cells than samples", *train, TINY.replace("--cells 3", "--cells 10000"))
+    assert not list(tmp_path.rglob("*.safetensors"))
     succeeds(*train, TINY)
     assert (tmp_path / "metrics.jsonl").read_text().count("\n") == 2
 
@@ -267,11 +268,9 @@ def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, fails)
         ("--rays 1000000000 with 8 samples needs", "--rays 1000000000"),
         ("--rays 64 with 1000000000 samples needs", "--samples 1000000000"),
         ("samples needs 1180591620717411303424.0 GiB of memory or more", f"--samples {10**400}"),
-        ("--reservoir 1000000000000 needs", "--reservoir 1000000000000"),
-        ("--reservoir-batches 1000000000000 needs", "--reservoir-batches 1000000000000"),
     ):
         fails(message, train, given)
-    monkeypatch.setattr("voronerf.app.train.networks.SAMPLE_BYTES", 0)
+    monkeypatch.setattr(sys.modules["voronerf.app.train.build"], "SAMPLE_BYTES", 0)
     fails("count must be at most 2147483647, got 8000000000000", train, "--rays 8000000000000")
     monkeypatch.setitem(COMMANDS, "info", no_memory_to_import)
     fails("not enough memory; try a smaller --width", "info")
@@ -313,9 +312,8 @@ def test_signals_leave_a_usable_checkpoint(tmp_path, monkeypatch, capsys):
     output = process.communicate(timeout=600)[0].decode()
     leaves_a_checkpoint(process.returncode, output)
 
-    train_step = Trainer.train_step
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
-        monkeypatch.setattr(Trainer, "train_step", lambda t, n=number: (signal.raise_signal(n), train_step(t))[1])
+        monkeypatch.setattr(TrainingDisplay, "after_step", lambda *_, number=number: signal.raise_signal(number))
         before = signal.signal(number, signal.SIG_DFL)  # nohup, and the background of a shell, ignore some
         try:
             leaves_a_checkpoint(main(words("train --resume --out", tmp_path)), "".join(capsys.readouterr()))
@@ -326,12 +324,12 @@ def test_signals_leave_a_usable_checkpoint(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 def test_a_second_signal_ends_at_once(tmp_path, monkeypatch, capsys):
-    def interrupted(trainer):
+    def interrupt(display, state):
         signal.raise_signal(signal.SIGUSR1)
-        assert trainer.stopped
+        assert state.stopped
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Trainer, "train_step", interrupted)
+    monkeypatch.setattr(TrainingDisplay, "after_step", interrupt)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests without it
     try:
         assert main(words("train --data builtin --out", tmp_path, TINY)) == 130

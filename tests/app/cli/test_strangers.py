@@ -136,7 +136,7 @@ def test_shapes_are_compared_before_memory_is_taken(trained, tmp_path):
         change(run, checkpoint)
         save_checkpoint(path, checkpoint)
     code = (
-        "import resource, sys, time, voronerf.app.train.trainer; from voronerf.app.cli import main; "
+        "import resource, sys, time, voronerf.app.train; from voronerf.app.cli import main; "
         "most = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; "
         "before, start, sys.stderr = most(), time.process_time(), sys.stdout; "
         "[main(command) for run in sys.argv[1:] for command in (['eval', run], ['train', '--resume', '--out', run])];"
