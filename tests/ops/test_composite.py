@@ -193,25 +193,6 @@ def test_gradcheck():
     assert torch.autograd.gradgradcheck(run, (*packed, background))
 
 
-@pytest.mark.parametrize("form", ["dense", "packed"])
-def test_gradients_of_the_backend(device, backend, form):
-    inputs = [*rays(7, 19), torch.rand(7, 3)]
-    cotangents = [torch.randn(7, 3), torch.randn(7), torch.randn(7), torch.randn(7, 19)]
-
-    def gradients(dtype, device, backend):
-        leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs]
-        given = leaves[:4] if form == "dense" else [leaf.flatten(0, 1) for leaf in leaves[:4]]
-        ray_offsets = None if form == "dense" else offsets_of([19] * 7, device)
-        found = composite(*given, ray_offsets=ray_offsets, background=leaves[4], backend=backend)
-        weighed = sum((part * g.to(part).reshape(part.shape)).sum() for part, g in zip(found, cotangents))
-        return list(torch.autograd.grad(weighed, leaves))
-
-    exact = gradients(torch.float64, torch.device("cpu"), "reference")
-    plain = gradients(torch.float32, torch.device("cpu"), "reference")
-    for found, same, right in zip(gradients(torch.float32, device, backend), plain, exact):
-        assert_as_exact(found, same, right)
-
-
 @pytest.mark.parametrize("background", ["ray", "all", ""])
 def test_gradients_in_front_of_any_background(backend, background):
     for given in (dense(4, 33, 3, background), scene([3, 0, 130, 1], 2, background, outside=(2, 5))):

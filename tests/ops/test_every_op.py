@@ -263,6 +263,21 @@ def test_refuses(op, message):
         getattr(ops, name)(**{**given, **case.refused[message]})
 
 
+@pytest.mark.parametrize("backend", ["reference", "native"])
+@pytest.mark.parametrize("op", CASES)
+def test_refuses_offsets_that_are_no_offsets(op, backend):
+    case = CASES[op]
+    for kind in case.kinds.values() if backend in backends.implemented(op) else ():
+        given = case.make(Draw(**kind), 6)
+        for name in given.keys() & {"offsets", "ray_offsets"}:
+            last = len(given[name]) - 1
+            for place, wrong in ((0, -1), (last // 2, int(given[name][-1]) + 1), (last, 1000)):
+                bad = given[name].clone()
+                bad[place] = wrong
+                with pytest.raises(ValueError, match=rf"^\S+: {name} must rise[ ,].* number of .*, got "):
+                    getattr(ops, case.call or op)(**{**given, name: bad}, backend=backend)
+
+
 def shapes_of(name, call, given):
     """The shapes that a call checks, by the names of its tensors, and how often it speaks of each letter."""
     shapes, letters = {}, Counter()

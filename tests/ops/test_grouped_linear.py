@@ -83,14 +83,6 @@ def test_without_bias(device, backend):
     torch.testing.assert_close(found, expected)
 
 
-def test_identical_cells_are_one_layer(device, backend):
-    counts = COUNTS["unequal"]
-    x, weight, bias = (tensor.to(device) for tensor in layer(counts, 31, 8))
-    weight, bias = weight[:1].expand(4, -1, -1), bias[:1].expand(4, -1)
-    found = grouped_linear(x, offsets_of(counts, device), weight, bias, backend=backend)
-    torch.testing.assert_close(found, torch.nn.functional.linear(x, weight[0], bias[0]), rtol=1e-5, atol=1e-5)
-
-
 def test_rows_of_no_cell_are_zero(device, backend):
     x, weight, bias = (tensor.to(device).requires_grad_() for tensor in layer([3, 4, 5], 4, 2))
     offsets = torch.tensor([2, 5, 9], dtype=torch.int32, device=device)
@@ -180,11 +172,3 @@ def test_errors():
     refuses = refusals(grouped_linear, x=x, offsets=offsets, weight=weight)
     refuses("weight must have no empty dimension, got [2, 0, 4]", weight=weight[:, :0])
     refuses("activation must be one of none, relu, ..., sine, got 'tanh'", activation="tanh")
-
-
-@pytest.mark.parametrize("bad", [[0, 2, 6], [0, 4, 3], [-1, 2, 5]])
-def test_offsets_that_are_no_offsets_are_refused(backend, bad):
-    need("grouped_linear", backend, torch.device("cpu"), torch.float32)
-    x, weight, bias = layer([2, 3], 4, 5)
-    with pytest.raises(ValueError, match=r"^grouped_linear: offsets must rise from 0 or more to at most .* 5, got"):
-        grouped_linear(x, torch.tensor(bad, dtype=torch.int32), weight, bias, backend=backend)

@@ -9,7 +9,7 @@ from op_cases import COUNTS, FLOATS, need, offsets_of, refusals, refused
 from tolerances import assert_as_exact, error
 from torch import Tensor
 
-from voronerf.ops import frequency_encode, grouped_mlp, integrated_encode, spherical_harmonics
+from voronerf.ops import grouped_mlp, integrated_encode, spherical_harmonics
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
 pytestmark = pytest.mark.op("grouped_mlp")
@@ -153,15 +153,6 @@ def test_directions_of_each_sample_and_of_each_ray_agree(device, backend):
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_encoded_and_raw_positions_agree(device, backend):
-    case = Case.make("plain", COUNTS["odd"])
-    leaves = case.leaves(torch.float32, device)
-    raw = case.run(grouped_mlp, leaves, backend=backend)
-    case.table = MLP(case.table.layers, case.table.outputs)
-    encoded = case.run(grouped_mlp, [frequency_encode(leaves[0], 4), *leaves[1:]], backend=backend)
-    torch.testing.assert_close(raw, encoded, rtol=1e-5, atol=1e-5)
-
-
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])
 def test_harmonics_inside_and_before(device, backend, degree):
     case = Case.make("spherical", COUNTS["odd"])
@@ -204,17 +195,6 @@ def test_infinity_in_bfloat16_stays_what_it_is(device, backend, width, request):
     found = grouped_mlp(x.bfloat16(), offsets, half, [None, None], layers=table, backend=backend)
     assert found[1].tolist() == [2.0 * width] * 5
     assert found[0].nan_to_num(0.0).tolist() == [0.0] * 5 and (cuda or not bool(found.isnan().any()))
-
-
-def test_identical_cells_are_one_chain_of_layers(device, backend):
-    case = Case.make("plain", COUNTS["unequal"])
-    leaves = [tensor.to(device) for tensor in case.inputs]
-    leaves[2:] = [tensor[:1].expand_as(tensor) for tensor in leaves[2:]]
-    first, second, bias = (tensor[0] for tensor in leaves[2:])
-    hidden = torch.nn.functional.softplus(torch.nn.functional.linear(frequency_encode(leaves[0], 4), first, bias))
-    torch.testing.assert_close(
-        case.run(grouped_mlp, leaves, backend=backend), torch.nn.functional.linear(hidden, second), rtol=1e-4, atol=1e-5
-    )
 
 
 def test_wide_positions_with_half_weights_keep_their_octaves(device, backend):
@@ -326,15 +306,6 @@ def test_inputs_without_features_are_refused(device, backend):
     # What no layer reads may be empty.
     unread = MLP((Layer((DIRECTIONS,), 4, "relu"),), (0,))
     assert call(unread, 0, 3, directions=positions).shape == (5, 4)
-
-
-@pytest.mark.parametrize("bad", [[0, 2, 6], [0, 4, 3], [-1, 2, 5]])
-def test_offsets_that_are_no_offsets_are_refused(backend, bad):
-    need("grouped_mlp", backend, CPU, torch.float32)
-    case = Case.make("nerf", [2, 3])
-    case.offsets = torch.tensor(bad, dtype=torch.int32)
-    with pytest.raises(ValueError, match=r"^grouped_mlp: offsets must rise from 0 or more to at most .* 5, got"):
-        case.run(grouped_mlp, case.inputs, backend=backend)
 
 
 def test_errors():

@@ -151,13 +151,3 @@ def test_bad_arguments():
         render_loss(raw, deltas, offsets, target, density_scale=0.0)
     with refused(ValueError, "render_loss: hidden must lie in [0, 1), got 1.0"):
         render_loss(raw, deltas, offsets, target, hidden=1.0, **rest)
-
-
-def test_offsets_that_fall(backend):
-    raw, deltas, _, target, _ = rays([4, 2], torch.float32)
-    offsets = torch.tensor([0, 4, 3], dtype=torch.int32)
-    with refused(
-        ValueError,
-        "render_loss: ray_offsets must rise from 0 or more to at most the number of samples, 6, got 3 for ray 2",
-    ):
-        render_loss(raw, deltas, offsets, target, density_scale=SCALE, backend=backend)
