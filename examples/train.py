@@ -24,7 +24,7 @@ loss = RayLoss(renderer, sparse_depth=0.003)
 optimizer = Adam.of({"field": router}, lr=0.02, views=len(views), sparse=["features"])
 strategy = SplitStrategy({"field": router}, [PlannedSplit(at=0.2, children=16)], generator=random)
 where = {"near": scene.near, "far": scene.far, "box": scene.box, "background": scene.background_colour()}
-batches = RayBatches(views.cameras, views.images, masks=views.masks, sparse=views.sightings, **where)
+batches = RayBatches(views.cameras, views.images, masks=views.masks, sparse=views.sparse_depth, **where)
 rays, step, start = 512, 0, time.perf_counter()
 while (done := (time.perf_counter() - start) / seconds) < 1:
     strategy.step_pre_backward(optimizer, done, step)  # 16 cells, whose networks start as copies of the coarse one
