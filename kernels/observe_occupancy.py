@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import warp as wp
 
 from voronerf.kernels._launch import array, launch
-from voronerf.ops.observe_occupancy.reference import Observed
+from voronerf.ops._core.declare import declared
 
 wp.set_module_options({"enable_backward": False})
 
@@ -92,7 +94,8 @@ def _compare_kernel(
     occupied[cells[i]] = wp.where(density[cells[i]] >= threshold, wp.uint8(1), wp.uint8(0))
 
 
-def observe_occupancy(given: Observed) -> None:
+@declared("observe_occupancy").plain
+def observe_occupancy(given: Any) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
     density, m = given.density, given.positions.shape[0]
     cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)

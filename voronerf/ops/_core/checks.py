@@ -263,9 +263,9 @@ def check_positive(op: str, name: str, value: float) -> None:
 
 
 def check_interval(op: str, name: str, value: float, low: float, high: float, rule: str) -> None:
-    """`check_number`, and ValueError outside of an interval that ``rule`` writes, such as "[0, 1)"."""
+    """`check_number`, and ValueError outside of an interval that ``rule`` writes, "[0, 1)" or "0 to 1"."""
     check_number(op, name, value)
-    if not (low <= value < high or (value == high and rule.endswith("]"))):
+    if not (low <= value < high or (value == high and not rule.endswith(")"))):
         raise ValueError(f"{op}: {name} must lie in {rule}, got {value}")
 
 

@@ -17,10 +17,11 @@ their fake), their gradients (`Declaration.derivatives`), and the members of com
 
 A tensor is written as its dtypes and its shape. The dtypes are ``floating``, names of some (``float32|float64``),
 ``same`` as the first floating-point tensor, or ``wide``, the same but at least float32. The shape has numbers, letters,
-a letter plus one, and arguments that are integers; ``r?`` is a dimension that may be missing, with one row for all. Of
-``[m] if ray_offsets else [r, s]`` the first holds where that argument is given. In the shape of a result an entry is
+a letter plus one, and arguments that are integers. Of ``[3] or [r, 3]`` the first holds for a tensor of as many
+dimensions, of ``[m] if ray_offsets else [r, s]`` where that argument is given. In the shape of a result an entry is
 any expression of letters and arguments. An int is written as a range (``1..4``, ``0..``), a float as ``positive``, or
-an interval (``[0, 1)``), a str as its choices (``linear|disparity``).
+an interval (``[0, 1)``, ``0 to 1``), a str as its choices (``linear|disparity``). What is written by its class alone is
+an instance of it.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from __future__ import annotations
 import collections
 import inspect
 import re
+import types
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -88,19 +90,22 @@ class Shaped(NamedTuple):
     wide: bool = False
     condition: str = ""
     otherwise: tuple[int | str, ...] = ()
-    maybe: bool = False
+
+    @property
+    def either(self) -> bool:
+        """Whether it may have the one shape or the other."""
+        return bool(self.otherwise) and not self.condition
 
     @staticmethod
     def parse(text: str) -> Shaped:
         """Of what a signature says."""
-        found = re.fullmatch(r"([\w|]+) \[(.*?)\](?: if (\w+) else \[(.*)\])?", text)
+        found = re.fullmatch(r"([\w|]+) \[(.*?)\](?: (?:if (\w+) else|or) \[(.*)\])?", text)
         assert found is not None, f"a tensor is written as dtypes and a shape, got {text!r}"
         dtypes, shape, condition, otherwise = found.groups()
         known = _DTYPES.get(dtypes)
         if known is None:
             known = tuple(getattr(torch, name) for name in dtypes.split("|"))
-        entries = _entries(shape.replace("?", ""))
-        return Shaped(known, entries, dtypes == "wide", condition or "", _entries(otherwise or ""), "?" in shape)
+        return Shaped(known, _entries(shape), dtypes == "wide", condition or "", _entries(otherwise or ""))
 
 
 def _entries(text: str) -> tuple[int | str, ...]:
@@ -120,14 +125,13 @@ class Argument(NamedTuple):
         """The check of its value, as Python."""
         name, kind, rule, place = self.name, self.kind, self.rule, f"'{op}', '{self.name}', {self.name}"
         if kind is Tensor:
-            shape, entries = repr(rule.shape), "".join(f", {entry!r}" for entry in rule.shape)
-            if rule.condition:
-                shape = f"({shape} if {rule.condition} is not None else {rule.otherwise!r})"
-            if rule.maybe:
+            entries = "".join(f", {entry!r}" for entry in rule.shape)
+            if rule.otherwise:
+                question = f"{rule.condition} is not None" if rule.condition else f"{name}.dim() == {len(rule.shape)}"
+                entries = f", *({rule.shape!r} if {question} else {rule.otherwise!r})"
+            if rule.either:
                 yield f"check_tensor({place})"
-                shape = f"{shape}[{name}.dim() == {len(rule.shape) - 1} :]"
             dtypes = "wide" if rule.wide else f"{name}_dtypes"
-            entries = f", *{shape}" if rule.condition or rule.maybe else entries
             yield f"given.tensor('{name}', {name}, {dtypes}{entries})"
             if detach and (not rule.dtypes or {*rule.dtypes} & {*FLOATING}):
                 yield f"if {name}.requires_grad: {name} = {name}.detach()"
@@ -138,9 +142,9 @@ class Argument(NamedTuple):
         elif kind is float:
             yield f"{name}_rule({place})"
             yield f"{name} = float({name})"
-        else:
-            checks = {bool: f"check_flag({place})", str: f"check_choice({place}, {name}_rule)"}
-            yield checks.get(kind, f"check_kind({place}, {name}_kind)")
+        elif isinstance(kind, type):
+            kinds = {bool: f"check_flag({place})", str: f"check_choice({place}, {name}_rule)"}
+            yield kinds.get(kind, f"check_kind({place}, {name}_kind)")
 
 
 class Declaration:
@@ -150,6 +154,7 @@ class Declaration:
         name: of the op.
         arguments: one after another, without ``backend``.
         results: tensors, by their names.
+        allocate: memory for the results, from the named tuple.
         Inputs: the arguments as a named tuple, which has the letters of their shapes as attributes.
     """
 
@@ -176,7 +181,7 @@ class Declaration:
         text = (
             memory[:-2] if len(self.results) == 1 else f"({memory})" if "result0" in self.results else f"make({memory})"
         )
-        self._allocate = eval(f"lambda given: {text}", {"make": self._Results, "torch": torch})
+        self.allocate = eval(f"lambda given: {text}", {"make": self._Results, "torch": torch})
         _DECLARED[name] = self
 
     def _tensors(self) -> list[Argument]:
@@ -189,7 +194,7 @@ class Declaration:
             for shape, condition in ((rule.shape, rule.condition), (rule.otherwise, f"not {rule.condition}")):
                 known = [f"given.{rule.condition} is {'' if condition.startswith('not') else 'not '}None"]
                 known = known if rule.condition else [f"given.{name} is not None"] if optional else []
-                for place, entry in enumerate(() if rule.maybe else shape):
+                for place, entry in enumerate(() if rule.either else shape):
                     if isinstance(entry, str) and entry not in [argument.name for argument in self.arguments]:
                         letter, _, one = entry.partition("+")
                         size = f"given.{name}.shape[{place}]{' - 1' if one else ''}"
@@ -210,7 +215,7 @@ class Declaration:
     def _values(self) -> dict[str, str]:
         """The expressions of arguments and letters."""
         found = {**{each.name: f"given.{each.name}" for each in self.arguments}, **self._letters()}
-        for name in [each.name for each in self._tensors() if each.rule.maybe]:
+        for name in [each.name for each in self._tensors() if each.rule.either]:
             found[f"{name}_per_ray"] = f"(given.{name} is not None and given.{name}.dim() > 1)"
         return found
 
@@ -276,6 +281,20 @@ class Declaration:
         yield f"run = resolve('{self.name}', backend=backend, device={first}.device, dtype={first}.dtype)"
         yield f"return run({names})" if self._pack is None else f"return pack(run({names}))"
 
+    def plain(self, fill: Callable[..., None]) -> Callable[..., Any]:
+        """An implementation that is no custom op, as nothing traces or differentiates it: `custom_op`, but for that."""
+        new, inputs, allocate = tuple.__new__, self.Inputs, self.allocate
+
+        def run(*flat: Any) -> Any:
+            given = new(inputs, flat)
+            if not self.results:
+                return fill(given)
+            found = allocate(given)
+            fill(given, found)
+            return found
+
+        return run
+
     def custom_op(self, name: str = "", **options: Any) -> Callable[[Callable[..., None]], Op]:
         """Makes ``fill(given, found)`` a custom op: it is handed the arguments, and memory for the results.
 
@@ -283,23 +302,14 @@ class Declaration:
             name: of the custom op; without it that of the op.
             options: of `make_op`.
         """
+        return lambda fill: self.make_op(name or self.name, self.plain(fill), self.allocate, fill, **options)
 
-        new, inputs = tuple.__new__, self.Inputs
-
-        def allocate(*flat: Any) -> Any:
-            return self._allocate(self.Inputs._make(flat))
-
-        def of(fill: Callable[..., None]) -> Op:
-            def run(*flat: Any) -> Any:
-                given = new(inputs, flat)
-                found = self._allocate(given)
-                fill(given, found)
-                return found
-
-            signature = inspect.Signature(self._flat(), return_annotation=self._hint)
-            return make_op(name or self.name, run, allocate, Structs(signature), fill, **options)
-
-        return of
+    def make_op(
+        self, name: str, run: Callable[..., Any], fake: Callable[[Any], Any], described: Any, **options: Any
+    ) -> Op:
+        """The custom op that ``run`` is of the arguments; ``fake`` gives memory for its results, from a named tuple."""
+        structs = Structs(inspect.Signature(self._flat(), return_annotation=self._hint))
+        return make_op(name, run, lambda *flat: fake(self.Inputs._make(flat)), structs, described, **options)
 
     def backward_op(self, name: str, forward: Op, formula: Callable[..., Any]) -> Callable[[Callable[..., None]], Op]:
         """Makes ``fill(given, arriving, gradients)`` the gradients of a custom op.
@@ -342,31 +352,38 @@ class Declaration:
     def _flat(self) -> list[inspect.Parameter]:
         return [_parameter(each.name, each.kind | None if each.optional else each.kind) for each in self.arguments]
 
-    def inputs(self, kind: Any, **others: str) -> Callable[[Any], Any]:
+    def inputs(self, kind: Any, **others: str | Callable[[Any], Any]) -> Callable[[Any], Any]:
         """What makes a struct of the compiled module of the arguments.
 
         Args:
             kind: the struct, whose members are arguments or letters of their shapes.
-            others: expressions of these, for members that are neither.
+            others: expressions of these, for members that are neither; or functions of the arguments.
 
         Raises:
             NameError: a member that is none of this.
         """
-        return self._struct(
-            kind, "given", {**self._values(), **{name: self._given(text) for name, text in others.items()}}
-        )
+        values = self._values()
+        for name, other in others.items():
+            values[name] = self._given(other) if isinstance(other, str) else f"{name}_of(given)"
+        scope = {f"{name}_of": other for name, other in others.items() if not isinstance(other, str)}
+        return self._struct(kind, "given", values, scope)
 
-    def outputs(self, kind: Any) -> Callable[[Any], Any]:
-        """What makes a struct of the compiled module, whose members are the results, of memory for these."""
-        return self._struct(kind, "found", {name: f"found.{name}" for name in self.results})
+    def outputs(self, kind: Any, **others: str) -> Callable[[Any], Any]:
+        """What makes a struct of the compiled module, whose members are the results, of memory for these.
 
-    def _struct(self, kind: Any, source: str, values: dict[str, str]) -> Callable[[Any], Any]:
+        Args:
+            kind: the struct.
+            others: results by the names of members, where they have another.
+        """
+        values = {name: f"found.{others.get(name, name)}" for name in [*self.results, *others]}
+        return self._struct(kind, "found", values, {})
+
+    def _struct(self, kind: Any, source: str, values: dict[str, str], scope: dict[str, Any]) -> Callable[[Any], Any]:
         if unknown := [name for name in kind._fields if name not in values]:
             raise NameError(f"{self.name}: {kind.__name__} must have members of its declaration, got {unknown}")
         members = ", ".join(values[name] for name in kind._fields)
-        made: Callable[[Any], Any] = eval(
-            f"lambda {source}: new(kind, ({members},))", {"new": tuple.__new__, "kind": kind}
-        )
+        scope |= {"new": tuple.__new__, "kind": kind, "torch": torch}
+        made: Callable[[Any], Any] = eval(f"lambda {source}: new(kind, ({members},))", scope)
         return made
 
 
@@ -383,8 +400,8 @@ def _argument(name: str, hint: Any) -> Argument:
     rule = ""
     if typing.get_origin(hint) is typing.Annotated:
         hint, rule = typing.get_args(hint)
-    kinds = [kind for kind in typing.get_args(hint) or (hint,) if kind is not type(None)]
-    (kind,) = kinds
+    options = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else [hint]
+    (kind,) = (kind for kind in options if kind is not type(None))
     made: Any = rule
     if kind is Tensor:
         made = Shaped.parse(rule)
@@ -403,7 +420,7 @@ def _of_floats(rule: str) -> Callable[[str, str, float], None]:
         return checks.check_positive
     if not rule:
         return checks.check_number
-    low, high = (float(end) for end in rule[1:-1].split(","))
+    low, high = (float(end) for end in re.findall(r"[\d.]+", rule))
     return lambda op, name, value: checks.check_interval(op, name, value, low, high, rule)
 
 

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import Implementation
-from voronerf.ops._core.checks import Checked, check_integer, check_number
-
-_OP = backends.declare("balance_centres", native=Implementation(("cpu",), (torch.float32,)))
+from voronerf.ops._core.declare import declare
 
 
+def _prepare(given: Any) -> Any:
+    if given.k < 1:
+        raise ValueError("balance_centres: centres must hold at least one centre, got none")
+    return given
+
+
+@declare(native=Implementation(("cpu",), (torch.float32,)), prepare=_prepare)
 def balance_centres(
-    samples: Tensor,
-    masses: Tensor,
-    centres: Tensor,
+    samples: Annotated[Tensor, "float32 [m, 3]"],
+    masses: Annotated[Tensor, "float64 [m]"],
+    centres: Annotated[Tensor, "float32 [k, 3]"],
     *,
-    steps: int = 500,
+    steps: Annotated[int, "0.."] = 500,
     alpha: float = 0.05,
-    neighbours: int = 8,
+    neighbours: Annotated[int, "1.."] = 8,
     backend: str = "auto",
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Annotated[Tensor, "float32 [k, 3]"], Annotated[Tensor, "float64 [k]"]]:
     """Moves all centres `steps` times towards cells of equal mass; see ``voronerf.diagram.balance``.
 
     ``v_i <- v_i + alpha * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i`` (Elsner et al. 2023, section 3.2). N(i)
@@ -51,16 +57,3 @@ def balance_centres(
         >>> weights  # 3 and 1 before
         tensor([2., 2.], dtype=torch.float64)
     """
-    given = Checked(_OP)
-    given.tensor("samples", samples, (torch.float32,), "m", 3)
-    given.tensor("masses", masses, (torch.float64,), "m")
-    given.tensor("centres", centres, (torch.float32,), "k", 3)
-    check_integer(_OP, "steps", steps, 0)
-    check_integer(_OP, "neighbours", neighbours, 1)
-    check_number(_OP, "alpha", alpha)
-    if given.sizes["k"] < 1:
-        raise ValueError(f"{_OP}: centres must hold at least one centre, got none")
-    run = backends.resolve(_OP, backend=backend, device=samples.device, dtype=samples.dtype)
-    tensors = samples.detach(), masses.detach(), centres.detach()
-    moved, weights = run(*tensors, steps, float(alpha), neighbours)
-    return moved, weights

@@ -24,7 +24,7 @@ def composite(
     deltas: Annotated[Tensor, "same [m] if ray_offsets else [r, s]"],
     *,
     ray_offsets: Annotated[Tensor | None, "int32 [r+1]"] = None,
-    background: Annotated[Tensor | None, "same [r?, c]"] = None,
+    background: Annotated[Tensor | None, "same [c] or [r, c]"] = None,
     backend: str = "auto",
 ) -> Composite:
     """Volume rendering: colour, opacity and depth of rays, from the density and colour of their samples.

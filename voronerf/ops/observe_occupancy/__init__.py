@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, Implementation
-from voronerf.ops._core.checks import LIKE_FIRST, Checked, check_count, check_number, check_writable, detached
-from voronerf.ops.observe_occupancy.reference import Observed
+from voronerf.ops._core.checks import check_writable
+from voronerf.ops._core.declare import declare
 
-_OP = backends.declare(
-    "observe_occupancy",
+
+def _prepare(given: Any) -> Any:
+    check_writable("observe_occupancy", "density", given.density)
+    check_writable("observe_occupancy", "occupied", given.occupied)
+    if given.density.numel() < 1:
+        raise ValueError(f"observe_occupancy: density must have at least one cell, got {list(given.density.shape)}")
+    return given
+
+
+@declare(
     native=Implementation(EVERYWHERE, (torch.float32,)),
     warp=Implementation(EVERYWHERE, (torch.float32,)),
+    small=["density"],
+    prepare=_prepare,
 )
-
-
 def observe_occupancy(
-    density: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    positions: Tensor,
-    sigma: Tensor,
-    deltas: Tensor,
-    weights: Tensor,
+    density: Annotated[Tensor, "float32 [x, y, z]"],
+    occupied: Annotated[Tensor, "bool [x, y, z]"],
+    box: Annotated[Tensor, "same [2, 3]"],
+    positions: Annotated[Tensor, "same [m, 3]"],
+    sigma: Annotated[Tensor, "same [m]"],
+    deltas: Annotated[Tensor, "same [m]"],
+    weights: Annotated[Tensor, "same [m]"],
     *,
-    decay: float,
+    decay: Annotated[float, "0 to 1"],
     threshold: float,
     hidden: float,
     backend: str = "auto",
@@ -64,22 +73,3 @@ def observe_occupancy(
         >>> density.flatten(), occupied.flatten()
         (tensor([2., 9., 4.]), tensor([False,  True,  True]))
     """
-    given = Checked(_OP)
-    given.tensor("density", density, (torch.float32,), "x", "y", "z")
-    given.tensor("occupied", occupied, (torch.bool,), "x", "y", "z")
-    given.tensor("box", box, LIKE_FIRST, 2, 3)
-    given.tensor("positions", positions, LIKE_FIRST, "m", 3)
-    for name, value in (("sigma", sigma), ("deltas", deltas), ("weights", weights)):
-        given.tensor(name, value, LIKE_FIRST, "m")
-    check_count(_OP, "density", density.numel())
-    check_writable(_OP, "density", density)
-    check_writable(_OP, "occupied", occupied)
-    if density.numel() < 1:
-        raise ValueError(f"{_OP}: density must have at least one cell, got {list(density.shape)}")
-    for name, number in (("decay", decay), ("threshold", threshold), ("hidden", hidden)):
-        check_number(_OP, name, number)
-    if not 0 <= decay <= 1:
-        raise ValueError(f"{_OP}: decay must lie in 0 to 1, got {decay}")
-    tensors = [detached(tensor) for tensor in (density, occupied, box, positions, sigma, deltas, weights)]
-    observed = Observed._make([*tensors, float(decay), float(threshold), float(hidden)])
-    backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)(observed)

@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from voronerf.ops._core import native
-from voronerf.ops.observe_occupancy.reference import Observed
+from voronerf.ops._core.declare import declared
+
+_OP = declared("observe_occupancy")
+_samples = _OP.inputs(native.compiled.ObservedSamples)
 
 
-def observe_occupancy(given: Observed) -> None:
+@_OP.plain
+def observe_occupancy(given: Any) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
-    density, m, (x, y, z) = given.density, len(given.positions), given.density.shape
-    samples = native.compiled.ObservedSamples(
-        positions=given.positions,
-        sigma=given.sigma,
-        deltas=given.deltas,
-        weights=given.weights,
-        box=given.box,
-        x=x,
-        y=y,
-        z=z,
-        m=m,
-        decay=given.decay,
-        threshold=given.threshold,
-        hidden=given.hidden,
-    )
+    density, occupied, m = given.density, given.occupied.view(torch.uint8), given.m
     memory = density.new_empty(m, dtype=torch.int32), density.new_empty(m)  # cells, and the densities that these had
-    occupied = given.occupied.view(torch.uint8)
-    native.compiled.observe_occupancy(samples, density, occupied, *memory, native.machine(density))
+    native.compiled.observe_occupancy(_samples(given), density, occupied, *memory, native.machine(density))

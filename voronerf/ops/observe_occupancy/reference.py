@@ -2,43 +2,37 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 
-class Observed(NamedTuple):
-    """A grid, samples in it, and what they count; see ``voronerf.ops.observe_occupancy``."""
-
-    density: Tensor
-    occupied: Tensor
-    box: Tensor
-    positions: Tensor
-    sigma: Tensor
-    deltas: Tensor
-    weights: Tensor
-    decay: float
-    threshold: float
-    hidden: float
-
-
 @torch.no_grad()
-def observe_occupancy(given: Observed) -> None:
+def observe_occupancy(
+    density: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    positions: Tensor,
+    sigma: Tensor,
+    deltas: Tensor,
+    weights: Tensor,
+    decay: float,
+    threshold: float,
+    hidden: float,
+) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
-    found = given.sigma.nan_to_num(nan=float("inf"), posinf=float("inf"))
+    found = sigma.nan_to_num(nan=float("inf"), posinf=float("inf"))
     # weight = light that arrives * share of it that is taken
-    seen = given.weights > given.hidden * -torch.expm1(-found * given.deltas)
-    rows = cells_of(given.positions, given.box, given.density.shape).long()
-    count = given.density.numel()
-    rows = torch.where(given.deltas != 0, rows, count)  # one cell more, for samples that say nothing
-    density, occupied = (torch.nn.functional.pad(table.view(-1), (0, 1)) for table in (given.density, given.occupied))
+    seen = weights > hidden * -torch.expm1(-found * deltas)
+    rows = cells_of(positions, box, density.shape).long()
+    count = density.numel()
+    rows = torch.where(deltas != 0, rows, count)  # one cell more, for samples that say nothing
+    faded, marked = (torch.nn.functional.pad(table.view(-1), (0, 1)) for table in (density, occupied))
     # A cell decays once, however often it occurs.
-    faded = density.scatter(0, rows, density[rows] * given.decay)
+    faded = faded.scatter(0, rows, faded[rows] * decay)
     raised = faded.scatter_reduce(0, rows, torch.where(seen, found, 0), "amax")
-    occupied[rows] = raised[rows] >= given.threshold
-    given.density.view(-1).copy_(raised[:count])
-    given.occupied.view(-1).copy_(occupied[:count])
+    marked[rows] = raised[rows] >= threshold
+    density.view(-1).copy_(raised[:count])
+    occupied.view(-1).copy_(marked[:count])
 
 
 def cells_of(points: Tensor, box: Tensor, shape: torch.Size) -> Tensor:

@@ -8,6 +8,8 @@ must know of its ray (`compose_runs`), from which the gradients follow (`run_gra
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import torch
 from torch import Tensor
 
@@ -17,30 +19,33 @@ from voronerf.ops._core.checks import (
     INDEX,
     LIKE_FIRST,
     Checked,
-    check_flag,
-    check_integer,
     check_number,
     check_positive,
     check_range,
 )
+from voronerf.ops._core.declare import declare
 from voronerf.ops.composite.reference import check_ray_offsets
 from voronerf.ops.ray_runs.reference import OwnSamples
 
 _FLOATS = (torch.float32, torch.float64)
 _NATIVE = Implementation(("cpu",), (torch.float32,), file="ray_runs")
-_OWN, _SUMS, _COMPOSE, _GRADIENTS = (
-    backends.declare(op, native=_NATIVE, reference=Implementation(file="ray_runs"))
-    for op in ("own_samples", "run_sums", "compose_runs", "run_gradients")
-)
+_REFERENCE = Implementation(file="ray_runs")
+_SUMS, _GRADIENTS = (backends.declare(op, native=_NATIVE, reference=_REFERENCE) for op in ("run_sums", "run_gradients"))
 
 
+def _prepare(given: Any) -> Any:
+    check_range("own_samples", "cells", given.cells, len(given.own))
+    return given
+
+
+@declare(native=_NATIVE, reference=_REFERENCE, prepare=_prepare)
 def own_samples(
-    positions: Tensor,
-    ray_index: Tensor,
-    depths: Tensor,
-    deltas: Tensor,
-    cells: Tensor,
-    own: Tensor,
+    positions: Annotated[Tensor, "float32|float64 [n, 3]"],
+    ray_index: Annotated[Tensor, "int32 [n]"],
+    depths: Annotated[Tensor, "same [n]"],
+    deltas: Annotated[Tensor, "same [n]"],
+    cells: Annotated[Tensor, "int32 [n]"],
+    own: Annotated[Tensor, "int32 [k]"],
     *,
     bent: bool = False,
     backend: str = "auto",
@@ -75,18 +80,6 @@ def own_samples(
         >>> mine.depths, mine.run_offsets
         (tensor([0.1000, 0.9000]), tensor([0, 1, 2], dtype=torch.int32))
     """
-    given = Checked(_OWN)
-    given.tensor("positions", positions, _FLOATS, "n", 3)
-    given.tensor("ray_index", ray_index, INDEX, "n")
-    given.tensor("depths", depths, LIKE_FIRST, "n")
-    given.tensor("deltas", deltas, LIKE_FIRST, "n")
-    given.tensor("cells", cells, INDEX, "n")
-    given.tensor("own", own, INDEX, "k")
-    check_flag(_OWN, "bent", bent)
-    check_range(_OWN, "cells", cells, len(own))
-    run = backends.resolve(_OWN, backend=backend, device=positions.device, dtype=positions.dtype)
-    found: OwnSamples = run(positions.detach(), ray_index, depths.detach(), deltas.detach(), cells, own, bent=bent)
-    return found
 
 
 def run_sums(raw: Tensor, samples: OwnSamples, *, density_scale: float, backend: str = "auto") -> tuple[Tensor, Tensor]:
@@ -116,9 +109,16 @@ def run_sums(raw: Tensor, samples: OwnSamples, *, density_scale: float, backend:
     return sums, density
 
 
+@declare(native=_NATIVE, reference=_REFERENCE)
 def compose_runs(
-    sums: Tensor, target: Tensor, *, background: Tensor | None = None, first: int, rays: int, backend: str = "auto"
-) -> tuple[Tensor, Tensor]:
+    sums: Annotated[Tensor, "float32|float64 [q, 6]"],
+    target: Annotated[Tensor, "same [r, 3]"],
+    *,
+    background: Annotated[Tensor | None, "same [3] or [r, 3]"] = None,
+    first: Annotated[int, "0.."],
+    rays: Annotated[int, "1.."],
+    backend: str = "auto",
+) -> tuple[Annotated[Tensor, "same [q, 6]"], Annotated[Tensor, "same []"]]:
     """Puts rays together from the runs of all ranks, and says what each run must know of its ray.
 
     Args:
@@ -144,15 +144,6 @@ def compose_runs(
         >>> float(loss), float(answers[0, 5])
         (0.25, 0.75)
     """
-    given = Checked(_COMPOSE)
-    given.tensor("sums", sums, _FLOATS, "q", 6)
-    given.tensor("target", target, LIKE_FIRST, "r", 3)
-    given.each_or_all("background", background, LIKE_FIRST, "r", 3)
-    check_integer(_COMPOSE, "first", first, 0)
-    check_integer(_COMPOSE, "rays", rays, 1)
-    run = backends.resolve(_COMPOSE, backend=backend, device=sums.device, dtype=sums.dtype)
-    answers, loss = run(sums, target, background, first, rays)
-    return answers, loss
 
 
 def run_gradients(

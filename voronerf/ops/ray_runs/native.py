@@ -5,34 +5,29 @@ No custom ops, because a step calls them inside of a node of autograd. n samples
 
 from __future__ import annotations
 
-import torch
+from typing import Any
+
 from torch import Tensor
 
 from voronerf.ops._core import native
+from voronerf.ops._core.declare import declared
 from voronerf.ops.ray_runs.reference import OwnSamples
 
+_OWN, _COMPOSE = declared("own_samples"), declared("compose_runs")
+_known, _own = (
+    _OWN.inputs(native.compiled.KnownSamples),
+    _OWN.outputs(native.compiled.OwnSamples, offsets="run_offsets"),
+)
+_runs = _COMPOSE.inputs(native.compiled.RunsOfRays)
 
-def own_samples(
-    positions: Tensor, ray_index: Tensor, depths: Tensor, deltas: Tensor, cells: Tensor, own: Tensor, *, bent: bool
-) -> OwnSamples:
+
+def own_samples(*flat: Any) -> OwnSamples:
     """Keeps the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
-    n = len(cells)
-    found_positions, (found_depths, found_deltas) = positions.new_empty(n, 3), depths.new_empty(2, n)
-    found_index, of_own, offsets = cells.new_empty(n), cells.new_empty(n), cells.new_empty(n + 1)
-    known = native.compiled.KnownSamples(
-        positions=positions, ray_index=ray_index, depths=depths, deltas=deltas, cells=cells, own=own, n=n, bent=bent
-    )
-    found = native.compiled.OwnSamples(
-        positions=found_positions,
-        ray_index=found_index,
-        depths=found_depths,
-        deltas=found_deltas,
-        cells=of_own,
-        offsets=offsets,
-    )
-    offsets = offsets[: native.compiled.own_samples(known, found, native.cpu()) + 1]
+    given = _OWN.Inputs._make(flat)
+    found = _OWN.allocate(given)  # of as many samples as there are
+    offsets = found.run_offsets[: native.compiled.own_samples(_known(given), _own(found), native.cpu()) + 1]
     m = int(offsets[-1])
-    return OwnSamples(found_positions[:m], found_index[:m], found_depths[:m], found_deltas[:m], of_own[:m], offsets)
+    return OwnSamples._make([*(part[:m] for part in found[:5]), offsets])
 
 
 def run_sums(raw: Tensor, samples: OwnSamples, density_scale: float) -> tuple[Tensor, Tensor]:
@@ -43,22 +38,11 @@ def run_sums(raw: Tensor, samples: OwnSamples, density_scale: float) -> tuple[Te
     return sums, density
 
 
-def compose_runs(
-    sums: Tensor, target: Tensor, background: Tensor | None, first: int, rays: int
-) -> tuple[Tensor, Tensor]:
+@_COMPOSE.plain
+def compose_runs(given: Any, found: tuple[Tensor, Tensor]) -> None:
     """Answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
-    answers = sums.new_empty(sums.shape)
-    given = native.compiled.RunsOfRays(
-        sums=sums,
-        target=target,
-        background=background,
-        background_per_ray=background is not None and background.dim() == 2,
-        q=len(sums),
-        first=first,
-        r=len(target),
-        rays=rays,
-    )
-    return answers, torch.tensor(native.compiled.compose_runs(given, answers, native.cpu()), dtype=sums.dtype)
+    answers, loss = found
+    loss.fill_(native.compiled.compose_runs(_runs(given), answers, native.cpu()))
 
 
 def run_gradients(

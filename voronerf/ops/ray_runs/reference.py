@@ -8,7 +8,7 @@ colour of run`` (NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -39,12 +39,12 @@ class OwnSamples(NamedTuple):
         tensor([0, 1], dtype=torch.int32)
     """
 
-    positions: Tensor
-    ray_index: Tensor
-    depths: Tensor
-    deltas: Tensor
-    cells: Tensor
-    run_offsets: Tensor
+    positions: Annotated[Tensor, "same [n, 3]"]
+    ray_index: Annotated[Tensor, "int32 [n]"]
+    depths: Annotated[Tensor, "same [n]"]
+    deltas: Annotated[Tensor, "same [n]"]
+    cells: Annotated[Tensor, "int32 [n]"]
+    run_offsets: Annotated[Tensor, "int32 [n + 1]"]
 
 
 class Runs(NamedTuple):
@@ -103,8 +103,8 @@ def own_samples(
     deltas: Tensor,
     cells: Tensor,
     own: Tensor,
-    *,
     bent: bool,
+    *,
     hidden: bool = True,
 ) -> OwnSamples:
     """Keeps the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``.

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import Implementation
-from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, detached
-
-_OP = backends.declare("sighting_gradient", native=Implementation(("cpu",), (torch.float32,)))
+from voronerf.ops._core.declare import declare
 
 
+@declare(native=Implementation(("cpu",), (torch.float32,)))
 def sighting_gradient(
-    density: Tensor,
-    depths: Tensor,
-    deltas: Tensor,
-    weights: Tensor,
-    ray_offsets: Tensor,
-    distances: Tensor,
+    density: Annotated[Tensor, "float32|float64 [m]"],
+    depths: Annotated[Tensor, "same [m]"],
+    deltas: Annotated[Tensor, "same [m]"],
+    weights: Annotated[Tensor, "same [m]"],
+    ray_offsets: Annotated[Tensor, "int32 [s+1]"],
+    distances: Annotated[Tensor, "same [s]"],
     *,
     backend: str = "auto",
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Annotated[Tensor, "same []"], Annotated[Tensor, "same [m]"]]:
     """The sum of the loss of rays that end at known points, and its gradient to the densities of their samples.
 
     A sample was seen there if it lies within 0.03 of the distance of the point and its own length of it. The loss of a
@@ -56,13 +56,3 @@ def sighting_gradient(
         >>> loss, gradient.abs().round(decimals=3)  # less fog is better
         (tensor(0.6931), tensor([0.1000, 0.0000]))
     """
-    given = Checked(_OP)
-    given.tensor("density", density, (torch.float32, torch.float64), "m")
-    for name, value in (("depths", depths), ("deltas", deltas), ("weights", weights)):
-        given.tensor(name, value, LIKE_FIRST, "m")
-    given.tensor("ray_offsets", ray_offsets, INDEX, "s+1")
-    given.tensor("distances", distances, LIKE_FIRST, "s")
-    tensors = [detached(tensor) for tensor in (density, depths, deltas, weights, ray_offsets, distances)]
-    run = backends.resolve(_OP, backend=backend, device=density.device, dtype=density.dtype)
-    loss, gradient = run(*tensors)
-    return loss, gradient

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from torch import Tensor
 
 from voronerf.ops._core import native
+from voronerf.ops._core.declare import declared
 from voronerf.ops.sighting_gradient.reference import NEARBY
 
+_OP = declared("sighting_gradient")
+_inputs = _OP.inputs(native.compiled.Sightings, offsets="ray_offsets", nearby=str(NEARBY))
 
-def sighting_gradient(
-    density: Tensor, depths: Tensor, deltas: Tensor, weights: Tensor, ray_offsets: Tensor, distances: Tensor
-) -> tuple[Tensor, Tensor]:
+
+@_OP.plain
+def sighting_gradient(given: Any, found: tuple[Tensor, Tensor]) -> None:
     """The loss [] and its gradient [m]; see ``voronerf.ops.sighting_gradient``."""
-    loss, of_rays, gradient = (density.new_empty(size) for size in ((), distances.shape, density.shape))
-    given = native.compiled.Sightings(
-        density=density,
-        depths=depths,
-        deltas=deltas,
-        weights=weights,
-        offsets=ray_offsets,
-        distances=distances,
-        nearby=NEARBY,
-        s=len(distances),
-        m=len(density),
-    )
-    native.compiled.sighting_gradient(given, loss, of_rays, gradient, native.cpu())
-    return loss, gradient
+    loss, gradient = found
+    of_rays = loss.new_empty(given.s)
+    native.compiled.sighting_gradient(_inputs(given), loss, of_rays, gradient, native.cpu())
