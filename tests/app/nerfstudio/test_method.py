@@ -64,7 +64,7 @@ def trainer_of(folder: Path, out: Path, *, load: Path | None = None, alpha: str 
     data = config.pipeline.datamanager
     data.data, data.dataparser = folder, BlenderDataParserConfig(alpha_color=alpha)
     data.train_num_rays_per_batch = data.eval_num_rays_per_batch = 64
-    config.pipeline.model = VoronerfModelConfig(**{"cells": (4,), "split_at": (0.5,), "samples": 48, **model})
+    config.pipeline.model = VoronerfModelConfig(**{"cells": (4,), "split_at": (0.5,), "samples": (48,), **model})
     trainer = config.setup()
     trainer.setup()
     return trainer
@@ -108,9 +108,9 @@ def test_it_trains_splits_evaluates_and_resumes(folder: Path, tmp_path: Path) ->
 def test_a_training_that_ends_before_the_split_makes_it_when_it_is_resumed(folder: Path, tmp_path: Path) -> None:
     trainer = trainer_of(folder, tmp_path, field_options=SMALL, split_at=(0.99,))
     trainer.train()
-    kept = len(trainer.pipeline.model.cells.reservoir)
+    kept = len(trainer.pipeline.model.strategy.reservoir)
     again = trainer_of(folder, tmp_path, load=trainer.checkpoint_dir, field_options=SMALL, split_at=(0.99,))
-    assert again.pipeline.model.num_cells == 1 and len(again.pipeline.model.cells.reservoir) == kept > 0
+    assert again.pipeline.model.num_cells == 1 and len(again.pipeline.model.strategy.reservoir) == kept > 0
     again.train()
     assert again.pipeline.model.num_cells == 4
 
@@ -118,10 +118,10 @@ def test_a_training_that_ends_before_the_split_makes_it_when_it_is_resumed(folde
 @pytest.mark.parametrize(
     "model",
     [
-        {"field": "nerf", "width": 8, "sampling": "hierarchical", "samples": 8, "fine_samples": 8},
-        {"field": "mipnerf", "width": 8, "sampling": "hierarchical", "samples": 8, "fine_samples": 8},
-        {"sampling": "proposal", "samples": 8, "fine_samples": 8, "contraction": "sphere", "field_options": SMALL},
-        {"occupancy": False, "samples": 8, "field_options": SMALL},
+        {"field": "nerf", "width": 8, "sampling": "hierarchical", "samples": (8, 8)},
+        {"field": "mipnerf", "width": 8, "sampling": "hierarchical", "samples": (8, 8)},
+        {"samples": (8,), "contraction": "sphere", "field_options": SMALL},
+        {"occupancy": False, "samples": (8,), "field_options": SMALL},
     ],
     ids=lambda model: "-".join(map(str, model.values())),
 )

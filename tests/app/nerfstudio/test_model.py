@@ -114,12 +114,12 @@ def test_a_step_is_one_operation_and_learns(model_module: Any, monkeypatch: pyte
             return len(views)
 
     config = model_module.VoronerfModelConfig(
-        cells=(4,), split_at=(0.5,), samples=24, field_options=("log2_entries=10", "levels=2")
+        cells=(4,), split_at=(0.5,), samples=(24,), field_options=("log2_entries=10", "levels=2")
     )
     box = types.SimpleNamespace(aabb=scene.box)
     metadata = {"cameras": Cameras(), "background": torch.ones(3)}
     model = model_module.VoronerfModel(config, box, len(views), metadata=metadata, device="cpu").train()
-    assert "loss: networks, colours, loss and gradients in one operation, on the native" in model.learner.explain()
+    assert "loss: networks, colours, loss and gradients in one operation, on the native" in model.ray_loss.explain()
     calls = []
     evaluate = routed_mlp.forward.inside
     monkeypatch.setattr(routed_mlp.forward, "inside", lambda *given: calls.append(len(calls)) or evaluate(*given))

@@ -17,7 +17,7 @@ from voronerf.nerf.adam import Adam
 
 @dataclasses.dataclass
 class AdamConfig(OptimizerConfig):
-    """Adam as :func:`voronerf.app.train.networks.make_optimizer` makes it."""
+    """Adam with the settings of :meth:`voronerf.nerf.Adam.of`."""
 
     _target: type = Adam
     lr: float = 0.02
