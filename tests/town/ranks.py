@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch.distributed import TCPStore
 
-from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint, network_files
+from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
 
 #: Seconds until ranks that hang are ended.
 LIMIT = 300
@@ -44,7 +44,7 @@ def start_ranks(function, each, folder, restarts=0, store=None):
     The store is that of earlier starts, as torchrun keeps it.
     """
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["voronerf.app.cli", "voronerf.app.train.trainer"])
+    context.set_forkserver_preload(["voronerf.app.cli", "voronerf.app.train.loop"])
     store, size = store or new_store(), len(each)
     ranks = [
         context.Process(target=_rank, args=(rank, size, store.port, folder, restarts, function, given))
@@ -83,9 +83,13 @@ def on_ranks(function, *args, folder, size=2, each=None, restarts=0, store=None)
     return [rank.exitcode for rank in ranks], texts
 
 
-def joint_tensors(run):
-    """The tensors of the files of all territories, from the last checkpoint of a run."""
+def network_files(run):
+    """The files of the territories of the last checkpoint of a run."""
     path = checkpoint_path(run)
-    files = network_files(load_checkpoint(path, keep=lambda name: not name.startswith("part-")).values)
-    found = [load_checkpoint(path.with_name(file)).tensors for file in files]
+    return [path.with_name(name) for name in load_checkpoint(path).values["parts"][0]["networks"]]
+
+
+def town_tensors(run):
+    """The tensors of the last checkpoint of a run, and of the files of all territories."""
+    found = [load_checkpoint(path).tensors for path in (checkpoint_path(run), *network_files(run))]
     return {f"{number}.{name}": tensor for number, part in enumerate(found) for name, tensor in part.items()}

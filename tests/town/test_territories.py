@@ -1,0 +1,177 @@
+"""Territories: where they are, what of space they reach, where rays go, and the loss of rays that cross them."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers import refuses, seeded
+
+from voronerf import NeRF, OccupancyGrid, VoronoiDiagram, VoronoiRouter
+from voronerf.app.scenes import builtin_scene, city_scene
+from voronerf.nerf import Batch, Occupancy, Rays, Renderer
+from voronerf.nerf.contraction import Contraction
+from voronerf.town.group import Group
+from voronerf.town.rays import Territory, meet, step_together
+from voronerf.town.territories import Territories, cut_space, halve
+
+BOX = torch.tensor([[0.0, 0, 0], [4.0, 2, 2]])
+
+
+def line(count=2):
+    """Territories side by side along x, in a box of 4 x 2 x 2."""
+    middles = (torch.arange(count) + 0.5) * 4 / count
+    centres = torch.stack((middles, torch.ones(count), torch.ones(count)), 1)
+    boxes = torch.stack([torch.tensor([[m - 2 / count, 0, 0], [m + 2 / count, 2, 2]]) for m in middles.tolist()])
+    return Territories(centres, boxes, torch.zeros(0), torch.zeros(0))
+
+
+@pytest.fixture(scope="module")
+def city():
+    return city_scene(2, blocks=(2, 3), train_views=6, test_views=2)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 8])
+def test_the_views_of_a_city_are_shared_out(city, count):
+    scene = city
+    found = cut_space(scene, count, None)
+    sizes = torch.bincount(found.train, minlength=count)
+    assert len(found) == count and int(sizes.max()) - int(sizes.min()) <= 1
+    assert len(found.test) == 12 and 0 <= int(found.test.min()) <= int(found.test.max()) < count
+    points = torch.lerp(scene.box[0], scene.box[1], torch.rand(20_000, 3, generator=seeded()))
+    owner = VoronoiDiagram(found.centres).locate(points).long()
+    low, high = found.boxes[owner].unbind(1)
+    assert ((points >= low - 1e-4) & (points <= high + 1e-4)).all(), "a point is in the box of its territory"
+    for number in range(count):
+        place, inside = found.place(number), found.boxes[number]
+        own = points[((points >= inside[0]) & (points <= inside[1])).all(1)]
+        mine = place.own[place.cells(own, "auto").long()] == 0
+        assert torch.equal(mine, VoronoiDiagram(found.centres).locate(own) == number)
+
+
+def test_a_cut_that_cannot_be_made():
+    scene = builtin_scene(8, train_views=3, test_views=1)
+    refuses("--territories must be at most the 3 training views of builtin, got 4", cut_space, scene, 4, None)
+    refuses("needs a scene with a box or --contraction", cut_space, replace(scene, box=None), 2, None)
+    poses = scene.train.cameras.poses[:1].repeat(3, 1, 1)
+    still = replace(scene.train, cameras=replace(scene.train.cameras, poses=poses))
+    refuses("at most the places that views of builtin look at", cut_space, replace(scene, train=still), 2, None)
+    bent = cut_space(replace(scene, box=None), 2, Contraction(torch.zeros(3), 2.0))
+    assert bent.boxes.abs().max() <= 4.0
+
+
+def test_halves_are_even_and_compact():
+    places = torch.rand(103, 3, generator=seeded())
+    part = halve(places, 8)
+    assert set(torch.bincount(part).tolist()) <= {12, 13}
+    spread = torch.stack([places[part == number].var(0).sum() for number in range(8)])
+    assert float(spread.mean()) < 0.6 * float(places.var(0).sum())
+
+
+def test_voxels_outside_of_a_territory():
+    territories = line(3)
+    grid = OccupancyGrid(BOX, (8, 4, 4), threshold=1.0)
+    outside = territories.place(1).outside(grid)
+    points = torch.lerp(BOX[0], BOX[1], torch.rand(50_000, 3, generator=seeded()))
+    mine = VoronoiDiagram(territories.centres).locate(points) == 1
+    assert not outside[grid.cells(points[mine]).long()].any()
+    assert outside.view(8, 4, 4)[0].all() and not outside.view(8, 4, 4)[3:5].any()
+    grid.occupied.zero_()
+    assert (territories.place(1).bounds(grid)[0] > territories.place(1).bounds(grid)[1]).all()
+    grid.occupied[2, 1, 3] = grid.occupied[4, 2, 3] = True
+    assert territories.place(1).bounds(grid).tolist() == [[1.0, 0.5, 1.5], [2.5, 1.5, 2.0]]
+
+
+def test_which_territories_a_ray_meets():
+    bounds = torch.cat(
+        (line(4).boxes, torch.tensor([[[math.inf] * 3, [-math.inf] * 3], [[-math.inf] * 3, [math.inf] * 3]]))
+    )
+    origins = torch.tensor([[-1.0, 1, 1], [1.5, 1, 5], [1.5, 1, 1], [9.0, 9, 9]])
+    directions = torch.tensor([[1.0, 0, 0], [0.0, 0, -1], [1.0, 0, 0], [1.0, 0, 0]])
+    met = meet(bounds, Rays(origins, directions), torch.zeros(4), torch.tensor([10.0, 10, 1, 10]))
+    expected = [[1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 0], [1, 1, 1, 1]]
+    assert met.int().tolist() == expected
+
+
+def members(count):
+    """Territories in a line, each with networks of its own."""
+    found = {}
+    for number in range(count):
+        torch.manual_seed(number)
+        router = VoronoiRouter(NeRF(width=16, depth=2, density_scale=1.0), torch.zeros(1, 3), coords="first3")
+        grid = OccupancyGrid(line(count).boxes[number], 4, threshold=1e-6)
+        renderer = Renderer({"field": router}, Occupancy(grid, 64))
+        found[number] = Territory(line(count).place(number), renderer, torch.Generator())
+    return found
+
+
+def run(own, batches):
+    """The losses and gradients of all territories, with the same random samples whenever it is called."""
+    for member in own.values():
+        member.generator.manual_seed(3)
+        member.renderer.field.zero_grad()
+    return step_together(Group(torch.device("cpu")), own, [0] * len(own), line(len(own)).boxes, batches)
+
+
+def fill(own, densities, colours):
+    """Makes every territory a fog."""
+    for number, member in own.items():
+        field = member.renderer.field.module
+        with torch.no_grad():
+            for p in field.parameters():
+                p.zero_()
+            biases = {tuple(p.shape[1:]): p for name, p in field.named_parameters() if name.endswith("bias")}
+            biases[1,].fill_(math.log(math.expm1(densities[number])) if densities[number] < 50 else densities[number])
+            biases[3,].copy_(torch.logit(colours[number]))
+
+
+def rays_through(count):
+    """Rays from the left through all of the box."""
+    generator = seeded()
+    origins = torch.stack((torch.full((count,), -1.0), *(torch.rand(2, count, generator=generator) + 0.5)), 1)
+    aim = torch.stack((torch.full((count,), 5.0), *(torch.rand(2, count, generator=generator) + 0.5)), 1)
+    directions = torch.nn.functional.normalize(aim - origins, dim=1)
+    return Batch(Rays(origins, directions), torch.full((count,), 0.5), torch.full((count,), 9.0), torch.rand(count, 3))
+
+
+def test_gradients_are_those_of_the_loss():
+    """Along random directions of all parameters, the change of the sum of the losses is what the gradients say."""
+    own, batches = members(3), {0: rays_through(20), 1: rays_through(1), 2: rays_through(12)}
+    parameters = [p for member in own.values() for p in member.renderer.field.parameters()]
+    run(own, batches)
+    gradients = [p.grad.clone() for p in parameters]
+    assert all(bool(gradient.any()) for gradient in gradients[-2:]), "rays from elsewhere teach a territory"
+    for seed in range(3):
+        ways = [torch.randn(p.shape, generator=seeded(seed)) for p in parameters]
+        slope = float(sum((way * gradient).sum() for way, gradient in zip(ways, gradients, strict=True)))
+        ends = []
+        for side in (-1, 2):
+            with torch.no_grad():
+                for p, way in zip(parameters, ways, strict=True):
+                    p.add_(way, alpha=side * 2e-3)
+            ends.append(float(sum(each.loss for each in run(own, batches).values())))
+        with torch.no_grad():
+            for p, way in zip(parameters, ways, strict=True):
+                p.sub_(way, alpha=2e-3)
+        assert (ends[1] - ends[0]) / 4e-3 == pytest.approx(slope, rel=0.03, abs=2e-4)
+
+
+def test_colours_are_those_of_all_territories_in_turn():
+    """A fog of one colour in each: the light of a ray is that of the formula, whoever draws it."""
+    own, densities = members(2), (0.3, 0.7)
+    colours = torch.tensor([[0.9, 0.1, 0.2], [0.2, 0.8, 0.4]])
+    fill(own, densities, colours)
+    origins, directions = torch.tensor([[-1.0, 1, 1], [5.0, 1, 1]]), torch.tensor([[1.0, 0, 0], [-1.0, 0, 0]])
+    light = [math.exp(-2 * density) for density in densities]
+    mine = [(1 - through) * colour for through, colour in zip(light, colours, strict=True)]
+    expected = torch.stack((mine[0] + light[0] * mine[1], mine[1] + light[1] * mine[0])) + light[0] * light[1]
+    batch = Batch(Rays(origins, directions), torch.zeros(2), torch.full((2,), 9.0), expected, torch.ones(3))
+    found = run(own, {0: batch})
+    assert float(found[0].loss) < 1e-5 and len(found[1].weights) == 128
+
+
+def test_a_ray_that_has_ended_goes_no_further():
+    own = members(3)
+    fill(own, (100.0,) * 3, torch.full((3, 3), 0.5))
+    found = run(own, {0: rays_through(30)})
+    assert len(found[0].weights) and not found.keys() - {0}

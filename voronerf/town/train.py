@@ -1,0 +1,392 @@
+"""Training in territories: parts of space with networks, grid, optimiser and views of their own; rays cross borders.
+
+Ranks share out the territories. What a territory computes does not depend on which rank has it, so that one process
+trains the same run as many, bit for bit. T territories.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.app.files import json_text, write_text
+from voronerf.app.scenes import Scene
+from voronerf.app.scenes.record import write_scene
+from voronerf.app.train import Callback, Checkpoint, CheckpointError, ConfigError, State, TrainConfig, build, load
+from voronerf.app.train.build import make_batches, make_grid
+from voronerf.app.train.callbacks import KEPT, PATIENCE, all_finite, diverged
+from voronerf.app.train.checkpoint import checkpoint_path, checkpoint_paths, keep_checkpoint, load_checkpoint
+from voronerf.app.train.checkpoint import save_checkpoint
+from voronerf.app.train.defaults import resolve
+from voronerf.app.train.loop import stage_of
+from voronerf.app.train.resume import snapshot
+from voronerf.diagram import VoronoiDiagram
+from voronerf.nerf import Batch, Occupancy, OccupancyGrid, RenderOutput
+from voronerf.ops._core import backends
+from voronerf.town.geometry import Similarity
+from voronerf.town.group import Group, RankLost
+from voronerf.town.rays import Territory, step_together
+from voronerf.town.run import TOWN, index_of
+from voronerf.town.territories import Territories, cut_space
+
+#: Steps after which territories tell all others what of them is not empty; sooner at first.
+SURVEY_EVERY = 64
+#: Steps after which ranks agree on the time and on stops.
+AGREE_EVERY = 8
+#: The most voxels of the grid that a finished run is drawn with.
+VOXELS = 1 << 21
+
+
+@dataclass
+class Town:
+    """A training in territories, of which this rank has some; :func:`build_town` makes it.
+
+    Attributes:
+        config: The settings of a territory.
+        drawn: The settings with which the run is drawn as a whole: strata are as long as those of its territories.
+        scene: The whole scene.
+        group: The ranks.
+        territories: All of them.
+        owner: The rank of each, [T].
+        states: Of the territories of this rank, by their numbers.
+        members: The same, as rays see them.
+        bounds: [T, 2, 3], around what of each is not empty.
+        stopping: Whether somebody asked this rank to end the training.
+    """
+
+    config: TrainConfig
+    drawn: TrainConfig
+    scene: Scene
+    group: Group
+    territories: Territories
+    owner: list[int]
+    states: dict[int, State]
+    members: dict[int, Territory]
+    bounds: Tensor
+    stopping: bool = False
+
+    @property
+    def out(self) -> Path:
+        """The run directory."""
+        assert self.config.out is not None
+        return self.config.out
+
+    @property
+    def first(self) -> State:
+        """The first territory of this rank, which has the time and the steps of all."""
+        return next(iter(self.states.values()))
+
+    def stop(self) -> None:
+        """Ends the training on all ranks some steps later, with a checkpoint."""
+        self.stopping = True
+
+    def survey(self) -> None:
+        """All territories tell what of them is not empty."""
+        bounds = torch.zeros_like(self.bounds)
+        for number, state in self.states.items():
+            bounds[number] = self.members[number].place.bounds(state.renderer.occupancy)
+        self.bounds = self.group.total(bounds)
+
+
+def check_territories(config: TrainConfig, count: int, ranks: int) -> None:
+    """Rejects settings that a training in territories does not support.
+
+    Raises:
+        ConfigError: Names the setting.
+    """
+    rules: dict[str, tuple[bool, str]] = {
+        "out": (config.out is not None, "be given: all ranks write there"),
+        "sampling": (config.sampling == "stratified", "be stratified: no territory sees whole rays"),
+        "field": (not config.field_type.cones, "take points: cones cross borders"),
+        "contraction": (config.contraction != "ndc", "be none or sphere: parts have no normalised device coordinates"),
+        "occupancy": (config.occupancy, "be on"),
+        "precision": (config.precision == "fp32", "be fp32"),
+        "sparse_depth": (not config.sparse_depth, "be 0: no territory sees whole rays"),
+    }
+    for name, (fits, rule) in rules.items():
+        if not fits:
+            raise ConfigError(
+                f"--{name.replace('_', '-')} must {rule}, in territories, got {getattr(config, name)!r}"
+            )
+    if count < ranks:
+        raise ConfigError(f"--territories must be at least the {ranks} ranks, got {count}")
+
+
+def build_town(
+    config: TrainConfig, scene: Scene, count: int, group: Group, *, on_event: Callable[[str], None] | None = None
+) -> Town:
+    """All that a training in territories needs on this rank, before its first step.
+
+    Args:
+        config: The settings of a territory.
+        scene: The scene that ``config.data`` names.
+        count: T.
+        group: The ranks.
+        on_event: Called with a line of text for what happens.
+
+    Raises:
+        ConfigError: For settings that territories do not support, or that do not fit the scene.
+    """
+    config = replace(config, sparse_depth=0.0)
+    check_territories(config, count, group.size)
+    whole = resolve(config, scene)
+    check_territories(whole, count, group.size)
+    contraction = scene.space(whole.contraction).contraction
+    try:
+        territories = cut_space(scene, count, contraction)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    owner = [number * group.size // count for number in range(count)]
+    states: dict[int, State] = {}
+    members: dict[int, Territory] = {}
+    for number in (n for n in range(count) if owner[n] == group.rank):
+        own = replace(config, seed=(config.seed + 1_000_003 * number) % 2**63)
+        batches = make_batches(own, scene, territories.views(number))
+        place = territories.place(number)
+        state = states[number] = build(own, territories.scene(scene, number), batches=batches, on_event=on_event)
+        if (obstacle := state.ray_loss.why_not_fused()) is not None:
+            raise ConfigError(f"--field {config.field} cannot be trained in territories: {obstacle}")
+        sampler = state.renderer.sampler
+        assert isinstance(sampler, Occupancy)
+        if contraction is None:
+            state.renderer.sampler = Occupancy(
+                sampler.grid,
+                sampler.samples,
+                space=sampler.space,
+                empty=place.outside(sampler.grid),
+                backend=sampler.backend,
+            )
+        members[number] = Territory(place, state.renderer, state.draws)
+    drawn = whole
+    if contraction is None and scene.box is not None:
+        lengths = [float((box[1] - box[0]).norm()) for box in (scene.box, territories.boxes[0])]
+        samples = resolve(config, territories.scene(scene, 0)).samples or (64,)
+        drawn = replace(whole, samples=(math.ceil(samples[0] * lengths[0] / lengths[1]),))
+    return Town(config, drawn, scene, group, territories, owner, states, members, territories.boxes.clone())
+
+
+def train(
+    town: Town,
+    callbacks: Sequence[Callback] = (),
+    *,
+    checkpoint_every: float = math.inf,
+    clock: Callable[[], float] = time.perf_counter,
+) -> None:
+    """Trains to the end, or until :meth:`Town.stop`; all ranks call it together.
+
+    Args:
+        town: What :func:`build_town` made.
+        callbacks: Called with the state of the first territory of this rank.
+        checkpoint_every: Seconds of training between checkpoints; one is written at the end.
+        clock: Counts seconds; that of rank 0 counts.
+
+    Raises:
+        TrainingError: When gradients or parameters stop being finite; the last checkpoint is left as it was.
+        OSError: When a checkpoint cannot be written.
+        RankLost: When another rank has ended.
+    """
+    group, first, passed, saved_at = town.group, town.first, 0.0, town.first.seconds
+    alone = all(state.thread_deterministic for state in town.states.values())
+    while first.fraction < 1 and not first.stopped:
+        started = clock()
+        with backends.torch_on_one_thread() if alone else nullcontext():
+            if first.step % SURVEY_EVERY == 0 or (first.step < SURVEY_EVERY and first.step & (first.step - 1) == 0):
+                town.survey()
+            batches = {number: _prepare(state) for number, state in town.states.items()}
+            outputs = step_together(group, town.members, town.owner, town.bounds, batches)
+            for number, state in town.states.items():
+                _learn(state, batches[number], outputs[number])
+        passed += clock() - started
+        if group.size == 1 or first.step % AGREE_EVERY == 0 or first.step == town.config.steps:
+            agreed = torch.tensor([passed * (group.rank == 0), float(town.stopping)], dtype=torch.float64)
+            seconds, stop = group.total(agreed).tolist()
+            passed = 0.0
+            for state in town.states.values():
+                state.seconds += seconds
+                state.stopped |= stop > 0
+                if state.skipped_in_a_row >= PATIENCE:
+                    raise diverged(town.out, f"gradients of {state.skipped_in_a_row} steps in a row not finite", state.step)
+        for callback in callbacks:
+            callback.after_step(first)
+        if first.seconds - saved_at >= checkpoint_every:
+            save(town)
+            saved_at = first.seconds
+    if first.fraction >= 1:
+        for state in town.states.values():
+            assert isinstance(state.sampler, Occupancy)
+            with state.averaged():
+                state.sampler.fill_holes(state.renderer.field, state.config.seed)
+    save(town)
+
+
+def _prepare(state: State) -> Batch:
+    """What comes before the loss of a step: splits, empty space, rays."""
+    strategy, optimizer = state.strategy, state.optimizer
+    if strategy.splits or len(strategy.reservoir) >= (strategy.planned.children if strategy.planned else 0):
+        done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
+        if done is not None:
+            state.stages.append(stage_of(state, done))
+            if not strategy.inherit:
+                optimizer.drop_averages()
+    optimizer.set_learning_rate(state.learning_rate())
+    state.sampler.step_pre_backward(state.renderer.field, state.step, state.generator)
+    state.renderer.train()
+    optimizer.zero_grad(set_to_none=True)
+    return state.batches.draw(state.rays, state.draws)
+
+
+def _learn(state: State, batch: Batch, output: RenderOutput) -> None:
+    """What comes after the loss of a step has left its gradients."""
+    state.sampler.step_post_backward(output)
+    state.optimizer.update(state.guard, output.loss)
+    state.optimizer.after_step(state.step)
+    state.strategy.step_post_backward(output)
+    state.rays_done += len(batch.rays)
+    state.step += 1
+    state.read(output)
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def save(town: Town) -> None:
+    """Writes the checkpoints of all territories, and then the one that names them, which counts from then on.
+
+    Raises:
+        TrainingError: When parameters or moments are not finite.
+        OSError: When something cannot be written; the last checkpoint is left as it was.
+        RankLost: When that is so on another rank.
+    """
+    group, count, folder = town.group, len(town.owner), checkpoint_path(town.out).parent
+    token = f"{town.first.step}-{group.gather(secrets.token_hex(4))[0]}"
+    names = [f"networks-{token}-{number}.safetensors" for number in range(count)]
+    failure: OSError | None = None
+    try:
+        for number, state in town.states.items():
+            if not all_finite(state.optimizer):
+                raise diverged(town.out, "parameters or moments of Adam not finite", state.step)
+            save_checkpoint(folder / names[number], snapshot(state))
+    except OSError as error:
+        failure = error
+    if group.any(failure is not None):
+        raise failure or RankLost("another rank could not write the checkpoint")
+    own = {n: (s.router.diagram.state_dict(), s.renderer.occupancy) for n, s in town.states.items()}
+    found = {number: told for each in group.gather(own) for number, told in each.items()}
+    if group.rank == 0:
+        if not (town.out / TOWN).is_file():
+            write_text(town.out / TOWN, json_text({"territories": count}) + "\n")
+            write_text(town.out / "config.json", town.config.to_json())
+            write_scene(town.out / "scene.json", town.scene)
+        keep_checkpoint(town.out, _index(town, names, [found[number] for number in range(count)]), KEPT)
+        named = {name for path in checkpoint_paths(town.out) for name in _names(path)}
+        for path in folder.glob("networks-*.safetensors"):
+            if path.name not in named:
+                path.unlink(missing_ok=True)
+
+
+def _names(path: Path) -> list[str]:
+    """The files that a checkpoint names; all that there are for one that cannot be read."""
+    try:
+        return list(load_checkpoint(path).values["parts"][0]["networks"])
+    except CheckpointError:
+        return [each.name for each in path.parent.glob("networks-*.safetensors")]
+
+
+def _index(town: Town, names: list[str], found: Sequence[tuple[dict[str, Tensor], OccupancyGrid]]) -> Checkpoint:
+    """The checkpoint that names the files of all territories; with it the run is opened as a run of one part."""
+    diagrams = [VoronoiDiagram.from_state(state) for state, _ in found]
+    sizes = torch.tensor([diagram.num_cells for diagram in diagrams])
+    diagram = diagrams[0]
+    if len(found) > 1:
+        diagram, _ = VoronoiDiagram(town.territories.centres).refine(dict(enumerate(diagrams)))
+    owner, grids = torch.repeat_interleave(torch.arange(len(found)), sizes), [grid for _, grid in found]
+    sphere, grid = grids[0].contraction, None
+    if sphere is None:
+        grid = _whole_grid(make_grid(town.drawn, town.scene, "cpu", 1), grids)
+    place = {
+        "networks": names,
+        "frame": Similarity().to_values(),
+        "region": [],
+        "layer": 0,
+        "contraction": None if sphere is None else {"centre": sphere.centre.tolist(), "radius": sphere.radius},
+    }
+    index = index_of(town.drawn, [(diagram, owner.int())], [place], grid)
+    return replace(index, tensors={**index.tensors, "bounds": town.bounds.clone()})
+
+
+def resume(town: Town) -> None:
+    """Puts all territories where they were at the last checkpoint that all ranks can read.
+
+    Raises:
+        CheckpointError: When there is none, or it is of another configuration.
+    """
+    errors: list[CheckpointError] = []
+    for path in checkpoint_paths(town.out):
+        index, parts, failure = Checkpoint({}, {}), dict[int, Checkpoint](), None
+        try:
+            index = load_checkpoint(path)
+            names = index.values["parts"][0]["networks"]
+            if len(names) != len(town.owner) or "bounds" not in index.tensors:
+                raise CheckpointError(f"{path}: must name {len(town.owner)} territories, got {len(names)} files")
+            parts = {number: load_checkpoint(path.with_name(names[number])) for number in town.states}
+        except CheckpointError as error:
+            failure = error
+        except (KeyError, IndexError, TypeError) as error:
+            failure = CheckpointError(f"{path}: not a checkpoint of territories: {error}")
+        if not town.group.any(failure is not None):
+            for number, state in town.states.items():
+                load(state, parts[number])
+            town.bounds = index.tensors["bounds"].clone()
+            if errors:
+                town.first.say(f"{errors[0]}; {path.name} takes its place")
+            return
+        errors.append(failure or CheckpointError(f"{path}: another rank cannot read it"))
+    raise errors[0] if errors else CheckpointError(f"{town.out}: there is no checkpoint")
+
+
+def _whole_grid(like: OccupancyGrid, grids: Sequence[OccupancyGrid]) -> OccupancyGrid:
+    """One grid over the box of another; occupied where that of any territory is, too much rather than too little."""
+    box = like.box
+    sizes = torch.stack([((g.box[1] - g.box[0]) / torch.tensor(g.occupied.shape)).cpu() for g in grids]).amax(0)
+    shape = ((box[1] - box[0]) / sizes).floor().clamp(1, 512)
+    shape = (shape * min(1.0, (VOXELS / float(shape.prod())) ** (1 / 3))).floor().clamp(min=1).long()
+    whole = OccupancyGrid(box, shape.tolist(), threshold=like.threshold)
+    whole.occupied.zero_()
+    corners = torch.cartesian_prod(*(torch.tensor((0.001, 0.999)),) * 3)
+    for grid in grids:
+        full = grid.occupied.view(-1).nonzero()[:, 0]
+        for corner in corners:
+            points = grid.points(full, corner.expand(len(full), 3).to(full.device)).cpu()
+            whole.occupied.view(-1)[whole.cells(points).long()] = True
+    whole.density = torch.where(whole.occupied, 2 * whole.threshold, 0.0)
+    return whole
+
+
+def summary_of(town: Town) -> dict[str, Any]:
+    """What ``summary.json`` says of a training, on all ranks alike; scores are added to it."""
+    states = town.states.values()
+    own = [(s.parameter_count, len(s.strategy.plan) - s.strategy.splits, s.skipped, s.rays_done) for s in states]
+    own = [(*each, state.router.num_cells) for each, state in zip(own, states, strict=True)]
+    told = town.group.total(torch.tensor(own, dtype=torch.float64).sum(0))
+    parameters, left, skipped, rays, cells = map(int, told.tolist())
+    return {
+        "complete": town.first.fraction >= 1,
+        "seconds": town.first.seconds,
+        "steps": town.first.step,
+        "rays_per_second": rays / max(town.first.seconds, 1e-9),
+        "parameters": parameters,
+        "cells": cells,
+        "splits_left": left,
+        "skipped_steps": skipped,
+        "width": town.drawn.width,
+        "territories": len(town.owner),
+    }
