@@ -145,10 +145,10 @@ class Group:
         out = torch.cat([torch.empty(0, width, device=self.device), *(parts[key] for each in sent for key in each)])
         found = out
         if self.size > 1:
-            rows = [[sum(int(counts[key]) for key in each) for each in keys] for keys in (came, sent)]
-            found = out.new_empty(sum(rows[0]), width)
+            coming, going = ([sum(int(counts[key]) for key in each) for each in keys] for keys in (came, sent))
+            found = out.new_empty(sum(coming), width)
             with waiting():
-                dist.all_to_all_single(found, out, *rows)
+                dist.all_to_all_single(found, out, coming, going)
         keys = [key for each in came for key in each]
         return dict(sorted(zip(keys, found.split([int(counts[key]) for key in keys]), strict=True)))
 

@@ -119,7 +119,7 @@ class Pass:
 
 
 def meet(bounds: Tensor, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
-    """Which rays [r] meet which boxes [T, 2, 3] between near and far: bool [T, r]. An empty box has its corners swapped."""
+    """Which rays [r] meet which boxes [T, 2, 3] between near and far: bool [T, r]; swapped corners are an empty box."""
     inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
     low, high = ((bounds[:, None, end] - rays.origins) * inverse for end in (0, 1))
     first, last = torch.minimum(low, high).amax(-1), torch.maximum(low, high).amin(-1)
@@ -186,9 +186,9 @@ def step_together(
         answers |= zip(keys, rest, strict=True)
         learnt = home.learn(own, loss)
         outputs[number].append(_nothing(loss) if learnt is None else learnt)
-    told = group.send(answers, found, owner, SUM)
+    came = group.send(answers, found, owner, SUM)
     for number, guest in guests.items():
-        own = torch.cat([guest.sums[:0], *(told[key] for key in told if key[1] == number)])
+        own = torch.cat([guest.sums[:0], *(came[key] for key in came if key[1] == number)])
         if (learnt := guest.learn(own, own.new_zeros(()))) is not None:
             outputs[number].append(learnt)
     return {number: functools.reduce(_both, each) for number, each in outputs.items()}
@@ -227,5 +227,5 @@ def _both(one: RenderOutput, two: RenderOutput) -> RenderOutput:
         torch.cat((a.depths, b.depths)),
         torch.cat((a.deltas, b.deltas)),
     )
-    values = (torch.cat((getattr(one, name), getattr(two, name))) for name in ("error", "weights", "density"))
-    return RenderOutput(one.loss + two.loss, *values, samples, one.colour)
+    values = {n: torch.cat((getattr(one, n), getattr(two, n))) for n in ("error", "weights", "density")}
+    return RenderOutput(one.loss + two.loss, samples=samples, colour=one.colour, **values)

@@ -64,7 +64,8 @@ def write_parts(run: Path, config: TrainConfig, parts: Parts, grid: OccupancyGri
             tensors = {f"router.{key}": tensor.cpu().clone() for key, tensor in network.router.state_dict().items()}
             save_checkpoint(folder / name, Checkpoint(tensors, {"config": network.config.to_values()}))
     placed = [place_of(part, [names[id(network.router)] for network in part.networks]) for part in parts]
-    save_checkpoint(checkpoint_path(run), index_of(config, [*parts], placed, grid))
+    cells = [(part.diagram, part.owner) for part in parts]
+    save_checkpoint(checkpoint_path(run), index_of(config, cells, placed, grid))
 
 
 def place_of(part: Part, files: Sequence[str]) -> dict[str, Any]:
@@ -80,13 +81,16 @@ def place_of(part: Part, files: Sequence[str]) -> dict[str, Any]:
 
 
 def index_of(
-    config: TrainConfig, parts: Sequence[Part], placed: list[dict[str, Any]], grid: OccupancyGrid | None
+    config: TrainConfig,
+    cells: Sequence[tuple[VoronoiDiagram, Tensor]],
+    placed: list[dict[str, Any]],
+    grid: OccupancyGrid | None,
 ) -> Checkpoint:
-    """The checkpoint that names the files of the networks of parts."""
+    """The checkpoint of parts, each with its diagram and the network of each leaf, whose networks are in files."""
     tensors: dict[str, Tensor] = {} if grid is None else {f"occupancy.{k}": v for k, v in grid.state_dict().items()}
-    for number, part in enumerate(parts):
-        tensors |= {f"part-{number}.diagram.{name}": value for name, value in part.diagram.state_dict().items()}
-        tensors[f"part-{number}.owner"] = part.owner
+    for number, (diagram, owner) in enumerate(cells):
+        tensors |= {f"part-{number}.diagram.{name}": value for name, value in diagram.state_dict().items()}
+        tensors[f"part-{number}.owner"] = owner
     tensors = {name: value.cpu().clone() for name, value in tensors.items()}
     return Checkpoint(tensors, {"config": config.to_values(), "parts": placed})
 

@@ -24,13 +24,18 @@ from voronerf.app.scenes.record import write_scene
 from voronerf.app.train import Callback, Checkpoint, CheckpointError, ConfigError, State, TrainConfig, build, load
 from voronerf.app.train.build import make_batches, make_grid
 from voronerf.app.train.callbacks import KEPT, PATIENCE, all_finite, diverged
-from voronerf.app.train.checkpoint import checkpoint_path, checkpoint_paths, keep_checkpoint, load_checkpoint
-from voronerf.app.train.checkpoint import save_checkpoint
+from voronerf.app.train.checkpoint import (
+    checkpoint_path,
+    checkpoint_paths,
+    keep_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
 from voronerf.app.train.defaults import resolve
 from voronerf.app.train.loop import stage_of
 from voronerf.app.train.resume import snapshot
 from voronerf.diagram import VoronoiDiagram
-from voronerf.nerf import Batch, Occupancy, OccupancyGrid, RenderOutput
+from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Perspective, RenderOutput
 from voronerf.ops._core import backends
 from voronerf.town.geometry import Similarity
 from voronerf.town.group import Group, RankLost
@@ -114,9 +119,7 @@ def check_territories(config: TrainConfig, count: int, ranks: int) -> None:
     }
     for name, (fits, rule) in rules.items():
         if not fits:
-            raise ConfigError(
-                f"--{name.replace('_', '-')} must {rule}, in territories, got {getattr(config, name)!r}"
-            )
+            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, in territories, got {getattr(config, name)!r}")
     if count < ranks:
         raise ConfigError(f"--territories must be at least the {ranks} ranks, got {count}")
 
@@ -214,7 +217,9 @@ def train(
                 state.seconds += seconds
                 state.stopped |= stop > 0
                 if state.skipped_in_a_row >= PATIENCE:
-                    raise diverged(town.out, f"gradients of {state.skipped_in_a_row} steps in a row not finite", state.step)
+                    raise diverged(
+                        town.out, f"gradients of {state.skipped_in_a_row} steps in a row not finite", state.step
+                    )
         for callback in callbacks:
             callback.after_step(first)
         if first.seconds - saved_at >= checkpoint_every:
@@ -310,6 +315,7 @@ def _index(town: Town, names: list[str], found: Sequence[tuple[dict[str, Tensor]
         diagram, _ = VoronoiDiagram(town.territories.centres).refine(dict(enumerate(diagrams)))
     owner, grids = torch.repeat_interleave(torch.arange(len(found)), sizes), [grid for _, grid in found]
     sphere, grid = grids[0].contraction, None
+    assert not isinstance(sphere, Perspective)
     if sphere is None:
         grid = _whole_grid(make_grid(town.drawn, town.scene, "cpu", 1), grids)
     place = {
@@ -373,10 +379,12 @@ def _whole_grid(like: OccupancyGrid, grids: Sequence[OccupancyGrid]) -> Occupanc
 
 def summary_of(town: Town) -> dict[str, Any]:
     """What ``summary.json`` says of a training, on all ranks alike; scores are added to it."""
-    states = town.states.values()
-    own = [(s.parameter_count, len(s.strategy.plan) - s.strategy.splits, s.skipped, s.rays_done) for s in states]
-    own = [(*each, state.router.num_cells) for each, state in zip(own, states, strict=True)]
-    told = town.group.total(torch.tensor(own, dtype=torch.float64).sum(0))
+    own = torch.zeros(5, dtype=torch.float64)
+    for state in town.states.values():
+        left = len(state.strategy.plan) - state.strategy.splits
+        counts = state.parameter_count, left, state.skipped, state.rays_done, state.router.num_cells
+        own += torch.tensor(counts, dtype=torch.float64)
+    told = town.group.total(own)
     parameters, left, skipped, rays, cells = map(int, told.tolist())
     return {
         "complete": town.first.fraction >= 1,

@@ -189,12 +189,19 @@ class State:
             self.on_event(line)
 
 
-def build(config: TrainConfig, scene: Scene, *, on_event: Callable[[str], None] | None = None) -> State:
+def build(
+    config: TrainConfig,
+    scene: Scene,
+    *,
+    batches: RayBatches | None = None,
+    on_event: Callable[[str], None] | None = None,
+) -> State:
     """All that a training needs, before its first step.
 
     Args:
         config: The settings.
         scene: The scene that ``config.data`` names.
+        batches: Of rays; None for those of all training views of the scene.
         on_event: Called with a line of text for each split, evaluation and checkpoint.
 
     Raises:
@@ -221,7 +228,7 @@ def build(config: TrainConfig, scene: Scene, *, on_event: Callable[[str], None] 
     generator = torch.Generator().manual_seed(config.seed)
     # Random numbers are drawn on the device that uses them, so that the host need not wait.
     draws = generator if device.type == "cpu" else torch.Generator(device).manual_seed(config.seed)
-    batches = make_batches(config, scene)
+    batches = make_batches(config, scene) if batches is None else batches
     routers = make_routers(config)
     for router in routers.values():
         router.generator = draws
