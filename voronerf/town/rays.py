@@ -191,7 +191,7 @@ def step_together(
         own = torch.cat([guest.sums[:0], *(came[key] for key in came if key[1] == number)])
         if (learnt := guest.learn(own, own.new_zeros(()))) is not None:
             outputs[number].append(learnt)
-    return {number: functools.reduce(_both, each) for number, each in outputs.items()}
+    return {number: functools.reduce(_both, each) for number, each in outputs.items() if each}
 
 
 def _table(batch: Batch, rows: Tensor) -> Tensor:

@@ -19,14 +19,14 @@ from rich.console import Console
 
 from voronerf.app.cli.compare import compare
 from voronerf.app.cli.demo import demo
-from voronerf.app.cli.display import one_line
+from voronerf.app.cli.display import one_line, say
 from voronerf.app.cli.eval import evaluate_run
 from voronerf.app.cli.export import export
 from voronerf.app.cli.info import info
 from voronerf.app.cli.process import process
 from voronerf.app.cli.render import render
-from voronerf.app.cli.town import cut, join, place
-from voronerf.app.cli.train import command_of, train
+from voronerf.app.cli.town import cut, join, place, train_territories
+from voronerf.app.cli.train import WHAT_TO_TRY, train, with_stored_settings
 from voronerf.app.cli.view import view
 from voronerf.app.train.config import ConfigError
 from voronerf.app.train.loop import TrainingError
@@ -48,6 +48,7 @@ NO_MEMORY = (
 #: What ``voronerf NAME`` runs; arguments and docstring of each function are its options and its help.
 COMMANDS: dict[str, Callable[..., int]] = {
     "train": train,
+    "train-territories": train_territories,
     "eval": evaluate_run,
     "render": render,
     "export": export,
@@ -60,6 +61,9 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo,
     "process": process,
 }
+
+#: The commands that train, which take stored settings and end with a checkpoint when they are stopped.
+TRAININGS = ("train", "train-territories")
 
 
 def main(args: list[str] | None = None) -> int:
@@ -79,7 +83,7 @@ def main(args: list[str] | None = None) -> int:
     warnings.showwarning = _show_warning
     threading.excepthook = _show_thread_error
     with contextlib.ExitStack() as stack:
-        if args[:1] != ["train"]:  # which ends with a checkpoint
+        if args[:1] not in ([name] for name in TRAININGS):  # which end with a checkpoint
             stack.enter_context(_exit_on_sigterm())
         return _run(args)
 
@@ -100,12 +104,18 @@ def _exit_on_sigterm() -> Iterator[None]:
 
 def _run(args: list[str]) -> int:
     """Parses the command line and runs the command; prints errors to stderr."""
+    if args == ["train"]:
+        for line in WHAT_TO_TRY.splitlines():
+            say(line)
     try:
         for word in args:  # the parser prints a word that it does not know as it is
             if any(unicodedata.category(char) == "Cc" for char in word):
                 raise ConfigError(f"arguments must have no control characters, got {word}")
         return tyro.extras.subcommand_cli_from_dict(
-            {**COMMANDS, "train": command_of(args)},
+            {
+                **COMMANDS,
+                **{name: with_stored_settings(COMMANDS[name], args) for name in TRAININGS if name in args[:1]},
+            },
             prog="voronerf",
             description="Adaptive Voronoi NeRFs: one small network per Voronoi cell, trained and run as one.",
             args=args,

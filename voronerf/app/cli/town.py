@@ -1,21 +1,34 @@
-"""``voronerf join | cut | place``: runs of several parts."""
+"""``voronerf join | cut | place | train-territories``: runs of several parts."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import torch
 import tyro
 
-from voronerf.app.cli.display import say
+from voronerf.app.cli.display import TrainingDisplay, console, say
 from voronerf.app.cli.opening import AS_IN_TRAINING
-from voronerf.app.files import read_json
+from voronerf.app.cli.train import stopped_by_signals
+from voronerf.app.evaluate.panels import write_panels
+from voronerf.app.files import json_text, read_json, write_text
 from voronerf.app.run import Run
-from voronerf.app.train.config import ConfigError
-from voronerf.town import editing
+from voronerf.app.scenes import BUILTIN, load_scene
+from voronerf.app.train.build import check_device
+from voronerf.app.train.callbacks import CHECKPOINT_EVERY
+from voronerf.app.train.checkpoint import checkpoint_paths
+from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.run_directory import choose_directory, held
+from voronerf.town import editing, open_run
+from voronerf.town import train as territories_train
 from voronerf.town.editing import Source, check_out
 from voronerf.town.geometry import Similarity, Solid
+from voronerf.town.group import Group, local_rank, restarts
 
 #: Numbers of a transform on the command line.
 MOVE = "tx ty tz rx ry rz s"
@@ -170,3 +183,81 @@ def place(
     except ValueError as error:
         raise ConfigError(f"--scale, --turn, --at: {error}") from None
     return tell(out, editing.place(opened(run), opened(thing), at, out, degrees=turn, scale=scale))
+
+
+def train_territories(
+    config: TrainConfig,
+    *,
+    territories: int | None = None,
+    resume: bool = False,
+    file: Annotated[Path | None, tyro.conf.arg(name="config")] = None,
+    checkpoint_every: float = CHECKPOINT_EVERY,
+    panels: int = 4,
+) -> int:
+    """Train a large scene in territories, each with cells, table, views and rays of its own; rays cross their borders.
+
+    `torchrun --nproc-per-node 4 -m voronerf train-territories --out RUN` shares them out over processes, on any number
+    of which the run is the same bit for bit. The finished run is scored; `eval`, `view`, `join` and `cut` open it.
+
+    Args:
+        config: The settings of each territory.
+        territories: How many; default the least power of two that gives each process one.
+        resume: Continue the run in --out from its last checkpoint.
+        file: JSON of settings by their names, such as the config.json of a run; options that are given come first.
+        checkpoint_every: Seconds of training between checkpoints.
+        panels: Test views drawn as panels at the end.
+    """
+    device = torch.device(f"cuda:{local_rank()}" if config.device == "cuda" else config.device)
+    check_device(str(device))
+    config = replace(config, device=str(device))
+    group = Group.join(device)
+    try:
+        with contextlib.ExitStack() as stack:
+            if group.rank:  # the first speaks
+                null = stack.enter_context(open(os.devnull, "w"))
+                stack.enter_context(contextlib.redirect_stdout(null))
+                stack.enter_context(contextlib.redirect_stderr(null))
+            count = territories or 1 << (group.size - 1).bit_length()
+            return _train_territories(config, group, count, resume, checkpoint_every, panels)
+    except Exception as error:
+        if group.may_tell(error):
+            raise
+        return 1
+
+
+def _train_territories(
+    config: TrainConfig, group: Group, count: int, resume: bool, checkpoint_every: float, panels: int
+) -> int:
+    """Trains on this rank; the first writes the scores of the finished run."""
+    group.check_same(config, count)
+    territories_train.check_territories(config, count, group.size)
+    out, reading = config.out, dict(config.reading)
+    assert out is not None
+    if group.size > 1 and config.data not in BUILTIN:  # each rank reads its own of one copy
+        reading["images"] = "disk"
+    scene = load_scene(config.data, **reading)
+    group.check_same_scene(scene)
+    if group.rank == 0:  # alone, for what it writes is there already when others look
+        resume = resume or (restarts() > 0 and bool(checkpoint_paths(out)))
+        choose_directory(config, scene, resume=resume)
+    resume = group.gather(resume)[0]
+    with held(out) if group.rank == 0 else contextlib.nullcontext():
+        display = TrainingDisplay(console, scene.name)
+        with display.progress:
+            town = territories_train.build_town(config, scene, count, group, on_event=display.on_event)
+            if resume:
+                territories_train.resume(town)
+            with stopped_by_signals(town.stop):
+                territories_train.train(town, [display], checkpoint_every=checkpoint_every)
+        summary = territories_train.summary_of(town)
+        group.leave()  # the others would wait for the pictures
+        if group.rank == 0:
+            if summary["complete"]:
+                opened = open_run(out, scene=scene, backend=config.backend)
+                summary |= opened.evaluate(views=config.eval_views, lpips=config.lpips)
+                say(f"{count} territories, {summary['cells']} cells: psnr {summary['psnr']:.2f} dB")
+                if panels:
+                    write_panels(opened.renderer, opened.diagram, opened.scene, out / "images", views=panels)
+            write_text(out / "summary.json", json_text(summary, indent=2) + "\n")
+            say(f"wrote {out}" if summary["complete"] else f"stopped; continue with --resume --out {out}")
+    return 0 if summary["complete"] else 130

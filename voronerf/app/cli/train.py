@@ -10,7 +10,7 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -170,7 +170,12 @@ def run_training(
                 callbacks.append(TensorBoard(out / "tensorboard", scores))
             watched = None if watch is None else watch(state, scores)
             callbacks += [] if watched is None else [watched]
-            _run(state, callbacks, checkpoints)
+            with stopped_by_signals(state.stop):
+                try:
+                    run(state, callbacks)
+                except SceneError:  # of images on disk that were cut short: what was learnt stays
+                    checkpoints.on_end(state)
+                    raise
         if not scores.summary["complete"]:
             again = f" --data {shlex.quote(config.data)}" if is_outside(out, config.data) else ""
             say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}{again}")
@@ -184,8 +189,9 @@ def run_training(
         return scores.summary
 
 
-def _run(state: State, callbacks: Sequence[Callback], checkpoints: Checkpoints) -> None:
-    """Runs a training that the signals of ``STOPPING`` stop."""
+@contextlib.contextmanager
+def stopped_by_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """A context in which the first of the signals of ``STOPPING`` calls ``stop``, and a second ends the process."""
     # One that is ignored stays so, as under nohup or where a shell started it in the background.
     before = {number: signal.getsignal(number) for number in STOPPING}
     before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
@@ -194,29 +200,23 @@ def _run(state: State, callbacks: Sequence[Callback], checkpoints: Checkpoints) 
         for number, handler in before.items():
             signal.signal(number, handler)
 
-    def stop(number: int, frame: FrameType | None) -> None:
-        state.stop()
+    def handle(number: int, frame: FrameType | None) -> None:
+        stop()
         restore()
 
     for number in before:
-        signal.signal(number, stop)
+        signal.signal(number, handle)
     try:
-        run(state, callbacks)
-    except SceneError:  # of images on disk that were cut short: what was learnt stays
-        checkpoints.on_end(state)
-        raise
+        yield
     finally:
         restore()
 
 
-def command_of(args: list[str]) -> Callable[..., int]:
-    """Returns :func:`train`, whose defaults are the settings of --config, or for --resume those of the run in --out."""
-    if args == ["train"]:
-        for line in WHAT_TO_TRY.splitlines():
-            say(line)
+def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callable[..., int]:
+    """A command that trains, whose defaults are the settings of --config, or for --resume those of the run in --out."""
     file, out = _given_path(args, "--config"), _given_path(args, "--out")
-    if "train" not in args[:1] or (file is None and "--resume" not in args):
-        return train
+    if file is None and "--resume" not in args:
+        return command
     if file is not None and "--resume" in args:
         raise ConfigError("--config must be left out with --resume, which goes on with the settings of the run")
     if file is not None and not file.is_file():
@@ -224,7 +224,7 @@ def command_of(args: list[str]) -> Callable[..., int]:
     stored = read_config(file) if file is not None else None if out is None else stored_config(out)
     folder = out if file is None else file.parent
     if folder is None or stored is None:
-        return train
+        return command
 
     def given(name: str) -> bool:
         return any(word == f"--{name}" or word.startswith(f"--{name}=") for word in args)
@@ -239,14 +239,14 @@ def command_of(args: list[str]) -> Callable[..., int]:
     elif length == {"budget"} and stored.steps is not None:
         stored = replace(stored, budget=sys.float_info.max, steps=None)
 
-    @functools.wraps(train)
-    def train_on(config: TrainConfig = stored, **others: Any) -> int:
-        return train(config, **others)
+    @functools.wraps(command)
+    def with_settings(config: TrainConfig = stored, **others: Any) -> int:
+        return command(config, **others)
 
-    first, *others = inspect.signature(train).parameters.values()
+    first, *others = inspect.signature(command).parameters.values()
     signature = inspect.Signature([first.replace(default=stored), *others])
-    train_on.__signature__ = signature  # type: ignore[attr-defined]
-    return train_on
+    with_settings.__signature__ = signature  # type: ignore[attr-defined]
+    return with_settings
 
 
 def _given_path(args: list[str], option: str) -> Path | None:
