@@ -44,7 +44,7 @@ def test_promises_name_tests_that_are_there() -> None:
 def options() -> dict[str, set[str]]:
     """The options of each command, as docs/options.md shows them."""
     text = script(ROOT / "docs" / "scripts" / "options.py")
-    commands = re.findall(r"^## voronerf (\w+)\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
+    commands = re.findall(r"^## voronerf ([\w-]+)\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
     return {name: set(re.findall(r"--[a-z][a-z-]+", part)) for name, part in commands}
 
 
@@ -59,7 +59,7 @@ def test_every_option_is_on_the_page() -> None:
 
 @pytest.mark.parametrize("name", [name for name in PAGES if "changelog" not in name])
 def test_options_on_a_page_exist(name: str) -> None:
-    for command, line in re.findall(r"voronerf (\w+)( [^`\n|#]*)", (ROOT / name).read_text()):
+    for command, line in re.findall(r"voronerf ([\w-]+)( [^`\n|#]*)", (ROOT / name).read_text()):
         for option in re.findall(r"(?<!\w)--[a-z-]+", line) if command in options() else ():
             assert option in options()[command], f"{name}: voronerf {command} has no {option}"
 

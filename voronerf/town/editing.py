@@ -96,6 +96,13 @@ def join(runs: Sequence[Run], out: Path | str, *, frames: Sequence[Similarity] |
     Raises:
         ConfigError: For runs that cannot be joined; see the guide.
         OSError: When it cannot be written; nothing is left then.
+
+    Examples:
+        >>> from voronerf.app import open_run
+        >>> from voronerf.town import Similarity, join
+        >>> def beside_each_other(east, west, out):
+        ...     frames = [Similarity(), Similarity.of((2.0, 0, 0))]
+        ...     return join([open_run(east), open_run(west)], out, frames=frames)
     """
     if len(runs) < 2 or (frames is not None and len(frames) != len(runs)):
         count = "none" if frames is None else f"{len(frames)}"
@@ -118,6 +125,12 @@ def cut(run: Run, kept: Solid | Sequence[int], out: Path | str, *, outside: bool
     Raises:
         ConfigError: When nothing is left, or there is no such cell.
         OSError: When it cannot be written; nothing is left then.
+
+    Examples:
+        >>> from voronerf.app import open_run
+        >>> from voronerf.town import Solid, cut
+        >>> def ball_of(run, out):
+        ...     return cut(open_run(run), Solid(ball=(0, 0, 0.4, 0.5)), out)
     """
     source = Source.of(run)
     if isinstance(kept, Solid):
@@ -155,6 +168,13 @@ def place(
     Raises:
         ConfigError: For an object without bounds.
         OSError: When it cannot be written; nothing is left then.
+
+    Examples:
+        >>> from voronerf.app import open_run
+        >>> from voronerf.town import open_run as open_parts
+        >>> from voronerf.town import place
+        >>> def on_the_ground(garden, statue, out):
+        ...     return place(open_run(garden), open_parts(statue), (0.2, -0.1, 0), out, scale=0.5)
     """
     source, box = Source.of(thing), thing.scene.box
     if box is None:

@@ -178,6 +178,11 @@ def open_run(
         CheckpointError: If there is no usable checkpoint.
         ConfigError: For an argument that cannot be used, or a folder of the run that is a link to elsewhere.
         SceneError: If the scene cannot be read.
+
+    Examples:
+        >>> from voronerf.town import open_run
+        >>> def first_picture(joined):
+        ...     return open_run(joined).render(0).colour
     """
     path = Path(path)
     check_device(device)

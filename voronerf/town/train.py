@@ -31,7 +31,7 @@ from voronerf.app.train.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from voronerf.app.train.defaults import resolve, space_of
+from voronerf.app.train.defaults import resolve
 from voronerf.app.train.loop import stage_of
 from voronerf.app.train.resume import snapshot
 from voronerf.diagram import VoronoiDiagram
@@ -143,7 +143,7 @@ def build_town(
     check_territories(config, count, group.size)
     whole = resolve(config, scene)
     check_territories(whole, count, group.size)
-    contraction = space_of(whole, scene).contraction
+    contraction = scene.space(whole.contraction).contraction
     try:
         territories = cut_space(scene, count, contraction)
     except ValueError as error:
