@@ -13,9 +13,6 @@ from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
 from voronerf.router import dispatch
-from voronerf.router.grouped import Grouped, Loop
-from voronerf.router.grouping import Grouping
-from voronerf.router.layout import Call, Layout
 
 CENTRES = torch.rand(6, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
 
@@ -104,55 +101,6 @@ def test_measuring_leaves_no_trace(requires_grad: bool) -> None:
     if text.startswith("forward: grouped"):
         assert torch.equal(after, torch.get_rng_state()) and router.module.seen == fixed.module.seen == 1
     assert all(parameter.grad is None for parameter in router.parameters()) and x.grad is None
-
-
-@pytest.mark.measures
-def test_times_are_those_of_a_step() -> None:
-    """Forward and backward where there is one; the loop of 16 cells takes longer than one pass for all of them."""
-
-    seen = []
-
-    class Spy(nn.Linear):
-        def forward(self, x: Tensor) -> Tensor:
-            y = super().forward(x)
-            if y.requires_grad:
-                y.register_hook(lambda gradient: seen.append("backward"))
-            return y
-
-    router, x = VoronoiRouter(Spy(3, 2), CENTRES, coords="first3", way="grouped"), uniform((300,))
-    router(x)
-    seen.clear()
-    layout = Call(router.module, "forward", Layout((300,), None, frozenset()), ["input"], (x,), {})
-    grouping = Grouping(router.diagram.locate(x), 300, 6, x.device, "auto")
-    times = dispatch.measure([Grouped(), Loop()], layout, grouping)
-    assert len(times) == 2 and all(0 < time < 10 for time in times) and seen.count("backward") >= 2 * (1 + 6)
-    with torch.no_grad():
-        seen.clear()
-        dispatch.measure([Grouped(), Loop()], layout, grouping)
-        assert not seen
-
-
-class Decides(nn.Module):
-    """Reads values of the samples on the way."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = network()
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.net(x) if float(x[:, 0].max()) < 100 else -self.net(x)
-
-
-@pytest.mark.filterwarnings("ignore:VoronoiRouter")
-def test_a_module_that_reads_values_is_tried_again_by_doubling(monkeypatch: pytest.MonkeyPatch) -> None:
-    tries, call, own = [], [0], dispatch.Probe.is_groupable
-    monkeypatch.setattr(dispatch.Probe, "is_groupable", lambda trial: tries.append(call[0]) or own(trial))
-    router, x = VoronoiRouter(Decides(), CENTRES, coords="first3"), uniform((60,))
-    for number in range(100):
-        call[0] = number
-        router(x)
-    assert len(tries) <= 8 and tries[:2] == [1, 2]
-    assert router.explain().startswith("forward: cell by cell: torch.Tensor.__float__ reads values of the samples")
 
 
 class Half(nn.Module):

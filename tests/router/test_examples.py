@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from convention_harness import EXAMPLES
 
-ELSEWHERE = ("nerf_pytorch_style",)  # which has a test of its own
+ELSEWHERE = ("nerf_pytorch_style", "train")  # which have tests of their own
 SCRIPTS = sorted(path for path in EXAMPLES.glob("*.py") if path.stem not in ELSEWHERE)
 
 

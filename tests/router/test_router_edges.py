@@ -63,29 +63,9 @@ def directions(n: int) -> Tensor:
     return nn.functional.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
 
 
-class Wrapped(Moved):
-    """One whose arguments have no names of their own."""
-
-    def forward(self, *args: Any, **kwargs: Any) -> Any:
-        return super().forward(*args, **kwargs)
-
-
-class Own(NeRF):
-    """One with a ``forward`` and an ``activate`` of its own, which may say different things."""
-
-    def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        colour, density = super().activate(raw)
-        return colour, 2 * density
-
-    def forward(self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> Any:
-        colour, density = super().forward(positions, directions, ray_index)
-        return colour * 0.5, density
-
-
 @pytest.mark.filterwarnings("ignore:.*runs cell by cell")
-@pytest.mark.parametrize("kind", [Moved, Wrapped, Own])
-def test_such_fields_as_the_renderer_calls_them(kind: type[NeRF]) -> None:
-    field, x = kind(width=16, depth=2), samples()[:, :3]
+def test_such_fields_as_the_renderer_calls_them() -> None:
+    field, x = Moved(width=16, depth=2), samples()[:, :3]
     rays, index = directions(10), (torch.arange(40) % 10).int()
     router = VoronoiRouter(field, centres())
     expected = field(x, rays, index)

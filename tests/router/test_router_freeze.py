@@ -7,9 +7,7 @@ import pytest
 import torch
 
 from voronerf import NeRF, VoronoiRouter
-from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Rays, Renderer, Step
 from voronerf.nerf.adam import Adam
-from voronerf.nerf.average import update_averages
 from voronerf.nerf.fields import HashGridField
 from voronerf.ops import forward_with_tape
 
@@ -158,44 +156,18 @@ def test_forward_with_tape_leaves_frozen_cells_out(backend):
         forward_with_tape({**network, "frozen": torch.zeros(4)})
 
 
-def test_a_step_leaves_out_rays_that_teach_nothing():
-    router = make("table")
-    grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [2.0, 2, 2]]), 8, threshold=0.01)
-    step = Step(Renderer({"field": router}, Occupancy(grid, 32)))
-    origins = torch.tensor([[x, y, -2.0] for x in (-0.2, 1.2) for y in (-0.2, 1.2)] * 4)
-    rays = Rays(origins, torch.tensor([[0.0, 0, 1]]).expand(16, 3))
-    batch = Batch(rays, torch.zeros(16), torch.full((16,), 4.0), torch.rand(16, 3), torch.rand(16, 3))
-
-    def run():
-        router.zero_grad()
-        found = step.run(batch, torch.Generator().manual_seed(3))
-        found.loss.backward()
-        return found, [p.grad.clone() for p in router.parameters()]
-
-    _, expected = run()
-    router.freeze([1, 2, 3])
-    found, learnt = run()
-    assert len(found.error) == 4 and len(found.importance()) == len(found.weights)
-    for own, full in zip(learnt, expected, strict=True):
-        torch.testing.assert_close(own[0], full[0])
-        assert not own[1:].any()
-    router.freeze()
-    found, learnt = run()
-    assert len(found.error) == 1 and not any(g.any() for g in learnt)
-
-
 def test_averages_of_frozen_cells_stay():
     router, points = make("grouped"), torch.rand(200, 3)
-    optimizer = Adam([{"params": list(router.parameters())}], lr=0.1)
+    optimizer = Adam([{"params": list(router.parameters())}], lr=0.1, average=0.98)
     for step in (0, 4):
         gradients(router, points)
         optimizer.step()
-        update_averages(optimizer, 0.98, step)
+        optimizer.after_step(step)
     router.freeze(FROZEN)
     old = [optimizer.state[p]["average"].clone() for p in router.parameters()]
     gradients(router, points)
     optimizer.step()
-    update_averages(optimizer, 0.98, 8)
+    optimizer.after_step(8)
     for p, before in zip(router.parameters(), old, strict=True):
         now = optimizer.state[p]["average"]
         assert torch.equal(now[FROZEN], before[FROZEN]) and not torch.equal(now[LEARNING], before[LEARNING])

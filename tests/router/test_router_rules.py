@@ -32,30 +32,6 @@ class FiLM(nn.Module):
         return self.out(x)
 
 
-class WideFiLM(FiLM):
-    """The same with a dimension in the middle, as pi-GAN has it."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        freq, phase = self.mapping(self.code).chunk(2, -1)
-        x = x[:, None]
-        for layer in self.layers:
-            x = layer(x)
-            x = torch.sin(freq[0].expand_as(x) * x + phase.unsqueeze(1).expand_as(x))
-        return self.out(x)[:, 0]
-
-
-class Normed(nn.Module):
-    """stable-dreamfusion: LayerNorm between layers."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = nn.Sequential(nn.Linear(3, 8), nn.LayerNorm(8), nn.SiLU(), nn.Linear(8, 2))
-        self.rms = nn.RMSNorm(2)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.rms(self.net(x))
-
-
 class Added(nn.Module):
     """Layers written by ``addmm``."""
 
@@ -133,14 +109,11 @@ class Spectrum(Gabor):
 MODULES: dict[str, Callable[[], nn.Module]] = {
     "addmm": Added,
     "FiLM": FiLM,
-    "FiLM in the middle": WideFiLM,
-    "LayerNorm": Normed,
     "stacked planes": TensorVM,
     "stacked planes, border": lambda: TensorVM("border"),
     "stacked planes, reflection": lambda: TensorVM("reflection"),
     "data of a parameter": BARF,
     "complex layers": Gabor,
-    "complex layers without bias": lambda: Gabor(bias=False),
     "complex results": Spectrum,
 }
 

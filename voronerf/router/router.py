@@ -477,15 +477,27 @@ class VoronoiRouter(nn.Module):
         directions: Tensor | None = None,
         ray_index: Tensor | None = None,
     ) -> Any:
-        field, table = self.field, self.field.layers
-        features = 6 if table.integrated else 3
+        features = 6 if self.field.layers.integrated else 3
         if positions.ndim != 2 or positions.shape[1] != features:
             raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
-        if not table.uses_directions:
-            directions = ray_index = None
-        given: dict[str, Any] = {"directions": directions, "direction_index": ray_index}
-        given.update(self._where(positions, coords), frozen=self.frozen_cells, backend=self.backend)
-        return field.activate(routed_mlp(positions, **parameters_of_table(field, self.num_cells), **given)[0])
+        given = self._arguments(coords, positions, directions, ray_index)
+        return self.field.activate(routed_mlp(**given, backend=self.backend)[0])
+
+    def _arguments(
+        self, coords: Tensor | None, positions: Tensor, directions: Tensor | None, ray_index: Tensor | None
+    ) -> dict[str, Any]:
+        """Those of ``routed_mlp``; ``coords`` decide the cells, or for None the positions."""
+        given = {"positions": positions, **parameters_of_table(self.field, self.num_cells), "frozen": self.frozen_cells}
+        if self.field.layers.uses_directions:
+            given.update(directions=directions, direction_index=ray_index)
+        diagram = self.diagram
+        if self.num_cells > 1 and self.assignment == "stochastic" and self.training:
+            given["cells"] = self.assign((positions[:, :3] if coords is None else coords).detach())
+        elif self.num_cells > 1:
+            given.update(centres=diagram.centres, coords=coords)
+            if diagram.depth > 1:
+                given.update(child_offsets=diagram.child_offsets, child=diagram.child, depth=diagram.depth)
+        return given
 
     def table_arguments(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any] | None:
         """``routed_mlp`` arguments for what the networks give before ``activate``, or None if unsupported.
@@ -494,13 +506,10 @@ class VoronoiRouter(nn.Module):
         """
         if not self.by_table or self._coords_of_table(None, (positions,), {}) is not None:
             return None
-        given = {"positions": positions, **parameters_of_table(self.field, self.num_cells), "frozen": self.frozen_cells}
-        if self.field.layers.uses_directions:
-            given.update(directions=directions, direction_index=ray_index)
-        where = self._where(positions, None)
-        if "centres" in where:
-            where["coords"], where["centres"] = of_one_dtype(positions, where["centres"])
-        return {**given, **where}
+        given = self._arguments(None, positions, directions, ray_index)
+        if "centres" in given:
+            given["coords"], given["centres"] = of_one_dtype(positions, given["centres"])
+        return given
 
     def last_output(self, positions: Tensor) -> Tensor | None:
         """The last output of the layer table, [n, width], without the layers that it does not need.
@@ -513,10 +522,9 @@ class VoronoiRouter(nn.Module):
         table, kept = for_last_output(self.field.layers)
         if table.uses_directions or self._coords_of_table(None, (positions,), {}) is not None:
             return None
-        given = parameters_of_table(self.field, self.num_cells)
+        given = self._arguments(None, positions, None, None)
         given.update({name: [given[name][i] for i in kept] for name in ("weights", "biases")}, layers=table)
-        given["frozen"] = self.frozen_cells
-        return routed_mlp(positions, **given, backend=self.backend, **self._where(positions, None))[0]
+        return routed_mlp(**given, backend=self.backend)[0]
 
     def explain(self) -> str:
         """How each method has been carried out, a line for each: fused, grouped or cell by cell, and why.
@@ -616,18 +624,6 @@ class VoronoiRouter(nn.Module):
         if self.methods:
             self._assigned = Assigned(grouping, positions.detach().clone(), key, {method})
         return grouping
-
-    def _where(self, positions: Tensor, coords: Tensor | None) -> dict[str, Any]:
-        """Arguments of ``routed_mlp``: the cells if they are drawn, else the diagram's tables."""
-        diagram = self.diagram
-        if self.num_cells == 1:
-            return {}
-        if self.assignment == "stochastic" and self.training:
-            return {"cells": self.assign((positions[:, :3] if coords is None else coords).detach())}
-        tables = {"centres": diagram.centres, "coords": coords}
-        if diagram.depth == 1:
-            return tables
-        return {**tables, "child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_watch": None, "_assigned": None}
