@@ -13,16 +13,6 @@ from voronerf.app.cli.main import COMMANDS
 from voronerf.app.cli.opening import Opening
 from voronerf.app.train.config import TrainConfig
 
-#: Headings above the settings of `voronerf train`, each before the setting that it names.
-SECTIONS = {
-    "data": "Scene, run and machine",
-    "budget": "Length of the training",
-    "field": "Network",
-    "cells": "Cells",
-    "rays": "Samples along the rays",
-    "lr": "Optimiser",
-    "evaluations": "Evaluation and pictures",
-}
 HEADER = ["| option | values | default | |", "|---|---|---|---|"]
 
 
@@ -33,22 +23,17 @@ def markdown() -> str:
         summary, _, arguments = inspect.cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")
         lines += [f"## voronerf {name}", "", summary, ""]
         if name == "train":
-            lines += [*train_tables(), "### Viewer", ""]
+            lines += [*train_tables(), "### This training", ""]
         lines += table(function, arguments)
     return "\n".join(lines) + "\n"
 
 
 def train_tables() -> list[str]:
-    """The settings of a training run under their headings."""
-    unknown = set(SECTIONS) - {field.name for field in dataclasses.fields(TrainConfig)}
-    if unknown:
-        raise ValueError(f"options: SECTIONS must name settings of TrainConfig, got {', '.join(sorted(unknown))}")
+    """The settings of a training, a table for each group of them."""
     lines = []
-    for field, line in zip(dataclasses.fields(TrainConfig), settings(TrainConfig), strict=True):
-        if field.name in SECTIONS:
-            lines += ["", f"### {SECTIONS[field.name]}", "", *HEADER]
-        lines.append(line)
-    return [*lines, ""]
+    for group in reversed(TrainConfig.__bases__):
+        lines += [f"### {group.__name__.removesuffix('Settings')}", "", *HEADER, *settings(group), ""]
+    return lines
 
 
 def settings(kind: type) -> list[str]:
@@ -60,6 +45,7 @@ def settings(kind: type) -> list[str]:
 def table(function: Callable[..., Any], arguments: str) -> list[str]:
     """The arguments of a command."""
     texts, kinds = dict(argument_docs(arguments)), get_type_hints(function)
+    marked = get_type_hints(function, include_extras=True)
     lines = []
     for name, parameter in inspect.signature(function).parameters.items():
         if kinds[name] is TrainConfig:
@@ -68,14 +54,17 @@ def table(function: Callable[..., Any], arguments: str) -> list[str]:
             lines += settings(Opening)
             continue
         positional = parameter.kind is parameter.POSITIONAL_ONLY
-        label = name.upper() if positional else f"--{dashed(name)}"
+        shown = next(
+            (word.name for word in getattr(marked[name], "__metadata__", ()) if getattr(word, "name", None)), name
+        )
+        label = name.upper() if positional else f"--{dashed(shown)}"
         lines.append(row(label, kinds[name], parameter.default, texts[name]))
     return [*HEADER, *lines, ""] if lines else ["No options.", ""]
 
 
 def row(label: str, kind: Any, default: Any, text: str) -> str:
     """One line of a table."""
-    shown = "" if default in (None, inspect.Parameter.empty) else f"`{words(default)}`"
+    shown = "" if default in (None, (), inspect.Parameter.empty) else f"`{words(default)}`"
     if isinstance(default, bool):
         label, shown = f"{label}` or `{label.replace('--', '--no-')}", "on" if default else "off"
     text = re.sub(r"(?<![`\w])(--[a-z][a-z-]+)", r"`\1`", " ".join(text.split()))

@@ -14,7 +14,7 @@ import torch
 
 PAGES = Path(__file__).resolve().parents[2] / "docs" / "reference"
 PACKAGES = ("voronerf", *(f"voronerf.{name}" for name in ("ops", "diagram", "router", "nerf", "nerf.fields", "town")))
-PACKAGES += tuple(f"voronerf.app.{name}" for name in ("scenes", "train", "evaluate", "render", "export"))
+PACKAGES += ("voronerf.app", *(f"voronerf.app.{name}" for name in ("scenes", "train", "evaluate", "render", "export")))
 
 
 def resolve(path: str) -> Any:
