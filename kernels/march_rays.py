@@ -7,19 +7,18 @@ on its own (``fuse_fp`` off): a sample falls in the same cell.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import torch
 import warp as wp
-from torch import Tensor
 
 from voronerf.kernels._launch import array, filled, launch
 from voronerf.ops._core.checks import MAX_COUNT
-from voronerf.ops._core.custom_op import custom_op
-from voronerf.ops.march_rays.reference import March, Rays
+from voronerf.ops._core.declare import declared
+from voronerf.ops.march_rays.reference import March
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+_OP = declared("march_rays")
 
 
 @wp.func
@@ -211,39 +210,31 @@ def _march_kernel(given: Given, counting: wp.bool, offsets: wp.array(dtype=wp.in
         out.stop[ray] = given.samples
 
 
-def march_rays(rays: Rays, capacity: int | None) -> March:
-    """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
-    offsets = _count(rays, MAX_COUNT if capacity is None else capacity)
-    rows = int(offsets[-1]) if capacity is None else capacity
-    return March(offsets, *_fill(rays, offsets, rows))
-
-
-@custom_op("march_rays_warp_count")
-def _count(rays: Rays, capacity: int) -> Iterator[Tensor]:
-    near, r = rays.near, rays.near.shape[0]
-    offsets = near.new_empty(r + 1, dtype=torch.int32)
-    yield offsets
-    counts = torch.zeros_like(offsets)
-    out = filled(Samples(), counts=counts[1:], positions=rays.origins[:0])
+def _march_rays(*flat: Any) -> March:
+    given = _OP.Inputs._make(flat)
+    near, r, capacity, inputs = given.near, given.r, given.capacity, _inputs(given)
+    counts = near.new_zeros(r + 1, dtype=torch.int32)
+    out = filled(Samples(), counts=counts[1:], positions=given.origins[:0])
     filled(out, ray_index=counts[:0], depths=near[:0], deltas=near[:0], stop=counts[:0])
-    launch(_march_kernel, r, [_inputs(rays), True, array(counts[:0], near), out], near)
+    launch(_march_kernel, r, [inputs, True, array(counts[:0], near), out], near)
     # In int64: the number of samples of all rays may not fit int32; the capacity does.
-    offsets.copy_(counts.cumsum(dim=0).clamp(max=capacity))
+    offsets = counts.cumsum(dim=0).clamp(max=MAX_COUNT if capacity is None else capacity).int()
+    found = March.memory(near, offsets, int(offsets[-1]) if capacity is None else capacity)
+    for part in found[1:5]:  # 0 in rows that belong to no ray
+        part.zero_()
+    launch(_march_kernel, r, [inputs, False, array(offsets, near), _samples(found)], near)
+    return found
 
 
-@custom_op("march_rays_warp_fill")
-def _fill(rays: Rays, offsets: Tensor, rows: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
-    near, r = rays.near, rays.near.shape[0]
-    # Rays, depths, deltas and positions, 0 in rows that belong to no ray; and where the rays stop.
-    index, stop = near.new_zeros(rows, dtype=torch.int32), near.new_empty(r, dtype=torch.int32)
-    depths, deltas, positions = near.new_zeros(rows), near.new_zeros(rows), near.new_zeros(rows, 3)
-    yield index, depths, deltas, positions, stop
-    out = filled(Samples(), counts=offsets[:0], ray_index=index, depths=depths, deltas=deltas)
-    filled(out, positions=positions, stop=stop)
-    launch(_march_kernel, r, [_inputs(rays), False, array(offsets, near), out], near)
+def _samples(found: March) -> Any:
+    out = filled(Samples(), counts=found.ray_offsets[:0], ray_index=found.ray_index, depths=found.depths)
+    return filled(out, deltas=found.deltas, positions=found.positions, stop=found.stop)
 
 
-def _inputs(rays: Rays) -> Any:
+march_rays = _OP.make_op("march_rays_warp", _march_rays, March.fake, _march_rays)
+
+
+def _inputs(rays: Any) -> Any:
     near, contraction = rays.near, rays.contraction
     none = near.new_empty(0, dtype=torch.int32)
     given = filled(
@@ -256,5 +247,7 @@ def _inputs(rays: Rays) -> Any:
         started=rays.start is not None,
         space=near.new_empty(0, 0) if contraction is None else contraction.view(-1, contraction.shape[-1]),
     )
-    rest = ("origins", "directions", "near", "far", "occupied", "box", "samples", "disparity", "most")
+    rest = ("origins", "directions", "near", "far", "occupied", "box", "samples")
+    most = rays.samples if rays.most is None else rays.most
+    filled(given, disparity=rays.spacing == "disparity", most=most)
     return filled(given, **{name: getattr(rays, name) for name in rest})

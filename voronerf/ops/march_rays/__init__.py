@@ -2,36 +2,48 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, Implementation
-from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_choice, check_count, check_integer, detached
-from voronerf.ops.march_rays.reference import March, Rays
+from voronerf.ops._core.checks import check_count
+from voronerf.ops._core.declare import declare
+from voronerf.ops.march_rays.reference import March
 
-_OP = backends.declare(
-    "march_rays", native=Implementation(EVERYWHERE, (torch.float32,)), warp=Implementation(EVERYWHERE, (torch.float32,))
+
+def _prepare(given: Any) -> Any:
+    if given.seed is not None and given.uniforms is not None:
+        raise ValueError("march_rays: seed must be None where uniforms are given, got both")
+    check_count("march_rays", "samples of all rays", given.origins.shape[0] * given.samples)
+    if given.occupied.numel() < 1:
+        raise ValueError(f"march_rays: occupied must have at least one cell, got {list(given.occupied.shape)}")
+    return given
+
+
+@declare(
+    native=Implementation(EVERYWHERE, (torch.float32,)),
+    warp=Implementation(EVERYWHERE, (torch.float32,)),
+    small=["occupied"],
+    prepare=_prepare,
 )
-_SPACINGS = ("linear", "disparity")
-
-
 def march_rays(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    samples: int,
+    origins: Annotated[Tensor, "float32|float64 [r, 3]"],
+    directions: Annotated[Tensor, "same [r, 3]"],
+    near: Annotated[Tensor, "same [r]"],
+    far: Annotated[Tensor, "same [r]"],
+    occupied: Annotated[Tensor, "bool [x, y, z]"],
+    box: Annotated[Tensor, "same [2, 3]"],
+    samples: Annotated[int, "1..65535"],
     *,
-    uniforms: Tensor | None = None,
-    seed: Tensor | None = None,
-    spacing: str = "linear",
-    start: Tensor | None = None,
-    most: int | None = None,
-    capacity: int | None = None,
-    contraction: Tensor | None = None,
+    uniforms: Annotated[Tensor | None, "same [r, samples]"] = None,
+    seed: Annotated[Tensor | None, "int32 [1]"] = None,
+    spacing: Annotated[str, "linear|disparity"] = "linear",
+    start: Annotated[Tensor | None, "int32 [r]"] = None,
+    most: Annotated[int | None, "1.."] = None,
+    capacity: Annotated[int | None, "1.."] = None,
+    contraction: Annotated[Tensor | None, "same [4] or [5, 3]"] = None,
     backend: str = "auto",
 ) -> March:
     """Stratified samples of rays without those in empty cells of a grid, packed for ``composite``.
@@ -87,45 +99,3 @@ def march_rays(
         >>> march.ray_offsets
         tensor([0, 2], dtype=torch.int32)
     """
-    check_integer(_OP, "samples", samples, 1, 65_535)
-    given = Checked(_OP)
-    given.sizes["s"] = samples
-    given.tensor("origins", origins, (torch.float32, torch.float64), "r", 3)
-    given.tensor("directions", directions, LIKE_FIRST, "r", 3)
-    given.tensor("near", near, LIKE_FIRST, "r")
-    given.tensor("far", far, LIKE_FIRST, "r")
-    given.tensor("occupied", occupied, (torch.bool,), "x", "y", "z")
-    given.tensor("box", box, LIKE_FIRST, 2, 3)
-    given.optional("uniforms", uniforms, LIKE_FIRST, "r", "s")
-    if seed is not None and uniforms is not None:
-        raise ValueError(f"{_OP}: seed must be None where uniforms are given, got both")
-    given.optional("seed", seed, INDEX, 1)
-    given.optional("start", start, INDEX, "r")
-    sphere = isinstance(contraction, Tensor) and contraction.dim() == 1
-    given.optional("contraction", contraction, LIKE_FIRST, *((4,) if sphere else (5, 3)))
-    check_choice(_OP, "spacing", spacing, _SPACINGS)
-    for name, value in (("most", most), ("capacity", capacity)):
-        if value is not None:
-            check_integer(_OP, name, value, 1)
-            check_count(_OP, name, value)
-    check_count(_OP, "occupied", occupied.numel())
-    check_count(_OP, "samples of all rays", given.sizes["r"] * samples)
-    if occupied.numel() < 1:
-        raise ValueError(f"{_OP}: occupied must have at least one cell, got {list(occupied.shape)}")
-    run = backends.resolve(_OP, backend=backend, device=origins.device, dtype=origins.dtype)
-    rays = Rays(
-        origins=detached(origins),
-        directions=detached(directions),
-        near=detached(near),
-        far=detached(far),
-        occupied=occupied,
-        box=detached(box),
-        uniforms=detached(uniforms),
-        seed=seed,
-        start=start,
-        contraction=detached(contraction),
-        samples=samples,
-        disparity=spacing == "disparity",
-        most=samples if most is None else most,
-    )
-    return March(*run(rays, capacity))

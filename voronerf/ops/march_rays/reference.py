@@ -6,44 +6,10 @@ sample falls in is then the same everywhere.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
-
-
-class Rays(NamedTuple):
-    """What ``march_rays`` reads; ``voronerf.ops.march_rays`` says what each is.
-
-    Attributes:
-        origins: [r, 3].
-        directions: [r, 3].
-        near: [r].
-        far: [r].
-        occupied: bool [x, y, z].
-        box: [2, 3].
-        uniforms: [r, s] or None.
-        seed: int32 [1] or None.
-        start: int32 [r] or None.
-        contraction: [4], [5, 3] or None.
-        samples: s.
-        disparity: whether strata are equal steps of 1 / distance.
-        most: samples of a ray, at the most.
-    """
-
-    origins: Tensor
-    directions: Tensor
-    near: Tensor
-    far: Tensor
-    occupied: Tensor
-    box: Tensor
-    uniforms: Tensor | None
-    seed: Tensor | None
-    start: Tensor | None
-    contraction: Tensor | None
-    samples: int
-    disparity: bool
-    most: int
 
 
 class March(NamedTuple):
@@ -68,18 +34,46 @@ class March(NamedTuple):
         (tensor([0.2500, 0.7500, 1.2500, 1.7500]), tensor([0, 0, 0, 0], dtype=torch.int32))
     """
 
-    ray_offsets: Tensor
-    ray_index: Tensor
-    depths: Tensor
-    deltas: Tensor
-    positions: Tensor
-    stop: Tensor
+    ray_offsets: Annotated[Tensor, "int32 [r + 1]"]
+    ray_index: Annotated[Tensor, "int32 [m]"]
+    depths: Annotated[Tensor, "same [m]"]
+    deltas: Annotated[Tensor, "same [m]"]
+    positions: Annotated[Tensor, "same [m, 3]"]
+    stop: Annotated[Tensor, "int32 [r]"]
+
+    @staticmethod
+    def memory(near: Tensor, offsets: Tensor, rows: Any) -> March:
+        """Memory for so many samples, after the offsets of the rays."""
+        index, stop = (near.new_empty(count, dtype=torch.int32) for count in (rows, near.shape[0]))
+        return March(offsets, index, near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3), stop)
+
+    @staticmethod
+    def fake(given: Any) -> March:
+        """Without a capacity the number of samples depends on where the rays go."""
+        rows = torch.library.get_ctx().new_dynamic_size() if given.capacity is None else given.capacity
+        offsets = given.near.new_empty(given.near.shape[0] + 1, dtype=torch.int32)
+        return March.memory(given.near, offsets, rows)
 
 
 @torch.no_grad()
-def march_rays(rays: Rays, capacity: int | None) -> March:
+def march_rays(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    samples: int,
+    uniforms: Tensor | None,
+    seed: Tensor | None,
+    spacing: str,
+    start: Tensor | None,
+    most: int | None,
+    capacity: int | None,
+    contraction: Tensor | None,
+) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
-    origins, directions, near, far, occupied, box, uniforms, seed, start, contraction, samples, disparity, most = rays
+    disparity, most = spacing == "disparity", samples if most is None else most
     r, device = len(near), near.device
     stratum = torch.arange(samples + 1, device=device)
     # Divisions are by tensors: one by a number may be done as a product with its reciprocal, and round otherwise.

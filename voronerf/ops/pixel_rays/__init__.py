@@ -2,29 +2,42 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, Implementation
-from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_number, detached
-from voronerf.ops.pixel_rays.reference import PixelRays, Pixels
-
-_OP = backends.declare("pixel_rays", native=Implementation(EVERYWHERE, (torch.float32,)))
+from voronerf.ops._core.declare import declare
+from voronerf.ops.pixel_rays.reference import PixelRays
 
 
+def _prepare(given: Any) -> Any:
+    near, far, channels = given.near, given.far, given.images.shape[3]
+    if (given.lens is None) != (given.tables is None):
+        raise ValueError("pixel_rays: lens and tables must be given together, got one")
+    if channels not in (3, 4):
+        raise ValueError(f"pixel_rays: images must have 3 or 4 channels, got {channels}")
+    if not 0 <= near < far:
+        raise ValueError(f"pixel_rays: near and far must satisfy 0 <= near < far, got {near} and {far}")
+    if torch.finfo(torch.float32).max < far < float("inf"):
+        raise ValueError(f"pixel_rays: far must be at most 3.4e+38 or infinite, got {far}")
+    return given
+
+
+@declare(native=Implementation(EVERYWHERE, (torch.float32,)), prepare=_prepare)
 def pixel_rays(
-    poses: Tensor,
-    intrinsics: Tensor,
-    images: Tensor,
-    index: Tensor,
+    poses: Annotated[Tensor, "float32 [c, 4, 4]"],
+    intrinsics: Annotated[Tensor, "same [c, 4]"],
+    images: Annotated[Tensor, "uint8 [c, h, w, channels]"],
+    index: Annotated[Tensor, "int64 [b]"],
     *,
     near: float,
     far: float,
-    box: Tensor | None = None,
-    lens: Tensor | None = None,
-    tables: Tensor | None = None,
-    background: Tensor | None = None,
+    box: Annotated[Tensor | None, "same [2, 3]"] = None,
+    lens: Annotated[Tensor | None, "int32 [c]"] = None,
+    tables: Annotated[Tensor | None, "same [l, h, w, 2]"] = None,
+    background: Annotated[Tensor | None, "same [3] or [b, 3]"] = None,
     backend: str = "auto",
 ) -> PixelRays:
     """The rays of a training step: through the centres of pixels, cut to a box, with the colours of the pixels.
@@ -66,26 +79,3 @@ def pixel_rays(
         >>> rays.near, rays.far, rays.colour
         (tensor([2.]), tensor([3.]), tensor([[1.0000, 0.8000, 0.8000]]))
     """
-    given = Checked(_OP)
-    given.tensor("poses", poses, (torch.float32,), "c", 4, 4)
-    given.tensor("intrinsics", intrinsics, LIKE_FIRST, "c", 4)
-    given.tensor("images", images, (torch.uint8,), "c", "h", "w", "channels")
-    given.tensor("index", index, (torch.int64,), "b")
-    given.optional("box", box, LIKE_FIRST, 2, 3)
-    given.optional("lens", lens, INDEX, "c")
-    given.optional("tables", tables, LIKE_FIRST, "l", "h", "w", 2)
-    if (lens is None) != (tables is None):
-        raise ValueError(f"{_OP}: lens and tables must be given together, got one")
-    given.each_or_all("background", background, LIKE_FIRST, "b", 3)
-    if given.sizes["channels"] not in (3, 4):
-        raise ValueError(f"{_OP}: images must have 3 or 4 channels, got {given.sizes['channels']}")
-    check_number(_OP, "near", near)
-    check_number(_OP, "far", far)
-    if not 0 <= near < far:
-        raise ValueError(f"{_OP}: near and far must satisfy 0 <= near < far, got {near} and {far}")
-    if torch.finfo(torch.float32).max < far < float("inf"):
-        raise ValueError(f"{_OP}: far must be at most 3.4e+38 or infinite, got {far}")
-    run = backends.resolve(_OP, backend=backend, device=poses.device, dtype=poses.dtype)
-    box, tables, background = (detached(tensor) for tensor in (box, tables, background))
-    views = detached(poses), detached(intrinsics), images
-    return PixelRays(*run(Pixels(*views, index, box, lens, tables, background, float(near), float(far))))

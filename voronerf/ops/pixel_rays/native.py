@@ -2,48 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-from torch import Tensor
+from typing import Any
 
 from voronerf.ops._core import native
 from voronerf.ops._core.checks import check_range
-from voronerf.ops._core.custom_op import custom_op
-from voronerf.ops.pixel_rays.reference import Pixels
+from voronerf.ops._core.declare import declared
+
+_OP = declared("pixel_rays")
+_inputs, _outputs = (
+    _OP.inputs(native.compiled.PixelRaysInputs, pixels="index"),
+    _OP.outputs(native.compiled.PixelRaysOutputs),
+)
 
 
-@custom_op("pixel_rays_native")
-def pixel_rays(pixels: Pixels) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+@_OP.custom_op("pixel_rays_native")
+def pixel_rays(given: Any, found: Any) -> None:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    poses, intrinsics, images, index, box, lens, tables, background, near, far = pixels
-    b = index.shape[0]
-    origins, directions, colour = poses.new_empty(b, 3), poses.new_empty(b, 3), poses.new_empty(b, 3)
-    first, last = poses.new_empty(b), poses.new_empty(b)
-    yield origins, directions, first, last, colour
-    compiled = native.compiled
-    c, h, w, channels = images.shape
-    given = compiled.PixelRaysInputs(
-        poses=poses,
-        intrinsics=intrinsics,
-        lens=lens,
-        tables=tables,
-        images=images,
-        pixels=index,
-        box=box,
-        background=background,
-        background_per_ray=background is not None and background.dim() == 2,
-        c=c,
-        h=h,
-        w=w,
-        channels=channels,
-        b=b,
-        l=0 if tables is None else len(tables),
-        near=near,
-        far=far,
-    )
-    results = compiled.PixelRaysOutputs(origins=origins, directions=directions, near=first, far=last, colour=colour)
-    machine = native.machine(poses)
-    if isinstance(machine, compiled.Cuda):
-        compiled.pixel_rays(given, results, machine)
-    elif not compiled.pixel_rays(given, results, machine):
-        check_range("pixel_rays", "index", index, c * h * w)
+    inputs, machine = _inputs(given), native.machine(given.poses)
+    # Only on the CPU the compiled function says whether all pixels are in range.
+    if native.compiled.pixel_rays(inputs, _outputs(found), machine) is False:
+        check_range("pixel_rays", "index", given.index, inputs.c * inputs.h * inputs.w)

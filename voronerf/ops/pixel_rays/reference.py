@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,32 +30,27 @@ class PixelRays(NamedTuple):
                 [0.2000, 0.2000, 0.2000]])
     """
 
-    origins: Tensor
-    directions: Tensor
-    near: Tensor
-    far: Tensor
-    colour: Tensor
-
-
-class Pixels(NamedTuple):
-    """What ``pixel_rays`` reads; ``voronerf.ops.pixel_rays`` says what each is."""
-
-    poses: Tensor  # [c, 4, 4]
-    intrinsics: Tensor  # [c, 4]
-    images: Tensor  # uint8 [c, h, w, 3 or 4]
-    numbers: Tensor  # int64 [b], of the pixels
-    box: Tensor | None  # [2, 3] or None
-    lens: Tensor | None  # int32 [c] or None
-    tables: Tensor | None  # [l, h, w, 2] or None
-    background: Tensor | None  # [3], [b, 3] or None
-    near: float  # nearest distance
-    far: float  # farthest
+    origins: Annotated[Tensor, "same [b, 3]"]
+    directions: Annotated[Tensor, "same [b, 3]"]
+    near: Annotated[Tensor, "same [b]"]
+    far: Annotated[Tensor, "same [b]"]
+    colour: Annotated[Tensor, "same [b, 3]"]
 
 
 @torch.no_grad()
-def pixel_rays(pixels: Pixels) -> PixelRays:
+def pixel_rays(
+    poses: Tensor,
+    intrinsics: Tensor,
+    images: Tensor,
+    index: Tensor,
+    near: float,
+    far: float,
+    box: Tensor | None = None,
+    lens: Tensor | None = None,
+    tables: Tensor | None = None,
+    background: Tensor | None = None,
+) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    poses, intrinsics, images, index, box, lens, tables, background, near, far = pixels
     c, h, w, channels = images.shape
     check_range("pixel_rays", "index", index, c * h * w)
     pixel = index % (h * w)

@@ -22,8 +22,9 @@ from voronerf.ops._core.checks import (
     check_positive,
     detached,
 )
+from voronerf.ops._core.declare import declared
 from voronerf.ops.composite import composite
-from voronerf.ops.march_rays.reference import March, Rays
+from voronerf.ops.march_rays.reference import March
 from voronerf.ops.render_opaque.reference import Operations, RaySums, Rule
 from voronerf.ops.routed_mlp import check_routed, routed_mlp
 
@@ -126,20 +127,21 @@ def render_opaque(
     run = backends.resolve(_OP, backend=backend, device=device, dtype=origins.dtype)
     if backend == "auto" and backends.chosen(_OP, device, origins.dtype) == "reference":
         run = functools.partial(run, operations=_operations(device, origins.dtype))
-    rays = Rays(
+    rays = declared("march_rays").Inputs(
         origins=detached(origins),
         directions=detached(directions),
         near=detached(near),
         far=detached(far),
         occupied=occupied,
         box=detached(box),
+        samples=samples,
         uniforms=None,
         seed=None,
+        spacing=spacing,
         start=None,
+        most=None,
+        capacity=None,
         contraction=detached(contraction),
-        samples=samples,
-        disparity=spacing == "disparity",
-        most=samples,
     )
     found = run(rays, table, Rule(density_scale, opaque, wave, heaviest))
     return RaySums(*found)
@@ -148,4 +150,4 @@ def render_opaque(
 def _operations(device: torch.device, dtype: torch.dtype) -> Operations:
     """Each operation on the backend that "auto" gives it."""
     march = backends.resolve("march_rays", backend="auto", device=device, dtype=dtype)
-    return Operations(lambda rays, capacity: March(*march(rays, capacity)), routed_mlp, composite)
+    return Operations(lambda *rays: March(*march(*rays)), routed_mlp, composite)

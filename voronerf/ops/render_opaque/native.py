@@ -17,7 +17,7 @@ from voronerf.ops.grouped_mlp import native as grouped_mlp
 from voronerf.ops.grouped_mlp.layer_table import Given, in_float32, table_of
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import inputs_of, march_rays
-from voronerf.ops.march_rays.reference import March, Rays
+from voronerf.ops.march_rays.reference import March
 from voronerf.ops.render_opaque import reference
 from voronerf.ops.render_opaque.reference import Operations, RaySums, Rule
 from voronerf.ops.routed_mlp.native import routed_mlp
@@ -26,7 +26,7 @@ _APART = Operations(march_rays=lambda *given: March(*march_rays(*given)), routed
 
 
 @torch.no_grad()
-def render_opaque(rays: Rays, network: Mapping[str, Any], rule: Rule) -> RaySums:
+def render_opaque(rays: Any, network: Mapping[str, Any], rule: Rule) -> RaySums:
     """Every ray up to the first surface, in float32; see ``voronerf.ops.render_opaque``."""
     weights, biases, centres = network["weights"], network["biases"], network["centres"]
     floats = (*weights, *biases, centres, network["features"], network["directions"])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops.composite.reference import Composite, composite
-from voronerf.ops.march_rays.reference import Rays, march_rays
+from voronerf.ops.march_rays.reference import march_rays
 from voronerf.ops.routed_mlp.reference import routed_mlp
 
 
@@ -77,7 +77,7 @@ REFERENCE = Operations()
 
 
 @torch.no_grad()
-def render_opaque(rays: Rays, network: Mapping[str, Any], rule: Rule, operations: Operations = REFERENCE) -> RaySums:
+def render_opaque(rays: Any, network: Mapping[str, Any], rule: Rule, operations: Operations = REFERENCE) -> RaySums:
     """Every ray up to the first surface; see ``voronerf.ops.render_opaque``."""
     centres, directions = network.get("centres"), network.get("directions")
     of_samples = ("positions", "coords", "directions", "direction_index")
@@ -85,7 +85,7 @@ def render_opaque(rays: Rays, network: Mapping[str, Any], rule: Rule, operations
 
     def look(live: Tensor, start: Tensor | None) -> Wave:
         of_rays = {name: getattr(rays, name)[live] for name in ("origins", "directions", "near", "far")}
-        march = operations.march_rays(rays._replace(**of_rays, start=start, most=rule.wave), None)
+        march = operations.march_rays(*rays._replace(**of_rays, start=start, most=rule.wave))
         positions = march.positions.to(network["positions"].dtype)
         coords = None if centres is None else positions.to(centres.dtype)
         seen_from: dict[str, Any] = {"directions": None, "direction_index": None}
