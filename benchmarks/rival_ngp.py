@@ -28,8 +28,8 @@ from voronerf.app.evaluate.scores import ViewScore, mean_scores, view_numbers
 from voronerf.app.scenes import Scene
 from voronerf.app.train import TrainConfig
 from voronerf.app.train.build import make_batches
-from voronerf.app.train.defaults import make_contraction, pixel_at_the_middle
 from voronerf.nerf.cameras import Rays
+from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.sampling import stratified_depths
 
@@ -214,13 +214,13 @@ class Rival:
         self.evaluations, self.eval_views = evaluations, eval_views
         self.generator = torch.Generator().manual_seed(seed)
         self.batches = make_batches(TrainConfig(), scene)
-        self.contraction = make_contraction(scene) if scene.box is None else None
+        self.contraction = scene.space("sphere").contraction if scene.box is None else None
         if scene.box is not None:
             self.low, self.size = scene.box[0], scene.box[1] - scene.box[0]
-        elif self.contraction is not None:
+        elif isinstance(self.contraction, Contraction):
             self.low = self.contraction.centre - 2 * self.contraction.radius
             self.size = torch.full((3,), 4 * self.contraction.radius)
-        finest = config.finest or max(round(2 * float(self.size.max()) / pixel_at_the_middle(scene)), 32)
+        finest = config.finest or max(round(2 * float(self.size.max()) / scene.pixel(scene.space("none"))), 32)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.field = NGP(config, finest)

@@ -228,7 +228,7 @@ def test_matched_parameters(settings):
 
 
 def test_a_nested_picture(settings):
-    small = replace(settings, budget=0.4, downscale=4 * settings.downscale)  # the picture is taken four times as large
+    small = replace(settings, budget=0.2, downscale=4 * settings.downscale)  # the picture is taken four times as large
     paper.repeat(small, ("nested-2d",))
     rows = read_json(settings.out / "nested-2d.json")["results"]
     cells = {row["variant"]: row["cells"] for row in rows}

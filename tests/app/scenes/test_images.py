@@ -87,6 +87,7 @@ def test_bands_of_rows_are_parts_of_the_whole(tmp_path, monkeypatch, mode, facto
     assert np.array_equal(read_image(tmp_path / "a.png", factor), area_average(whole, factor))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="units of ru_maxrss")
 def test_large_images_are_reduced_one_after_another(tmp_path):
     """16 million grey pixels each, which are 48 MB in colour and 192 MB as float32."""

@@ -18,7 +18,7 @@ from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.scenes import SceneError, load_scene, photographs
 from voronerf.app.train import ConfigError, TrainConfig
 from voronerf.app.train.build import make_batches, make_renderer, make_routers
-from voronerf.app.train.defaults import make_contraction, resolve
+from voronerf.app.train.defaults import resolve
 from voronerf.nerf.cameras import Cameras, orbit_cameras
 
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
@@ -234,7 +234,7 @@ def test_a_forward_facing_scene_fills_the_cube_of_its_contraction(tmp_path):
     for normalise in (True, False):
         scene = load_scene(tmp_path, normalise=normalise)
         assert resolve(TrainConfig(), scene).contraction == "ndc"
-        space = make_contraction(scene, "ndc")
+        space = scene.space("ndc").contraction
         places = []
         for index in range(7):
             rays = scene.train.cameras.image_rays(index)
@@ -244,8 +244,8 @@ def test_a_forward_facing_scene_fills_the_cube_of_its_contraction(tmp_path):
         assert (low > -1.001).all() and (high < 1.001).all() and (high - low > 1.4).all()
     again = load_scene(tmp_path, downscale=5)  # drops pixels at the border
     assert space.slopes == again.contraction.slopes
-    with pytest.raises(ConfigError, match="--contraction ndc needs a forward-facing scene, "):
-        make_contraction(load_scene(tmp_path, kind="unbounded"), "ndc")
+    unbounded = load_scene(tmp_path, kind="unbounded")
+    refuses("contraction ndc needs forward-facing cameras", unbounded.space, "ndc", error=SceneError)
 
 
 def test_a_folder_trains_is_scored_and_opened_again(tmp_path):

@@ -288,6 +288,7 @@ def test_normalise_degenerate_poses():
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_lego():
     scene = load_scene(needs("lego"), downscale=4)
     assert scene.train.images.shape == (100, 100, 100, 4) and scene.test.images.shape == (200, 100, 100, 4)
