@@ -226,6 +226,9 @@ def test_compile_checkpoint_and_functional_call(generator: torch.Generator) -> N
         for a, b in zip(torch.autograd.grad(found.square().sum(), parameters), wanted, strict=True):
             torch.testing.assert_close(a, b)
     assert not torch.allclose(torch.func.functional_call(router, halves, (x,)), expected)
+    torch._dynamo.reset()
+    with pytest.raises(Exception, match="a routed module runs as it is, between two graphs"):
+        torch.compile(router, backend="eager", fullgraph=True)(x)
     torch.testing.assert_close(router(x), expected)
 
 

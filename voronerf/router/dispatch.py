@@ -23,9 +23,7 @@ from torch import Tensor
 
 from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.router import rules  # noqa: F401  registers the rules
-from voronerf.router.compiled import Graph, graph_of, spec_of
 from voronerf.router.double import Double
-from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters
 from voronerf.router.layout import Call, Results, map_tensors
@@ -77,7 +75,6 @@ class Dispatch:
     def forget(self) -> None:
         """Drops all plans, after a change of dtype, device or parameters' names."""
         self.plans: dict[Any, CallPlan] = {}
-        self.graphs: dict[Any, Graph] = {}  # of fused calls, by method and spec, for graphs of torch.compile
         self._warned: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
 
@@ -122,10 +119,6 @@ class Dispatch:
             if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
                 check_rays(call)
             ways, is_open = probe.find_ways(options, self._warn_once)
-        if isinstance(ways[0], Fused):
-            spec, graph = spec_of(call.args, call.kwargs), graph_of(ways[0].result, layout)
-            if spec is not None and graph is not None:
-                self.graphs[call.method, spec] = graph
         if len(self.plans) >= _PLANS:
             self.plans.clear()
         plan = self.plans[key] = CallPlan(ways, options.way == "fastest", is_open)

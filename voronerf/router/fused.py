@@ -70,7 +70,7 @@ class Fused:
         self._module = call.module
         trace = Trace(call, given)
         self._n, self._inputs, self._shared, self._parameters = trace.n, trace.inputs, trace.shared, trace.parameters
-        self.result, self._outputs = trace.result, trace.outputs
+        self._result, self._outputs = trace.result, trace.outputs
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
         if not all(isinstance(value, fx.Node) and value.meta["on"] == SAMPLES for value in self._outputs):
             raise Unfusable("a result depends on no sample")
@@ -268,7 +268,7 @@ class Fused:
         with torch.set_grad_enabled(recorded or self._differentiates):
             self._compute(values, grouping, sort)
         found = [values[node] if recorded else values[node].detach() for node in self._outputs]
-        return Results(self.result, found, grouping if sort else None)
+        return Results(self._result, found, grouping if sort else None)
 
     def _compute(self, values: dict[Any, Any], grouping: Grouping, sort: bool) -> None:
         order = None if sort else grouping.source

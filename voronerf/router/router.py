@@ -30,7 +30,6 @@ from voronerf.router.cells import (
     renew_cells,
     stack_parameters,
 )
-from voronerf.router.compiled import built, number_of, spec_of, structure_of
 from voronerf.router.dispatch import Dispatch
 from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
@@ -38,11 +37,7 @@ from voronerf.router.optimizers import check_optimizer, drop_state, freeze_cells
 from voronerf.router.probe import Options
 from voronerf.router.table import LayeredField, described_by_table, each_direction, parameters_of_table
 
-_NO_GRAPH = (
-    "VoronoiRouter: a graph without breaks takes a router with fuse=True that has made such a call before, of tensors, "
-    "numbers and strings, without frozen cells and autocast; its results are tensors, or tuples, lists and dicts of "
-    "them"
-)
+_NO_GRAPH = "VoronoiRouter: a routed module runs as it is, between two graphs of torch.compile"
 Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
@@ -155,7 +150,7 @@ class VoronoiRouter(nn.Module):
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._layered = isinstance(module, LayeredField)
-        self._dispatch, self._number = Dispatch(), number_of(self)
+        self._dispatch = Dispatch()
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
         self.register_buffer("frozen_cells", None, persistent=False)
         self._by_table = self._layered and described_by_table(self.module)
@@ -557,40 +552,19 @@ class VoronoiRouter(nn.Module):
             ) from None
 
     def _route(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
-        """One call of a method of the module; in a graph one operation where it is fused, else a break of the graph."""
-        if (
-            torch.compiler.is_compiling()
-            and self.fuse
-            and self.frozen_cells is None
-            and not torch.is_autocast_enabled("cpu")
-        ):
-            rule = coords if coords is not None else self.coords
-            spec = spec_of(args, kwargs)
-            structure = None if spec is None else structure_of(self._number, method, spec)
-            if structure is not None:
-                tensors = [value for value in (*args, *kwargs.values()) if isinstance(value, Tensor)]
-                positions, parameters = find_positions(rule, args, kwargs), list(self.module.parameters())
-                found = torch.ops.voronerf.routed(self._number, method, repr(spec), positions, tensors, parameters)
-                return built(structure, found)
-        if torch.compiler.is_compiling() or "torch._dynamo" in sys.modules:
-            return self._route_uncompiled(method, *args, coords=coords, **kwargs)
-        return self._route_as_it_is(method, *args, coords=coords, **kwargs)
+        """One call of a method of the module, which breaks a graph of ``torch.compile``."""
+        compiling = torch.compiler.is_compiling() or "torch._dynamo" in sys.modules
+        run = self._route_uncompiled if compiling else self._route_as_it_is
+        return run(method, *args, coords=coords, **kwargs)
 
     def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
+        """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
         called = getattr(self.module, method)
         if coords is not None and "coords" in (accepted_names([called]) or ()):  # the method's own argument
             kwargs, coords = {**kwargs, "coords": coords}, None
         rule = coords if coords is not None else self.coords
-        if rule is None and self._layered:
-            rule = "first3"
-        positions = find_positions(rule, args, kwargs)
-        return self._call(self.module, method, positions, args, kwargs)
-
-    _route_uncompiled = not_compiled(_route_as_it_is, _NO_GRAPH)
-
-    def _call(self, module: nn.Module, method: str, positions: Tensor, args: Any, kwargs: dict[str, Any]) -> Any:
-        """Arranges the arguments, evaluates them by the router's module or a double of it, and restores results."""
-        known = argument_names(getattr(module, method))
+        positions = find_positions("first3" if rule is None and self._layered else rule, args, kwargs)
+        known = argument_names(called)
         names = [*known[: len(args)], *map(str, range(len(known), len(args)))]
 
         def named(item: str | int) -> str:
@@ -602,10 +576,12 @@ class VoronoiRouter(nn.Module):
             frozenset(map(named, self.shared)),
             self.layout == "flat",
         )
-        call = Call(module, method, layout, [*names, *kwargs], args, kwargs)
+        call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
         grouping = self._group(method, positions)
         options = Options(self.fuse, self.way, bool(self.methods))
         return self._dispatch.evaluate(call, grouping, options, self.frozen_cells).restored(layout)
+
+    _route_uncompiled = not_compiled(_route_as_it_is, _NO_GRAPH)
 
     def _group(self, method: str, positions: Tensor) -> Grouping:
         """The samples in their cells; other methods that are called with the same positions share it."""
@@ -630,14 +606,12 @@ class VoronoiRouter(nn.Module):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
-        self._number = number_of(self)
         freeze_cells(self.module, self.frozen_cells)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> VoronoiRouter:
         detach_results(self, memo)
         copied = memo[id(self)] = type(self).__new__(type(self))
         copied.__dict__.update({key: copy.deepcopy(value, memo) for key, value in self.__getstate__().items()})
-        copied._number = number_of(copied)
         freeze_cells(copied.module, copied.frozen_cells)
         return copied
 
