@@ -1,4 +1,4 @@
-"""Joint trainings whose ranks are killed, stopped and paused, find no room, read damage, or are given other data."""
+"""Trainings in territories whose ranks are killed, stopped or paused, find no room, or are given other data."""
 
 from __future__ import annotations
 
@@ -17,18 +17,14 @@ from given import FIELDS, TINY
 from training_attacks import same_runs, same_tensors
 
 from voronerf.app.cli import main
-from voronerf.app.train.checkpoint import checkpoint_path, checkpoint_paths, load_checkpoint, network_files
-from voronerf.town.distributed import group
+from voronerf.app.train.checkpoint import checkpoint_path, checkpoint_paths, load_checkpoint
+from voronerf.town import group
 
-sys.path.append(str(Path(__file__).parents[1] / "town" / "distributed"))
+sys.path.append(str(Path(__file__).parents[1] / "town"))
 from ranks import complaints, said_by, start_ranks
 
-#: The networks of a joint training, which has four territories.
-VARIANTS = (
-    *FIELDS.values(),
-    [*FIELDS["hashgrid"], "--contraction", "sphere"],
-    [*FIELDS["nerf"], "--cells", "2", "2", "--split-at", "0.3", "0.6"],
-)
+#: The networks of a training, which has four territories.
+VARIANTS = (FIELDS["hashgrid"], [*FIELDS["hashgrid"], "--contraction", "sphere"])
 #: Of a chain: ranks that are killed, stopped for good, and stopped for as many seconds.
 FAULTS = {"kill": 10, "stop": 10, "pause": 2}
 PAUSE = 1.5
@@ -52,7 +48,7 @@ class Ranks:
     Args:
         out: The run directory; what is printed goes beside it.
         size: How many ranks.
-        options: Of ``voronerf train``.
+        options: Of ``voronerf train-territories``.
         also: More of them for the last rank alone.
         file_size: The bytes that a file of the last rank may have.
     """
@@ -61,7 +57,7 @@ class Ranks:
         self, out: Path, size: int, options: list[str], also: tuple[str, ...] = (), file_size: int | None = None
     ) -> None:
         again = ["--resume"] if checkpoint_paths(out) else []
-        args = ["train", "--out", str(out), *options, *again]
+        args = ["train-territories", "--out", str(out), *options, *again]
         last = ([*args, *also], file_size)
         self.said = out.with_name(f"{out.name}-said")
         shutil.rmtree(self.said, ignore_errors=True)
@@ -164,18 +160,21 @@ def _same_runs(whole: Path, part: Path) -> None:
     same_runs(whole, part, {"joint.owner"})
     found = []
     for run in (whole, part):
-        index = load_checkpoint(checkpoint_path(run), keep=lambda name: not name.startswith("part-"))
-        files = network_files(index.values)
-        found.append([load_checkpoint(checkpoint_path(run).with_name(file)) for file in files])
+        files = _territories(checkpoint_path(run))
+        found.append([load_checkpoint(file) for file in files])
     for first, second in zip(*found, strict=True):
         same_tensors(first, second)
+
+
+def _territories(index: Path) -> list[Path]:
+    """The files of territories that a checkpoint names."""
+    return [index.with_name(name) for name in load_checkpoint(index).values["parts"][0]["networks"]]
 
 
 def _damage(rng: random.Random, run: Path) -> None:
     """Changes a bit of a territory's file of the last checkpoint."""
     last = checkpoint_paths(run)[0]
-    files = network_files(load_checkpoint(last, keep=lambda name: not name.startswith("part-")).values)
-    path = last.with_name(rng.choice(files))
+    path = rng.choice(_territories(last))
     data = bytearray(path.read_bytes())
     data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
     path.write_bytes(data)
