@@ -1,14 +1,12 @@
 import math
 from types import SimpleNamespace
 
-from rich.console import Console
-
 from voronerf.app.cli.display import TrainingDisplay
 
 
 def test_the_loss_is_that_of_the_steps_whose_loss_was_read():
     """On a GPU the first losses are not known, and a resumed run begins at a later step."""
-    display = TrainingDisplay(Console(quiet=True), "run")
+    display = TrainingDisplay("run")
     router = SimpleNamespace(num_cells=1)
     for step, loss in ((51, math.nan), (52, math.nan), (53, 0.4), (54, 0.2)):
         state = SimpleNamespace(step=step, loss=loss, router=router, fraction=0.5, rays_done=100, seconds=1.0)

@@ -34,8 +34,6 @@ def demo(
     cells: int = 64,
     blocks: int = 3,
     size: int = 50,
-    seed: int = 0,
-    backend: str = "auto",
 ) -> int:
     """Train a built-in city twice for the same time, with one small network and with one in each cell, and compare.
 
@@ -45,8 +43,6 @@ def demo(
         cells: Voronoi cells.
         blocks: Blocks on each side of the city.
         size: Pixels along the side of the images, 100 over a whole number.
-        seed: Seed of both runs.
-        backend: Backend of the operations.
     """
     downscale = BUILTIN_SIZE // size if 1 <= size <= BUILTIN_SIZE else 0
     if not downscale or BUILTIN_SIZE // downscale != size:
@@ -64,8 +60,6 @@ def demo(
             cells=levels,
             split_at=(0.1,) * len(levels),
             samples=(96,),
-            seed=seed,
-            backend=backend,
             evaluations=1,
             eval_views=10**6,  # all of them, beside the budget
         )
@@ -82,7 +76,7 @@ def demo(
         scores[name] = run_training(config, scene, panels=0, quiet=True)
         if not scores[name]["complete"]:
             return 130
-        runs[name] = open_run(out / name, scene=scene, backend=backend)
+        runs[name] = open_run(out / name, scene=scene)
     captions = {name: f"{score['psnr']:.2f} dB" for name, score in scores.items()}
     caption = f"one network, {captions['one']} | {cells} cells, {captions['cells']}"
     around = _around(blocks, PICTURE)

@@ -11,9 +11,7 @@ from rich.markup import escape
 from rich.progress import (
     BarColumn,
     Progress,
-    TaskID,
     TextColumn,
-    TimeElapsedColumn,
     TimeRemainingColumn,
     track,
 )
@@ -50,18 +48,15 @@ def one_line(text: str) -> str:
 
 
 class TrainingDisplay(Callback):
-    """Shows step, stage, rays/s, loss, PSNR and the time left; the trainer's callbacks are its two methods.
-
-    Its ``progress`` is the live line, which shows while it is entered.
+    """Shows step, stage, rays/s, loss, PSNR and the time left in a live line, while ``progress`` is entered.
 
     Args:
-        console: Where to write; its own detection of a terminal decides between a live line and plain ones.
         label: Name of the run.
         quiet: Leave out lines that stay.
     """
 
-    def __init__(self, console: Console, label: str, *, quiet: bool = False) -> None:
-        self.console, self.quiet = console, quiet
+    def __init__(self, label: str, *, quiet: bool = False) -> None:
+        self.quiet = quiet
         self.progress = Progress(
             TextColumn("[bold]{task.description}"),
             BarColumn(bar_width=24),
@@ -104,43 +99,5 @@ class TrainingDisplay(Callback):
 
     def on_event(self, line: str) -> None:
         """Prints a line that stays, above the live one."""
-        if self.quiet:
-            return
-        self.console.print(printable(line), highlight=False, markup=False, emoji=False)
-
-
-class StageDisplay:
-    """Shows the stages of a long command: a bar for each on a terminal, with the time left; plain lines elsewhere.
-
-    Its ``progress`` are the bars, which show while it is entered.
-
-    Args:
-        console: Where to write.
-    """
-
-    def __init__(self, console: Console) -> None:
-        self.console = console
-        self.progress = Progress(
-            TextColumn("[bold]{task.description:<10}"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.fields[count]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-            refresh_per_second=4,
-        )
-        self.tasks: dict[str, TaskID] = {}
-
-    def show(self, stage: str, done: int, total: int) -> None:
-        """Shows how much of a stage is done; a total of 0 is not known."""
-        if stage not in self.tasks:
-            self.tasks[stage] = self.progress.add_task(stage, total=None, count="")
-            if not self.console.is_terminal:
-                self.say(stage)
-        count = f"{done} of {total}" if total else str(done or "")
-        self.progress.update(self.tasks[stage], completed=done, total=total or None, count=count)
-
-    def say(self, line: str) -> None:
-        """Prints a line that stays."""
-        self.console.print(printable(line), highlight=False, markup=False, emoji=False, soft_wrap=True)
+        if not self.quiet:
+            say(line)

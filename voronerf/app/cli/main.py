@@ -82,9 +82,8 @@ def main(args: list[str] | None = None) -> int:
         gc.enable()
     warnings.showwarning = _show_warning
     threading.excepthook = _show_thread_error
-    with contextlib.ExitStack() as stack:
-        if args[:1] not in ([name] for name in TRAININGS):  # which end with a checkpoint
-            stack.enter_context(_exit_on_sigterm())
+    ends_with_checkpoint = bool(args) and args[0] in TRAININGS
+    with contextlib.nullcontext() if ends_with_checkpoint else _exit_on_sigterm():
         return _run(args)
 
 
@@ -111,11 +110,9 @@ def _run(args: list[str]) -> int:
         for word in args:  # the parser prints a word that it does not know as it is
             if any(unicodedata.category(char) == "Cc" for char in word):
                 raise ConfigError(f"arguments must have no control characters, got {word}")
+        stored = {name: with_stored_settings(COMMANDS[name], args) for name in TRAININGS if name in args[:1]}
         return tyro.extras.subcommand_cli_from_dict(
-            {
-                **COMMANDS,
-                **{name: with_stored_settings(COMMANDS[name], args) for name in TRAININGS if name in args[:1]},
-            },
+            COMMANDS | stored,
             prog="voronerf",
             description="Adaptive Voronoi NeRFs: one small network per Voronoi cell, trained and run as one.",
             args=args,

@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from voronerf.app.cli.display import StageDisplay, console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from voronerf.app.cli.display import console, say
 from voronerf.app.cli.opening import check_counts
 from voronerf.app.scenes.process import process as make_scene
 
@@ -35,7 +37,7 @@ def process(
         verbose: Show what COLMAP says.
     """
     check_counts(frames=frames, max_features=max_features)
-    display = StageDisplay(console)
+    display = StageDisplay()
     with display.progress:
         make_scene(
             source,
@@ -46,7 +48,36 @@ def process(
             mapper=mapper,
             max_features=max_features,
             verbose=verbose,
-            say=display.say,
+            say=say,
             progress=display.show,
         )
     return 0
+
+
+class StageDisplay:
+    """Shows the stages of a long command: a bar for each on a terminal, with the time left; plain lines elsewhere.
+
+    Its ``progress`` are the bars, which show while it is entered.
+    """
+
+    def __init__(self) -> None:
+        self.progress = Progress(
+            TextColumn("[bold]{task.description:<10}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[count]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+            refresh_per_second=4,
+        )
+        self.tasks: dict[str, TaskID] = {}
+
+    def show(self, stage: str, done: int, total: int) -> None:
+        """Shows how much of a stage is done; a total of 0 is not known."""
+        if stage not in self.tasks:
+            self.tasks[stage] = self.progress.add_task(stage, total=None, count="")
+            if not console.is_terminal:
+                say(stage)
+        count = f"{done} of {total}" if total else str(done or "")
+        self.progress.update(self.tasks[stage], completed=done, total=total or None, count=count)

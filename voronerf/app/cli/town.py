@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from voronerf.app.cli.display import TrainingDisplay, console, say
+from voronerf.app.cli.display import TrainingDisplay, say
 from voronerf.app.cli.opening import AS_IN_TRAINING
 from voronerf.app.cli.train import stopped_by_signals
 from voronerf.app.evaluate.panels import write_panels
@@ -242,7 +242,7 @@ def _train_territories(
         choose_directory(config, scene, resume=resume)
     resume = group.gather(resume)[0]
     with held(out) if group.rank == 0 else contextlib.nullcontext():
-        display = TrainingDisplay(console, scene.name)
+        display = TrainingDisplay(scene.name)
         with display.progress:
             town = territories_train.build_town(config, scene, count, group, on_event=display.on_event)
             if resume:

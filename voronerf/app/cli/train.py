@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from voronerf.app.cli.display import TrainingDisplay, console, say
+from voronerf.app.cli.display import TrainingDisplay, say
 from voronerf.app.cli.view import import_viewer
 from voronerf.app.evaluate.lpips import find_lpips
 from voronerf.app.evaluate.panels import write_panels
@@ -151,7 +151,7 @@ def run_training(
     if panels and len(os.fsencode(longest)) > LONGEST_NAME:
         raise ConfigError(f"--panels must be 0 with image names of more than {LONGEST_NAME} bytes, got {longest}")
     with held(out):
-        display = TrainingDisplay(console, scene.name, quiet=quiet)
+        display = TrainingDisplay(scene.name, quiet=quiet)
         with display.progress:
             for note in scene.notes:
                 display.on_event(f"{scene.name}: {note}")
