@@ -151,13 +151,12 @@ def _on_white(picture: Tensor, opacity: Tensor) -> Tensor:
 def write_panels(renderer: Renderer, diagram: VoronoiDiagram, scene: Scene, folder: Path, *, views: int) -> list[Path]:
     """Draws truth, render, error, depth and cells of evenly spread test views, a PNG each; returns the paths."""
     paths = []
-    background = scene.background_colour()
     for view in view_numbers(len(scene.test), views):
         image = render_view(renderer, scene, view)
         # Each pixel in the colour of the cell of its heaviest sample, as in figure 1 of the paper.
         cells = diagram.locate(image.heaviest.reshape(-1, 3), backend=renderer.backend)
-        cells = cells.reshape(image.opacity.shape).cpu()
-        path = folder / f"{scene.test.names[view]}.png"
-        save_panel(path, scene.test.truth(view, background), RenderedImage(*(part.cpu() for part in image)), cells)
-        paths.append(path)
+        paths.append(folder / f"{scene.test.names[view]}.png")
+        truth = scene.test.truth(view, scene.background_colour())
+        parts = RenderedImage(*(part.cpu() for part in image))
+        save_panel(paths[-1], truth, parts, cells.reshape(image.opacity.shape).cpu())
     return paths

@@ -5,25 +5,21 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from voronerf.app.files import write_bytes
 
 
-def plot_curves(path: Path, curves: Mapping[str, Sequence[tuple[float, float]]], **options: Any) -> None:
-    """Writes the picture of :func:`draw_curves` to a file; arguments are those of that function."""
-    write_bytes(path, draw_curves(curves, **options))
-
-
-def draw_curves(
+def plot_curves(
+    path: Path,
     curves: Mapping[str, Sequence[tuple[float, float]]],
     *,
     splits: Mapping[str, Sequence[float]] | None = None,
     title: str = "",
-) -> bytes:
-    """Test PSNR over training time, one line per run, as a PNG.
+) -> None:
+    """Writes test PSNR over training time, one line per run, as a PNG.
 
     Args:
+        path: The file.
         curves: For each label the points (seconds, PSNR in dB).
         splits: For each label the seconds at which its cells were split, drawn as dotted lines.
         title: Above the axes.
@@ -46,4 +42,4 @@ def draw_curves(
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=130)
     pyplot.close(figure)
-    return buffer.getvalue()
+    write_bytes(path, buffer.getvalue())

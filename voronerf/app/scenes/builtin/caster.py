@@ -47,6 +47,8 @@ class Caster:
         local = _CORNERS * np.array([solid.extent() for solid in solids])[:, None]
         self._corners = local @ np.stack(turns).swapaxes(1, 2) + np.array([solid.centre for solid in solids])[:, None]
         self._across = np.linalg.svd(light[None].astype(np.float64))[2][1:].T  # [3, 2]
+        shadows = self._corners @ self._across
+        self._shadows = shadows.min(1).T - 2 * SLACK, shadows.max(1).T + 2 * SLACK  # [2, m] each
 
     def first(
         self, origins: Array, directions: Array, solid: Rows, near: Array, start: Rows, end: Rows
@@ -149,10 +151,8 @@ class Caster:
         square = row * side + column
         order = np.argsort(square, kind="stable")
         ends = np.append(0, np.bincount(square, minlength=side * side).cumsum())
-        shadow = self._corners @ self._across  # [m, 8, 2]
-        reach = 2 * SLACK
-        x0, y0 = ((shadow.min(1).T - reach - low[:, None]) // width).clip(0, side - 1).astype(np.int64)
-        x1, y1 = ((shadow.max(1).T + reach - low[:, None]) // width).clip(-1, side - 1).astype(np.int64)
+        x0, y0 = ((self._shadows[0] - low[:, None]) // width).clip(0, side - 1).astype(np.int64)
+        x1, y1 = ((self._shadows[1] - low[:, None]) // width).clip(-1, side - 1).astype(np.int64)
         which, step = _rows(np.maximum(y1 - y0 + 1, 0))
         first = (y0[which] + step) * side
         start, end = ends[first + x0[which]], ends[np.maximum(first + x1[which] + 1, first + x0[which])]
