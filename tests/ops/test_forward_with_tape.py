@@ -53,9 +53,9 @@ def squares(out):
 
 def learn(given, *, backward=False, backend="auto"):
     """The loss, with gradients."""
-    outputs = forward_with_tape(given, backend=backend)
-    assert not outputs.raw.requires_grad
-    return outputs.learn(*squares(outputs.raw), backward=backward)
+    tape = forward_with_tape(given, backend=backend)
+    assert not tape.raw.requires_grad
+    return tape.backward(*squares(tape.raw), defer=not backward)
 
 
 def composed(given):
@@ -150,20 +150,23 @@ def test_is_once_differentiable(device, backend):
 
 def test_refuses_what_makes_no_sense(device, backend):
     given = network(device)
-    with refused(ValueError, "forward_with_tape: network must hold positions, weights, biases and layers, got ..."):
+    with refused(
+        ValueError,
+        "forward_with_tape: network must hold positions, weights, biases and layers, got no weights, biases, layers",
+    ):
         forward_with_tape({"positions": given["positions"]})
     with refused(TypeError, "forward_with_tape: unknown arguments other"):
         forward_with_tape({**given, "other": 1})
     with refused(ValueError, "forward_with_tape: weights[1] must have shape ..."):
         forward_with_tape({**given, "weights": [given["weights"][0], given["weights"][1][:, :2]]})
-    outputs = forward_with_tape(given, backend=backend)
-    loss, gradient = squares(outputs.raw)
+    tape = forward_with_tape(given, backend=backend)
+    loss, gradient = squares(tape.raw)
     with refused(ValueError, "forward_with_tape: loss must have shape [], got [40, 3]"):
-        outputs.learn(gradient, gradient)
+        tape.backward(gradient, gradient)
     with refused(ValueError, "forward_with_tape: gradient must have shape [40, 3], got [3]"):
-        outputs.learn(loss, gradient[0])
+        tape.backward(loss, gradient[0])
     with refused(TypeError, "forward_with_tape: loss must be a tensor, got float"):
-        outputs.learn(0.0, gradient)
-    with refused(TypeError, "forward_with_tape: backward must be True or False, got int"):
-        outputs.learn(loss, gradient, backward=1)
+        tape.backward(0.0, gradient)
+    with refused(TypeError, "forward_with_tape: defer must be True or False, got int"):
+        tape.backward(loss, gradient, defer=1)
     assert all(parameter.grad is None for parameter in parameters_of(given))

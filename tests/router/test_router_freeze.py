@@ -146,8 +146,8 @@ def test_forward_with_tape_leaves_frozen_cells_out(backend):
     router, points = make("table"), torch.rand(100, 3)
     router.freeze(FROZEN)
     network = router.table_arguments(points, torch.ones(100, 3), None)
-    outputs = forward_with_tape(network, backend=backend)
-    outputs.learn(outputs.raw.square().sum(), 2 * outputs.raw, backward=True)
+    tape = forward_with_tape(network, backend=backend)
+    tape.backward(tape.raw.square().sum(), 2 * tape.raw)
     for p in router.parameters():
         assert not p.grad[FROZEN].any() and p.grad[LEARNING].any()
     with pytest.raises(ValueError, match=r"frozen must have shape \[k\] with k = 4, got \[3\]"):

@@ -148,10 +148,10 @@ class RayLoss:
         if depths is not None:
             samples = samples.counted()
         network = cast(Any, field.table_arguments(samples.inputs, batch.rays.directions, samples.ray_index))
-        outputs = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
+        tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
         scale = float(cast(Any, field.module).density_scale)
         found, gradient = render_loss_gradient(
-            outputs.raw,
+            tape.raw,
             samples.deltas,
             samples.ray_offsets,
             batch.target,
@@ -180,7 +180,7 @@ class RayLoss:
         shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
         if shares is not None:
             gradient = gradient * shares[:, None]
-        loss = outputs.learn(loss, gradient, backward=backward)
+        loss = tape.backward(loss, gradient, defer=not backward)
         return RenderOutput(loss, found.error, found.weights, found.density, samples, found.colour)
 
     def _separate(self, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:

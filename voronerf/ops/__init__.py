@@ -16,7 +16,7 @@ from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_pixels import draw_pixels
 from voronerf.ops.draw_pixels.reference import Runs
-from voronerf.ops.forward_with_tape import Outputs, forward_with_tape
+from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
 from voronerf.ops.grouped_mlp import grouped_mlp
@@ -44,13 +44,13 @@ __all__ = [
     "HashGrid",
     "Layer",
     "March",
-    "Outputs",
     "OwnSamples",
     "PixelRays",
     "RaySums",
     "RenderLoss",
     "Rule",
     "Runs",
+    "Tape",
     "adam",
     "balance_centres",
     "cell_sort",

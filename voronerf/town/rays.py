@@ -23,7 +23,7 @@ from voronerf.nerf.occupancy import HIDDEN
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.volume import Samples, gradient_shares
-from voronerf.ops.forward_with_tape import Outputs, forward_with_tape
+from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.ray_runs import OwnSamples, compose_runs, own_samples, run_gradients, run_sums
 from voronerf.router import VoronoiRouter
 from voronerf.town.group import Group, Key
@@ -86,10 +86,8 @@ class Pass:
         field = cast(VoronoiRouter, renderer.field)
         self.scale = float(cast(Any, field.module).density_scale)
         network = field.table_arguments(self.own.positions, rays.directions, self.own.ray_index)
-        self.outputs: Outputs = forward_with_tape(cast(Any, network), backend=renderer.backend)
-        self.sums, self.density = run_sums(
-            self.outputs.raw, self.own, density_scale=self.scale, backend=renderer.backend
-        )
+        self.tape: Tape = forward_with_tape(cast(Any, network), backend=renderer.backend)
+        self.sums, self.density = run_sums(self.tape.raw, self.own, density_scale=self.scale, backend=renderer.backend)
         ray = self.sums[:, -1].long()
         optical = torch.zeros_like(near).index_add_(0, ray, self.sums[:, 3])
         last = torch.zeros_like(near).scatter_reduce_(
@@ -107,14 +105,14 @@ class Pass:
         if not len(self.sums):
             return None
         rule: dict[str, Any] = {"density_scale": self.scale, "hidden": HIDDEN, "backend": self.renderer.backend}
-        gradient, weights = run_gradients(self.outputs.raw, self.own, answers, **rule)
+        gradient, weights = run_gradients(self.tape.raw, self.own, answers, **rule)
         shares = gradient_shares(self.renderer.sampler.space.full_gradient, self.own.depths)
         gradient = gradient if shares is None else gradient * shares[:, None]
         error = weights.new_zeros(len(self.ids))
         error[self.sums[:, -1].long()] = answers[:, -1]
         own = self.own
         samples = Samples(own.positions, own.ray_index, own.run_offsets, own.depths, own.deltas)
-        loss = self.outputs.learn(loss, gradient, backward=True)
+        loss = self.tape.backward(loss, gradient)
         return RenderOutput(loss, error, weights, self.density, samples, weights.new_empty(0, 3))
 
 

@@ -22,7 +22,7 @@ from voronerf.ops.routed_mlp import native as routed_mlp
 from voronerf.ops.routed_mlp import of_samples
 
 
-def forward_with_tape(network: Mapping[str, Any]) -> tuple[Tensor, Tape]:
+def forward_with_tape(network: Mapping[str, Any]) -> Tape:
     """The outputs and their tape, once differentiable; see ``voronerf.ops.forward_with_tape``."""
     floats = (network["positions"], *network["weights"], *network["biases"], network.get("features"))
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in floats)
@@ -36,13 +36,14 @@ def forward_with_tape(network: Mapping[str, Any]) -> tuple[Tensor, Tape]:
         out, cells, order, offsets, encoded = routed_mlp.forward.inside(*call)
         rows = None if native.on_cuda(out) else call.where.rows  # CUDA has left out the others
         out, cells = routed_mlp.first_rows(out, cells if call.where.cells is None else call.where.cells, rows)
-    return out, _Kept(call, rows, cells, order, offsets, encoded, network.get("frozen"))
+    return _Kept(out, call, rows, cells, order, offsets, encoded, network.get("frozen"))
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _Kept(Tape):
     """What the backward pass takes of the forward pass."""
 
+    raw: Tensor
     call: routed_mlp.Call
     rows: Tensor | None
     cells: Tensor
@@ -51,18 +52,18 @@ class _Kept:
     encoded: Tensor
     frozen: Tensor | None
 
-    def learn(self, loss: Tensor, gradient: Tensor, backward: bool) -> Tensor:
+    def _backward(self, loss: Tensor, gradient: Tensor, defer: bool) -> Tensor:
         taken = self.call.network
         parameters = [*taken.weights, *taken.biases, taken.features, taken.positions, taken.directions]
         needs = [parameter is not None and parameter.requires_grad for parameter in parameters]
         with torch.no_grad():
             found = self._gradients(gradient, needs)
             learning = [each for each in parameters if each is not None and each.requires_grad]
-            if backward and all(map(_takes_gradients, learning)):
+            if not defer and all(map(_takes_gradients, learning)):
                 for parameter, slope in zip(learning, found, strict=True):
                     parameter.grad = slope if parameter.grad is None else parameter.grad.add_(slope)
                 return loss
-        return learnt(with_gradients(loss, learning, found), backward)
+        return learnt(with_gradients(loss, learning, found), defer)
 
     def _gradients(self, gradient: Tensor, needs: Sequence[bool]) -> list[Tensor]:
         """Those of the weights, biases, features, positions and directions that need them."""

@@ -2,52 +2,89 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from voronerf.ops._core.checks import check_flag, check_shape, detached
 from voronerf.ops.routed_mlp import of_samples
 from voronerf.ops.routed_mlp.reference import routed_mlp
 
 
-class Tape(Protocol):
-    """What outputs were computed from, for their backward pass."""
+class Tape(ABC):
+    """What networks put out, to learn from.
 
-    def learn(self, loss: Tensor, gradient: Tensor, backward: bool) -> Tensor:
-        """The loss with gradients; see `voronerf.ops.forward_with_tape.Outputs.learn`."""
-        ...
+    Attributes:
+        raw: float32 [n, out], without gradients.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import MLP, Layer
+        >>> from voronerf.ops import forward_with_tape
+        >>> weight = torch.tensor([[[2.0]]], requires_grad=True)
+        >>> table = MLP((Layer(("positions",), 1),), outputs=(0,))
+        >>> network = {"positions": torch.ones(4, 1), "weights": [weight], "biases": [None], "layers": table}
+        >>> tape = forward_with_tape(network)
+        >>> loss = tape.backward(tape.raw.square().mean(), tape.raw * (2 / 4))
+        >>> float(loss), float(weight.grad)
+        (4.0, 4.0)
+    """
+
+    raw: Tensor
+
+    def backward(self, loss: Tensor, gradient: Tensor, *, defer: bool = False) -> Tensor:
+        """Adds to ``.grad`` of the parameters what follows from the gradient of a loss to ``raw``. To be called once.
+
+        Args:
+            loss: [].
+            gradient: [n, out], of the loss to ``raw``.
+            defer: Whether that waits for the ``backward`` of the result.
+
+        Returns:
+            The loss [], without gradients unless deferred.
+
+        Raises:
+            ValueError: a loss or gradient of another shape.
+        """
+        check_shape("forward_with_tape", "loss", loss, ())
+        check_shape("forward_with_tape", "gradient", gradient, self.raw.shape)
+        check_flag("forward_with_tape", "defer", defer)
+        return self._backward(detached(loss), detached(gradient), defer)
+
+    @abstractmethod
+    def _backward(self, loss: Tensor, gradient: Tensor, defer: bool) -> Tensor: ...
 
 
-def forward_with_tape(
-    network: Mapping[str, Any], evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp
-) -> tuple[Tensor, Tape]:
+def forward_with_tape(network: Mapping[str, Any], evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp) -> Tape:
     """The outputs and their tape; see ``voronerf.ops.forward_with_tape``."""
     network = dict(network)
     frozen = network.pop("frozen", None)
     out, cells = evaluate(**network)
-    return out.detach().float(), _Graph(out, cells, frozen)
+    return _Graph(out.detach().float(), out, cells, frozen)
 
 
 @dataclass(frozen=True)
-class _Graph:
+class _Graph(Tape):
     """That of torch's own autograd."""
 
+    raw: Tensor
     out: Tensor
     cells: Tensor
     frozen: Tensor | None
 
-    def learn(self, loss: Tensor, gradient: Tensor, backward: bool) -> Tensor:
+    def _backward(self, loss: Tensor, gradient: Tensor, defer: bool) -> Tensor:
         if self.frozen is not None:
             gradient = gradient.masked_fill(of_samples(self.frozen, self.cells), 0)
-        return learnt(with_gradients(loss, [self.out], [gradient]), backward)
+        return learnt(with_gradients(loss, [self.out], [gradient]), defer)
 
 
-def learnt(loss: Tensor, backward: bool) -> Tensor:
-    """A loss, with ``backward`` after its backward pass."""
-    if not backward:
+def learnt(loss: Tensor, defer: bool) -> Tensor:
+    """A loss, after its backward pass unless that is deferred."""
+    if defer:
         return loss
     loss.backward()
     return loss.detach()

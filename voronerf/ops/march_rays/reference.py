@@ -56,23 +56,24 @@ class March(NamedTuple):
 
 
 @torch.no_grad()
-def march_rays(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    samples: int,
-    uniforms: Tensor | None,
-    seed: Tensor | None,
-    spacing: str,
-    start: Tensor | None,
-    most: int | None,
-    capacity: int | None,
-    contraction: Tensor | None,
-) -> March:
+def march_rays(*given: Any) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
+    (
+        origins,
+        directions,
+        near,
+        far,
+        occupied,
+        box,
+        samples,
+        uniforms,
+        seed,
+        spacing,
+        start,
+        most,
+        capacity,
+        contraction,
+    ) = given
     disparity, most = spacing == "disparity", samples if most is None else most
     r, device = len(near), near.device
     stratum = torch.arange(samples + 1, device=device)

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 
 @torch.no_grad()
-def observe_occupancy(
-    density: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    positions: Tensor,
-    sigma: Tensor,
-    deltas: Tensor,
-    weights: Tensor,
-    decay: float,
-    threshold: float,
-    hidden: float,
-) -> None:
+def observe_occupancy(*given: Any) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
+    density, occupied, box, positions, sigma, deltas, weights, decay, threshold, hidden = given
     found = sigma.nan_to_num(nan=float("inf"), posinf=float("inf"))
     # weight = light that arrives * share of it that is taken
     seen = weights > hidden * -torch.expm1(-found * deltas)

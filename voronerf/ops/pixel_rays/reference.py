@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,19 +38,9 @@ class PixelRays(NamedTuple):
 
 
 @torch.no_grad()
-def pixel_rays(
-    poses: Tensor,
-    intrinsics: Tensor,
-    images: Tensor,
-    index: Tensor,
-    near: float,
-    far: float,
-    box: Tensor | None = None,
-    lens: Tensor | None = None,
-    tables: Tensor | None = None,
-    background: Tensor | None = None,
-) -> PixelRays:
+def pixel_rays(*given: Any) -> PixelRays:
     """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
+    poses, intrinsics, images, index, near, far, box, lens, tables, background = given
     c, h, w, channels = images.shape
     check_range("pixel_rays", "index", index, c * h * w)
     pixel = index % (h * w)
