@@ -158,6 +158,7 @@ class Scores(Callback):
         if self.out is not None:
             self.metrics = [line for line in read_metrics(self.out) if line["step"] <= state.step]
         self.done = min(len(self.metrics), self._due(state))
+        self.after_step(state)  # of one that was stopped
 
     def _due(self, state: State) -> int:
         return int(state.fraction * state.config.evaluations + 1e-9)

@@ -1,0 +1,334 @@
+"""The loop of a training on a tiny built-in scene: stages, splits, files, the grid, and that it never dies."""
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import read_json, refuses, trained
+from tiny_runs import HIERARCHICAL, Each, small, started, steps_of
+
+from voronerf.app import open_run
+from voronerf.app.evaluate.scores import evaluate, render_view
+from voronerf.app.files import read_json_lines
+from voronerf.app.train import ConfigError, TrainConfig, build, run, train
+from voronerf.app.train.build import count_parameters, solve_width
+from voronerf.app.train.defaults import octaves_for, resolve
+from voronerf.app.train.run_directory import choose_directory, held
+from voronerf.nerf import OccupancyGrid
+from voronerf.nerf.cameras import Cameras
+from voronerf.ops._core import native
+from voronerf.ops._core.backends import BackendUnavailable
+
+
+def weight_of(state):
+    return state.router.module.trunk[0].weight.detach().clone()
+
+
+def test_a_run_and_its_directory(tmp_path, scene):
+    lines, steps = [], []
+    follow = Each(lambda state: steps.append(state.step))
+    summary = trained(small(tmp_path), scene, on_event=lines.append, callbacks=[follow])
+    assert steps == list(range(1, 25))
+    assert summary == read_json(tmp_path / "summary.json")
+    assert summary["complete"] and summary["steps"] == 24 and summary["cells"] == 4
+    assert summary["rays_per_second"] == pytest.approx(24 * 64 / summary["seconds"])
+    coarse, local = summary["stages"]
+    assert (coarse["cells"], coarse["started_at_second"], coarse["balance_before"]) == (1, 0, None)
+    assert (local["cells"], local["started_at_step"], local["split_cells"]) == (4, 12, 1)
+    metrics = read_json_lines(tmp_path / "metrics.jsonl")
+    assert [line["step"] for line in metrics] == [12, 24]
+    assert all(metrics[-1][name] == summary[name] for name in ("psnr", "psnr_of_mean_error"))
+    assert summary["psnr_of_mean_error"] <= summary["psnr"] and 0 < summary["ssim"] <= 1
+    config = TrainConfig.from_json((tmp_path / "config.json").read_text())
+    assert config == resolve(small(tmp_path), scene)
+    opened = open_run(tmp_path, scene=scene)
+    assert opened.config == config and summary["parameters"] == sum(p.numel() for p in opened.router.parameters())
+    assert (tmp_path / "samples" / "level-1.npz").is_file() and len(lines) == 3
+
+
+def test_training_learns_and_the_reference_learns_the_same(scene):
+    white = -10 * (scene.test.truth(0, torch.ones(3)) - 1).square().mean().log10()
+    psnr = {}
+    for backend in ("auto", "reference"):
+        state = started(scene, 60, backend=backend, steps=60, rays=128, width=16)
+        psnr[backend] = evaluate(state.renderer, scene, views=1)[0].psnr
+    assert psnr["auto"] > float(white) + 1 and psnr["auto"] == pytest.approx(psnr["reference"], abs=0.5)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_no_collapse_to_white(scene, seed):
+    """A NeRF that gives up paints every ray white; its opacity is then 0 and no gradient brings it back."""
+    state = started(scene, 100, steps=100, seed=seed, rays=256, samples=(24,), width=32, cells=())
+    image = render_view(state.renderer, scene, 0)
+    alpha = scene.test.images[0][..., 3].float() / 255
+    assert image.opacity[alpha > 0.99].mean() > 0.5
+
+
+# --- splits ----------------------------------------------------------------------------------------------------------
+
+
+def test_nested_levels_and_cells_too_small(scene, monkeypatch):
+    monkeypatch.setattr("voronerf.nerf.split.MIN_SAMPLES", 8)
+    settings = {"cells": (3, 3), "split_at": (0.5, 0.9)}
+    coarse, first, second = started(scene, 24, **settings).stages
+    assert (coarse.cells, first.cells) == (1, 3) and second.cells in (3, 5, 7, 9)
+    # No cell holds that many samples, so none is split on the second level, and training goes on.
+    lines = []
+    state = build(small(**settings), scene, on_event=lines.append)
+    state.strategy.min_samples = 10_000
+    assert [stage.cells for stage in steps_of(state, 24).stages] == [1, 3, 3]
+    assert state.stages[2].balance_after is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "at", "cells"),
+    [
+        ({"split_at": (7,)}, [0, 7], [1, 4]),
+        # The worst cell first until there are enough, the last of them into what is missing: 4, 4 and 3.
+        (
+            {"cells": (3, 4), "max_cells": 11, "split_at": (0.2, 0.8), "steps": 50},
+            [0, 10, 20, 30, 40],
+            [1, 3, 6, 9, 11],
+        ),
+    ],
+)
+def test_when_and_into_what_is_split(scene, monkeypatch, settings, at, cells):
+    state = build(small(**settings), scene)
+    state.strategy.min_samples = 8
+    steps_of(state, state.config.steps)
+    assert state.router.num_cells == state.config.final_cells == cells[-1]
+    assert [stage.started_at_step for stage in state.stages] == at
+    assert [stage.cells for stage in state.stages] == cells
+
+
+def test_splits_that_never_come_are_said(tmp_path, scene):
+    lines = []
+    summary = trained(small(tmp_path, cells=(2, 2), split_at=(0.5, 0.99)), scene, on_event=lines.append)
+    assert summary["complete"] and summary["cells"] == 2 and summary["splits_left"] == 1
+    assert "Run ended before 1 of 2 planned splits." in lines
+
+
+def test_more_cells_than_samples(scene):
+    with pytest.raises(ValueError, match="more cells than samples: 390 cells are asked for, 60 samples were kept in 3"):
+        train(build(small(cells=(390,), split_at=(3,)), scene))
+
+
+def test_children_inherit_or_start_afresh(scene):
+    spread = []
+    for init in ("inherit", "random"):
+        weight = weight_of(started(scene, 13, init=init))
+        spread.append(float((weight[0] - weight[1]).abs().mean()))
+    assert 0 < spread[0] < 0.05 < 0.1 < spread[1]
+
+
+def test_coarse_and_fine_networks_inherit_alike(scene):
+    """After the split every cell of both networks has its parent's parameters and Adam's moments."""
+    state = started(scene, 12, **HIERARCHICAL)
+
+    def found():
+        weights = {name: router.module.trunk[0].weight for name, router in state.routers.items()}
+        return {n: (w.detach().clone(), state.optimizer.state[w]["exp_avg"].clone()) for n, w in weights.items()}
+
+    before = found()
+    assert state.strategy.step_pre_backward(state.optimizer, 0.5, 12) is not None
+    assert not torch.equal(before["field"][0], before["coarse"][0])
+    for name, (weight, moment) in found().items():
+        assert torch.equal(weight, before[name][0].expand_as(weight))
+        assert bool(moment.any()) and torch.equal(moment, before[name][1].expand_as(moment))
+    assert torch.equal(state.routers["coarse"].diagram.centres, state.router.diagram.centres)
+
+
+# --- what depends on the scene ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("field", ["nerf", "kilonerf"])
+def test_parameters_decide_the_width(scene, field):
+    state = build(small(width=None, depth=None, field=field, parameters=30_000), scene)
+    config = state.config
+    assert config.width == solve_width(config, 30_000) and config.lr == 0.02
+    assert count_parameters(config) <= 30_000 < count_parameters(config, config.width + 1)
+    steps_of(state, 13)
+    assert count_parameters(config) == state.parameter_count
+    again = build(replace(small(field=field, parameters=30_000, width=None, depth=None), **HIERARCHICAL), scene)
+    assert again.config.width < config.width  # two networks share them
+    refuses("--parameters must be at least", build, small(parameters=7), scene, error=ConfigError)
+
+
+def test_octaves_follow_the_pixels(scene):
+    """100 x 100 images of a Blender-like scene: 8 octaves; the paper's 10 at 400 x 400; one more for half the pixel.
+
+    Of cones, those that a pixel leaves: at the middle of the scene the last keeps more than a thousandth, the next
+    would keep nothing.
+    """
+    some = scene.train.cameras
+    for size, octaves in ((50, 7), (100, 8), (200, 9), (400, 10)):
+        cameras = Cameras(some.poses, some.intrinsics * size / some.width, size, size)
+        sharp = replace(scene, train=replace(scene.train, cameras=cameras))
+        assert octaves_for(sharp.pixel(sharp.space())) == octaves
+        cones = resolve(TrainConfig(field="mipnerf"), sharp).network_options["position_octaves"]
+        assert cones == octaves + 2
+        rays = cameras.rays(0, torch.tensor([size // 2]), torch.tensor([size // 2]), cones=True)
+        variance = float(4 * rays.radii) ** 2 / 4
+        left = [math.exp(-0.5 * 4.0**octave * variance) for octave in (cones - 1, cones)]
+        assert left[0] > 1e-4 and left[1] < 1e-9
+
+
+def test_a_panorama_from_one_place_trains(scene):
+    poses = scene.train.cameras.poses.clone()
+    poses[:, :3, 3] = 0
+    around = replace(scene, train=replace(scene.train, cameras=replace(scene.train.cameras, poses=poses)), near=0.05)
+    assert 4 <= octaves_for(replace(around, box=None).pixel(around.space("none"))) <= 14
+
+
+def test_empty_space_is_skipped_wherever_that_works(scene):
+    for settings in (HIERARCHICAL, {"field": "mipnerf"}):
+        assert not resolve(TrainConfig(**settings), scene).occupancy
+    sphere = {"contraction": "sphere"}
+    for settings in ({}, {"field": "kilonerf"}, {"field": "nerf"}, sphere, sphere | {"field": "kilonerf"}):
+        assert resolve(TrainConfig(**settings), scene).occupancy
+        assert not resolve(TrainConfig(occupancy=False, **settings), scene).occupancy
+        resolved = resolve(TrainConfig(**settings), replace(scene, box=None))
+        assert resolved.occupancy == (resolved.contraction != "none")
+
+
+def test_a_hash_grid_in_a_scene_without_bounds_is_contracted(scene):
+    unbounded = replace(scene, box=None)
+    assert resolve(TrainConfig(), unbounded).contraction == "sphere"
+    assert resolve(TrainConfig(), scene).contraction == "none"
+    assert resolve(TrainConfig(field="nerf"), unbounded).contraction == "none"
+
+
+# --- the occupancy grid ----------------------------------------------------------------------------------------------
+
+
+def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch):
+    def only_below(grid, *_, **__):
+        grid.occupied[:, :, grid.occupied.shape[2] // 2 :] = False
+
+    # What is empty: the upper half of the box, which the field is then never asked about.
+    for method in ("update", "observe"):
+        monkeypatch.setattr(OccupancyGrid, method, only_below)
+    summary = trained(small(tmp_path, split_at=(0.9,), occupancy=True), scene)
+    opened = open_run(tmp_path, scene=scene).renderer
+    points = np.load(tmp_path / "samples" / "level-1.npz")["points"][-20:]
+    grid = opened.occupancy
+    assert grid.share == 0.5 and summary["cells"] == 4
+    assert len(points) > 0 and points[:, 2].max() < float(grid.box[:, 2].mean())
+    assert evaluate(opened, scene, views=2)[1].psnr == pytest.approx(
+        2 * summary["psnr"] - evaluate(opened, scene, views=1)[0].psnr
+    )
+
+
+@pytest.mark.parametrize(("contraction", "settling"), [("sphere", 4), ("none", 0)])
+def test_a_grid_in_a_sphere_settles_before_it_learns(scene, monkeypatch, contraction, settling):
+    monkeypatch.setattr("voronerf.nerf.samplers.SETTLING_STEPS", 4)
+    monkeypatch.setattr("voronerf.nerf.samplers.REVISIT_EVERY", 1)
+    state = build(small(contraction=contraction, occupancy=True, cells=()), scene)
+    new, learnt, most = state.sampler.grid.density.clone(), [], []
+    sample = state.sampler.sample
+
+    def counted(*rays, **given):
+        samples = sample(*rays, **given)
+        most.append(int(samples.ray_offsets.diff().max()))
+        return samples
+
+    monkeypatch.setattr(state.sampler, "sample", counted)
+    steps_of(state, 6, Each(lambda s: learnt.append(not torch.equal(s.sampler.grid.density, new))))
+    assert learnt == [step >= settling for step in range(6)]
+    assert all((count <= 12 // 4) == (step < settling) for step, count in enumerate(most[:6]))
+
+
+def test_holes_of_the_grid_are_filled_once_at_the_end_by_the_averaged_field(scene, monkeypatch):
+    filled = []
+    monkeypatch.setattr(OccupancyGrid, "fill_holes", lambda grid, field, **_: filled.append(weight_of(state)))
+    state = started(scene, 12, occupancy=True, contraction="sphere")
+    assert not filled
+    train(state)
+    with state.averaged():
+        assert len(filled) == 1 and torch.equal(filled[0], weight_of(state))
+    assert not torch.equal(filled[0], weight_of(state))
+    train(build(small(occupancy=True, contraction="none"), scene))  # what is in a box gains nothing by it
+    assert len(filled) == 1
+
+
+def test_a_step_takes_more_rays_where_space_is_empty(scene):
+    """A quarter of the samples of the first steps, by at most eight times the rays."""
+    state = build(small(field="hashgrid", depth=1, occupancy=True, steps=12, cells=()), scene)
+    rays, voxels = [], state.sampler.grid.occupied.numel()
+    for kept in (voxels, voxels // 4, voxels // 16, 0):
+        state.sampler.grid.density.view(-1)[kept:] = state.sampler.grid.occupied.view(-1)[kept:] = 0
+        steps_of(state, 1)
+        rays.append(state.rays)
+    assert 64 <= rays[0] <= rays[1] < rays[2] <= 512 and rays[3] == 512
+
+
+# --- directories, backends, devices ----------------------------------------------------------------------------------
+
+
+def test_a_run_directory_has_one_run(tmp_path, scene, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = [str(choose_directory(small(), scene).out) for _ in range(3)]
+    assert names == [f"runs/{scene.name}{end}" for end in ("", "-2", "-3")]
+    other = Path("runs/other")
+    with held(other):
+        if sys.platform != "win32":
+            in_use = pytest.raises(ConfigError, match="--out must not be in use by another run, got runs/other")
+            with in_use, held(other):
+                raise AssertionError("two hold it")
+        (other / "config.json").write_text("")
+    with held(other), held(Path("runs/empty")):
+        pass
+    assert other.is_dir() and not Path("runs/empty").exists()
+
+
+def test_refused_before_anything_is_written(tmp_path, scene):
+    with pytest.raises(BackendUnavailable):
+        build(small(tmp_path, backend="warp"), scene)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("occupancy", [False, True])
+def test_the_reference_calls_nothing_compiled(scene, monkeypatch, occupancy):
+    """Three steps and a split, counted at the compiled module; the native backend does call it."""
+    calls = []
+    real = native.compiled
+
+    class Counted:
+        def __getattr__(self, name):
+            calls.append(name)
+            return getattr(real, name)
+
+    for backend in ("reference", "native"):
+        settings = {"cells": (2,), "split_at": (2,), "field": "hashgrid", "depth": 1}
+        state = build(small(backend=backend, occupancy=occupancy, **settings), scene)
+        with monkeypatch.context() as patch:
+            patch.setattr(native, "compiled", Counted())
+            calls.clear()
+            steps_of(state, 3)
+        assert bool(calls) == (backend == "native"), sorted(set(calls))
+
+
+@pytest.mark.cuda
+def test_training_on_a_gpu(tmp_path, scene):
+    assert trained(small(tmp_path, device="cuda", assignment="stochastic"), scene)["cells"] == 4
+    assert len(open_run(tmp_path, scene=scene, device="cpu").evaluate(views=1)["views"]) == 1
+
+
+def test_callbacks_are_called_in_their_order(scene):
+    said = []
+
+    class Says(Each):
+        def __init__(self, name):
+            super().__init__(lambda state: said.append((name, state.step)))
+            self.on_start = lambda state: said.append((name, "start"))
+            self.on_end = lambda state: said.append((name, "end"))
+            self.after_split = lambda state, done: said.append((name, len(done.points) > 0))
+
+    run(build(small(steps=2, split_at=(1,)), scene), [Says("a"), Says("b")])
+    assert said[:2] == [("a", "start"), ("b", "start")] and said[-2:] == [("a", "end"), ("b", "end")]
+    assert said[2:-2] == [(name, what) for what in (1, True, 2) for name in "ab"]
