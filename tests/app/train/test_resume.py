@@ -57,7 +57,7 @@ def test_an_evaluation_that_was_stopped_is_made_again(tmp_path, scene, monkeypat
         states = []
 
         def stopping_view(*args, stop_at=stop_at, states=states, **options):
-            if states[0].step == stop_at:
+            if states and states[0].step == stop_at:
                 states[0].stop()
             return rendered(*args, **options)
 

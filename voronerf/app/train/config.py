@@ -321,9 +321,8 @@ def check_config(config: TrainConfig) -> None:
         count = "one number" if passes == 1 else f"{passes} numbers, one for each pass"
         need(len(config.samples) == passes and min(config.samples) >= 1, "samples", f"be {count} of at least 1")
     _check_field_options(config)
-    need(
-        all(2 <= k <= RESERVOIR for k in config.cells), "cells", f"lie in 2..{RESERVOIR} on every level (none for one)"
-    )
+    fits = all(2 <= k <= RESERVOIR for k in config.cells)
+    need(fits, "cells", f"lie in 2..{RESERVOIR} on every level (none for one network)")
     if config.max_cells is not None:
         need(len(config.cells) in (1, 2), "max_cells", "come with one or two numbers of --cells")
         need(config.max_cells > config.cells[0], "max_cells", f"exceed the {config.cells[0]} cells of the first split")
