@@ -138,7 +138,7 @@ def renderer_of(fields, *, samples, fine_samples=0, occupancy=None, picture_samp
     """A renderer with the sampler that suits the names of the fields and what else is given."""
     given = {"space": Space(**space), "backend": backend}
     if occupancy is not None:
-        sampler = Occupancy(occupancy, samples, picture_samples=picture_samples, **given)
+        sampler = Occupancy(occupancy, samples, picture_samples=picture_samples or samples, **given)
     else:
         sampler = Hierarchical(samples, fine_samples, **given) if fine_samples else Stratified(samples, **given)
     return Renderer(fields, sampler, backend=backend)

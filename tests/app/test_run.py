@@ -9,13 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import refuses
+from helpers import read_json, refuses, trained
 
-from voronerf import open_run
+from voronerf.app import open_run
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.checkpoint import CheckpointError
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.trainer import Trainer
 from voronerf.nerf import turntable_cameras
 
 SIZE = {
@@ -24,10 +23,9 @@ SIZE = {
     "width": 8,
     "depth": 1,
     "rays": 64,
-    "samples": 8,
+    "samples": (8,),
     "evaluations": 1,
-    "reservoir": 400,
-    "reservoir_batches": 10,
+    "eval_views": 3,
 }
 
 
@@ -37,26 +35,24 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, scene):
-    folder = tmp_path_factory.mktemp("run")
-    trainer = Trainer(TrainConfig(out=folder, steps=20, cells=(4,), **SIZE), scene)
-    return trainer, trainer.run()
+def folder(tmp_path_factory, scene):
+    out = tmp_path_factory.mktemp("run")
+    trained(TrainConfig(out=out, steps=20, cells=(4,), **SIZE), scene)
+    return out
 
 
-def test_a_run_is_what_was_trained(trained, scene) -> None:
-    trainer, summary = trained
-    run = open_run(str(trainer.out), scene=scene)
-    assert (run.config, run.path) == (trainer.config, trainer.out)
-    assert run.router is run.routers["field"] and run.diagram is run.router.diagram and run.renderer.field is run.router
-    assert torch.equal(run.diagram.centres, trainer.router.diagram.centres)
+def test_a_run_is_what_was_trained(folder, scene) -> None:
+    summary, run = read_json(folder / "summary.json"), open_run(str(folder), scene=scene)
+    assert run.path == folder and run.config == TrainConfig.from_json((folder / "config.json").read_text())
+    assert run.diagram is run.router.diagram and run.renderer.field is run.router and run.diagram.num_cells == 4
     scores = run.evaluate(lpips="off")
     assert {name: scores[name] for name in ("psnr", "ssim")} == {name: summary[name] for name in ("psnr", "ssim")}
     assert [view["name"] for view in scores["views"]] == list(scene.test.names)
     assert len(run.evaluate(views=2, lpips="off")["views"]) == 2
 
 
-def test_any_camera_is_rendered(trained, scene) -> None:
-    run = open_run(trained[0].out, scene=scene)
+def test_any_camera_is_rendered(folder, scene) -> None:
+    run = open_run(folder, scene=scene)
     first, picture = run.render(0), run.render(1)
     assert picture.colour.shape == (16, 16, 3) and picture.depth.shape == picture.opacity.shape == (16, 16)
     assert not torch.equal(first.colour, picture.colour) and not picture.colour.requires_grad
@@ -82,23 +78,19 @@ def mappings(folder):
 
 
 def test_networks_stay_in_their_file(scene, tmp_path) -> None:
-    size = SIZE | {"width": 320, "depth": 3, "min_cell_samples": 1, "final_views": 1, "average": 0.0}
-    trainer = Trainer(TrainConfig(out=tmp_path, steps=2, cells=(8,), split_at_steps=(1,), **size), scene)
-    trainer.run()
+    size = SIZE | {"width": 320, "depth": 3, "eval_views": 1, "average": 0.0}
+    summary = trained(TrainConfig(out=tmp_path, steps=2, cells=(8,), split_at=(1,), **size), scene)
     run = open_run(tmp_path, scene=scene)
     assert run.diagram.num_cells == 8
     run.render(0)
     mapped = mappings(tmp_path)
-    assert (
-        mapped and sum(copied for _, _, copied in mapped) < 2 * trainer.parameter_count
-    )  # half of the networks' bytes
+    assert mapped and sum(copied for _, _, copied in mapped) < 2 * summary["parameters"]  # half of the networks' bytes
     for parameter in run.router.parameters():
         assert any(start <= parameter.data_ptr() < end for start, end, _ in mapped)
 
 
-def test_how_a_run_is_rendered_may_differ(trained, scene) -> None:
-    folder = trained[0].out
-    other = open_run(folder, scene=scene, samples=5, occupancy=True, backend="reference")
+def test_how_a_run_is_rendered_may_differ(folder, scene) -> None:
+    other = open_run(folder, scene=scene, samples=(5,), occupancy=True, backend="reference")
     assert other.renderer.sampler.samples == 5
     assert {other.renderer.backend, other.router.backend} == {"reference"}
     assert other.renderer.occupancy is not None and open_run(folder, scene=scene).renderer.occupancy is None
@@ -106,8 +98,7 @@ def test_how_a_run_is_rendered_may_differ(trained, scene) -> None:
     assert smaller.config.downscale == 10 and smaller.render(0).opacity.shape == (10, 10)
 
 
-def test_what_cannot_be_opened(trained, scene, tmp_path) -> None:
-    folder = trained[0].out
+def test_what_cannot_be_opened(folder, scene, tmp_path) -> None:
     refuses("last.safetensors: there is no checkpoint", open_run, tmp_path, scene=scene, error=CheckpointError)
     refuses("--device must be cpu or cuda, got 'meta'", open_run, folder, scene=scene, device="meta", error=ConfigError)
     with pytest.raises(ConfigError, match="--occupancy needs a scene with a box or --contraction"):

@@ -1,40 +1,12 @@
 """The optimiser of tables: few entries have a gradient, moments are inherited and saved."""
 
 import functools
-from typing import ClassVar
 
 import pytest
 import torch
-from tiny_runs import assert_resumes, small
 
-from voronerf import VoronoiRouter
-from voronerf.app.train.networks import make_optimizer
-from voronerf.app.train.trainer import Trainer
+from voronerf import HashGridField, VoronoiDiagram, VoronoiRouter
 from voronerf.nerf.adam import Adam
-from voronerf.nerf.fields import FIELDS, register_field
-
-
-@pytest.fixture
-def embedded():
-    @register_field("embedded")
-    class Embedded(torch.nn.Module):
-        """A feature for each slab of the box; a step meets few of the slabs."""
-
-        router_options: ClassVar = {"share": ["table"]}
-        sparse_parameters = ("tab*",)
-
-        def __init__(self, width: int = 8):
-            super().__init__()
-            self.table = torch.nn.Parameter(torch.randn(5000, 4))
-            self.out = torch.nn.Linear(4, 4)
-
-        def forward(self, positions, directions):
-            slab = (positions[:, 0] * 800 + 2500).long().clamp(0, 4999)
-            raw = self.out(torch.nn.functional.embedding(slab, self.table))
-            return torch.sigmoid(raw[:, :3]), torch.nn.functional.softplus(raw[:, 3])
-
-    yield "embedded"
-    del FIELDS["embedded"]
 
 
 def test_dense_groups_are_torchs():
@@ -67,25 +39,27 @@ def test_tables_move_where_they_have_a_gradient_and_keep_it():
     assert float(optimizer.state[table]["step"]) == 2 and bool((other < 1).all())
 
 
-def test_weights_shrink_by_the_rate_of_their_group_where_they_learn():
+def test_tables_shrink_by_the_rate_of_their_group_where_they_learn():
     table, asleep, other = (torch.nn.Parameter(torch.ones(6, 2)) for _ in range(3))
-    groups = [{"params": [other]}, {"params": [table, asleep], "sparse": True, "shrink": 0.1}]
+    groups = [{"params": [other]}, {"params": [table, asleep], "sparse": True, "shrink": 0.01}]
     optimizer = Adam(groups, lr=0.5)
     table.grad, other.grad = torch.zeros(6, 2), torch.zeros(6, 2)
-    optimizer.shrink(4)
-    assert torch.equal(table, torch.full((6, 2), 1 - 4 * 0.5 * 0.1))
+    optimizer.after_step(1)
+    assert bool((table == 1).all())
+    optimizer.after_step(16)
+    assert torch.equal(table, torch.full((6, 2), 1 - 16 * 0.5 * 0.01))
     assert bool((asleep == 1).all()) and bool((other == 1).all())
 
 
 def test_frozen_cells_do_not_shrink():
     router = VoronoiRouter(torch.nn.Linear(3, 2), torch.rand(4, 3))
     weight = router.module.weight
-    optimizer = Adam([{"params": [weight], "sparse": True, "shrink": 0.1}], lr=0.5)
+    optimizer = Adam([{"params": [weight], "sparse": True, "shrink": 0.01}], lr=0.5)
     router.freeze([0, 2])
     weight.grad, before = torch.zeros_like(weight), weight.detach().clone()
-    optimizer.shrink(1)
+    optimizer.after_step(0)
     assert torch.equal(weight[[0, 2]], before[[0, 2]])
-    assert torch.equal(weight[[1, 3]], before[[1, 3]] * (1 - 0.5 * 0.1))
+    assert torch.equal(weight[[1, 3]], before[[1, 3]] * (1 - 16 * 0.5 * 0.01))
 
 
 def test_a_scaled_gradient_is_unscaled_and_an_overflow_skipped():
@@ -103,26 +77,53 @@ def test_a_scaled_gradient_is_unscaled_and_an_overflow_skipped():
     assert torch.equal(*results)
 
 
-def test_a_field_names_its_tables(tmp_path, scene, embedded):
-    trainer = Trainer(small(tmp_path, field=embedded, depth=None), scene)
-    dense, tables = trainer.optimizer.param_groups
-    assert tables["sparse"] and not dense["sparse"] and len(dense["params"]) == 2
-    (table,) = tables["params"]
-    before = table.detach().clone()
-    trainer.on_step = lambda progress: trainer.request_stop() if progress.step == 2 else None
-    trainer.advance()
-    met = (trainer.optimizer.state[table]["exp_avg"] != 0).any(1)
-    assert bool(met.any()) and not bool(met.all())
-    shrunk = table[~met].detach() / before[~met]  # the others have the decay of the first step alone
-    assert float(shrunk.max()) < 1 and torch.allclose(shrunk, shrunk[0, 0])
-    assert bool((table[met] != before[met] * shrunk[0, 0]).any(1).all())
+def test_a_field_names_its_tables_which_shrink_less_with_many_views():
+    router = VoronoiRouter(HashGridField(width=8, levels=2, log2_entries=10), torch.rand(2, 3), share=["features"])
+    for views, shrink in ((1, 0.1), (300, 0.1), (3000, 0.01)):
+        optimizer = Adam.of({"field": router}, lr=0.1, views=views, sparse=["feat*"])
+        dense, tables = optimizer.param_groups
+        assert tables["sparse"] and not dense["sparse"] and tables["params"] == [router.module.features]
+        assert tables["shrink"] == pytest.approx(shrink)
 
 
-def test_tables_of_many_views_shrink_less(tmp_path, scene, embedded):
-    trainer = Trainer(small(tmp_path, field=embedded, depth=None), scene)
-    made = (make_optimizer(trainer.routers, trainer.config, views=views) for views in (1, 300, 3000))
-    assert [optimizer.param_groups[1]["shrink"] for optimizer in made] == pytest.approx([0.1, 0.1, 0.01])
+@pytest.mark.parametrize("decay", [0.5, 0.98])
+def test_averages_are_exponential_over_a_growing_window(decay):
+    weight, expected, passed = torch.nn.Parameter(torch.randn(5)), None, []
+    optimizer = Adam([weight], lr=0.1, average=decay)
+    for step in range(130):
+        weight.grad = torch.randn(5)
+        optimizer.update()
+        optimizer.after_step(step)
+        now = weight.detach().clone()
+        if step % 8 == 0:
+            window = min(1 / (1 - decay), max(1, step / 30))
+            new = 1 - (1 - 1 / window) ** 8
+            expected = now if expected is None else expected + (now - expected) * new
+        if step % 10 == 9:
+            with optimizer.averaged():
+                torch.testing.assert_close(weight.detach(), expected, rtol=1e-4, atol=1e-6)
+            assert torch.equal(weight.detach(), now)
+            passed.append(not torch.equal(expected, now))
+    assert len(passed) == 13 and any(passed)
+    optimizer.drop_averages()
+    with optimizer.averaged():
+        assert torch.equal(weight.detach(), now)
 
 
-def test_tables_resume_bit_for_bit(tmp_path, scene, embedded):
-    assert_resumes(tmp_path, scene, 15, field=embedded, depth=None)
+@pytest.mark.parametrize("inherit", [True, False])
+def test_children_have_the_average_of_their_parent(inherit):
+    router = VoronoiRouter(torch.nn.Linear(3, 2), torch.zeros(1, 3), coords="first3")
+    optimizer = Adam(router.parameters(), lr=0.1, average=0.9)
+    for step in range(60):
+        router(torch.rand(8, 3)).square().sum().backward()
+        optimizer.update()
+        optimizer.after_step(step)
+    with optimizer.averaged():
+        before = router.module.weight.detach().clone()
+    router.subdivide(
+        VoronoiDiagram(torch.rand(4, 3)), torch.zeros(4, dtype=torch.int64), optimizer=optimizer, inherit=inherit
+    )
+    if not inherit:
+        optimizer.drop_averages()
+    with optimizer.averaged():
+        assert torch.equal(router.module.weight, before.expand(4, 2, 3)) == inherit

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from helpers import refuses
 
 from voronerf import HashGridField, VoronoiRouter
-from voronerf.app.scenes import builtin_scene, load_scene
+from voronerf.app.scenes import SceneError, builtin_scene, load_scene
+from voronerf.app.train.build import check_memory, make_routers
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.networks import check_memory, count_parameters, make_routers, resolve_config
+from voronerf.app.train.defaults import resolve
 
 
 def rays(n):
@@ -62,20 +61,18 @@ def test_shared_layers_of_a_table():
 
 def test_settings_come_from_the_scene():
     scene = load_scene("builtin", downscale=5)
-    config = resolve_config(TrainConfig(field="hashgrid", field_options=("log2_entries=11", "levels=6")), scene)
-    field = make_routers(config, "cpu")["field"].module
+    config = resolve(TrainConfig(field="hashgrid", field_options=("log2_entries=11", "levels=6")), scene)
+    field = make_routers(config)["field"].module
     assert field.layers.grid.log2_entries == 11 and field.features.dim() == 2
     low, high = torch.tensor(field.layers.grid.box)
     torch.testing.assert_close((low + high) / 2, scene.box.mean(0))
     torch.testing.assert_close(high - low, (scene.box[1] - scene.box[0]).amax().expand(3))
-    finer = resolve_config(TrainConfig(field="hashgrid"), load_scene("builtin", downscale=2))
-    fine = make_routers(finer, "cpu")["field"].module.layers.grid.finest
+    finer = resolve(TrainConfig(field="hashgrid"), load_scene("builtin", downscale=2))
+    fine = make_routers(finer)["field"].module.layers.grid.finest
     assert 2.4 < fine / field.layers.grid.finest < 2.6
-    assert resolve_config(config, scene) == config
-    kept = resolve_config(TrainConfig(field="hashgrid", field_options=("finest=99",)), scene)
-    assert make_routers(kept, "cpu")["field"].module.layers.grid.finest == 99
-    own = make_routers(replace(config, cell_tables=True), "cpu")["field"]
-    assert own.module.features.dim() == 3
+    assert resolve(config, scene) == config
+    kept = resolve(TrainConfig(field="hashgrid", field_options=("finest=99",)), scene)
+    assert make_routers(kept)["field"].module.layers.grid.finest == 99
 
 
 def test_the_grid_grows_with_the_images():
@@ -88,25 +85,16 @@ def test_the_grid_grows_with_the_images():
         assert contracted == {"box": box, "finest": 353, "log2_entries": entries}
 
 
-def test_shared_parameters_count_once():
-    shared, own = (TrainConfig(field="hashgrid", cells=(4,), cell_tables=own) for own in (False, True))
-    field = HashGridField()
-    assert count_parameters(own) - count_parameters(shared) == 3 * field.features.numel()
-    assert count_parameters(own) == 4 * sum(parameter.numel() for parameter in field.parameters())
-
-
 def test_bad_settings():
     refuses("HashGridField: width must be at least 2 and depth 1, got 1 and 1", HashGridField, width=1)
     refuses("HashGrid: log2_entries must be an integer from 10 to 24, got 30", HashGridField, log2_entries=30)
-    with pytest.raises(ConfigError, match="--cell-tables must come with a field whose cells share parameters"):
-        TrainConfig(field="nerf", cell_tables=True)
-    with pytest.raises(ConfigError, match=r"--field hashgrid of --width 32 with 4096 cells needs .* GiB of"):
-        check_memory(TrainConfig(field="hashgrid", cells=(4096,), cell_tables=True))
+    with pytest.raises(ConfigError, match=r"--field nerf of --width 4096 with 10000 cells needs .* GiB of"):
+        check_memory(TrainConfig(field="nerf", cells=(10_000,), width=4096, depth=9))
     refuses("HashGridField: directions must be given", HashGridField(log2_entries=10), torch.rand(2, 3))
     capture = load_scene("builtin", downscale=10)
     object.__setattr__(capture, "box", None)
-    with pytest.raises(ConfigError, match="--field hashgrid needs --contraction sphere or auto for builtin, a sc"):
-        resolve_config(TrainConfig(contraction="none"), capture)
+    with pytest.raises(SceneError, match="builtin: has no box, a field that covers space needs contraction sphere or"):
+        resolve(TrainConfig(contraction="none"), capture)
 
 
 def test_a_table_that_does_not_fit_into_memory(monkeypatch):
@@ -123,7 +111,7 @@ def test_a_table_that_does_not_fit_into_memory(monkeypatch):
 )
 def test_large_images_and_long_trainings_get_more_of_both(side, contraction, budget, samples, entries):
     scene = builtin_scene(side, train_views=2, test_views=1)
-    config = resolve_config(TrainConfig(contraction=contraction, budget=budget), scene)
+    config = resolve(TrainConfig(contraction=contraction, budget=budget), scene)
     given = dict(text.split("=", 1) for text in config.field_options)
-    assert config.samples == samples and given.get("log2_entries") == (entries and str(entries))
-    assert resolve_config(TrainConfig(samples=7, contraction=contraction), scene).samples == 7
+    assert config.samples == (samples,) and given.get("log2_entries") == (entries and str(entries))
+    assert resolve(TrainConfig(samples=(7,), contraction=contraction), scene).samples == (7,)

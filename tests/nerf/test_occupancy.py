@@ -7,7 +7,6 @@ import torch
 from helpers import refuses, render_image, renderer_of, seeded
 
 from voronerf import HashGridField, NeRF, VoronoiRouter
-from voronerf.app.train.renderers import through_grid
 from voronerf.nerf import (
     Batch,
     Cameras,
@@ -15,8 +14,8 @@ from voronerf.nerf import (
     Occupancy,
     OccupancyGrid,
     Perspective,
+    RayLoss,
     Rays,
-    Step,
     Stratified,
     intersect_box,
     orbit_cameras,
@@ -259,7 +258,7 @@ def test_a_ray_that_ends_has_the_colour_before_its_end():
         return torch.full_like(positions, 0.25), torch.full_like(positions[:, 0], 8.0)
 
     rays = Rays(torch.tensor([[0.0, 0, -1], [0, 0, 0.9]]), torch.tensor([[0.0, 0, 1]]).expand(2, 3))
-    sampler = Occupancy(OccupancyGrid(BOX, 4, threshold=0.1), 200)
+    sampler = Occupancy(OccupancyGrid(BOX, 4, threshold=0.1), 200, picture_samples=200)
     ends = torch.zeros(2), torch.tensor([2.0, 0.1])
     seen = render_until_opaque(fog, rays, *ends, sampler, background=WHITE)
     left = math.exp(-0.8)  # of the second ray, which does not end
@@ -271,9 +270,9 @@ def test_a_ray_that_ends_has_the_colour_before_its_end():
 
 def test_pictures_have_twice_the_strata_of_a_training_up_to_a_bound():
     grid = OccupancyGrid(BOX, 4, threshold=0.1)
-    found = {samples: through_grid(Stratified(samples), grid).picture_samples for samples in (64, 128, 256, 512)}
+    found = {samples: Occupancy(grid, samples).picture_samples for samples in (64, 128, 256, 512)}
     assert found == {64: 128, 128: 256, 256: 384, 512: 512}
-    assert through_grid(Stratified(64), grid, picture_samples=300).picture_samples == 300
+    assert Occupancy(grid, 64, picture_samples=300).picture_samples == 300
 
 
 @pytest.mark.parametrize("backend", ["auto", "reference"])
@@ -301,7 +300,7 @@ def test_rays_that_meet_nothing_show_the_background():
     rays = Rays(torch.zeros(3, 3), torch.eye(3))
     ends = torch.full((3,), 0.1), torch.full((3,), 0.9)
     asked = Ball()
-    seen = render_until_opaque(asked, rays, *ends, Occupancy(grid, 8), background=WHITE)
+    seen = render_until_opaque(asked, rays, *ends, Occupancy(grid, 8, picture_samples=8), background=WHITE)
     assert asked.asked == 0
     assert torch.equal(seen.colour, torch.ones(3, 3)) and torch.equal(seen.depth, ends[1])
     assert torch.equal(seen.heaviest, 0.9 * torch.eye(3))
@@ -377,7 +376,7 @@ def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sighti
 
     def compare(renderer):
         batch = Batch(rays, *ends(rays), target, background, seen)
-        found = Step(renderer, sightings=sightings).run(batch, torch.Generator().manual_seed(3))
+        found = RayLoss(renderer, sparse_depth=sightings)(batch, torch.Generator().manual_seed(3))
         return found, torch.autograd.grad(found.loss, list(router.parameters()))
 
     found, gradients = compare(renderer)
@@ -397,7 +396,7 @@ def test_samples_that_no_light_reaches_have_no_gradient():
     for of in (router, lambda *given: router(*given)):  # the second is a field without a table
         renderer = renderer_of({"field": of}, samples=96, occupancy=tight_grid())
         batch = Batch(rays, *ends(rays), torch.zeros(len(rays), 3))
-        found = Step(renderer).run(batch, torch.Generator().manual_seed(3))
+        found = RayLoss(renderer)(batch, torch.Generator().manual_seed(3))
         gradients.append(torch.autograd.grad(found.loss, router.module.features)[0])
     some, every = gradients
     assert 0 < some.count_nonzero() < every.count_nonzero()

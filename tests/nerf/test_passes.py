@@ -13,17 +13,16 @@ from voronerf.nerf import (
     Hierarchical,
     Occupancy,
     OccupancyGrid,
+    RayLoss,
     Rays,
     Renderer,
     Space,
-    Step,
     Stratified,
     render_rays,
 )
 from voronerf.nerf.sampling import (
     PADDING,
     blurred_weights,
-    interlevel_loss,
     strata_uniforms,
     stratified_edges,
     union_depths,
@@ -69,7 +68,6 @@ def test_a_second_pass_finds_a_thin_surface():
 def test_who_is_asked_about_what():
     for first, options, of_first, of_field in (
         ("coarse", {"fine_samples": 4}, [[3 * 8, 3]], [[3 * 12, 3]]),
-        ("proposal", {"fine_samples": 4}, [[3 * 8, 3]], [[3 * 4, 3]]),
         (None, {"fine_samples": 4, "cones": True}, [], [[3 * 8, 6], [3 * 4, 6]]),
         (None, {}, [], [[3 * 8, 3]]),
     ):
@@ -124,47 +122,14 @@ def test_blurred_weights_against_slow_loop():
     assert float(blurred_weights(torch.ones(1, 1))) == pytest.approx(1 + PADDING)
 
 
-def test_interlevel_loss_against_slow_loop():
-    generator = seeded(0)
-    edges = torch.rand(6, 6, generator=generator).cumsum(1) + 0.5
-    found = torch.rand(6, 5, generator=generator).cumsum(1)
-    found[0] = torch.linspace(0, 10, 5)  # reaches beyond at both ends
-    weights, bounds = torch.rand(6, 5, generator=generator), torch.rand(6, 4, generator=generator) / 3
-    expected = 0.0
-    for r in range(6):
-        for i in range(5):
-            touched = [
-                float(bounds[r, j])
-                for j in range(4)
-                if float(found[r, j + 1]) > float(edges[r, i]) and float(found[r, j]) < float(edges[r, i + 1])
-            ]
-            w = float(weights[r, i])
-            expected += max(0.0, w - sum(touched)) ** 2 / (w + 1e-7) / 6
-    weights.requires_grad_(), bounds.requires_grad_()
-    loss = interlevel_loss(edges, weights, found, bounds)
-    assert float(loss.detach()) == pytest.approx(expected, rel=1e-5)
-    loss.backward()
-    assert weights.grad is None and bounds.grad is not None
-    assert float(bounds.grad.max()) < 1e-6 and float(bounds.grad.min()) < -0.01
-
-
-def test_a_proposal_that_bounds_the_weights_costs_nothing():
-    edges, weights = torch.linspace(0, 1, 9)[None], torch.rand(1, 8)
-    bounds = weights.reshape(1, 4, 2).sum(2)
-    assert float(interlevel_loss(edges, weights, edges[:, ::2].contiguous(), bounds)) == pytest.approx(0, abs=1e-9)
-
-
 def test_losses():
     target, higher = torch.rand(3, 3), Slab(0.2, 0.8)
     near, far = torch.zeros(3), torch.full((3,), 4.0)
-    for others, cones, share in (({}, True, 0.1), ({"coarse": higher}, False, 1.0), ({"proposal": higher}, False, 0)):
+    for others, cones, share in (({}, True, 0.1), ({"coarse": higher}, False, 1.0)):
         renderer = renderer_of({"field": Slab(), **others}, samples=6, fine_samples=5, cones=cones)
         first, last = renderer.render(rays(), near, far, background=WHITE, jitter=True, generator=seeded(2))
         expected = (last.colour - target).square().mean() + share * (first.colour - target).square().mean()
-        if "proposal" in others:
-            given = (x for each in (last, first) for x in (each.samples.edges, each.samples.by_ray(each.weights)))
-            expected = expected + interlevel_loss(*given)
-        found = Step(renderer).run(Batch(rays(), near, far, target, WHITE), seeded(2))
+        found = RayLoss(renderer)(Batch(rays(), near, far, target, WHITE), seeded(2))
         torch.testing.assert_close(found.loss, expected)
         torch.testing.assert_close(found.error, (last.colour - target).square().sum(1))
 
@@ -192,8 +157,7 @@ def test_uniforms_are_one_in_each_stratum():
 
 
 def test_training_draws_differ_and_pictures_do_not():
-    for fields, cones in (({"field": Slab(), "coarse": Slab()}, False), ({"field": Slab(), "proposal": Slab()}, False),
-                          ({"field": Slab()}, True)):  # fmt: skip
+    for fields, cones in (({"field": Slab(), "coarse": Slab()}, False), ({"field": Slab()}, True)):
         renderer = renderer_of(fields, samples=8, fine_samples=8, cones=cones)
         seeds = [seeded(seed) for seed in (0, 0, 1)]
         a, b, c = (renderer.render(rays(), 0.0, 4.0, jitter=True, generator=seed)[-1] for seed in seeds)

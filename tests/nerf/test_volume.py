@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import refuses, render_image, renderer_of, seeded
 
-from voronerf.nerf import Batch, OccupancyGrid, Space, Step, Stratified, render_rays
+from voronerf.nerf import Batch, OccupancyGrid, RayLoss, Space, Stratified, render_rays
 from voronerf.nerf.cameras import Rays, orbit_cameras
 
 BOX = torch.tensor([[-0.7, -0.7, -0.7], [0.7, 0.7, 0.7]])
@@ -135,9 +135,9 @@ def test_the_last_rays_end_at_points():
     renderer.sampler.sample = lambda *_, **__: rendered.samples  # without jitter
     expected = 0.1 * sum(-math.log(math.exp(-0.125 * before) * (1 - math.exp(-0.125 * many))) for before, many in ENDS)
     target, seen = rendered.colour, torch.tensor([2.0, 2.9])
-    step = Step(renderer, sightings=0.1)
-    assert float(step.run(Batch(ahead, *ends, target, None, seen)).loss) == pytest.approx(expected / 2, rel=1e-5)
-    assert float(step.run(Batch(ahead, *ends, target)).loss) == 0
+    loss = RayLoss(renderer, sparse_depth=0.1)
+    assert float(loss(Batch(ahead, *ends, target, None, seen)).loss) == pytest.approx(expected / 2, rel=1e-5)
+    assert float(loss(Batch(ahead, *ends, target)).loss) == 0
 
 
 def test_image_is_the_rays_of_its_pixels_whatever_the_chunk():

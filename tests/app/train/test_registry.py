@@ -10,16 +10,17 @@ from typing import Any, ClassVar
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import refuses
+from helpers import refuses, trained
 from torch import Tensor, nn
 
-from voronerf import MLP, Layer, open_run
+from voronerf import MLP, Layer
+from voronerf.app import open_run
 from voronerf.app.cli import main
 from voronerf.app.scenes import Scene, builtin_scene
+from voronerf.app.train.build import build, count_parameters
 from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.networks import count_parameters, resolve_config
-from voronerf.app.train.trainer import Trainer
+from voronerf.app.train.defaults import resolve
 from voronerf.nerf.fields import FIELDS, NeRF, register_field
 
 
@@ -124,41 +125,39 @@ def scene() -> Scene:
 
 
 def small(out: Path, **settings: Any) -> TrainConfig:
-    kept: dict[str, Any] = {"occupancy": False, "reservoir": 400, "reservoir_batches": 10, "evaluations": 1}
-    return TrainConfig(out=out, steps=20, cells=(3,), split_at=(0.5,), rays=64, samples=8, **{**kept, **settings})
+    kept: dict[str, Any] = {"occupancy": False, "evaluations": 1}
+    return TrainConfig(out=out, steps=20, cells=(3,), split_at=(0.5,), rays=64, samples=(8,), **{**kept, **settings})
 
 
 @pytest.mark.filterwarnings("ignore:VoronoiRouter")
 @pytest.mark.parametrize("name", KINDS)
 def test_every_kind_of_field_is_trained_split_resumed_and_scored(tmp_path: Path, scene: Scene, name: str) -> None:
     config = small(tmp_path / "whole", field=name, **KINDS[name][1])
-    trainer = Trainer(config, scene)
-    summary = trainer.run()
-    assert summary["cells"] == 3 and summary["parameters"] == count_parameters(trainer.config)
-    assert isinstance(trainer.router.module, KINDS[name][0])
+    summary = trained(config, scene)
+    resolved = resolve(config, scene)
+    assert summary["cells"] == 3 and summary["parameters"] == count_parameters(resolved)
 
     part = replace(config, out=tmp_path / "part")
-    first = Trainer(part, scene)
-    first.on_step = lambda p: first.request_stop() if p.step == 14 else None
-    first.run()
-    Trainer(replace(part, resume=True), scene).run()
+    trained(part, scene, stop_at=14)
+    trained(part, scene, resume=True)
     whole, resumed = (load_checkpoint(checkpoint_path(tmp_path / run)).tensors for run in ("whole", "part"))
     assert whole.keys() == resumed.keys() and all(torch.equal(whole[key], resumed[key]) for key in whole)
     changed = [key for key in whole if key.startswith("router.module.") and not torch.equal(*whole[key][:2])]
     assert changed  # cells have learned different things since the split
 
     run = open_run(tmp_path / "whole", scene=scene)
+    assert isinstance(run.router.module, KINDS[name][0])
     assert run.evaluate()["psnr"] == summary["psnr"]
     assert run.render(1).colour.shape == (16, 16, 3)
     if name in ("table", "fourier", "balls"):  # a layer table, or a class whose router has fuse=True
         assert "fused" in run.router.explain()
     del FIELDS[name]
-    with pytest.raises(ConfigError, match=f"got '{name}'; voronerf.nerf.fields.register_field adds others"):
+    with pytest.raises(ConfigError, match=f"register_field adds others, got '{name}'"):
         open_run(tmp_path / "whole", scene=scene)
 
 
 def test_options_reach_the_field(scene: Scene) -> None:
-    config = TrainConfig(field="foreign", field_options=("hidden=16", "growth=2.5", "kind=tanh"))
+    config = resolve(TrainConfig(field="foreign", field_options=("hidden=16", "growth=2.5", "kind=tanh")), scene)
     assert config.lr == 0.08 / 16 and (config.width, config.depth) == (None, None)
     field = config.field_type.build(config.network_options)
     assert isinstance(field, Foreign) and (field.growth, field.kind, field.head.in_features) == (2.5, "tanh", 16)
@@ -166,7 +165,7 @@ def test_options_reach_the_field(scene: Scene) -> None:
     built = nerf.field_type.build({**nerf.network_options, "position_octaves": 3})
     assert isinstance(built, NeRF) and built.density_scale == 20 and len(built.trunk) == 2
     assert TrainConfig.from_json(nerf.to_json()) == nerf
-    solved = resolve_config(TrainConfig(field="table", parameters=400, cells=()), scene)
+    solved = build(TrainConfig(field="table", parameters=400, cells=()), scene).config
     assert solved.width == 49 and count_parameters(solved) == 8 * 49 + 4
 
 
@@ -205,7 +204,7 @@ def test_what_cannot_be_built(scene: Scene) -> None:
         FIELDS["table"].build({"depth": 2})
     refuses("NeRF: width must be at least 2, got 1", FIELDS["nerf"].build, {"width": 1})
     with pytest.raises(ConfigError, match="--parameters needs a field with an option width, foreign has none"):
-        resolve_config(TrainConfig(field="foreign", field_options=("hidden=8",), parameters=100), scene)
+        build(TrainConfig(field="foreign", field_options=("hidden=8",), parameters=100), scene)
 
 
 def test_what_cannot_be_registered() -> None:
@@ -233,12 +232,12 @@ def test_a_field_that_returns_something_else(tmp_path: Path, scene: Scene, answe
 
     register_field("odd")(odd)
     with pytest.raises(ValueError, match=message):
-        Trainer(small(tmp_path, field="odd", lr=0.01), scene).run()
+        trained(small(tmp_path, field="odd", lr=0.01), scene)
 
 
 def test_the_command_line_takes_registered_fields(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     run = str(tmp_path / "run")
-    tiny = ["--downscale", "12", "--steps", "4", "--cells", "--rays", "32", "--samples", "8", "--final-views", "1"]
+    tiny = ["--downscale", "12", "--steps", "4", "--cells", "--rays", "32", "--samples", "8", "--eval-views", "1"]
     plain = ["--panels", "0", "--lpips", "off"]
     assert main(["train", "--out", run, "--field", "foreign", "--field-options", "hidden=8", *tiny, *plain]) == 0
     assert main(["eval", run, "--views", "1", *plain]) == 0
