@@ -21,13 +21,13 @@ typedef int32_t Ints __attribute__((vector_size(4 * kLanes)));
 constexpr int64_t kUnit = 16;  // rays that leap together, and samples that are filled in together
 
 // Cells of 32 strata from `first`, -1 outside the box.
-template <MarchWhere W, bool Jittered, bool Disparity>
+template <MarchWhere W, bool Disparity>
 VN_INLINE void cells_of(const MarchInputs& in, const MarchRay& ray, const float* origin, const float* direction,
                         const float* scale, const float* uniforms, int64_t first, int32_t* cells) {
   float edges[kMarchWord + 1];
   for (int64_t j = 0; j <= kMarchWord; ++j) edges[j] = march_edge(ray, first + j, Disparity);
   for (int64_t j = 0; j < kMarchWord; ++j) {
-    const float at = march_sample(ray, first + j, Jittered ? uniforms[j] : 0.5f, edges[j], edges[j + 1], Disparity);
+    const float at = march_sample(ray, first + j, uniforms[j], edges[j], edges[j + 1], Disparity);
     float point[3];
     march_point(in, W, origin, direction, at, point);
     cells[j] = march_cell(in, scale, point);
@@ -38,8 +38,8 @@ VN_INLINE int bits_of(uint32_t word) {
   return __builtin_popcount(word);
 }
 
-template <MarchWhere W, bool Jittered, bool Disparity>
-VN_INLINE void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
+template <MarchWhere W, bool Disparity>
+void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
   float scale[3];
   march_scale(in, scale);
@@ -54,15 +54,14 @@ VN_INLINE void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int
       const int64_t first = w * kMarchWord, left = in.s - first;
       int32_t cells[kMarchWord];
       float uniforms[kMarchWord];
-      if (Jittered && in.seed != nullptr) {
+      if (in.seed != nullptr) {
         for (int64_t j = 0; j < kMarchWord; ++j) uniforms[j] = hashed(key, static_cast<uint32_t>(first + j));
-      } else if (Jittered) {
+      } else {
         const int64_t there = left < kMarchWord ? left : kMarchWord;
-        for (int64_t j = 0; j < kMarchWord; ++j) uniforms[j] = 0.0f;
-        __builtin_memcpy(uniforms, in.uniforms + i * in.s + first, sizeof(float) * there);
+        for (int64_t j = 0; j < kMarchWord; ++j) uniforms[j] = 0.5f;
+        if (in.uniforms != nullptr) __builtin_memcpy(uniforms, in.uniforms + i * in.s + first, sizeof(float) * there);
       }
-      cells_of<W, Jittered, Disparity>(in, ray, in.origins + 3 * i, in.directions + 3 * i, scale, uniforms, first,
-                                       cells);
+      cells_of<W, Disparity>(in, ray, in.origins + 3 * i, in.directions + 3 * i, scale, uniforms, first, cells);
       uint32_t word = 0;
       for (int64_t j = 0; j < kMarchWord; ++j) {
         // Without a branch, which nothing could predict.
@@ -248,7 +247,7 @@ VN_INLINE void count_by_leaps(const MarchInputs& in, const uint8_t* room, uint32
   for (int64_t i = begin; i < end; ++i) {
     const bool ended = in.start != nullptr && in.start[i] >= in.s;
     if (ended || !wide(march_ray(in, i), Disparity)) {
-      count<W, false, Disparity>(in, mask, counts, i, i + 1);
+      count<W, Disparity>(in, mask, counts, i, i + 1);
       continue;
     }
     for (int64_t w = i * words; w < (i + 1) * words; ++w) mask[w] = 0;
@@ -259,9 +258,9 @@ VN_INLINE void count_by_leaps(const MarchInputs& in, const uint8_t* room, uint32
 
 // Samples in `strata`, at most kUnit of one ray, to rows from `row`.
 template <MarchWhere W, bool Disparity>
-VN_INLINE void fill_unit(const MarchInputs& in, const MarchRay& ray, uint32_t key, int64_t i, const int32_t* strata,
-                         int64_t many, int64_t row, int32_t* ray_index, float* depths, float* deltas,
-                         float* positions) {
+__attribute__((noinline)) void fill_unit(const MarchInputs& in, const MarchRay& ray, uint32_t key, int64_t i,
+                                         const int32_t* strata, int64_t many, int64_t row, int32_t* ray_index,
+                                         float* depths, float* deltas, float* positions) {
   const float *origin = in.origins + 3 * i, *direction = in.directions + 3 * i;
   float inside[kUnit], at[kUnit], length[kUnit], x[kUnit], y[kUnit], z[kUnit];
   if (in.seed != nullptr) {
@@ -329,13 +328,7 @@ VN_INLINE void count_in(const MarchInputs& in, const uint8_t* room, uint32_t* ma
     return in.disparity ? count_by_leaps<W, true>(in, room, mask, counts, begin, end)
                         : count_by_leaps<W, false>(in, room, mask, counts, begin, end);
   }
-  const bool middles = in.uniforms == nullptr && in.seed == nullptr;
-  if (in.disparity) {
-    middles ? count<W, false, true>(in, mask, counts, begin, end) : count<W, true, true>(in, mask, counts, begin, end);
-  } else {
-    middles ? count<W, false, false>(in, mask, counts, begin, end)
-            : count<W, true, false>(in, mask, counts, begin, end);
-  }
+  return in.disparity ? count<W, true>(in, mask, counts, begin, end) : count<W, false>(in, mask, counts, begin, end);
 }
 
 template <MarchWhere W>

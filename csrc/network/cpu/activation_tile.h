@@ -33,7 +33,7 @@ VN_INLINE void copy_row(const float* from, int64_t width, float* to) {
 }
 
 // In place; sine leaves its cosine in `slope` where that is kept.
-void activate(const MlpPlanLayer& layer, int64_t rows, float* value, float* slope) {
+[[maybe_unused]] void activate(const MlpPlanLayer& layer, int64_t rows, float* value, float* slope) {
   const int64_t size = rows * layer.padded;
   for (int64_t i = 0; i < size; i += kLanes) {
     const F32 x = load(value + i);
@@ -55,7 +55,8 @@ void activate(const MlpPlanLayer& layer, int64_t rows, float* value, float* slop
 }
 
 // gradient *= the activation's derivative, from its output or, for sine, from the cosine that was kept.
-void times_slope(const MlpPlanLayer& layer, int64_t rows, const float* value, const float* slope, float* gradient) {
+[[maybe_unused]] void times_slope(const MlpPlanLayer& layer, int64_t rows, const float* value, const float* slope,
+                                  float* gradient) {
   const int64_t size = rows * layer.padded;
   const F32 zero = splat(0.0f), one = splat(1.0f);
   for (int64_t i = 0; i < size; i += kLanes) {

@@ -66,7 +66,7 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
 
 // Weights [o][depth] -> panels [pairs of inputs][<= 64 of o, padded to 16 with 0]; each source starts a pair. Rows are
 // narrowed four at a time into `scratch`, then transposed, a pair being as wide as a float.
-void pack_forward(const float* weights, const MlpPlanLayer& layer, float* packed, float* scratch) {
+[[maybe_unused]] void pack_forward(const float* weights, const MlpPlanLayer& layer, float* packed, float* scratch) {
   const int64_t stride = layer.packed_depth + kGranule;
   for (int64_t first = 0; first < layer.padded; first += kPanel) {
     const int64_t columns = smaller(kPanel, layer.padded - first);
@@ -89,7 +89,8 @@ void pack_forward(const float* weights, const MlpPlanLayer& layer, float* packed
 }
 
 // The inputs of one source: weights [o][depth] -> panels [pairs of o][<= 64 of its width, padded to 16 with 0].
-void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPlanSource& source, float* packed) {
+[[maybe_unused]] void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPlanSource& source,
+                                    float* packed) {
   const int64_t padded = padded_width(source);
   for (int64_t first = 0; first < padded; first += kPanel) {
     const int64_t columns = smaller(kPanel, padded - first);
@@ -108,7 +109,7 @@ void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPla
 #else
 
 // weights [o][depth] -> panels [depth][<= 64 of o, padded to 16 with 0].
-void pack_forward(const float* weights, const MlpPlanLayer& layer, float* packed, float*) {
+[[maybe_unused]] void pack_forward(const float* weights, const MlpPlanLayer& layer, float* packed, float*) {
   for (int64_t first = 0; first < layer.padded; first += kPanel) {
     const int64_t columns = smaller(kPanel, layer.padded - first);
     float* panel = packed + first * layer.depth;
@@ -128,7 +129,8 @@ void pack_forward(const float* weights, const MlpPlanLayer& layer, float* packed
 }
 
 // The inputs of one source: weights [o][depth] -> panels [o][<= 64 of its width, padded to 16 with 0].
-void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPlanSource& source, float* packed) {
+[[maybe_unused]] void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPlanSource& source,
+                                    float* packed) {
   const int64_t padded = padded_width(source);
   for (int64_t first = 0; first < padded; first += kPanel) {
     const int64_t columns = smaller(kPanel, padded - first), count = smaller(columns, source.width - first);
