@@ -24,6 +24,8 @@ def markdown() -> str:
         lines += [f"## voronerf {name}", "", summary, ""]
         if name == "train":
             lines += [*train_tables(), "### This training", ""]
+        elif TrainConfig in get_type_hints(function).values():
+            lines += ["Takes the settings of `voronerf train`, and:", ""]
         lines += table(function, arguments)
     return "\n".join(lines) + "\n"
 

@@ -53,8 +53,8 @@ class Adam(torch.optim.Adam):
         >>> import torch
         >>> from voronerf.nerf import Adam
         >>> weight = torch.nn.Parameter(torch.ones(3))
-        >>> optimizer = Adam([weight], lr=0.1, average=0.9)
-        >>> for step in range(9):
+        >>> optimizer = Adam([weight], lr=0.001, average=0.9)
+        >>> for step in range(400):
         ...     weight.grad = torch.ones(3)
         ...     optimizer.update()
         ...     optimizer.after_step(step)

@@ -90,7 +90,7 @@ def render_until_opaque(
         >>> rays = Rays(torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]))
         >>> result = render_until_opaque(wall, rays, torch.zeros(1), torch.full((1,), 4.0), Occupancy(grid, 8))
         >>> result.colour, result.depth
-        (tensor([[1., 1., 1.]]), tensor([2.2500]))
+        (tensor([[1., 1., 1.]]), tensor([2.1250]))
     """
     contraction = sampler.space.contraction
     network = _network(field, rays, sampler)

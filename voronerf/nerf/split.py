@@ -137,7 +137,7 @@ class SplitStrategy:
         >>> rays = Rays(torch.zeros(9, 3), torch.nn.functional.normalize(torch.randn(9, 3)))
         >>> batch = Batch(rays, torch.ones(9), torch.full((9,), 3.0), torch.rand(9, 3))
         >>> for step in range(4):
-        ...     made = strategy.step_pre_backward(optimizer, step / 4, step)
+        ...     made = strategy.step_pre_backward(optimizer, step / 4, step)  # None, or a SplitDone
         ...     optimizer.zero_grad()
         ...     output = loss(batch, backward=True)
         ...     optimizer.step()

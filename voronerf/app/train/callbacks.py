@@ -291,6 +291,14 @@ class TensorBoard(Callback):
 
     Raises:
         ImportError: TensorBoard is not installed.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from voronerf.app.train import Scores, TensorBoard
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     scores = Scores(None)
+        ...     beside = [scores, TensorBoard(Path(folder), scores)]  # callbacks of `run`
     """
 
     EVERY = 10  # steps between two losses

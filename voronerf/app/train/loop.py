@@ -121,6 +121,20 @@ def run(state: State, callbacks: Sequence[Callback] = (), *, clock: Callable[[],
         state: What :func:`voronerf.app.train.build` made, and ``load`` may have moved on.
         callbacks: Called in their order.
         clock: Counts seconds.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from voronerf.app.scenes import builtin_scene
+        >>> from voronerf.app.train import Checkpoints, Divergence, Scores, TrainConfig, build, last_checkpoint, run
+        >>> scene = builtin_scene(16, train_views=4, test_views=2)
+        >>> config = TrainConfig(steps=20, cells=(4,), width=8, rays=64)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     out = Path(folder)
+        ...     run(build(config, scene), [Divergence(out), Checkpoints(out), scores := Scores(out)])
+        ...     kept = last_checkpoint(out)  # a Checkpoint
+        >>> scores.summary["steps"], "psnr" in scores.summary, kept.values["step"]
+        (20, True, 20)
     """
     for callback in callbacks:
         callback.on_start(state)

@@ -66,6 +66,17 @@ def load(state: State, checkpoint: Checkpoint) -> None:
 
     Raises:
         CheckpointError: When it is of another configuration, or something is missing or does not fit.
+
+    Examples:
+        >>> from voronerf.app.scenes import builtin_scene
+        >>> from voronerf.app.train import TrainConfig, build, load, snapshot, train
+        >>> scene = builtin_scene(16, train_views=4, test_views=2)
+        >>> config = TrainConfig(steps=20, cells=(4,), width=8, rays=64)
+        >>> first, second = build(config, scene), build(config, scene)  # each a State
+        >>> train(first)
+        >>> load(second, snapshot(first))
+        >>> second.step, second.router.num_cells
+        (20, 4)
     """
     config, stored = stored_values(checkpoint)
     different = differences(config, state.config)
