@@ -35,7 +35,7 @@ def scene_of(cameras: TheirCameras, box: Tensor, *, contracted: bool) -> Scene:
         box = box.cpu().float()
         far = float((ours.origins - box.mean(0)).norm(dim=-1).max() + (box[1] - box[0]).norm())
         return Scene("nerfstudio", views, views, 0.0, far, box, "linear", None)
-    frame = find_frame(poses.double(), "unbounded").undone()
+    frame = find_frame(poses.double(), "unbounded", normalise=False)
     sphere = Contraction(frame.centre.float(), frame.radius)
     return Scene(
         "nerfstudio", views, views, frame.near, frame.far, None, "disparity", None, kind="unbounded", contraction=sphere

@@ -73,27 +73,6 @@ class Reading:
     images: str = "auto"
 
 
-@dataclass(frozen=True)
-class Photographs:
-    """What a loader found.
-
-    Attributes:
-        source: the file to name in errors.
-        views: in the order of their names.
-        held_out: bool [c], the test views.
-        factor: by which the files are still to be reduced.
-        notes: what the loader has to say.
-        transform: float64 [4, 4], from the original coordinates to those of the poses.
-    """
-
-    source: Path
-    views: Sequence[View]
-    held_out: Tensor
-    factor: int
-    notes: tuple[str, ...] = ()
-    transform: Tensor | None = None
-
-
 def least_factor(longest: float) -> int:
     """The factor that leaves a side of so many pixels at most `LONGEST_SIDE`."""
     return max(math.ceil(longest / LONGEST_SIDE), 1)
@@ -119,42 +98,60 @@ def hold_out(count: int) -> Tensor:
     return torch.arange(count) % HOLD_OUT == 0
 
 
-def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scene:
+def photograph_scene(
+    source: Path,
+    folder: Path,
+    views: Sequence[View],
+    held_out: Tensor,
+    reading: Reading,
+    *,
+    factor: int,
+    notes: Sequence[str] = (),
+    transform: Tensor | None = None,
+) -> Scene:
     """Makes the scene of photographs.
+
+    Args:
+        source: the file to name in errors.
+        folder: of the scene.
+        views: in the order of their names.
+        held_out: bool [c], the test views.
+        reading: how the folder is read.
+        factor: by which the files are still to be reduced.
+        notes: what the loader has to say.
+        transform: float64 [4, 4], from the original coordinates to those of the poses.
 
     Raises:
         SceneError: an image cannot be read or has another shape than its camera, a lens cannot be inverted, or the kind
             does not fit.
     """
-    if len(found.views) < 2 or not bool(found.held_out.any()) or bool(found.held_out.all()):
-        raise SceneError(f"{found.source}: one image is too few, one is held out for testing")
+    if len(views) < 2 or not bool(held_out.any()) or bool(held_out.all()):
+        raise SceneError(f"{source}: one image is too few, one is held out for testing")
     # Training views first, so that the images of either part are a slice and no copy.
-    order = torch.cat(((~found.held_out).nonzero()[:, 0], found.held_out.nonzero()[:, 0])).tolist()
-    views, count = [found.views[index] for index in order], int((~found.held_out).sum())
+    order = torch.cat(((~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0])).tolist()
+    views, count = [views[index] for index in order], int((~held_out).sum())
     paths = [view.path for view in views]
     name = folder.resolve().name
-    images, sizes, on_disk = read_images(paths, found.factor, keep=reading.images, name=name)
-    masks = read_masks([view.mask for view in views], paths, sizes, found.factor, on_disk=on_disk, name=name)
+    images, sizes, on_disk = read_images(paths, factor, keep=reading.images, name=name)
+    masks = read_masks([view.mask for view in views], paths, sizes, factor, on_disk=on_disk, name=name)
     alpha = images.shape[-1] == 4 and any(bool((image[..., 3] < 255).any()) for image in images)
 
     poses = torch.stack([view.pose for view in views])
-    kind = _kind(poses, alpha, reading.kind, found.source)
+    kind = _kind(poses, alpha, reading.kind, source)
     if kind != "object" and images.shape[-1] == 4:
         # its own store: a part of each pixel cannot be drawn from a mapped file without a copy
-        opaque = read_images(paths, found.factor, keep="disk", name=name, most_channels=3).images if on_disk else None
+        opaque = read_images(paths, factor, keep="disk", name=name, most_channels=3).images if on_disk else None
         images = images[..., :3].contiguous() if opaque is None else opaque
     bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64)
-    frame = find_frame(poses, kind, bounds if len(bounds) else None)
-    if not reading.normalise:
-        frame = frame.undone()
-    cameras = _cameras(frame.poses(poses), views, sizes, found.source)
+    frame = find_frame(poses, kind, bounds if len(bounds) else None, normalise=reading.normalise)
+    cameras = _cameras(frame.poses(poses), views, sizes, source)
     contraction = _contraction(kind, frame, cameras)
-    cameras = cameras.downscaled(found.factor)
+    cameras = cameras.downscaled(factor)
     try:
         _ = cameras.lenses
     except ValueError as error:
-        raise SceneError(f"{found.source}: {error}") from None
-    masks = _without_dark_corners(cameras, masks, found.source, views)
+        raise SceneError(f"{source}: {error}") from None
+    masks = _without_dark_corners(cameras, masks, source, views)
     near, far, box = frame.near, frame.far, None
     if kind == "object":
         box = carve_box(cameras[:count], images[:count, ..., 3], near, far)
@@ -168,11 +165,11 @@ def photograph_scene(folder: Path, found: Photographs, reading: Reading) -> Scen
     faults = camera_faults(poses[:, :3, 3], bounds, ((view.lens, view.size[0]) for view in views))
     if lost := int(lost_cameras(poses[:, :3, 3]).sum()):
         faults.append(f"{lost} of {len(poses)} lie far from all others")
-    notes = [*found.notes, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
-    if reading.downscale is None and found.factor > 1:
+    notes = [*notes, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
+    if reading.downscale is None and factor > 1:
         size = f"{cameras.width} x {cameras.height}"
-        notes.append(f"images are reduced by {found.factor}, to {size} (--downscale 1 keeps their size)")
-    to_scene = frame.matrix if found.transform is None else frame.matrix @ found.transform
+        notes.append(f"images are reduced by {factor}, to {size} (--downscale 1 keeps their size)")
+    to_scene = frame.matrix if transform is None else frame.matrix @ transform
     return Scene(
         name,
         parts[0],
@@ -241,21 +238,8 @@ class Frame:
         moved[:, :3, :3] /= self.scale
         return moved
 
-    def undone(self) -> Frame:
-        """The same space in the coordinates of the files."""
-        back = torch.linalg.inv(self.matrix)
-        return Frame(
-            torch.eye(4, dtype=torch.float64),
-            self.near / self.scale,
-            self.far / self.scale,
-            back[:3, :3] @ self.centre + back[:3, 3],
-            self.radius / self.scale,
-            self.axes @ self.matrix[:3, :3] / self.scale,
-            self.measured,
-        )
 
-
-def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None) -> Frame:
+def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normalise: bool = True) -> Frame:
     """Finds the coordinates of a scene.
 
     The cameras' focus becomes the origin, or their middle where they have none in common; their mean up direction
@@ -266,6 +250,7 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None) -> Frame:
         poses: float64 [c, 4, 4].
         kind: of the scene.
         bounds: float64 [m, 2], the least and the largest depth of the points of m views.
+        normalise: False for the same space in the coordinates of the files.
     """
     cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
     outward = kind in ("forward", "inside-out")
@@ -290,7 +275,10 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None) -> Frame:
         near = max(NEARER * float(bounds[:, 0].min()) / length, LEAST_NEAR)
         far = max(FARTHER * float(bounds[:, 1].max()) / length, FAR)
     axes = torch.eye(3, dtype=torch.float64)[[0, 2, 1]]
-    return Frame(matrix, near, far, torch.zeros(3, dtype=torch.float64), 1.0, axes, measured)
+    if normalise:
+        return Frame(matrix, near, far, torch.zeros(3, dtype=torch.float64), 1.0, axes, measured)
+    same = torch.eye(4, dtype=torch.float64)
+    return Frame(same, near * length, far * length, centre.double(), length, axes @ turn, measured)
 
 
 def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Perspective | None:

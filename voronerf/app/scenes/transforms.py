@@ -22,7 +22,7 @@ from voronerf.app.files import leads_outside, read_json, write_text
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import read_header
 from voronerf.app.scenes.lenses import COEFFICIENTS, FISHEYE, FOV, PERSPECTIVE, Lens
-from voronerf.app.scenes.photographs import Photographs, Reading, View, hold_out, least_factor, photograph_scene
+from voronerf.app.scenes.photographs import Reading, View, hold_out, least_factor, photograph_scene
 from voronerf.app.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -295,7 +295,7 @@ def capture_scene(
     transform = None if applied is None else pose_of(applied, str(path), "applied_transform")
     views = [_view(frame, reading.downscale or 1) for frame in frames]
     factor = reading.downscale or least_factor(max(max(view.size) for view in views))
-    return photograph_scene(folder, Photographs(path, views, held_out, factor, tuple(notes), transform), reading)
+    return photograph_scene(path, folder, views, held_out, reading, factor=factor, notes=notes, transform=transform)
 
 
 def _view(frame: Frame, downscale: int) -> View:
