@@ -149,7 +149,7 @@ def test_a_camera_inside_of_the_scene_box_sees_all_of_space(folder: Path, tmp_pa
         box = SceneBox(torch.tensor(((-size,) * 3, (size,) * 3)))
         model = VoronerfModel(VoronerfModelConfig(), box, 3, metadata={"cameras": cameras}, device="cpu")
         found.append((model.settings.contraction, model.settings.occupancy))
-    assert found == [("none", True), ("sphere", False)]
+    assert found == [("none", True), ("sphere", True)]
 
 
 def test_wrong_settings_are_one_line(folder: Path, tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ class VoronerfModelConfig(ModelConfig):
     """Only the scene box (none), or all of space, with what is outside of a sphere mapped into a shell (sphere); auto
     is the box if all cameras stand outside of it."""
     occupancy: bool = True
-    """Skip empty space, where samples are stratified in the scene box."""
+    """Skip empty space, where samples are stratified."""
 
     def train_config(self, *, contracted: bool) -> TrainConfig:
         """The settings that ``voronerf train`` would have.
