@@ -171,28 +171,6 @@ def test_a_spoiled_density_spoils_the_weights_from_there_on(device, backend, for
     assert weights.flatten().isnan().tolist() == [False, False, True, True, True]
 
 
-def test_sums_are_float32_under_autocast(device, backend):
-    need("composite", backend, device, torch.float32)
-    inputs = [tensor.to(device) for tensor in rays(4, 9)]
-    expected = composite(*inputs, backend=backend)
-    with torch.autocast(device.type, torch.bfloat16):
-        found = composite(*inputs, backend=backend)
-    for one, other in zip(found, expected):
-        assert torch.equal(one, other)
-
-
-def test_gradcheck():
-    inputs = [tensor.requires_grad_() for tensor in rays(2, 4, 2, torch.float64)]
-    background = torch.rand(2, 2, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda *a: composite(*a[:4], background=a[4]), (*inputs, background))
-    assert torch.autograd.gradgradcheck(lambda *a: composite(*a[:4], background=a[4]), (*inputs, background))
-    packed = [tensor.detach().requires_grad_() for tensor in pack(tuple(inputs), [3, 2])]
-    ray_offsets = offsets_of([3, 2])
-    run = lambda *a: composite(*a[:4], ray_offsets=ray_offsets, background=a[4])  # noqa: E731
-    assert torch.autograd.gradcheck(run, (*packed, background))
-    assert torch.autograd.gradgradcheck(run, (*packed, background))
-
-
 @pytest.mark.parametrize("background", ["ray", "all", ""])
 def test_gradients_in_front_of_any_background(backend, background):
     for given in (dense(4, 33, 3, background), scene([3, 0, 130, 1], 2, background, outside=(2, 5))):

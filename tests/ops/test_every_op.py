@@ -59,7 +59,8 @@ first_kinds = rows(
         if run[0].partition(", ")[2] == next(iter(CASES[run[0].partition(",")[0]].kinds))
     ]
 )
-smooth_op = rows([run for run in RUNS if CASES[run[0].partition(",")[0]].differentiable])
+SMOOTH = [run for run in RUNS if CASES[run[0].partition(",")[0]].differentiable]
+smooth_op = rows(SMOOTH)
 natively = dict.fromkeys(name for name, backend, _ in RUNS if backend == "native")
 native_op = pytest.mark.parametrize("name", list(natively))
 
@@ -163,6 +164,42 @@ def test_dtypes(device, backend, name, dtype):
     plain, exact = (results(functools.partial(run, backend="reference"), inputs) for inputs in (given, wide))
     for part, same, right in zip(results(run, given), plain, exact, strict=True):
         assert_as_exact(part, same, right) if same.is_floating_point() else torch.testing.assert_close(part, right)
+
+
+@pytest.mark.parametrize(
+    "name", dict.fromkeys(run[0] for run in RUNS if CASES[run[0].partition(",")[0]].differentiable)
+)
+def test_gradcheck(name):
+    """Both derivatives of the reference in float64, along random directions."""
+    run, tensors = prepare(name, "reference", torch.device("cpu"), torch.float64)
+    wide = lambda tensor: tensor.detach().double().requires_grad_() if tensor.is_floating_point() else tensor  # noqa: E731
+    given = tree_map_only(Tensor, wide, tensors(3))
+    leaves = [leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor) and leaf.requires_grad]
+    if name == "render_loss":
+        leaves = [given["raw"]]
+
+    def call(*values):
+        new = dict(zip(map(id, leaves), values))
+        found = run(tree_map_only(Tensor, lambda tensor: new.get(id(tensor), tensor), given))
+        return tuple(part for part in tree_leaves(found) if isinstance(part, Tensor) and part.requires_grad)
+
+    assert torch.autograd.gradcheck(call, leaves, fast_mode=True)
+    assert torch.autograd.gradgradcheck(call, leaves, fast_mode=True)
+
+
+@rows([run for run in RUNS if run[0] in ("composite", "grouped_linear", "grouped_mlp", "routed_mlp")])
+def test_autocast(device, backend, name):
+    """Networks run in bfloat16, sums of rays in float32; gradients have the dtypes of what they are of."""
+    run, tensors = prepare(name, backend, device)
+    given = tensors(33)
+    with torch.autocast(device.type, torch.bfloat16):
+        found = results(run, given)
+    expected = results(run, given)
+    assert found[0].dtype == (torch.float32 if name == "composite" else torch.bfloat16)
+    assert all(part.dtype == other.dtype for part, other in zip(found[-2:], expected[-2:]))
+    torch.testing.assert_close(
+        found[0].float(), expected[0], **({} if name == "composite" else {"rtol": 0.1, "atol": 0.1})
+    )
 
 
 @smooth_op

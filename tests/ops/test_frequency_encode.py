@@ -42,14 +42,6 @@ def test_gradient_matches_the_formula(device, backend):
     torch.testing.assert_close(x.grad.double(), expected, rtol=1e-6, atol=1e-4)
 
 
-@pytest.mark.parametrize("include_input", [True, False])
-def test_gradcheck(include_input):
-    x = torch.rand(3, 2, dtype=torch.float64, requires_grad=True)
-    run = lambda x: frequency_encode(x, 3, include_input=include_input)  # noqa: E731
-    assert torch.autograd.gradcheck(run, x)
-    assert torch.autograd.gradgradcheck(run, x)
-
-
 def test_errors():
     x = torch.rand(4, 3)
     refuses = refusals(frequency_encode, x=x, octaves=2)

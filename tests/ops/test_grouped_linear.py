@@ -106,16 +106,6 @@ def test_what_is_not_a_number_stays_in_its_cell(device, backend):
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_gradcheck(activation):
-    counts = [2, 0, 1, 3]
-    inputs = [tensor.requires_grad_() for tensor in layer(counts, 2, 3, torch.float64)]
-    offsets = offsets_of(counts)
-    run = lambda x, w, b: grouped_linear(x, offsets, w, b, activation=activation, backend="reference")  # noqa: E731
-    assert torch.autograd.gradcheck(run, inputs)
-    assert torch.autograd.gradgradcheck(run, inputs)
-
-
-@pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_second_derivatives_match_a_plain_loop(device, backend, activation):
     counts = COUNTS["odd"]
     offsets = offsets_of(counts)
@@ -150,20 +140,6 @@ def test_gradients_that_nobody_asked_for_are_not_computed():
         (slope,) = torch.autograd.grad(y.sum(), x, create_graph=True)
         torch.autograd.grad(slope.square().sum(), weight, retain_graph=True)
         assert wanted == [[True, False], [False, True]]
-
-
-def test_autocast(device, backend):
-    counts = COUNTS["odd"]
-    x, weight, bias = (tensor.to(device).requires_grad_() for tensor in layer(counts, 7, 5))
-    offsets = offsets_of(counts, device)
-    with torch.autocast(device.type, torch.bfloat16):
-        y = grouped_linear(x, offsets, weight, bias, backend=backend)
-        mixed = grouped_linear(x.bfloat16(), offsets, weight, bias, backend=backend)
-    assert y.dtype == mixed.dtype == torch.bfloat16
-    expected = grouped_linear(x, offsets, weight, bias, backend=backend)
-    torch.testing.assert_close(y.float(), expected, rtol=0.05, atol=0.05)
-    y.sum().backward()
-    assert weight.grad.dtype == bias.grad.dtype == x.grad.dtype == torch.float32
 
 
 def test_errors():

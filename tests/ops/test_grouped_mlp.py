@@ -233,20 +233,6 @@ def test_what_is_not_a_number_stays_in_its_cell(device, backend):
     assert all(leaf.grad[[0, 2]].isfinite().all() for leaf in leaves[2:])
 
 
-@pytest.mark.parametrize("name", TABLES)
-def test_gradcheck(name):
-    case = Case.make(name, [2, 0, 1], torch.float64, rays=2)
-    if name == "tangled":
-        # Off the kink of its ReLU.
-        case.inputs[4] = case.inputs[4].abs() + 0.5
-    run = lambda *leaves: case.run(grouped_mlp, list(leaves), backend="reference")  # noqa: E731
-    leaves = case.leaves(torch.float64)
-    used = leaves if case.table.uses_directions else [leaves[0], *leaves[2:]]
-    call = run if case.table.uses_directions else lambda first, *rest: run(first, leaves[1], *rest)
-    # Thousands of parameters: one random direction through them rather than each in turn.
-    assert torch.autograd.gradcheck(call, used, fast_mode=name != "one layer")
-
-
 def test_second_derivatives(device, backend):
     case = Case.make("nerf", [3, 0, 2])
 
@@ -271,17 +257,6 @@ def test_second_derivatives_where_one_input_is_computed_from_another():
         return torch.cat([slope, *torch.autograd.grad(slope.square().sum(), positions)])
 
     torch.testing.assert_close(penalty(grouped_mlp), penalty(loops.grouped_mlp))
-
-
-def test_autocast(device, backend):
-    case = Case.make("nerf", COUNTS["odd"])
-    leaves = case.leaves(torch.float32, device)
-    with torch.autocast(device.type, torch.bfloat16):
-        y = case.run(grouped_mlp, leaves, backend=backend)
-    assert y.dtype == torch.bfloat16
-    torch.testing.assert_close(y.float(), case.run(grouped_mlp, leaves, backend=backend), rtol=0.1, atol=0.1)
-    y.sum().backward()
-    assert all(leaf.grad.dtype == torch.float32 for leaf in leaves)
 
 
 def test_inputs_without_features_are_refused(device, backend):

@@ -136,14 +136,6 @@ def test_gradients_of_two_orders(device, backend, grid):
         assert (a - c).norm() <= 2 * (b - c).norm() + 1e-5 * c.norm() + 1e-30
 
 
-def test_gradcheck():
-    grid = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=40, interpolation="smoothstep", box=BOX)
-    x = points(4, grid, torch.float64).requires_grad_()
-    table = features(grid, torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: hash_encode(x, table, grid), x)
-    assert torch.autograd.gradgradcheck(lambda x: hash_encode(x, table.detach(), grid), x)
-
-
 def test_a_table_for_each_cell(device, backend):
     grid = GRIDS["both"]
     tables = torch.randn(3, *grid.table_shape, device=device)

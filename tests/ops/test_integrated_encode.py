@@ -30,12 +30,6 @@ def test_large_variances_fade_to_zero(device, backend):
     assert (found == 0).all()
 
 
-def test_gradcheck():
-    means = torch.rand(3, 3, dtype=torch.float64, requires_grad=True)
-    variances = torch.rand(3, 3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda m, v: integrated_encode(m, v, 3), (means, variances))
-
-
 def test_errors():
     means = torch.rand(4, 3)
     refuses = refusals(integrated_encode, means=means, variances=means, octaves=2)

@@ -127,17 +127,6 @@ def test_the_gradient_has_a_gradient(device, backend):
     assert_as_exact(second, plain, exact)
 
 
-def test_checked_gradient_of_the_reference():
-    raw, deltas, offsets, target, background = rays([3, 0, 2])
-    raw.requires_grad_()
-
-    def loss(raw):
-        rest = {"background": background, "density_scale": SCALE, "backend": "reference"}
-        return render_loss(raw, deltas, offsets, target, **rest).loss
-
-    assert torch.autograd.gradcheck(loss, raw)
-
-
 def test_bad_arguments():
     raw, deltas, offsets, target, background = rays([4, 2], torch.float32)
     rest = {"background": background, "density_scale": SCALE}

@@ -205,17 +205,6 @@ def test_samples_nowhere_go_to_the_first_cell(device, backend):
         assert leaves[0].grad[others].isfinite().all() and leaves[2].grad[1:].isfinite().all()
 
 
-def test_autocast(device, backend):
-    case = Case.make()
-    leaves = case.given(torch.float32, device)
-    with torch.autocast(device.type, torch.bfloat16):
-        out, _ = case.run(leaves, backend=backend)
-    assert out.dtype == torch.bfloat16
-    torch.testing.assert_close(out.float(), case.run(leaves, backend=backend)[0], rtol=0.1, atol=0.1)
-    out.sum().backward()
-    assert all(leaf.grad.dtype == torch.float32 for leaf in leaves)
-
-
 @pytest.mark.parametrize("rays", [3, None])
 def test_second_derivatives(device, backend, rays):
     case = Case.make("integrated", "flat", n=9, rays=rays)

@@ -95,16 +95,6 @@ def test_gradient_matches_autograd_in_float64(device, backend, n, degree):
     torch.testing.assert_close(leaf.grad.double().cpu(), exact.grad, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("degree", [1, 2, 3, 4])
-def test_gradcheck(degree):
-    directions = directions_of(3).requires_grad_()
-    run = lambda d: spherical_harmonics(d, degree)  # noqa: E731
-    if degree > 1:
-        assert torch.autograd.gradcheck(run, directions)
-    if degree > 2:
-        assert torch.autograd.gradgradcheck(run, directions)
-
-
 def test_not_a_number_stays_in_its_row(device, backend):
     directions = directions_of(20).float().to(device)
     directions[7, 1] = torch.nan
