@@ -1,4 +1,4 @@
-"""Trainings in territories whose ranks are killed, stopped or paused, find no room, or are given other data."""
+"""Trainings in territories: ranks are killed, stopped, paused, have no room, read damage, or are given other data."""
 
 from __future__ import annotations
 
@@ -14,17 +14,21 @@ from pathlib import Path
 
 from attempts import REFUSED, RIGHT, Failed
 from given import FIELDS, TINY
-from training_attacks import same_runs, same_tensors
 
-from voronerf.app.cli import main
-from voronerf.app.train.checkpoint import checkpoint_path, checkpoint_paths, load_checkpoint
+from voronerf.app.cli.main import main
+from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.town import group
 
 sys.path.append(str(Path(__file__).parents[1] / "town"))
-from ranks import complaints, said_by, start_ranks
+from ranks import complaints, network_files, said_by, start_ranks, town_tensors
 
-#: The networks of a training, which has four territories.
-VARIANTS = (FIELDS["hashgrid"], [*FIELDS["hashgrid"], "--contraction", "sphere"])
+#: The networks of a training in four territories.
+VARIANTS = (
+    ["--field", "nerf"],
+    FIELDS["hashgrid"],
+    [*FIELDS["hashgrid"], "--contraction", "sphere"],
+    ["--field", "nerf", "--cells", "2", "2", "--split-at", "0.3", "0.6"],
+)
 #: Of a chain: ranks that are killed, stopped for good, and stopped for as many seconds.
 FAULTS = {"kill": 10, "stop": 10, "pause": 2}
 PAUSE = 1.5
@@ -156,25 +160,16 @@ def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[st
 
 
 def _same_runs(whole: Path, part: Path) -> None:
-    """Compares the files of all territories, too; which rank has them may differ."""
-    same_runs(whole, part, {"joint.owner"})
-    found = []
-    for run in (whole, part):
-        files = _territories(checkpoint_path(run))
-        found.append([load_checkpoint(file) for file in files])
-    for first, second in zip(*found, strict=True):
-        same_tensors(first, second)
-
-
-def _territories(index: Path) -> list[Path]:
-    """The files of territories that a checkpoint names."""
-    return [index.with_name(name) for name in load_checkpoint(index).values["parts"][0]["networks"]]
+    """Compares the files of all territories."""
+    first, second = town_tensors(whole), town_tensors(part)
+    other = [name for name in first.keys() | second.keys() if name not in first or not first[name].equal(second[name])]
+    if other:
+        raise Failed(f"{part} has other tensors than {whole}: {other[:5]}")
 
 
 def _damage(rng: random.Random, run: Path) -> None:
     """Changes a bit of a territory's file of the last checkpoint."""
-    last = checkpoint_paths(run)[0]
-    path = rng.choice(_territories(last))
+    path = rng.choice(network_files(run))
     data = bytearray(path.read_bytes())
     data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
     path.write_bytes(data)

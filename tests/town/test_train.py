@@ -1,0 +1,174 @@
+"""Trainings in territories: the same run on any number of ranks, after a kill, and after damage; what is refused."""
+
+import os
+import shutil
+import signal
+from unittest import mock
+
+import pytest
+import torch
+from ranks import complaints, network_files, new_store, on_ranks, town_tensors
+
+from voronerf.app.cli.main import main
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
+from voronerf.town import open_run, rays, train
+
+ARGUMENTS = """
+train-territories --data builtin --downscale 8 --width 8 --field-options levels=4 log2_entries=10 --rays 16 --cells 2
+--split-at 6 --steps 24 --panels 0 --territories 3 --lpips off --eval-views 1
+"""
+
+
+def command(out, *more):
+    return [*ARGUMENTS.split(), "--out", str(out), *more]
+
+
+def in_step(number, harm):
+    """A context in which rank 1 does something in a step."""
+    real, steps = rays.step_together, iter(range(10_000))
+
+    def step_together(group, *given):
+        if next(steps) == number and group.rank == 1:
+            harm()
+        return real(group, *given)
+
+    return mock.patch.object(train, "step_together", step_together)
+
+
+def dies(args, step):
+    with in_step(step, lambda: os.kill(os.getpid(), signal.SIGKILL)):
+        return main(args)
+
+
+def is_asked_to_stop(args, step):
+    with in_step(step, lambda: os.kill(os.getpid(), signal.SIGTERM)):
+        return main(args)
+
+
+def has_no_room(args):
+    full = OSError(28, "No space left on device")
+    with mock.patch.object(train, "save_checkpoint", side_effect=full):
+        return main(args)
+
+
+def same(first, second):
+    first, second = town_tensors(first), town_tensors(second)
+    return first.keys() == second.keys() and all(first[name].equal(second[name]) for name in first)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run of one process, which nothing happened to."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert on_ranks(main, command(out), folder=out.parent, size=1)[0] == [0]
+    return out
+
+
+@pytest.fixture(scope="module")
+def resumed(tmp_path_factory):
+    """A run that two ranks have stopped and continued, so that it has two checkpoints."""
+    folder = tmp_path_factory.mktemp("resumed")
+    assert on_ranks(is_asked_to_stop, command(folder / "run"), 12, folder=folder)[0] == [130, 130]
+    assert on_ranks(main, command(folder / "run", "--resume"), folder=folder)[0] == [0, 0]
+    return folder / "run"
+
+
+def test_a_run_of_territories_is_opened_as_one_field(whole):
+    scene = builtin_scene(12, train_views=8, test_views=1)
+    opened = open_run(whole, scene=scene)
+    assert opened.router.num_cells == 6 and len(opened.router[0].networks) == 3
+    assert opened.render(0).colour.isfinite().all()
+    assert opened.renderer.occupancy is not None
+
+
+@pytest.mark.parametrize("size", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_any_number_of_ranks_trains_the_same_run(tmp_path, whole, size):
+    assert on_ranks(main, command(tmp_path / "run"), folder=tmp_path, size=size)[0] == [0] * size
+    assert same(whole, tmp_path / "run")
+
+
+def test_a_run_that_was_stopped_and_continued_is_the_same(whole, resumed):
+    last = checkpoint_path(resumed)
+    assert last.with_name("last-1.safetensors").is_file() and same(whole, resumed)
+
+
+def test_a_rank_that_is_killed(tmp_path, whole):
+    """The other says so; started again as by torchrun, the run ends bit for bit as one that nothing happened to."""
+    args = command(tmp_path / "run", "--checkpoint-every", "1e-6")
+    codes, texts = on_ranks(dies, args, 19, folder=tmp_path)
+    assert codes == [1, -signal.SIGKILL] and len(complaints(texts)) == 1
+    assert "another rank has ended" in complaints(texts)[0]
+    assert on_ranks(main, args, folder=tmp_path, restarts=1)[0] == [0, 0]
+    assert same(whole, tmp_path / "run")
+
+
+@pytest.mark.parametrize("harm", [pytest.param("cut short", marks=pytest.mark.slow), "changed", "missing"])
+def test_a_damaged_part(tmp_path, whole, resumed, harm):
+    """All ranks take the checkpoint before, and say which file was no good."""
+    shutil.copytree(resumed, tmp_path / "run")
+    part = network_files(tmp_path / "run")[1]
+    data = bytearray(part.read_bytes())
+    if harm == "missing":
+        part.unlink()
+    else:
+        data[-5] ^= 1
+        part.write_bytes(data[: len(data) // (1 if harm == "changed" else 2)])
+    codes, texts = on_ranks(main, command(tmp_path / "run", "--resume"), folder=tmp_path)
+    assert codes == [0, 0] and "takes its place" in texts[0] and same(whole, tmp_path / "run")
+
+
+def test_no_checkpoint_is_left(tmp_path, resumed):
+    shutil.copytree(resumed, tmp_path / "run")
+    for file in checkpoint_path(tmp_path / "run").parent.glob("*"):
+        file.write_bytes(b"")
+    codes, texts = on_ranks(main, command(tmp_path / "run", "--resume"), folder=tmp_path)
+    assert codes == [1, 1] and len(complaints(texts)) == 1 and "not a readable checkpoint" in complaints(texts)[0]
+
+
+def test_files_of_checkpoints_that_are_gone_are_removed(whole, resumed):
+    assert len(list(checkpoint_path(whole).parent.glob("networks-*"))) == 3
+    assert len(list(checkpoint_path(resumed).parent.glob("networks-*"))) == 6
+
+
+def test_a_full_disk(tmp_path):
+    codes, texts = on_ranks(has_no_room, command(tmp_path / "run"), folder=tmp_path)
+    assert codes == [1, 1]
+    assert len(complaints(texts)) == 1 and "No space left on device" in complaints(texts)[0]
+    assert not (tmp_path / "run").exists() or not list((tmp_path / "run").rglob("last*"))
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--sampling", "hierarchical"], "--sampling must be stratified: no territory sees whole rays"),
+        (["--no-occupancy"], "--occupancy must be on, in territories, got False"),
+        (["--territories", "1"], "--territories must be at least the 2 ranks, got 1"),
+        (["--territories", "999"], "--territories must be at most the"),
+    ],
+)
+def test_settings_that_territories_do_not_support(tmp_path, more, said):
+    """One rank says so at every start: what ranks of an earlier start have left in torchrun's store is not theirs."""
+    store = new_store()
+    for restarts in range(1 + (more[0] == "--sampling")):
+        given = command(tmp_path / "run", *more)
+        codes, texts = on_ranks(main, given, folder=tmp_path, restarts=restarts, store=store)
+        assert codes == [1, 1] and not (tmp_path / "run").exists()
+        assert len(complaints(texts)) == 1 and said in complaints(texts)[0]
+
+
+def test_ranks_that_differ(tmp_path):
+    each = [(command(tmp_path / "run"),), (command(tmp_path / "run", "--seed", "1"),)]
+    codes, texts = on_ranks(main, folder=tmp_path, each=each)
+    assert codes == [1, 1] and not (tmp_path / "run").exists()
+    assert complaints(texts) == ["voronerf: error: --seed must be the same on all ranks, got 0 on 0 and 1 on 1"]
+
+
+def test_a_training_learns(whole):
+    index = load_checkpoint(checkpoint_path(whole))
+    assert index.values["parts"][0]["networks"] and index.tensors["bounds"].shape == (3, 2, 3)
+    for path in network_files(whole):
+        found = load_checkpoint(path)
+        assert found.values["step"] == 24 and found.values["skipped"] == 0
+        assert any(bool(t.any()) for name, t in found.tensors.items() if name.endswith("exp_avg"))
+        assert torch.isfinite(found.tensors["router.module.features"]).all()
