@@ -46,31 +46,6 @@ def trained(field: NeRF, generator: torch.Generator) -> tuple[VoronoiRouter, tor
     return router, optimizer
 
 
-def test_subdivide_inherits_parameters_and_moments(field: NeRF, generator: torch.Generator) -> None:
-    router, optimizer = trained(field, generator)
-    positions, directions = samples(200, generator)
-    before = [t.detach() for t in router(positions, directions)]
-    old = {name: p.detach().clone() for name, p in router.named_parameters()}
-    moments = {name: copy.deepcopy(optimizer.state[p]) for name, p in router.named_parameters()}
-    diagram, parents = router.diagram.refine({0: torch.randn(4, 3, generator=generator), 2: torch.randn(2, 3)})
-    router.subdivide(diagram, parents, optimizer=optimizer)
-
-    assert router.num_cells == 7
-    for name, parameter in router.named_parameters():
-        assert torch.equal(parameter, old[name][parents]), name
-        state = optimizer.state[parameter]
-        for key in ("exp_avg", "exp_avg_sq"):
-            assert torch.equal(state[key], moments[name][key][parents]), (name, key)
-        assert torch.equal(state["step"], moments[name]["step"])
-    # Nothing else is left in the optimiser, and its groups keep their rates.
-    assert set(optimizer.state) == set(router.parameters())
-    assert {p for g in optimizer.param_groups for p in g["params"]} == set(router.parameters())
-    assert [g["lr"] for g in optimizer.param_groups] == [1e-2, 1e-3]
-    # The split itself changes nothing that is seen: no ghosting, no seam.
-    for now, then in zip(router(positions, directions), before, strict=True):
-        torch.testing.assert_close(now, then)
-
-
 def test_results_from_before_a_split_that_are_still_held_do_not_disturb(
     field: NeRF, generator: torch.Generator
 ) -> None:

@@ -12,7 +12,7 @@ import torch.utils.checkpoint
 from convention_calls import Truncated
 from torch import Tensor, nn
 
-from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
+from voronerf import NeRF, VoronoiRouter
 from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.router import rules
 
@@ -212,16 +212,3 @@ def test_centres_go_where_the_module_is(device: torch.device) -> None:
     router.subdivide(3, points=x[:, :3], weights=torch.ones(40, device=device))
     assert router.diagram.centres.device.type == device.type and router.num_cells == 3
     close(router(x), coarse)
-
-
-# Splits ---------------------------------------------------------------------------------------------------------------
-
-
-def test_fresh_parameters_are_drawn_anew_each_time() -> None:
-    router = VoronoiRouter(network(), torch.zeros(1, 3), coords="first3")
-    found = []
-    for k in (3, 6):
-        diagram = VoronoiDiagram(centres(k))
-        router.subdivide(diagram, torch.arange(k) % router.num_cells, inherit=False)
-        found.append(router.module[0].weight.detach().clone())
-    assert not torch.equal(found[0], found[1][:3])

@@ -50,8 +50,6 @@ def _items(value: Any) -> dict[Any, Any] | None:
         return value
     if isinstance(value, (list, tuple)):
         return dict(enumerate(value))
-    if isinstance(value, slice):
-        return {"start": value.start, "stop": value.stop, "step": value.step}
     if callable(value):
         return None
     if dataclasses.is_dataclass(value) and not hasattr(value, "__dict__"):
@@ -65,7 +63,7 @@ def _rebuilt(value: Any, items: dict[Any, Any], new: dict[Any, Any]) -> Any:
         rebuilt = kind.__new__(kind)  # no copy: dicts whose items are attributes have none
         rebuilt.update(new)
         return rebuilt
-    if isinstance(value, slice) or hasattr(value, "_fields"):
+    if hasattr(value, "_fields"):
         return kind(*new.values())
     if isinstance(value, (list, tuple)):
         return kind(new.values())
