@@ -48,7 +48,7 @@ STEPS: dict[str, Callable[[Any, Tensor], Tensor]] = {
     "tanhshrink": lambda net, h: F.tanhshrink(3 * h),
     "atan, erf": lambda net, h: torch.atan(h) + torch.erf(h),
     "a power": lambda net, h: (h + 1.2) ** 2.4 + (h + 1.1) ** (1 / 3),
-    "sign": lambda net, h: h * torch.sign(h),
+    "sign, ceil": lambda net, h: h * torch.sign(h) + (3 * h).ceil(),
     "addcmul, addcdiv": lambda net, h: torch.addcmul(h, h, h, value=0.5) + torch.addcdiv(h, h, h.exp()),
     "masks": lambda net, h: h.masked_fill((h > 0.2) | (h == 0.1), 0.0) * ((h != 0) & ~(h < -1)),
     "all, any": lambda net, h: h * ((h > -1).all(-1, keepdim=True) | (h > 0.3).any(-1, keepdim=True)),

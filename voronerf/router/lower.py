@@ -159,6 +159,7 @@ _WRITTEN_OUT: dict[str, Callable[..., Any]] = {
     "_log_softmax": _log_softmax,
     "mish": lambda x: x * F.softplus(x).tanh(),
     "log_sigmoid_forward": lambda x: (-F.softplus(-x), x.new_zeros(0)),
+    "ceil": lambda x: -(-x).floor(),
     "sign": lambda x: (x > 0).to(x.dtype) - (x < 0).to(x.dtype),
     "addcmul": lambda x, y, z, value=1: x + value * (y * z),
     "addcdiv": lambda x, y, z, value=1: x + value * (y / z),
