@@ -6,17 +6,19 @@ contenders take turns in one process, each call reads different inputs than the 
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import gc
 import os
 import platform
 import re
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 
@@ -84,6 +86,13 @@ def metadata(**extra: Any) -> dict[str, Any]:
         "machine": processor(),
         "native": backends.describe()["native"],
     }
+
+
+class Parser(argparse.ArgumentParser):
+    """Errors in one line: "PROG: error: MESSAGE"."""
+
+    def error(self, message: str) -> NoReturn:
+        sys.exit(f"{self.prog}: error: {message}")
 
 
 @dataclass

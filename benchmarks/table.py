@@ -7,12 +7,13 @@ python benchmarks/table.py benchmarks/results/foreign_fields.json --foreign     
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import sys
 from pathlib import Path
 from typing import Any, NoReturn
+
+from harness import Parser
 
 Row = dict[str, Any]
 
@@ -29,13 +30,6 @@ SHOWN = (
     r"^routed_mlp/(w64d4|mlp32) n=262144 k=(16|256)/",
 )
 """Rows of the table in docs/performance.md, by op/case/dtype/direction."""
-
-
-class Parser(argparse.ArgumentParser):
-    """Errors in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        fail(message)
 
 
 def fail(message: str) -> NoReturn:
@@ -69,15 +63,8 @@ def best(row: Row) -> tuple[str, float] | None:
 
 
 def milliseconds(value: float) -> str:
-    return (
-        f"{value:.3f}"
-        if value < 1
-        else f"{value:.2f}"
-        if value < 10
-        else f"{value:.1f}"
-        if value < 100
-        else f"{value:.0f}"
-    )
+    places = next((places for places, most in ((3, 1), (2, 10), (1, 100)) if value < most), 0)
+    return f"{value:.{places}f}"
 
 
 def markdown(rows: list[Row]) -> list[str]:
@@ -119,7 +106,7 @@ def foreign_markdown(rows: list[Row]) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Prints what was asked for."""
-    parser = Parser(description=(__doc__ or "").split("\n\n")[0], allow_abbrev=False)
+    parser = Parser("table", description=(__doc__ or "").split("\n\n")[0], allow_abbrev=False)
     parser.add_argument("file", type=Path)
     parser.add_argument(
         "--rows", action="append", metavar="REGEX", help="rows whose op/case/dtype/direction it occurs in"

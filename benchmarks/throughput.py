@@ -31,7 +31,7 @@ from typing import Any, NoReturn
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "65536")
 
 import torch
-from harness import Others, Peaks, Stopwatch, Timing, instruction_set, measure, metadata, processor, threads
+from harness import Others, Parser, Peaks, Stopwatch, Timing, instruction_set, measure, metadata, processor, threads
 from ops import cases_any as cases_any
 from ops import cases_foreign as cases_foreign
 from ops import cases_hash as cases_hash
@@ -56,20 +56,13 @@ SLOW = ("compile", "F.grouped_mm")
 """Parts of the names of alternatives that take seconds to compile or to run, which --quick leaves out."""
 
 
-class Parser(argparse.ArgumentParser):
-    """Errors in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        fail(message)
-
-
 def fail(message: str) -> NoReturn:
     sys.exit(f"throughput: error: {message}")
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """The options, checked."""
-    parser = Parser(description=(__doc__ or "").split("\n\n")[0], allow_abbrev=False)
+    parser = Parser("throughput", description=(__doc__ or "").split("\n\n")[0], allow_abbrev=False)
     parser.add_argument("--quick", action="store_true", help="every operation once, under a minute")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the results go as well")
     parser.add_argument("--filter", metavar="REGEX", help="rows whose op/case/dtype/direction it occurs in")

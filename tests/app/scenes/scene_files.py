@@ -1,15 +1,26 @@
 """Scenes written to folders, as Blender's and as captures."""
 
 import json
+import os
 import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from voronerf.app.scenes.lenses import MODELS
 
 Contents = dict[str, Any]
+DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
+
+
+def needs(name):
+    """The folder of a downloaded scene."""
+    if not (DATA / name).is_dir():
+        pytest.skip(f"{DATA / name} is not there; set VORONERF_DATA to a folder that holds {name}")
+    return DATA / name
 
 
 def write_blender(folder, scene, angle):

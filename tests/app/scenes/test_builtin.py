@@ -5,10 +5,11 @@ import pytest
 import torch
 from helpers import refuses
 
-from voronerf.app.scenes import builtin_scene, load_scene
+from voronerf.app.scenes import builtin_scene, load_scene, rich_scene
 from voronerf.app.scenes.builtin.caster import Caster
 from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, shaded
 from voronerf.app.scenes.builtin.plain import SOLIDS
+from voronerf.app.scenes.builtin.rich import SOLIDS as RICH
 from voronerf.app.scenes.builtin.solids import Box, Cylinder, Sphere, Torus, rotation
 from voronerf.app.scenes.carving import carve_box
 from voronerf.nerf.cameras import Cameras
@@ -156,6 +157,31 @@ def test_sizes():
     assert builtin_scene(1, train_views=1, test_views=1).train.images.shape == (1, 1, 1, 4)
     refuses("builtin: size must be >= 1, got 0", builtin_scene, 0)
     refuses("at least one view", builtin_scene, 4, train_views=0)
+
+
+def test_the_rich_scene_has_every_kind_often_and_stands_on_the_plinth():
+    for kind, least in ((Box, 190), (Sphere, 100), (Cylinder, 35), (Torus, 30)):
+        assert sum(isinstance(solid, kind) for solid in RICH) >= least
+    lows = [float(solid.bounds()[0, 2]) for solid in RICH[1:]]
+    assert min(lows) >= -0.4605, "nothing sinks into the plinth's top at -0.46"
+
+
+def test_the_rich_scene_is_of_the_usual_form():
+    scene = rich_scene(24, train_views=2, test_views=1)
+    assert scene.name == "builtin-rich" and scene.train.images.shape == (2, 24, 24, 4) and len(scene.test) == 1
+    alpha = scene.test.images[0, ..., 3].float() / 255
+    assert 0.15 < float(alpha.mean()) < 0.8 and bool((alpha > 0.99).any()) and bool((alpha == 0).any())
+    seen = scene.test.images[0][alpha > 0.99][:, :3].float()
+    assert float(seen.std(0).mean()) > 25, "many colours"
+    assert scene.box is not None and bool((scene.box[1] > scene.box[0]).all())
+    refuses("builtin-rich: size must be >= 1, got 0", rich_scene, 0)
+
+
+def test_the_rich_scene_is_named_on_the_command_line(monkeypatch):
+    import voronerf.app.scenes as data
+
+    monkeypatch.setitem(data.BUILTIN, "builtin-rich", lambda size: size)
+    assert load_scene("builtin-rich", downscale=4) == 25
 
 
 def test_carved_box_holds_the_scene_and_is_tight(scene):

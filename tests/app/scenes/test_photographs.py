@@ -1,17 +1,15 @@
 """Folders of photographs: COLMAP's, LLFF's and nerfstudio's readers, what they share, and what they refuse."""
 
 import json
-import os
 import struct
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from helpers import refuses, trained
 from PIL import Image
-from scene_files import rewrite, write_capture, write_colmap, write_images, write_llff
+from scene_files import needs, rewrite, write_capture, write_colmap, write_images, write_llff
 
 from voronerf.app import open_run
 from voronerf.app.evaluate.panels import write_panels
@@ -21,16 +19,9 @@ from voronerf.app.train.build import make_batches, make_renderer, make_routers
 from voronerf.app.train.defaults import resolve
 from voronerf.nerf.cameras import Cameras, orbit_cameras
 
-DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
 COUNT, SIZE = 9, (12, 10)
 POSES = orbit_cameras(COUNT, radius=4, elevation=20, width=12, height=10, focal=20, centre=(1, 2, 3)).poses
 POINTS = np.random.default_rng(0).normal(size=(60, 3)) * 0.4 + (1, 2, 3)
-
-
-def needs(name):
-    if not (DATA / name).is_dir():
-        pytest.skip(f"{DATA / name} is not there; set VORONERF_DATA to a folder that holds {name}")
-    return DATA / name
 
 
 def write_both(folder, sizes=(SIZE,) * COUNT, *, binary=True, **save):

@@ -3,27 +3,17 @@
 import json
 import logging
 import math
-import os
 from pathlib import Path
 
 import pytest
 import torch
 from PIL import Image
-from scene_files import rewrite, write_blender, write_capture
+from scene_files import needs, rewrite, write_blender, write_capture
 
 from voronerf.app.scenes import builtin_scene, load_scene
 from voronerf.app.scenes.photographs import find_frame
 from voronerf.nerf import Space, Stratified, render_rays
 from voronerf.nerf.cameras import Cameras, focus_point, orbit_cameras
-
-DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
-
-
-def needs(name):
-    folder = DATA / name
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is not there; set VORONERF_DATA to a folder that holds {name}")
-    return folder
 
 
 def test_blender_round_trip(tmp_path):
