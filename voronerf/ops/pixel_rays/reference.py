@@ -53,7 +53,7 @@ def pixel_rays(*given: Any) -> PixelRays:
         bent = (table >= 0) & (table < len(tables))
         right, down = tables.reshape(-1, 2)[torch.where(bent, table, 0) * (h * w) + pixel].unbind(-1)
         square = right * right + down * down
-        u, v, ahead = (torch.where(bent, *pair) for pair in ((2 * right, u), (2 * down, v), (1 - square, ahead)))
+        u, v, ahead = (torch.where(bent, a, b) for a, b in ((2 * right, u), (2 * down, v), (1 - square, ahead)))
     local = torch.stack((u, -v, -ahead), dim=-1)
     directions = torch.nn.functional.normalize((poses[camera, :3, :3] * local[:, None, :]).sum(-1), dim=-1)
     origins = poses[camera, :3, 3]
