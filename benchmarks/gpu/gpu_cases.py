@@ -46,7 +46,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     from voronerf.ops._core.layers import MLP, POSITIONS, Layer
     from voronerf.ops.cell_sort.native import sort as sort_cells
     from voronerf.ops.cell_sort.reference import cell_sort as specified
-    from voronerf.ops.grouped_mlp.native import using_way
+    from voronerf.ops.grouped_mlp.network import using_way
 
     where, cases_of_ops = torch.device(device), every_case()
 

@@ -37,7 +37,7 @@ def compare(device: str, name: str, precision: str, ways: tuple[str, ...], n: in
     """Outputs and gradients of all ways, of which chained ones have no gradients of their own."""
     import torch
 
-    from voronerf.ops.grouped_mlp.native import using_way
+    from voronerf.ops.grouped_mlp.network import using_way
 
     given = batch(device, name, precision, n)
     found = {}

@@ -114,7 +114,7 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
 
     import voronerf
     from voronerf.ops.cell_sort.native import sort as sort_cells
-    from voronerf.ops.grouped_mlp.native import using_way
+    from voronerf.ops.grouped_mlp.network import using_way
 
     rows = Rows(out, "roofs", again, device)
     where, row = rows.device, rows.add

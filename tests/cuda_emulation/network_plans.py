@@ -6,8 +6,7 @@ from emulated_networks import KIB
 
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops._core.native import compiled
-from voronerf.ops.grouped_mlp import layer_table
-from voronerf.ops.grouped_mlp import native as grouped_mlp
+from voronerf.ops.grouped_mlp import network as grouped_mlp
 
 PRECISIONS = compiled.MlpPrecision
 WAYS = grouped_mlp.WAYS
@@ -35,10 +34,10 @@ def table(layers, d=None):
     d = d or (6 if layers.integrated else 3)
     seen = torch.zeros(1, 3) if layers.uses_directions else None
     weights = [torch.zeros(1, o, i) for o, i in layers.weight_shapes(d, 3 if layers.uses_directions else 0)]
-    call = layer_table.Given(torch.zeros(1, d), weights, [None] * len(weights), layers, seen)
-    given, _ = layer_table.network(call, None, hashed_before=False)
-    key = layer_table.table_key(given.table, given.positions, given.weights, given.directions)
-    return layer_table.table_of(*key)
+    call = grouped_mlp.Given(torch.zeros(1, d), weights, [None] * len(weights), layers, seen)
+    given, _ = grouped_mlp.network(call, None, hashed_before=False)
+    key = grouped_mlp.table_key(given.table, given.positions, given.weights, given.directions)
+    return grouped_mlp.table_of(*key)
 
 
 def plan(layers, n=MANY, k=16, *, precision="bfloat16", backward=True, d=None, asked="auto"):

@@ -22,7 +22,7 @@ from voronerf.ops._core import backends
 from voronerf.ops._core import native as _native
 from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops.cell_sort.native import sort as sort_cells
-from voronerf.ops.grouped_mlp.native import using_way
+from voronerf.ops.grouped_mlp.network import using_way
 
 # Values in registers, with weights that stay or pass through; in shared memory, where that is asked for; and what fits
 # no fused network: layer by layer.

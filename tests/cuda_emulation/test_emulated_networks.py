@@ -30,8 +30,8 @@ from network_plans import PRECISIONS, plain, plan, way
 import voronerf
 from voronerf.nerf.fields import NeRF
 from voronerf.ops._core.layers import MLP, POSITIONS, Layer
-from voronerf.ops.grouped_mlp import layer_table
-from voronerf.ops.grouped_mlp.native import _choose_way, using_way
+from voronerf.ops.grouped_mlp import network as layer_table
+from voronerf.ops.grouped_mlp.network import _choose_way, using_way
 
 HALVES = ("bfloat16", "float16")
 FUSED = (227, 99, 64, 40, 20)

@@ -16,8 +16,7 @@ from voronerf.ops.cell_sort.native import WAYS
 from voronerf.ops.cell_sort.native import sort as sort_cells
 from voronerf.ops.draw_pixels import native as draw_pixels
 from voronerf.ops.draw_pixels import reference as draw_pixels_reference
-from voronerf.ops.grouped_mlp.layer_table import Given, network
-from voronerf.ops.grouped_mlp.native import backward
+from voronerf.ops.grouped_mlp.network import Given, backward, network
 
 
 @pytest.fixture(params=(0, 1, 2), autouse=True)

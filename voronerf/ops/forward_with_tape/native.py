@@ -17,7 +17,7 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops.forward_with_tape import reference
 from voronerf.ops.forward_with_tape.reference import Tape, learnt, with_gradients
-from voronerf.ops.grouped_mlp import native as grouped_mlp
+from voronerf.ops.grouped_mlp import network as grouped_mlp
 from voronerf.ops.routed_mlp import native as routed_mlp
 from voronerf.ops.routed_mlp import of_samples
 

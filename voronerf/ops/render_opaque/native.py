@@ -13,8 +13,8 @@ from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops.composite.native import composite
-from voronerf.ops.grouped_mlp import native as grouped_mlp
-from voronerf.ops.grouped_mlp.layer_table import Given, in_float32, table_of
+from voronerf.ops.grouped_mlp import network as grouped_mlp
+from voronerf.ops.grouped_mlp.network import Given, in_float32, table_of
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import inputs_of, march_rays
 from voronerf.ops.march_rays.reference import March

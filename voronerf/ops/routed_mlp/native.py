@@ -19,8 +19,9 @@ from voronerf.ops._core import native
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.cell_sort import native as cell_sort
-from voronerf.ops.grouped_mlp import native as grouped_mlp
-from voronerf.ops.grouped_mlp.layer_table import Given, Network, network
+from voronerf.ops.grouped_mlp import network as grouped_mlp
+from voronerf.ops.grouped_mlp.gradients import gradients_of_network, keep_network, kept_network
+from voronerf.ops.grouped_mlp.network import Given, Network, network
 from voronerf.ops.locate_cell import native as locate_cell
 from voronerf.ops.nearest_centre import native as nearest_centre
 from voronerf.ops.routed_mlp.reference import Where, first_rows
@@ -129,13 +130,13 @@ def _setup(ctx: Any, inputs: Call, output: tuple[Tensor, ...]) -> None:
     ctx.alone = where.cells is None and where.centres is None
     ctx.mark_non_differentiable(found, order, offsets, encoded)
     ctx.set_materialize_grads(False)
-    grouped_mlp.keep_network(ctx, network, order, offsets, encoded)
+    keep_network(ctx, network, order, offsets, encoded)
 
 
 def _backward(ctx: Any, gradient: Tensor | None, *_others: None) -> tuple[Any, ...]:
-    network, (order, offsets, encoded) = grouped_mlp.kept_network(ctx)
+    network, (order, offsets, encoded) = kept_network(ctx)
     sorted_by = None if ctx.alone else order
-    found = grouped_mlp.gradients_of_network(ctx, gradient, network, offsets, sorted_by, encoded)
+    found = gradients_of_network(ctx, gradient, network, offsets, sorted_by, encoded)
     return found, Where(*cast(Any, (None,) * len(Where._fields))), None
 
 

@@ -1,23 +1,25 @@
-"""Gradients of whole networks that can be differentiated again: layer by layer, on the native ``grouped_linear``.
+"""The autograd of ops that run whole networks. n samples, r rays, k cells, p and q features of a raw position and
+direction.
 
-n samples, r rays, k cells, p and q features of a raw position and direction. The kernels of ``grouped_mlp.py`` take a
-network's gradients in one pass, which has no derivative of its own.
+The kernels take a network's gradients in one pass, which has no derivative of its own. Gradients that will be
+differentiated again are taken layer by layer, on the native ``grouped_linear``.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
+from voronerf.ops._core.derivatives import asked_for
 from voronerf.ops._core.layers import DIRECTIONS, POSITIONS
 from voronerf.ops.grouped_linear.activation import activate
 from voronerf.ops.grouped_linear.cpu import layer as linear
 from voronerf.ops.grouped_linear.reference import grouped_linear as _reference
-from voronerf.ops.grouped_mlp.layer_table import Network, Table, encoded_already
+from voronerf.ops.grouped_mlp.network import Network, Table, backward, encoded_already
 from voronerf.ops.grouped_mlp.reference import cells_of
 from voronerf.ops.grouped_mlp.reference import grouped_mlp as compose
 from voronerf.ops.hash_encode.native import hash_encode
@@ -27,7 +29,53 @@ from voronerf.ops.spherical_harmonics.native import spherical_harmonics
 _PIECE = 8192
 
 
-def gradients(
+def keep_network(ctx: Any, network: Network, *others: Tensor) -> None:
+    """Saves a network and other tensors for the backward pass."""
+    ctx.table, ctx.count = network.table, len(network.weights)
+    positions, weights, biases, _, *rest = network
+    ctx.save_for_backward(positions, *weights, *biases, *rest, *others)
+
+
+def kept_network(ctx: Any) -> tuple[Network, Sequence[Tensor]]:
+    """What `keep_network` saved."""
+    saved, count = ctx.saved_tensors, ctx.count
+    weights, biases = saved[1 : 1 + count], saved[1 + count : 1 + 2 * count]
+    directions, index, features, *others = saved[1 + 2 * count :]
+    return Network(saved[0], weights, biases, ctx.table, directions, index, features), others
+
+
+def gradients_of_network(
+    ctx: Any, gradient: Tensor | None, network: Network, offsets: Tensor, order: Tensor | None, encoded: Tensor
+) -> Network:
+    """Gradients in the place of what they are of, None where there is none; ``ctx``: whom the engine asks for them."""
+    count = ctx.count
+    if gradient is None:
+        return Network(*cast(Any, (None, [None] * count, [None] * count, None, None, None, None)))
+    positions, weights, biases, _, directions, index, features = network
+    asked = asked_for(ctx, (positions, *weights, *biases, directions, index, features))
+    to_positions, *to_parameters, to_directions, _, to_features = asked
+    wanted = *to_parameters, to_positions, to_directions, to_features
+    *found, of_positions, of_directions, of_features = _gradients(
+        gradient, network, offsets, order, encoded, asked=wanted
+    )
+    return Network(*cast(Any, (of_positions, found[:count], found[count:], None, of_directions, None, of_features)))
+
+
+def _gradients(
+    gradient: Tensor, network: Network, offsets: Tensor, order: Tensor | None, encoded: Tensor, *, asked: Sequence[bool]
+) -> list[Tensor | None]:
+    """Gradients of weights, biases, positions, directions and features, None for those that are not asked for."""
+    if torch.is_grad_enabled():
+        return _layer_by_layer(gradient, network, offsets, order, asked=asked)
+    *parameters, to_positions, to_directions, to_features = asked
+    wanted = [any(parameters), to_positions, to_directions, to_features]
+    *results, of_features = backward(gradient, network, offsets, order, encoded, wanted)
+    if network.features is not None and to_features:
+        of_features = of_features.to(network.features.dtype)
+    return [result if want else None for result, want in zip((*results, of_features), asked)]
+
+
+def _layer_by_layer(
     gradient: Tensor, network: Network, offsets: Tensor, order: Tensor | None, *, asked: Sequence[bool]
 ) -> list[Tensor | None]:
     """Gradients of weights, biases, positions, directions and features, None where they are not asked for.
