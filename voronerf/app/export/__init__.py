@@ -1,4 +1,4 @@
-"""Takes a trained run away: coloured points, a mesh, the cells of its diagram, cameras. Needs the extra `export`."""
+"""A trained run as files for other programs: splats, points, a mesh, cells, cameras, videos."""
 
 from voronerf.app.export.cameras import export_cameras
 from voronerf.app.export.cells import cell_meshes, export_cells

@@ -59,7 +59,7 @@ def write_geometry(path: Path, geometry: Any, **options: Any) -> None:
 
 
 def placed(run: Run, geometry: Any, to_files: bool) -> Any:
-    """A geometry of trimesh, in the coordinates of the scene's files where that is asked for."""
+    """A geometry of trimesh, in the coordinates of the scene's files if ``to_files``."""
     if to_files and run.scene.transform is not None:
         geometry.apply_transform(torch.linalg.inv(run.scene.transform).numpy())
     return geometry
@@ -159,7 +159,7 @@ def in_silence(parts: Sequence[Any], name: str) -> Iterable[Any]:
 
 
 def density_at(run: Run, nodes: Nodes, track: Track) -> Tensor:
-    """The densities of a run at nodes, float32 of their shape; seen from above, as densities depend on no direction."""
+    """The densities of a run at nodes, float32 of their shape; densities do not depend on the direction."""
     density = torch.empty(nodes.shape)
     down = torch.tensor([[0.0, 0.0, -1.0]])
     for first, last in track(nodes.slabs(), "density"):

@@ -1,4 +1,4 @@
-"""Ways of a camera through a scene: spirals, smooth paths through keyframes, and nerfstudio's file of a path.
+"""Camera paths: spirals, smooth paths through keyframes, and nerfstudio's file format.
 
 c cameras, f frames. Poses and pixels as in :mod:`voronerf.nerf.cameras`.
 

@@ -1,4 +1,4 @@
-"""Pictures to a video file."""
+"""Writes pictures as a video."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 
 
 def check_video(path: Path) -> None:
-    """Finds out before the frames are there whether :func:`write_video` can write them; makes the folder.
+    """Checks, before any frame is rendered, that :func:`write_video` can write them; makes the folder.
 
     Raises:
         ValueError: another suffix than .mp4.

@@ -1,4 +1,4 @@
-"""One browser: its camera, what it wants to see, and its panel."""
+"""One browser: its camera, the pictures it needs, and its panel."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Client:
         longest: Pixels along the longer side of its sharp picture.
         version: Counts what changes its picture.
         moved_at: When that was last.
-        wants_coarse: A picture now.
-        wants_sharp: A better one, when the camera rests.
+        wants_coarse: Whether it needs a coarse picture now.
+        wants_sharp: Whether it needs a sharp one when the camera rests.
         drawn_at: When the last sharp picture was done.
         cost: Seconds that it took.
     """
@@ -95,7 +95,7 @@ class Client:
         self.change()
 
     def _look_around(self) -> None:
-        """Takes the browser's camera, unless its canvas has no pixels or its numbers are none."""
+        """Takes the browser's camera, unless its canvas is empty or its numbers are not finite."""
         now = self.handle.camera
         numbers = (*now.wxyz, *now.position, now.fov)
         there = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)
@@ -122,7 +122,7 @@ class Client:
         self.change(level=depth, hidden=frozenset())
 
     def stand(self, cameras: Cameras, view: int) -> None:
-        """Goes to one of several cameras."""
+        """Moves to one of several cameras."""
         of = frustum(cameras, view)
         with self.handle.atomic():
             self.handle.camera.position = of["position"]
@@ -167,7 +167,7 @@ class Client:
         )
 
     def on(self, register: Callable[[Callable[[Any], None]], object], work: Callable[[], object]) -> None:
-        """Has something done when a part of the panel is used; where that fails, the client is disconnected."""
+        """Calls ``work`` when a part of the panel is used; disconnects the client if that fails."""
         register(lambda _: self.viewer.serve_client(self, work))
 
     def _resize(self, longest: int) -> None:
@@ -180,7 +180,7 @@ class Client:
         self.viewer.do(lambda: self.viewer.serve_client(self, lambda: self.pick(*event.screen_pos)))
 
     def pick(self, x: float, y: float) -> None:
-        """Describes the cell that is at a place of the picture, 0..1 from the left and from the top."""
+        """Describes the cell at a position in the picture, 0..1 from the left and from the top."""
         subject = self.viewer.subject
         self.picked = cell_at(subject, self.camera(self.longest), self.look, x, y)
         found = self.picked
@@ -198,7 +198,7 @@ class Client:
     # --- what is drawn into the scene ------------------------------------------------------------------------------
 
     def clear(self, kind: str) -> None:
-        """Takes away what is drawn of one kind."""
+        """Removes what is drawn of one kind."""
         for node in self.nodes[kind]:
             node.remove()
         self.nodes[kind] = []

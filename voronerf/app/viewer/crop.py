@@ -19,7 +19,7 @@ LEAST, ARROWS = 0.01, 0.12
 
 
 class CropBox:
-    """Renders the inside of a box only, and draws the box."""
+    """Renders only what is inside a box, and draws the box."""
 
     def __init__(self, client: Client) -> None:
         self.client, subject = client, client.viewer.subject
@@ -37,7 +37,7 @@ class CropBox:
         client.on(self.button.on_click, self.save)
 
     def show(self) -> None:
-        """Draws the box with its corners, or takes it away."""
+        """Draws the box with its corners, or removes it."""
         client, self.button.visible = self.client, self.shown.value
         client.clear("crop")
         if self.shown.value:
@@ -74,7 +74,7 @@ class CropBox:
         self.update()
 
     def update(self) -> None:
-        """Has the picture follow the box."""
+        """Redraws the box, and the picture inside it."""
         if self.shown.value:
             self.box.position = self.corners.mean(0)
             self.box.dimensions = tuple(self.corners[1] - self.corners[0])

@@ -98,7 +98,7 @@ def guarded(host: str) -> Iterator[None]:
 
 
 def _say(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """A line about what viser could not do with a message, such as to make a number of a text."""
+    """Logs a message that viser could not use, such as text in place of a number."""
     log.warning("a message of a browser is passed over: %.200s", context.get("exception", context["message"]))
 
 

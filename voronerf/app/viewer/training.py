@@ -62,18 +62,18 @@ class Training(Callback):
         self.end.on_click(lambda _: self.stop())
 
     def pause(self, paused: bool) -> None:
-        """Holds the training after the step in hand, or lets it go on."""
+        """Pauses the training after the current step, or continues it."""
         self.paused = paused
         self.button.label = "Go on" if paused else "Pause"
         self.viewer.wake.set()
 
     def stop(self) -> None:
-        """Ends the training after the step in hand."""
+        """Ends the training after the current step."""
         self.state.stop()
         self.viewer.wake.set()
 
     def after_step(self, state: State) -> None:
-        """Shows the state after a step; returns when training shall go on."""
+        """Shows the state after a step; returns when training may continue."""
         viewer, cells = self.viewer, state.router.num_cells
         if not viewer.clients and not self.paused:
             return
@@ -90,7 +90,7 @@ class Training(Callback):
             viewer.serve(lambda: not self.paused or state.stopped)
 
     def on_end(self, state: State) -> None:
-        """Takes the lines and the buttons away."""
+        """Removes the lines and the buttons."""
         for part in (self.line, self.button, self.end):
             part.remove()
 

@@ -1,7 +1,7 @@
 """The viewer: a server, its clients, and which picture is rendered next.
 
 One thread renders everything, that which calls :meth:`Viewer.render_next` or :meth:`Viewer.serve`: in a training it is
-the thread of the steps, so that a picture is never of half a step. The threads of the server only write down wishes.
+the thread of the steps, so that a picture is never of half a step. The threads of the server only set flags.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Viewer:
         return f"open {self.address} in a browser" + "; whoever can reach this machine can use the viewer" * others
 
     def _stand(self) -> None:
-        """Has new browsers stand where the first test view is."""
+        """Starts new browsers at the first test view."""
         start, scene = self.server.initial_camera, self.subject.scene
         cameras = scene.test.cameras
         start.position = cameras.origins[0].numpy()
@@ -97,7 +97,7 @@ class Viewer:
         start.fov = 2 * math.atan(cameras.size(0)[1] / 2 / float(cameras.intrinsics[0, 1]))
 
     def show(self, subject: Subject, points: Sequence[tuple[float, float]] = ()) -> None:
-        """Shows something else to every browser, with its curve; see :meth:`show_curve`."""
+        """Shows another subject to every browser, with its curve; see :meth:`show_curve`."""
         self.subject = subject
         self.server.gui.set_panel_label(subject.name)
         self._stand()
@@ -130,12 +130,12 @@ class Viewer:
         self.clients.pop(handle.client_id, None)
 
     def do(self, task: Callable[[], None]) -> None:
-        """Has something done by the thread that renders."""
+        """Runs a task on the thread that renders."""
         self.tasks.put(task)
         self.wake.set()
 
     def serve_client(self, client: Client, work: Callable[[], object]) -> None:
-        """Does something that a client asked for; where that fails, the client is disconnected, with a line."""
+        """Does what a client asked for; if that fails, disconnects the client and logs a line."""
         try:
             work()
         except Exception as error:  # whatever it asked for, the others and the training go on
@@ -149,7 +149,7 @@ class Viewer:
     # --- rendering -------------------------------------------------------------------------------------------------
 
     def serve(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Renders what is asked for, until a function says so or Ctrl-C."""
+        """Renders what clients need, until ``until()`` is true or Ctrl-C."""
         while not until():
             if not self.render_next():
                 # A picture may wait for its camera to rest; without one there is nothing to look at.
@@ -164,11 +164,11 @@ class Viewer:
         render_look(self.subject, camera, Look())
 
     def list_clients(self) -> list[Client]:
-        """Those that are there now."""
+        """The clients that are connected now."""
         return list(self.clients.values())
 
     def render_next(self) -> bool:
-        """Does the task or renders the picture that is most urgent; returns whether there was one."""
+        """Does the most urgent task or picture; returns whether there was one."""
         with contextlib.suppress(queue.Empty):
             self.tasks.get_nowait()()
             return True
@@ -184,7 +184,7 @@ class Viewer:
         return False
 
     def refresh(self) -> None:
-        """Has pictures at rest rendered again, since the weights have changed; as often as `REFRESH` allows."""
+        """Renders pictures at rest again, since the weights have changed, as often as `REFRESH` allows."""
         now = time.perf_counter()
         for client in self.list_clients():
             if now - client.drawn_at > client.cost / REFRESH:
