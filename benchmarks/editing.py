@@ -90,8 +90,8 @@ def city(out: Path, seconds: float, seeds: list[int]) -> None:
                 name = f"{way.split()[0]}-{side}-{seed}-{seconds:g}"
                 run, there = train(out / name, own, seconds, seed, cells=(8,)), out / f"cut-{name}"
                 if not there.exists():
-                    town.cut(run, town.Solid.box(*half(scene, side).tolist()), there)
-                halves.append(town.open_run(there, scene=scene))
+                    town.cut(run.path, town.Solid.box(*half(scene, side).tolist()), there)
+                halves.append(there)
             there = out / f"joined-{way.split()[0]}-{seed}-{seconds:g}"
             if not there.exists():
                 town.join(halves, there)

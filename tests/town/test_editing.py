@@ -6,6 +6,7 @@ import errno
 import importlib
 import json
 import os
+import shutil
 import signal
 from dataclasses import replace
 
@@ -17,8 +18,14 @@ from voronerf import town
 from voronerf.app import open_run
 from voronerf.app.cli.main import main
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.scenes.record import read_scene
-from voronerf.app.train.checkpoint import CheckpointError
+from voronerf.app.scenes.record import read_scene, write_scene
+from voronerf.app.train.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    checkpoint_path,
+    load_checkpoint,
+    save_checkpoint,
+)
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.town import Similarity, Solid, editing
 from voronerf.town.parts import Parts
@@ -67,17 +74,17 @@ def opened(runs, scene):
 
 
 def joined_run(runs, out, frames=None):
-    town.join(runs, out, frames=frames)
+    town.join([run.path for run in runs], out, frames=frames)
     return town.open_run(out, scene=runs[0].scene)
 
 
 def cut_run(run, kept, out, outside=False):
-    town.cut(run, kept, out, outside=outside)
+    town.cut(run.path, kept, out, outside=outside)
     return town.open_run(out, scene=run.scene)
 
 
 def placed_run(run, thing, at, out, scale=1.0):
-    town.place(run, thing, at, out, scale=scale)
+    town.place(run.path, thing.path, at, out, scale=scale)
     return town.open_run(out, scene=run.scene)
 
 
@@ -128,7 +135,7 @@ def test_a_joined_run_is_joined_and_cut_again(opened, tmp_path) -> None:
     assert len([*four.router]) == 4 and four.router.num_cells == 2 * pair.router.num_cells
     files = list((tmp_path / "four" / "checkpoints").glob("networks-*"))
     assert len(files) == 2  # what stands in two places is stored once
-    assert four.router[0].networks[0].router is four.router[2].networks[0].router
+    assert four.router[0].networks[0] is four.router[2].networks[0]
     low, high = pair.router[1].frame.points(opened[1].scene.box)
     back = cut_run(four, Solid.box(low.tolist(), high.tolist()), tmp_path / "back")
     assert len([*back.router]) < 4 and any(
@@ -144,7 +151,7 @@ def test_the_grid_has_all_that_the_grids_of_the_runs_have(opened, tmp_path) -> N
     joined = joined_run(opened, tmp_path / "joined", frames=frames)
     grid = joined.renderer.occupancy
     for run, frame in zip(opened, frames, strict=True):
-        own = editing.Source.of(run).grid
+        own = editing.Source.of(run.path).grid
         full = own.occupied.view(-1).nonzero()[:, 0]
         points = own.points(full, torch.rand(len(full), 3))
         assert grid.occupied.view(-1)[grid.cells(frame.points(points)).long()].all()
@@ -246,27 +253,33 @@ def test_out_is_a_new_folder(opened, tmp_path) -> None:
     assert contents(tmp_path / "run") == before and (tmp_path / "file").read_text() == "mine"
 
 
-def test_what_cannot_be_joined(opened, tmp_path, scene) -> None:
-    refuses("two runs or more", lambda: joined_run(opened[:1], tmp_path / "no"), error=ConfigError)
-    cones = replace(opened[0], config=replace(opened[0].config, field="mipnerf", field_options=(), occupancy=False))
-    refuses(
-        "cannot be joined or cut: its cones", lambda: joined_run([cones, opened[1]], tmp_path / "no"), error=ConfigError
-    )
-    endless = replace(opened[1], scene=replace(scene, box=None))
-    refuses(
-        "must have bounds to be joined", lambda: joined_run([opened[0], endless], tmp_path / "no"), error=ConfigError
-    )
-    refuses(
-        "an object must have bounds",
-        lambda: placed_run(opened[0], endless, (0, 0, 0), tmp_path / "no"),
-        error=ConfigError,
-    )
-    black = replace(opened[1], scene=replace(scene, background=None))
-    refuses(
-        "must have the background of first, white, got none",
-        lambda: joined_run([opened[0], black], tmp_path / "no"),
-        error=ConfigError,
-    )
+def altered(run, out, *, config=None, bias=0.0, **scene):
+    """A copy of a run with other settings, more density, or another scene in its files."""
+    shutil.copytree(run, out)
+    write_scene(out / "scene.json", replace(read_scene(run / "scene.json"), **scene))
+    found = load_checkpoint(checkpoint_path(out))
+    tensors = {name: tensor.clone() for name, tensor in found.tensors.items() if not name.startswith("optimizer.")}
+    if bias:
+        tensors["router.module.density.bias"] += bias
+    values = {**found.values, "config": {**found.values["config"], **(config or {})}}
+    save_checkpoint(checkpoint_path(out), Checkpoint(tensors, values))
+    return out
+
+
+def test_what_cannot_be_joined(runs, tmp_path) -> None:
+    one, two = runs
+    cones = altered(two, tmp_path / "cones", config={"field": "mipnerf", "field_options": []})
+    endless, black = altered(two, tmp_path / "endless", box=None), altered(two, tmp_path / "black", background=None)
+    for given, said in (
+        ([one], "two runs or more"),
+        ([cones, two], "cannot be joined or cut: its cones"),
+        ([one, endless], "must have bounds to be joined"),
+        ([one, black], "must have the background of first, white, got none"),
+        ([one, tmp_path], "must hold a run"),
+    ):
+        refuses(said, town.join, given, tmp_path / "no", error=ConfigError)
+    refuses("an object must have bounds", town.place, one, endless, (0, 0, 0), tmp_path / "no", error=ConfigError)
+    assert not (tmp_path / "no").exists()
 
 
 def test_pictures_are_where_the_joined_run_has_their_cameras(opened, scene, tmp_path) -> None:
@@ -332,9 +345,8 @@ def test_an_unbounded_run_is_cut_and_gets_an_object(tmp_path, scene) -> None:
         field_options=SMALL,
     )
     trained(config, open_space)
-    run = open_run(tmp_path / "wide", scene=open_space)
-    with torch.no_grad():
-        run.router.module.density.bias += 4  # so that there is something to cut
+    wide = altered(tmp_path / "wide", tmp_path / "dense", bias=4)  # so that there is something to cut
+    run = open_run(wide, scene=open_space)
     assert run.renderer.contraction is not None
     refuses("must lie within", lambda: cut_run(run, Solid(ball=(0, 0, 0, 99)), tmp_path / "no"), error=ConfigError)
     thing = cut_run(run, Solid(ball=(0, 0, 0, 0.6)), tmp_path / "thing")

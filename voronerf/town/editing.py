@@ -13,26 +13,25 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 import torch
 from torch import Tensor
 
 from voronerf.app.files import json_text, write_text
-from voronerf.app.run import Run
+from voronerf.app.run import open_run
 from voronerf.app.scenes import Scene
-from voronerf.app.scenes.record import write_scene
+from voronerf.app.scenes.record import read_scene, write_scene
 from voronerf.app.scenes.scene import Split
 from voronerf.app.train.build import PICTURE_POINTS, PICTURE_RESOLUTION, make_picture_grid
-from voronerf.app.train.checkpoint import checkpoint_paths
+from voronerf.app.train.checkpoint import checkpoint_paths, last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.occupancy import PICTURE_OPACITY, OccupancyGrid
-from voronerf.router import VoronoiRouter
 from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.parts import Network, Part, Parts
-from voronerf.town.run import TOWN, write_parts
+from voronerf.town.network import Network, config_of, is_shown
+from voronerf.town.parts import Part, Parts
+from voronerf.town.run import TOWN, is_town, open_parts, write_parts
 
 #: The most voxels of the grid of a run that was made of others; it has larger ones where it would have more.
 MOST_VOXELS = 1 << 22
@@ -57,36 +56,46 @@ class Source:
     grid: OccupancyGrid | None
 
     @classmethod
-    def of(cls, run: Run) -> Source:
-        """The source that a run is. Of its networks the field alone is taken.
+    def of(cls, run: Path | str) -> Source:
+        """The source in a run directory. Of its networks the field alone is taken.
 
         Raises:
             ConfigError: For a field of cones, or one in normalised device coordinates.
+            CheckpointError: If there is no usable checkpoint.
         """
-        name, config, scene, renderer = run.path.name, run.config, run.scene, run.renderer
+        run = Path(run)
+        name, record = run.name, run / "scene.json"
+        if not record.is_file():
+            raise ConfigError(f"{run}: must hold a run with the record of its scene, scene.json")
+        checkpoint = last_checkpoint(run, keep=lambda tensor: is_shown(tensor) or not tensor.startswith("optimizer."))
+        config, scene, state = config_of(checkpoint), read_scene(record), checkpoint.group("occupancy")
+        grid = OccupancyGrid.from_state(state) if state else None
+        if is_town(run):
+            return cls(name, config, scene, open_parts(run, checkpoint), grid)
         if config.field_type.cones:
             raise ConfigError(f"{name}: --field {config.field} cannot be joined or cut: its cones cross borders")
-        contraction, grid, field = renderer.contraction, renderer.occupancy, renderer.field
+        contraction, network = scene.space(config.contraction).contraction, Network(checkpoint)
         if isinstance(contraction, Perspective):
             raise ConfigError(f"{name}: --contraction ndc cannot be joined or cut: it belongs to one camera")
-        if isinstance(field, Parts):
-            return cls(name, config, scene, field, grid)
-        network = Network(cast(VoronoiRouter, run.router), replace(config, sampling="stratified"))
+        if config.sampling != "stratified":
+            network = Network.of(network.router, config)
         if contraction is not None:
             return cls(name, config, scene, Parts([Part([network], contraction=contraction)]), None)
         region = []
         if scene.box is not None:
             low, high = scene.box.tolist()
             region = [Solid.box(low, high)]
-            grid = grid or make_picture_grid(replace(config, sampling="stratified"), scene, renderer)
+            if grid is None:
+                config = replace(config, sampling="stratified")
+                grid = make_picture_grid(config, scene, open_run(run, scene=scene).renderer)
         return cls(name, config, scene, Parts([Part([network], region=region)]), grid)
 
 
-def join(runs: Sequence[Run], out: Path | str, *, frames: Sequence[Similarity] | None = None) -> Source:
+def join(runs: Sequence[Path | str], out: Path | str, *, frames: Sequence[Similarity] | None = None) -> Source:
     """Writes one run of several: where they overlap the nearest centre decides.
 
     Args:
-        runs: At least two; the first gives data, background and settings.
+        runs: At least two run directories; the first gives data, background and settings.
         out: A new directory; the runs stay as they are.
         frames: From the scene of each run into that of the new one; None for where they are.
 
@@ -98,23 +107,23 @@ def join(runs: Sequence[Run], out: Path | str, *, frames: Sequence[Similarity] |
         OSError: When it cannot be written; nothing is left then.
 
     Examples:
-        >>> from voronerf.app import open_run
         >>> from voronerf.town import Similarity, join
         >>> def beside_each_other(east, west, out):
-        ...     frames = [Similarity(), Similarity.of((2.0, 0, 0))]
-        ...     return join([open_run(east), open_run(west)], out, frames=frames)
+        ...     return join([east, west], out, frames=[Similarity(), Similarity.of((2.0, 0, 0))])
     """
     if len(runs) < 2 or (frames is not None and len(frames) != len(runs)):
         count = "none" if frames is None else f"{len(frames)}"
         raise ConfigError(f"join needs two runs or more, and a frame for each: got {len(runs)} runs, {count} frames")
-    return _write(join_sources([Source.of(run) for run in runs], frames or [Similarity()] * len(runs)), Path(out))
+    sources = {str(run): Source.of(run) for run in runs}
+    every = [sources[str(run)] for run in runs]
+    return _write(join_sources(every, frames or [Similarity()] * len(runs)), Path(out))
 
 
-def cut(run: Run, kept: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Source:
+def cut(run: Path | str, kept: Solid | Sequence[int], out: Path | str, *, outside: bool = False) -> Source:
     """Writes a run of what lies in a solid or in some cells; networks that show nothing of it are dropped.
 
     Args:
-        run: The run; it stays as it is.
+        run: The run directory; it stays as it is.
         kept: A solid of the scene, such as ``Solid.box(low, high)``, or numbers of cells.
         out: A new directory.
         outside: What does not lie there, in its place.
@@ -127,10 +136,9 @@ def cut(run: Run, kept: Solid | Sequence[int], out: Path | str, *, outside: bool
         OSError: When it cannot be written; nothing is left then.
 
     Examples:
-        >>> from voronerf.app import open_run
         >>> from voronerf.town import Solid, cut
         >>> def ball_of(run, out):
-        ...     return cut(open_run(run), Solid(ball=(0, 0, 0.4, 0.5)), out)
+        ...     return cut(run, Solid(ball=(0, 0, 0.4, 0.5)), out)
     """
     source = Source.of(run)
     if isinstance(kept, Solid):
@@ -144,8 +152,8 @@ def cut(run: Run, kept: Solid | Sequence[int], out: Path | str, *, outside: bool
 
 
 def place(
-    run: Run,
-    thing: Run,
+    run: Path | str,
+    thing: Path | str,
     at: Sequence[float],
     out: Path | str,
     *,
@@ -155,8 +163,8 @@ def place(
     """Writes a run with an object in it, whose density comes on top of the scene's.
 
     Args:
-        run: The scene; it stays as it is.
-        thing: The object, cut out or trained on white.
+        run: The run directory of the scene; it stays as it is.
+        thing: That of the object, cut out or trained on white.
         at: Where the middle of the bottom of its box shall be.
         out: A new directory.
         degrees: Turned about the axes x, y, z, in this order.
@@ -170,13 +178,12 @@ def place(
         OSError: When it cannot be written; nothing is left then.
 
     Examples:
-        >>> from voronerf.app import open_run
-        >>> from voronerf.town import open_run as open_parts
         >>> from voronerf.town import place
         >>> def on_the_ground(garden, statue, out):
-        ...     return place(open_run(garden), open_parts(statue), (0.2, -0.1, 0), out, scale=0.5)
+        ...     return place(garden, statue, (0.2, -0.1, 0), out, scale=0.5)
     """
-    source, box = Source.of(thing), thing.scene.box
+    source = Source.of(thing)
+    box = source.scene.box
     if box is None:
         raise ConfigError(f"{source.name}: an object must have bounds, which voronerf cut --box or --sphere gives it")
     foot = torch.cat(((box[0] + box[1])[:2] / 2, box[0, 2:]))

@@ -20,18 +20,10 @@ from torch import Tensor, nn
 
 from voronerf import ops
 from voronerf.app.train.build import as_field
-from voronerf.app.train.config import TrainConfig
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.contraction import Contraction
-from voronerf.router import VoronoiRouter
 from voronerf.town.geometry import Similarity, Solid
-
-
-class Network(NamedTuple):
-    """A router, and the settings that its network is made of."""
-
-    router: VoronoiRouter
-    config: TrainConfig
+from voronerf.town.network import Network
 
 
 class Part(nn.Module):
@@ -55,9 +47,9 @@ class Part(nn.Module):
     Examples:
         >>> import torch
         >>> from voronerf import NeRF, VoronoiRouter
-        >>> from voronerf.app.train.config import TrainConfig
-        >>> from voronerf.town.parts import Network, Part
-        >>> part = Part([Network(VoronoiRouter(NeRF(width=8, depth=1), torch.rand(4, 3)), TrainConfig())])
+        >>>         >>> from voronerf.town.network import Network
+        >>> from voronerf.town.parts import Part
+        >>> part = Part([Network.of(VoronoiRouter(NeRF(width=8, depth=1), torch.rand(4, 3)), TrainConfig())])
         >>> fewer = part.keep(torch.tensor([0, 2]))
         >>> fewer.num_cells, fewer.diagram.num_cells, fewer.owner
         (2, 4, tensor([ 0, -1,  0, -1], dtype=torch.int32))
@@ -79,14 +71,13 @@ class Part(nn.Module):
     ) -> None:
         super().__init__()
         self.networks = tuple(networks)
-        self.routers = nn.ModuleList(network.router for network in networks)
-        self.diagram = networks[0].router.diagram if diagram is None else diagram
+        self.diagram = networks[0].diagram if diagram is None else diagram
         leaves, device = self.diagram.num_cells, self.diagram.centres.device
         owner = torch.zeros(leaves, dtype=torch.int32) if owner is None else owner.int()
         if owner.shape != (leaves,):
             raise ValueError(f"Part: owner must have shape [{leaves}], got {list(owner.shape)}")
         counts = [int((owner == i).sum()) for i in range(len(networks))]
-        wanted = [network.router.num_cells for network in networks]
+        wanted = [network.diagram.num_cells for network in networks]
         if counts != wanted or int(owner.max()) >= len(counts):
             raise ValueError(
                 f"Part: owner must name as many leaves of each router as it has cells, {wanted}, got {counts}"
@@ -122,9 +113,12 @@ class Part(nn.Module):
             inside = kept[self.number[mine].long()]
             if bool(inside.any()):
                 owner[mine[inside]] = len(networks)
-                own = network.router if bool(inside.all()) else network.router.part(inside.nonzero()[:, 0])
-                networks.append(network._replace(router=own))
+                networks.append(network if bool(inside.all()) else network.part(inside.nonzero()[:, 0]))
         return self.changed(networks=networks, owner=owner) if networks else None
+
+    def open(self) -> None:
+        """Makes the routers of all networks."""
+        self.routers = nn.ModuleList(network.router for network in self.networks)
 
     def find(self, own: Tensor, backend: str = "auto") -> tuple[Tensor, Tensor]:
         """Which leaf points [n, 3] of the part's frame lie in, int64 [n], and for which the part speaks, bool [n]."""
@@ -185,12 +179,12 @@ class Parts(nn.Module):
     Examples:
         >>> import torch  # networks of two widths, the second moved by 2 along x and half as large
         >>> from voronerf import NeRF, VoronoiRouter
-        >>> from voronerf.app.train.config import TrainConfig
-        >>> from voronerf.town.geometry import Similarity
-        >>> from voronerf.town.parts import Network, Part, Parts
+        >>>         >>> from voronerf.town.geometry import Similarity
+        >>> from voronerf.town.network import Network
+        >>> from voronerf.town.parts import Part, Parts
         >>> first = VoronoiRouter(NeRF(width=16, depth=2), torch.zeros(1, 3))
         >>> second = VoronoiRouter(NeRF(width=8, depth=1), torch.tensor([[0.0, 0, -1], [0, 0, 1]]))
-        >>> routers = [[Network(router, TrainConfig())] for router in (first, second)]
+        >>> routers = [[Network.of(router, TrainConfig())] for router in (first, second)]
         >>> both = Parts([Part(routers[0]), Part(routers[1], frame=Similarity.of((2, 0, 0), scale=0.5))])
         >>> points, up = torch.tensor([[0.1, 0, 0], [1.9, 0, 0.2]]), torch.tensor([[0.0, 0, 1]])
         >>> [claim.part for claim in both.claims(0, points)]

@@ -7,8 +7,7 @@ their networks, which are checkpoints beside it.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from torch import Tensor
 from voronerf.app.run import Run
 from voronerf.app.scenes import Scene, load_scene
 from voronerf.app.scenes.record import placed, read_scene
-from voronerf.app.train.build import check_device, make_routers
+from voronerf.app.train.build import check_device
 from voronerf.app.train.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -29,18 +28,16 @@ from voronerf.app.train.checkpoint import (
     save_checkpoint,
 )
 from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.resume import check_shapes, load_averages, restore_routers
 from voronerf.app.train.run_directory import check_folders, check_stored_paths
 from voronerf.diagram import VoronoiDiagram
-from voronerf.nerf.adam import parameter_groups
 from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy, Sampler, Stratified
 from voronerf.nerf.volume import Space
-from voronerf.router import VoronoiRouter
 from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.parts import Network, Part, Parts
+from voronerf.town.network import Network, config_of, is_shown
+from voronerf.town.parts import Part, Parts
 
 #: The file by which the directory of a run of several parts is told.
 TOWN = "town.json"
@@ -52,18 +49,17 @@ def is_town(run: Path) -> bool:
 
 
 def write_parts(run: Path, config: TrainConfig, parts: Parts, grid: OccupancyGrid | None) -> None:
-    """Writes the checkpoint of a run of parts, after the files of their networks; a router in two places has one.
+    """Writes the checkpoint of a run of parts, after the files of their networks, one for those in two places.
 
     Raises:
         OSError: When it cannot be written.
     """
     folder, names = checkpoint_path(run).parent, dict[int, str]()
     for network in (network for part in parts for network in part.networks):
-        if id(network.router) not in names:
-            names[id(network.router)] = name = f"networks-{len(names)}.safetensors"
-            tensors = {f"router.{key}": tensor.cpu().clone() for key, tensor in network.router.state_dict().items()}
-            save_checkpoint(folder / name, Checkpoint(tensors, {"config": network.config.to_values()}))
-    placed = [place_of(part, [names[id(network.router)] for network in part.networks]) for part in parts]
+        if id(network) not in names:
+            names[id(network)] = name = f"networks-{len(names)}.safetensors"
+            save_checkpoint(folder / name, network.stored())
+    placed = [place_of(part, [names[id(network)] for network in part.networks]) for part in parts]
     cells = [(part.diagram, part.owner) for part in parts]
     save_checkpoint(checkpoint_path(run), index_of(config, cells, placed, grid))
 
@@ -95,30 +91,6 @@ def index_of(
     return Checkpoint(tensors, {"config": config.to_values(), "parts": placed})
 
 
-def config_of(checkpoint: Checkpoint) -> TrainConfig:
-    """The settings in a checkpoint."""
-    return TrainConfig.from_json(json.dumps(checkpoint.values["config"]), checkpoint.source)
-
-
-def open_network(path: Path, device: torch.device | str, backend: str) -> Network:
-    """The networks of a file, with their averaged weights.
-
-    Raises:
-        CheckpointError: When it is missing, damaged, or of other networks than its settings say.
-    """
-    keep: Callable[[str], bool] = lambda name: name.startswith("router.") or name.endswith(".average")  # noqa: E731
-    checkpoint = load_checkpoint(path, keep=keep)
-    config = replace(config_of(checkpoint), sampling="stratified")
-    check_shapes(config, checkpoint)
-    routers = make_routers(config, device)
-    restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
-    dense, tables = parameter_groups(routers, config.field_type.sparse_parameters)
-    load_averages([*dense, *tables], checkpoint)
-    router: VoronoiRouter = routers["field"].eval()
-    router.backend = backend
-    return Network(router, config)
-
-
 def open_parts(run: Path, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> Parts:
     """The parts that a checkpoint of a run names; a network that stands in several places is one object.
 
@@ -133,7 +105,8 @@ def open_parts(run: Path, checkpoint: Checkpoint, device: torch.device | str = "
                 if Path(name).name != name:
                     raise ValueError(f"networks must be files beside the checkpoint, got {name!r:.100}")
                 if name not in made:
-                    made[name] = open_network(checkpoint_path(run).with_name(name), device, backend)
+                    stored = load_checkpoint(checkpoint_path(run).with_name(name), keep=is_shown)
+                    made[name] = Network(stored, device, backend)
             seen = values["contraction"]
             part = Part(
                 [made[name] for name in values["networks"]],
@@ -200,6 +173,8 @@ def open_run(
     scene = load_scene(config.data, **reading) if scene is None else scene
     scene = _in_place(scene, read_scene(path / "scene.json"))
     parts = open_parts(path, checkpoint, device, backend)
+    for part in parts:
+        part.open()
     space = Space(None, scene.spacing, False, None)
     (count,) = samples or config.samples or (64,)
     sampler: Sampler = Stratified(count, space=space, backend=backend)

@@ -13,12 +13,11 @@ import torch
 import tyro
 
 from voronerf.app.cli.display import TrainingDisplay, say
-from voronerf.app.cli.opening import AS_IN_TRAINING
 from voronerf.app.cli.train import stopped_by_signals
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.files import json_text, read_json, write_text
-from voronerf.app.run import Run
 from voronerf.app.scenes import BUILTIN, load_scene
+from voronerf.app.scenes.record import read_scene
 from voronerf.app.train.build import check_device
 from voronerf.app.train.callbacks import CHECKPOINT_EVERY
 from voronerf.app.train.checkpoint import checkpoint_paths
@@ -32,13 +31,6 @@ from voronerf.town.group import Group, local_rank, restarts
 
 #: Numbers of a transform on the command line.
 MOVE = "tx ty tz rx ry rz s"
-
-
-def opened(run: Path) -> Run:
-    """A run with its cameras, without its images."""
-    if not (run / "scene.json").is_file():
-        raise ConfigError(f"{run}: must hold a run with the record of its scene, scene.json")
-    return AS_IN_TRAINING.open_without_images(run)
 
 
 def tell(out: Path, made: Source) -> int:
@@ -75,17 +67,17 @@ def join(
     frames = given_frames(len(runs), move, transforms)
     if align and frames:
         raise ConfigError("give --align, or --move and --transforms, not both")
-    sources = [opened(run) for run in runs]
     if align:
-        for number, run in enumerate(sources[1:], 1):
-            frame, error, count = editing.align(sources[0].scene, run.scene, str(runs[number]))
+        first, *others = (read_scene(run / "scene.json") for run in runs)
+        for number, scene in enumerate(others, 1):
+            frame, error, count = editing.align(first, scene, str(runs[number]))
             say(
                 f"{runs[number]}: scale {frame.scale:.6g}, {count} images in common, "
                 f"their cameras {error:.3g} scene units apart"
             )
             frames[number] = frame
     every = [frames.get(number, Similarity()) for number in range(len(runs))]
-    return tell(out, editing.join(sources, out, frames=every))
+    return tell(out, editing.join(runs, out, frames=every))
 
 
 def given_frames(runs: int, move: Sequence[tuple[str, str]], transforms: Path | None) -> dict[int, Similarity]:
@@ -155,7 +147,7 @@ def cut(
     except ValueError as error:
         raise ConfigError(f"--{given[0]}: {error}") from None
     kept = list(cells or ()) if solid is None else solid
-    return tell(out, editing.cut(opened(run), kept, out, outside=outside))
+    return tell(out, editing.cut(run, kept, out, outside=outside))
 
 
 def place(
@@ -182,7 +174,7 @@ def place(
         Similarity.of(at, turn, scale)
     except ValueError as error:
         raise ConfigError(f"--scale, --turn, --at: {error}") from None
-    return tell(out, editing.place(opened(run), opened(thing), at, out, degrees=turn, scale=scale))
+    return tell(out, editing.place(run, thing, at, out, degrees=turn, scale=scale))
 
 
 def train_territories(

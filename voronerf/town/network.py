@@ -1,0 +1,83 @@
+"""The networks of cells, as a file has them; the router is made of them when it is asked for."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from voronerf.app.train.build import make_routers
+from voronerf.app.train.checkpoint import Checkpoint
+from voronerf.app.train.config import TrainConfig
+from voronerf.app.train.resume import check_shapes, load_averages, restore_routers
+from voronerf.diagram import VoronoiDiagram
+from voronerf.nerf.adam import parameter_groups
+from voronerf.router import VoronoiRouter
+
+
+class Network:
+    """The networks of cells: settings and tensors.
+
+    Attributes:
+        diagram: The cells.
+
+    Args:
+        checkpoint: Of a training: the group "router" has the cells, "optimizer" may have averages of the weights.
+        device: Of the router.
+        backend: Of its operations.
+
+    Raises:
+        ValueError: For a checkpoint without cells.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> None:
+        self.checkpoint, self.device, self.backend = checkpoint, device, backend
+        self.diagram = VoronoiDiagram.from_state(checkpoint.group("router"), "diagram.")
+
+    @classmethod
+    def of(cls, router: VoronoiRouter, config: TrainConfig) -> Network:
+        """Those of a router, and the settings that its network is made of."""
+        tensors = {f"router.{name}": tensor for name, tensor in router.state_dict().items()}
+        network = cls(Checkpoint(tensors, {"config": replace(config, sampling="stratified").to_values()}))
+        network.router = router
+        return network
+
+    @functools.cached_property
+    def router(self) -> VoronoiRouter:
+        """With averaged weights, in evaluation mode.
+
+        Raises:
+            CheckpointError: For other networks than the settings say.
+        """
+        config = config_of(self.checkpoint)
+        check_shapes(config, self.checkpoint)
+        routers = make_routers(config, self.device)
+        restore_routers(routers, self.checkpoint, assign=torch.device(self.device).type == "cpu")
+        dense, tables = parameter_groups(routers, config.field_type.sparse_parameters)
+        load_averages([*dense, *tables], self.checkpoint)
+        router = routers["field"].eval()
+        router.backend = self.backend
+        return router
+
+    def part(self, cells: Sequence[int] | Tensor) -> Network:
+        """Those of some of the cells."""
+        return Network.of(self.router.part(cells), config_of(self.checkpoint))
+
+    def stored(self) -> Checkpoint:
+        """The checkpoint without what only a training needs."""
+        tensors = {name: tensor.cpu() for name, tensor in self.checkpoint.tensors.items() if is_shown(name)}
+        return Checkpoint(tensors, {"config": self.checkpoint.values["config"]})
+
+
+def is_shown(name: str) -> bool:
+    """Whether a tensor of a checkpoint says what networks show, and is not for training alone."""
+    return name.startswith("router") or name.endswith(".average")
+
+
+def config_of(checkpoint: Checkpoint) -> TrainConfig:
+    """The settings in a checkpoint."""
+    return TrainConfig.from_json(json.dumps(checkpoint.values["config"]), checkpoint.source)
