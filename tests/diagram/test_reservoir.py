@@ -1,10 +1,9 @@
 """The reservoir of importance samples against sorting every batch by hand."""
 
-import pytest
 import torch
 from helpers import refuses, same, seeded
 
-from voronerf.diagram.reservoir import SampleReservoir, select_heaviest
+from voronerf.diagram.reservoir import SampleReservoir
 
 
 def batch(seed, n):
@@ -106,21 +105,3 @@ def test_bad_input_gets_one_clear_line():
     add = SampleReservoir(5, batches=5).add
     refuses("got [4, 2] and [4]", add, torch.zeros(4, 2), torch.zeros(4))
     refuses("got [4, 3] and [3]", add, torch.zeros(4, 3), torch.zeros(3))
-
-
-@pytest.mark.parametrize(("n", "count"), [(0, 3), (1, 1), (5, 9), (1000, 37), (1000, 1000)])
-def test_keeps_the_heaviest(device, n, count):
-    points = torch.rand(n, 3)
-    importance = (torch.randperm(n) + 1).float() ** 5 * 1e-9
-    found = select_heaviest(points.to(device), importance.to(device), count)
-    order = importance.argsort(descending=True)[:count]
-    assert torch.equal(found[0].cpu(), points[order]) and torch.equal(found[1].cpu(), importance[order])
-
-
-def test_what_does_not_count_is_left_out(device):
-    points = torch.rand(8, 3)
-    points[1, 2], points[2, 0] = torch.nan, torch.inf
-    importance = torch.tensor([1.0, 9.0, 9.0, 0.0, torch.inf, torch.nan, -3.0, 2.0])
-    found = select_heaviest(points.to(device), importance.to(device), 5)
-    assert found[1].tolist() == [2, 1, 0, 0, 0]
-    assert torch.equal(found[0].cpu(), torch.cat([points[[7, 0]], torch.zeros(3, 3)]))

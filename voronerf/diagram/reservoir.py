@@ -11,21 +11,6 @@ import torch
 from torch import Tensor
 
 
-@torch.no_grad()
-def select_heaviest(points: Tensor, importance: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The `count` samples of largest importance, heaviest first, of float32 [n, 3] and [n]: at most n of them.
-
-    A sample counts if its importance is positive and finite and its point is finite; the last rows are 0 if fewer
-    count. No device value is read on the host.
-    """
-    # What is finite differs from itself by 0, the rest by NaN: less than half the time of isfinite and all.
-    x, y, z = points.unbind(1)
-    finite = (x - x) + (y - y) + (z - z) + (importance - importance) == 0
-    valid = (importance > 0) & finite
-    kept, index = torch.where(valid, importance, 0).topk(min(count, importance.shape[0]))
-    return torch.where(kept[:, None] > 0, points[index], 0), kept
-
-
 class SampleReservoir:
     """The heaviest samples of the last `batches` batches.
 
@@ -63,6 +48,7 @@ class SampleReservoir:
         self._importance = torch.zeros(batches, self.quota, device=device)
         self._added = 0
 
+    @torch.no_grad()
     def add(self, points: Tensor, importance: Tensor) -> None:
         """Keeps the heaviest samples of one batch.
 
@@ -79,13 +65,17 @@ class SampleReservoir:
                 f"got {list(points.shape)} and {list(importance.shape)}"
             )
         device = self._points.device
-        points = points.detach().reshape(-1, 3).to(device, torch.float32)
-        importance = importance.detach().reshape(-1).to(device, torch.float32)
-        heaviest, kept = select_heaviest(points, importance, self.quota)
+        points = points.reshape(-1, 3).to(device, torch.float32)
+        importance = importance.reshape(-1).to(device, torch.float32)
+        # What is finite differs from itself by 0, the rest by NaN: less than half the time of isfinite and all.
+        x, y, z = points.unbind(1)
+        finite = (x - x) + (y - y) + (z - z) + (importance - importance) == 0
+        counted = torch.where((importance > 0) & finite, importance, 0)
+        kept, index = counted.topk(min(self.quota, importance.shape[0]))
         slot = self._added % self.batches
         self._importance[slot] = 0
         self._importance[slot, : kept.shape[0]] = kept
-        self._points[slot, : kept.shape[0]] = heaviest
+        self._points[slot, : kept.shape[0]] = torch.where(kept[:, None] > 0, points[index], 0)
         self._added += 1
 
     def samples(self) -> tuple[Tensor, Tensor]:
