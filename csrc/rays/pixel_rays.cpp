@@ -27,6 +27,8 @@ bool pixel_rays_cpu(const PixelRaysInputs& in, const PixelRaysOutputs& out, int 
         return;
       }
       __builtin_prefetch(in.images + in.channels * in.pixels[i]);
+      const int64_t each = in.h * in.w, camera = in.pixels[i] / each;
+      __builtin_prefetch(table_entry(in, camera, in.pixels[i] - camera * each));
     }
     for (int64_t i = begin; i < end; ++i) pixel_ray(in, out, i);
   });

@@ -9,14 +9,19 @@
 
 namespace voronerf {
 
+// What the table of a lens has of a pixel; null for a camera without distortion.
+VN_HD const float* table_entry(const PixelRaysInputs& in, int64_t camera, int64_t pixel) {
+  if (in.tables == nullptr) return nullptr;
+  const int64_t table = in.lens[camera];
+  return table < 0 || table >= in.l ? nullptr : in.tables + 2 * (table * in.h * in.w + pixel);
+}
+
 VN_HD void pixel_direction(const PixelRaysInputs& in, int64_t camera, int64_t x, int64_t y, float* direction) {
   const float* lens = in.intrinsics + 4 * camera;
   const float* pose = in.poses + 16 * camera;
   const float px = static_cast<float>(x) + 0.5f, py = static_cast<float>(y) + 0.5f;
   float u = (px - lens[2]) / lens[0], v = (py - lens[3]) / lens[1], ahead = 1.0f;
-  const int64_t table = in.tables == nullptr ? -1 : in.lens[camera];
-  if (table >= 0 && table < in.l) {
-    const float* entry = in.tables + 2 * ((table * in.h + y) * in.w + x);
+  if (const float* entry = table_entry(in, camera, y * in.w + x)) {
     u = 2 * entry[0];
     v = 2 * entry[1];
     ahead = 1.0f - (entry[0] * entry[0] + entry[1] * entry[1]);
