@@ -14,6 +14,7 @@ pytest.importorskip("ipykernel", reason="ipykernel is not installed")
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("VORONERF_NOTEBOOK_SECONDS", "1")
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
