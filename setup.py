@@ -44,8 +44,6 @@ LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
 # One of each major version, which runs on its minor ones. Without 100 and 120 a Blackwell GPU would compile the PTX of
 # 90 for minutes when a kernel is first used.
 DEFAULT_ARCHITECTURES = "75;80;90;100;120"
-BINDINGS = 2
-"""Compilations that share the files of csrc/bindings."""
 
 
 class NinjaBuildExt(build_ext):
@@ -56,8 +54,7 @@ class NinjaBuildExt(build_ext):
         build = build_folder()
         build.mkdir(parents=True, exist_ok=True)
         cuda = find_cuda()
-        for name, text in bindings().items():
-            write_if_changed(build / name, text)
+        write_if_changed(build / "bindings.cpp", bindings())
         write_if_changed(build / "build_info.h", build_info(cuda))
         module = build / Path(self.get_ext_filename(ext.name)).name
         write_if_changed(build / "build.ninja", ninja_file(module, cuda))
@@ -163,7 +160,8 @@ def isas() -> dict[str, list[str]]:
     """Instruction sets of the compiler's architecture and their flags."""
     target = subprocess.run([*compiler(), "-dumpmachine"], check=True, capture_output=True, text=True).stdout
     architecture = target.split("-")[0].replace("arm64", "aarch64")
-    return {"portable": ["-DVN_ISA=0"], **ISAS.get(architecture, {})}
+    # For processors that have none of the others; compiled faster.
+    return {"portable": ["-DVN_ISA=0", "-O2"], **ISAS.get(architecture, {})}
 
 
 def build_info(cuda: Cuda) -> str:
@@ -194,12 +192,10 @@ def toolkit_major(nvcc: Path) -> int:
     return int(found[1])
 
 
-def bindings() -> dict[str, str]:
-    """Files that include those of csrc/bindings by turns: to read pybind11 takes the compiler longer than to compile
-    one of them."""
+def bindings() -> str:
+    """A file that includes those of csrc/bindings, whose headers take the compiler longer than themselves."""
     files = sorted((SOURCES / "bindings").glob("*.cpp"))
-    parts = {f"bindings_{part}.cpp": files[part::BINDINGS] for part in range(BINDINGS)}
-    return {name: "".join(f'#include "{file.as_posix()}"\n' for file in part) for name, part in parts.items()}
+    return "".join(f'#include "{file.as_posix()}"\n' for file in files)
 
 
 def ninja_file(module: Path, cuda: Cuda) -> str:
@@ -242,11 +238,10 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
             "  deps = gcc",
             "  description = $out",
         ]
-    objects = [f"{name}.o" for name in bindings()]
-    # First, because they take longest; half as long without loops to optimise, of which they have none.
+    objects = ["bindings.cpp.o"]
+    # Without loops to optimise, of which they have none.
     flags_of_bindings = join(["-O1", *(["-DVN_WITH_CUDA"] if cuda.nvcc is not None else [])])
-    for name in bindings():
-        lines += [f"build {name}.o: cxx {name}", f"  flags = {flags_of_bindings}"]
+    lines += ["build bindings.cpp.o: cxx bindings.cpp", f"  flags = {flags_of_bindings}"]
     for source in sorted(SOURCES.rglob("*.c*")):
         if source.parent.name == "bindings":
             continue

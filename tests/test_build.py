@@ -58,11 +58,6 @@ def test_files_of_one_name_in_two_rooms_make_two_objects(build):
     assert "build geometry/cell_sort.cpp.o" in objects and len(objects) == len(set(objects))
 
 
-def test_every_binding_is_compiled_once(build):
-    included = "".join(build["bindings"]().values()).splitlines()
-    assert sorted(included) == [f'#include "{file}"' for file in sorted((ROOT / "csrc" / "bindings").glob("*.cpp"))]
-
-
 @pytest.mark.parametrize("given", ["", "-Ofast -march=native", "-ffast-math -ffp-contract=fast"])
 def test_arithmetic_is_exact_whatever_flags_are_given(build, monkeypatch, given):
     monkeypatch.setenv("CXXFLAGS", given)

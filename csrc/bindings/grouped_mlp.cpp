@@ -7,7 +7,6 @@ namespace voronerf {
 VN_OPAQUE(MlpCudaCall);
 
 VN_BINDINGS(module) {
-  module.opaque<MlpCudaCall>();
   module.cpu("grouped_mlp", VN_CPU(grouped_mlp_cpu));
   module.cpu("grouped_mlp_backward", VN_CPU(grouped_mlp_backward_cpu));
   module.cuda("grouped_mlp", VN_CUDA(grouped_mlp_cuda));

@@ -1,7 +1,9 @@
 // The Python module voronerf.ops._core._C, which knows tensors by their dtypes and addresses alone and owns nothing.
-// voronerf/ops/_core/native is its only importer, and has validated shapes and devices and allocated outputs and workspaces.
-#include "bindings/module.h"
+// voronerf/ops/_core/native is its only importer, and has validated shapes and devices and allocated outputs and
+// workspaces.
+#include <pybind11/pybind11.h>
 
+#include "bindings/bind.h"
 #include "build_info.h"
 
 PYBIND11_MODULE(_C, module) {
@@ -11,5 +13,5 @@ PYBIND11_MODULE(_C, module) {
   module.attr("cuda_outcome") = VN_CUDA_OUTCOME;
   module.attr("cuda_architectures") = VN_CUDA_ARCHITECTURES;
   module.attr("cuda_major") = VN_CUDA_MAJOR;
-  voronerf::bind_all(module);
+  voronerf::bind_all(module.ptr());
 }

@@ -53,12 +53,12 @@ void bind_chain_layout(py::module_& module) {
   module.def("chain_weight_column", voronerf::chain_weight_column);
   // The plan of a table, or the rule that it breaks.
   module.def("chain_plan",
-             [](voronerf::Argument<voronerf::MlpTable> table, int precision, int64_t n, int64_t k, int capability,
+             [](const py::object& table, int precision, int64_t n, int64_t k, int capability,
                 int shared_bytes, int multiprocessors) -> py::object {
                voronerf::MlpChainPlan plan;
                const voronerf::MlpCudaDevice device = {capability, shared_bytes, multiprocessors, 1 << 20};
                const char* fault =
-                   voronerf::mlp_chain_plan(table.get(),
+                   voronerf::mlp_chain_plan(voronerf::struct_of<voronerf::MlpTable>(table.ptr()),
                                             static_cast<voronerf::MlpPrecision>(precision), n, k, device, plan);
                if (fault != nullptr) return py::str(fault);
                py::dict told;

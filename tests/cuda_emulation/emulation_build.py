@@ -95,8 +95,10 @@ def _build(out, sanitizer):
 
 def _for_python(path):
     """One file with everything that is written for Python: the compiler's time goes into pybind11's headers."""
-    files = [file for file in sorted((ROOT / "csrc" / "bindings").glob("*.cpp")) if "VN_CUDA(" in file.read_text()]
-    text = "".join(f'#include "{file}"\n' for file in [*files, *(HERE / name for name in sorted(PYTHON))])
+    bindings = ROOT / "csrc" / "bindings"
+    files = [file for file in sorted(bindings.glob("*.cpp")) if "VN_CUDA(" in file.read_text()]
+    files += [bindings / "bind.cpp", *(HERE / name for name in sorted(PYTHON))]
+    text = "".join(f'#include "{file}"\n' for file in files)
     _write(path, text)
     return path
 

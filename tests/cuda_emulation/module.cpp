@@ -1,6 +1,4 @@
 // The CUDA half of voronerf.ops._core._C, emulated: the bindings of csrc/bindings over .cu files compiled by g++.
-#include "bindings/module.h"
-
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
@@ -20,7 +18,7 @@ void bind_chain_layout(py::module_& module);
 void planted(const float* values, float* out, int* counter, int blocks, int threads, int bug);
 
 PYBIND11_MODULE(voronerf_emulation, module) {
-  voronerf::bind_all(module);
+  voronerf::bind_all(module.ptr());
   bind_index_maps(module);
   bind_plans(module);
   bind_chain_layout(module);
@@ -32,9 +30,9 @@ PYBIND11_MODULE(voronerf_emulation, module) {
   // What a call's plan says.
   module.def(
       "grouped_mlp_plan",
-      [](voronerf::Argument<voronerf::MlpTable> table, int precision, int64_t n, int64_t k, bool backward, int way) {
+      [](const py::object& table, int precision, int64_t n, int64_t k, bool backward, int way) {
         voronerf::MlpCudaChoice choice;
-        const char* fault = voronerf::mlp_cuda_choose(table.get(), static_cast<voronerf::MlpPrecision>(precision), n, k,
+        const char* fault = voronerf::mlp_cuda_choose(voronerf::struct_of<voronerf::MlpTable>(table.ptr()), static_cast<voronerf::MlpPrecision>(precision), n, k,
                                                       backward, static_cast<voronerf::MlpCudaWay>(way),
                                                       voronerf::mlp_cuda_device(), choice);
         VN_CHECK(fault == nullptr, fault);

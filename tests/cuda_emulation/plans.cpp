@@ -14,13 +14,13 @@ namespace {
 // Capability, shared memory of a block, multiprocessors and bytes of cache.
 using Device = std::vector<int64_t>;
 
-py::dict plan_for(voronerf::Argument<voronerf::MlpTable> table, int precision, int64_t n, int64_t k, bool backward,
+py::dict plan_for(const py::object& table, int precision, int64_t n, int64_t k, bool backward,
                   const Device& given) {
   const voronerf::MlpCudaDevice device{static_cast<int>(given[0]), static_cast<int>(given[1]),
                                        static_cast<int>(given[2]), given[3]};
   voronerf::MlpCudaChoice choice;
   const char* fault =
-      voronerf::mlp_cuda_choose(table.get(), static_cast<voronerf::MlpPrecision>(precision), n, k,
+      voronerf::mlp_cuda_choose(voronerf::struct_of<voronerf::MlpTable>(table.ptr()), static_cast<voronerf::MlpPrecision>(precision), n, k,
                                 backward, voronerf::MlpCudaWay::automatic, device, choice);
   if (fault != nullptr) throw std::runtime_error(fault);
   py::dict plan;

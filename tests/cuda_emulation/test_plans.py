@@ -8,7 +8,7 @@ from emulated_networks import BRANCHED, GAUSSIANS, KIB, WIDE, check
 from helpers import refuses
 from network_plans import PRECISIONS, SHARED, SIZES, assert_covers, nerf, plan, table
 
-from voronerf.nerf.fields import DensityField, HashGridField, NeRF
+from voronerf.nerf.fields import HashGridField, NeRF
 
 MIB = 1024 * KIB
 # Capability, shared memory that a block may ask for, multiprocessors, second-level cache.
@@ -28,7 +28,6 @@ NETWORKS = {
     "w64d4": NeRF(64, depth=4, view_directions=False, **OCTAVES).layers,
     "mlp32": NeRF(32, depth=2, view_directions=True, **OCTAVES).layers,
     **{f"nerf{w}": NeRF(w, depth=8, skips=(4,), view_directions=True, **OCTAVES).layers for w in (64, 256, 1024)},
-    "density": DensityField(32, depth=2, position_octaves=6, position_encoding="frequency").layers,
     "branched": BRANCHED,
     "wide": WIDE,
     "gaussians": GAUSSIANS,

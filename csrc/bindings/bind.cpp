@@ -1,0 +1,456 @@
+// Calls from Python of what the binding files list: the only file that reads pybind11.
+#include "bindings/bind.h"
+
+#include <pybind11/pybind11.h>
+
+#include <algorithm>
+#include <cstring>
+#include <deque>
+#include <map>
+#include <optional>
+#include <stdexcept>
+
+#include "common/cuda_device.h"
+
+namespace voronerf {
+
+namespace py = pybind11;
+
+namespace {
+
+constexpr size_t kMostParameters = 24;
+constexpr size_t kMostBytes = 2048;  // of all parameters of a call
+
+struct Bound {
+  Module::AnyFunction function;
+  Module::Call call;
+  std::vector<const Type*> given;       // by Python
+  std::vector<const Type*> parameters;  // of the function
+  const Type *result, *machine;         // null: none
+};
+
+struct Function {
+  std::string name;
+  std::vector<Bound> overloads;
+};
+
+std::map<std::string, Function>& functions() {
+  static std::map<std::string, Function> all;
+  return all;
+}
+
+// Objects that Python has for dtypes, by the names of load.h.
+std::map<std::string, PyObject*>& dtypes() {
+  static std::map<std::string, PyObject*> known;
+  return known;
+}
+
+// What a call has taken from Python, given back when it ends.
+class Frame {
+ public:
+  Frame() = default;
+  Frame(const Frame&) = delete;
+  Frame& operator=(const Frame&) = delete;
+  ~Frame() {
+    for (PyObject* each : kept_) Py_DECREF(each);
+  }
+
+  // False: not of that type. `place` becomes that of an opaque object itself.
+  bool load(const Type& type, PyObject* given, void*& place) {
+    switch (type.kind) {
+      case Type::Kind::boolean:
+        if (!PyBool_Check(given)) return false;
+        *static_cast<bool*>(place) = given == Py_True;
+        return true;
+      case Type::Kind::integer: {
+        if (!PyLong_Check(given)) return false;
+        const auto value =
+            type.is_signed ? PyLong_AsLongLong(given) : static_cast<long long>(PyLong_AsUnsignedLongLong(given));
+        if (value == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
+        store(place, value, type.size);
+        return true;
+      }
+      case Type::Kind::floating: {
+        if (!PyFloat_Check(given) && !PyLong_Check(given)) return false;
+        const double value = PyFloat_AsDouble(given);
+        if (type.size == sizeof(float)) {
+          *static_cast<float*>(place) = static_cast<float>(value);
+        } else {
+          *static_cast<double*>(place) = value;
+        }
+        return true;
+      }
+      case Type::Kind::enumeration:
+        if (!PyUnicode_Check(given)) return false;
+        for (size_t i = 0; i < type.values.size(); ++i) {
+          if (PyUnicode_CompareWithASCIIString(given, type.values[i].c_str()) != 0) continue;
+          store(place, static_cast<long long>(i), type.size);
+          return true;
+        }
+        return false;
+      case Type::Kind::tensor:
+        return load_tensor(type, given, *static_cast<void**>(place));
+      case Type::Kind::tensors:
+        *static_cast<void***>(place) = nullptr;
+        if (given == Py_None) return true;
+        arrays_.emplace_back();
+        return load_sequence(*type.of, given, [&](size_t count) {
+          arrays_.back().resize(count + 1);
+          *static_cast<void***>(place) = arrays_.back().data();
+          return arrays_.back().data();
+        });
+      case Type::Kind::sequence:
+        return load_sequence(*type.of, given, [&](size_t count) { return type.resize(place, count); });
+      case Type::Kind::structure:
+        return load_structure(type, given, static_cast<char*>(place));
+      case Type::Kind::opaque:
+        if (!PyCapsule_IsValid(given, type.exact.c_str())) return false;
+        place = PyCapsule_GetPointer(given, type.exact.c_str());
+        return true;
+      default:
+        return false;
+    }
+  }
+
+ private:
+  static void store(void* place, long long value, size_t size) { std::memcpy(place, &value, size); }
+
+  // Tensors: anything with a dtype, contiguous(), is_contiguous(), is_neg(), resolve_neg() and data_ptr().
+  bool load_tensor(const Type& type, PyObject* given, void*& address) {
+    address = nullptr;
+    if (given == Py_None) return true;
+    static PyObject *const dtype_word = PyUnicode_InternFromString("dtype"),
+                           *const address_word = PyUnicode_InternFromString("data_ptr"),
+                           *const negative_word = PyUnicode_InternFromString("is_neg"),
+                           *const resolve_word = PyUnicode_InternFromString("resolve_neg"),
+                           *const contiguous_word = PyUnicode_InternFromString("contiguous"),
+                           *const is_contiguous_word = PyUnicode_InternFromString("is_contiguous");
+    if (type.dtype != "any") {
+      if (type.known_dtype == nullptr) type.known_dtype = dtypes().at(type.dtype);
+      PyObject* const dtype = PyObject_GetAttr(given, dtype_word);
+      Py_XDECREF(dtype);  // a dtype lives as long as Python
+      if (dtype != type.known_dtype) return PyErr_Clear(), false;
+    }
+    PyObject* const answer = PyObject_CallMethodNoArgs(given, type.constant ? contiguous_word : is_contiguous_word);
+    if (answer == nullptr) return PyErr_Clear(), false;
+    if (type.constant) {
+      kept_.push_back(answer);
+    } else {
+      Py_DECREF(answer);  // True or False
+      if (answer != Py_True) return false;
+      Py_INCREF(given);
+      kept_.push_back(given);
+    }
+    PyObject* const negative = PyObject_CallMethodNoArgs(kept_.back(), negative_word);
+    if (negative == nullptr) return PyErr_Clear(), false;
+    Py_DECREF(negative);        // True or False
+    if (negative == Py_True) {  // memory holds the values negated, as of x.conj().imag
+      PyObject* const resolved = type.constant ? PyObject_CallMethodNoArgs(kept_.back(), resolve_word) : nullptr;
+      if (resolved == nullptr) return PyErr_Clear(), false;
+      Py_DECREF(std::exchange(kept_.back(), resolved));
+    }
+    PyObject* const number = PyObject_CallMethodNoArgs(kept_.back(), address_word);
+    if (number == nullptr) return PyErr_Clear(), false;
+    void* const found = PyLong_AsVoidPtr(number);
+    Py_DECREF(number);
+    alignas(64) static char nothing[64];
+    address = found == nullptr ? nothing : found;
+    return true;
+  }
+
+  template <typename Resize>
+  bool load_sequence(const Type& type, PyObject* given, const Resize& resize) {
+    PyObject* const items = PySequence_Fast(given, "");
+    if (items == nullptr) return PyErr_Clear(), false;
+    kept_.push_back(items);
+    const Py_ssize_t count = PySequence_Fast_GET_SIZE(items);
+    char* const data = static_cast<char*>(static_cast<void*>(resize(static_cast<size_t>(count))));
+    for (Py_ssize_t i = 0; i < count; ++i) {
+      void* place = data + i * static_cast<Py_ssize_t>(type.size);
+      if (!load(type, PySequence_Fast_GET_ITEM(items, i), place)) return false;
+    }
+    return true;
+  }
+
+  bool load_structure(const Type& type, PyObject* given, char* place) {
+    if (!is_one(type, given)) return false;
+    for (size_t i = 0; i < type.members.size(); ++i) {
+      const Member& member = type.members[i];
+      void* at = place + member.offset;
+      if (load(*member.type, PyTuple_GET_ITEM(given, static_cast<Py_ssize_t>(i)), at)) continue;
+      throw py::type_error(type.exact + ": " + member.name + " is no " + member.type->exact);
+    }
+    return true;
+  }
+
+  // A named tuple of these members.
+  static bool is_one(const Type& type, PyObject* given) {
+    if (Py_TYPE(given) == type.known_class) return true;
+    if (!PyTuple_Check(given)) return false;
+    PyObject* const names = PyObject_GetAttrString(given, "_fields");
+    if (names == nullptr) return PyErr_Clear(), false;
+    bool same = PyTuple_Check(names) && PyTuple_GET_SIZE(names) == static_cast<Py_ssize_t>(type.members.size());
+    for (size_t i = 0; same && i < type.members.size(); ++i) {
+      PyObject* const name = PyTuple_GET_ITEM(names, static_cast<Py_ssize_t>(i));
+      same = PyUnicode_Check(name) && PyUnicode_CompareWithASCIIString(name, type.members[i].name.c_str()) == 0;
+    }
+    Py_DECREF(names);
+    if (!same) return false;
+    Py_INCREF(Py_TYPE(given));
+    type.known_class = Py_TYPE(given);
+    return true;
+  }
+
+  std::vector<PyObject*> kept_;
+  std::deque<std::vector<void*>> arrays_;
+};
+
+// Values of parameters, made when they are loaded.
+class Values {
+ public:
+  Values() = default;
+  Values(const Values&) = delete;
+  Values& operator=(const Values&) = delete;
+  ~Values() {
+    for (size_t i = 0; i < count_; ++i) {
+      if (types_[i]->construct != nullptr) types_[i]->destroy(begins_[i]);
+    }
+  }
+  bool load(Frame& frame, const Type& type, PyObject* given) {
+    void*& begin = begins_[count_];
+    begin = memory_ + used_;
+    used_ += (type.size + alignof(std::max_align_t) - 1) / alignof(std::max_align_t) * alignof(std::max_align_t);
+    if (type.construct != nullptr) type.construct(begin);
+    types_[count_] = &type;
+    places_[count_] = begin;
+    return frame.load(type, given, places_[count_++]);
+  }
+  void* const* places() const { return places_; }
+  void replace(size_t i, void* place) { places_[i] = place; }
+
+ private:
+  alignas(std::max_align_t) char memory_[kMostBytes];
+  void *begins_[kMostParameters], *places_[kMostParameters];
+  const Type* types_[kMostParameters];
+  size_t count_ = 0, used_ = 0;
+};
+
+union Result {
+  bool boolean;
+  long long integer;
+  float single;
+  double real;
+  const char* text;
+  void* object;
+};
+
+py::object to_python(const Type* type, const Result& result) {
+  if (type == nullptr) return py::none();
+  switch (type->kind) {
+    case Type::Kind::boolean:
+      return py::bool_(result.boolean);
+    case Type::Kind::integer:
+      return py::int_(type->size == 4 ? static_cast<int32_t>(result.integer) : result.integer);
+    case Type::Kind::floating:
+      return py::float_(type->size == 4 ? static_cast<double>(result.single) : result.real);
+    case Type::Kind::text:
+      if (result.text == nullptr) return py::none();
+      return py::str(result.text);
+    default: {
+      py::capsule owner(result.object, type->destroy);
+      owner.set_name(type->exact.c_str());
+      return std::move(owner);
+    }
+  }
+}
+
+py::object run(const Bound& bound, Values& values) {
+  void* stream = nullptr;
+  [[maybe_unused]] int device = 0;
+  const size_t own = bound.given.size() - (bound.machine != nullptr);
+  if (bound.machine == &type_of<Cpu>()) {
+    auto& cpu = *static_cast<Cpu*>(values.places()[own]);
+    values.replace(bound.parameters.size() - 1, &cpu.threads);
+    if (bound.parameters.size() == own + 2) values.replace(own, &cpu.isa);
+  } else if (bound.machine != nullptr) {
+    const Cuda& cuda = *static_cast<const Cuda*>(values.places()[own]);
+    device = cuda.device;
+    stream = reinterpret_cast<void*>(cuda.stream);
+    values.replace(own, &stream);
+  }
+  Result result{};
+  {
+    std::optional<py::gil_scoped_release> released;
+    if (bound.machine != nullptr) released.emplace();
+#ifdef VN_WITH_CUDA
+    std::optional<CudaDevice> current;
+    if (bound.machine == &type_of<Cuda>()) current.emplace(device);
+#endif
+    bound.call(bound.function, values.places(), &result);
+  }
+  return to_python(bound.result, result);
+}
+
+py::object call_any(const Function& function, const py::args& given) {
+  for (const Bound& bound : function.overloads) {
+    if (bound.function == nullptr || bound.given.size() != given.size()) continue;
+    Frame frame;
+    Values values;
+    size_t i = 0;
+    while (i < given.size() &&
+           values.load(frame, *bound.given[i], PyTuple_GET_ITEM(given.ptr(), static_cast<Py_ssize_t>(i)))) {
+      ++i;
+    }
+    if (i == given.size()) return run(bound, values);
+  }
+  throw py::type_error(function.name + ": incompatible function arguments");
+}
+
+// CRC-32 as in zlib.
+uint32_t checksum(const std::string& text) {
+  uint32_t sum = ~0u;
+  for (const char letter : text) {
+    sum ^= static_cast<unsigned char>(letter);
+    for (int bit = 0; bit < 8; ++bit) sum = sum >> 1 ^ ((sum & 1) != 0 ? 0xEDB88320u : 0u);
+  }
+  return ~sum;
+}
+
+constexpr const char* kStub =
+    "# The compiled module, written by its build from what csrc/bindings binds; the checksum is its interface.\n"
+    "# A comment has the exact types of the C++ function, whose parameters these are. A tensor is contiguous, or "
+    "becomes\n"
+    "# so where it is const; None is a null pointer.\n"
+    "from collections.abc import Sequence\n"
+    "from typing import NamedTuple, overload\n"
+    "\n"
+    "import torch\n"
+    "from torch import Tensor\n"
+    "\n"
+    "interface: int\n"
+    "stub: str\n"
+    "compiler: str\n"
+    "openmp: bool\n"
+    "cuda: bool\n"
+    "cuda_outcome: str\n"
+    "cuda_architectures: str\n"
+    "cuda_major: int\n"
+    "\n"
+    "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n";
+
+// What is bound, as a stub for type checkers (voronerf/ops/_core/_C.pyi), and the classes that it needs.
+class Declarations {
+ public:
+  explicit Declarations(const py::module_& module) : module_(module) {}
+
+  void declare(const Type& type) {
+    if (type.of != nullptr) declare(*type.of);
+    if (type.kind == Type::Kind::opaque) {
+      texts_[type.exact] = "class " + type.exact + ": ...\n";
+    } else if (type.kind == Type::Kind::enumeration && texts_.count(type.exact) == 0) {
+      std::string names;
+      for (const std::string& value : type.values) names += (names.empty() ? "" : " ") + value;
+      texts_[type.exact] = type.exact + ": tuple[str, ...]  # " + names + "\n";
+      module_.attr(type.exact.c_str()) = tuple_of(type.values);
+    } else if (type.kind == Type::Kind::structure && texts_.count(type.exact) == 0) {
+      std::string& text = texts_[type.exact] = "class " + type.exact + "(NamedTuple):\n";
+      std::vector<std::string> names;
+      for (const Member& member : type.members) {
+        declare(*member.type);
+        const std::string &python = member.type->python, &exact = member.type->exact;
+        text += "    " + member.name + ": " + python + (python == exact ? "\n" : "  # " + exact + "\n");
+        names.push_back(member.name);
+      }
+      module_.attr(type.exact.c_str()) =
+          py::module_::import("collections").attr("namedtuple")(type.exact, tuple_of(names));
+    }
+  }
+
+  void declare(const Function& function) {
+    std::vector<std::string> lines;
+    text_ += "\n";
+    for (const Bound& bound : function.overloads) {
+      std::string line = "def " + function.name + "(";
+      for (size_t i = 0; i < bound.given.size(); ++i) {
+        declare(*bound.given[i]);
+        line += (i == 0 ? "_" : ", _") + std::to_string(i) + ": " + bound.given[i]->python;
+      }
+      if (bound.result != nullptr) declare(*bound.result);
+      lines.push_back(line + ") -> " + (bound.result == nullptr ? "None" : bound.result->python) + ": ...\n");
+    }
+    const bool overloaded = std::count(lines.begin(), lines.end(), lines[0]) < static_cast<long>(lines.size());
+    for (size_t i = 0; i < lines.size(); ++i) {
+      std::string exact;
+      for (const Type* each : function.overloads[i].given) exact += (exact.empty() ? "" : ", ") + each->exact;
+      text_ += "# " + exact + "\n";
+      if (std::find(lines.begin(), lines.end(), lines[i]) != lines.begin() + static_cast<long>(i)) continue;
+      text_ += (overloaded ? "@overload\n" : "") + lines[i];
+    }
+  }
+
+  std::string stub() const {
+    std::string text = kStub;
+    for (const auto& entry : texts_) text += "\n" + entry.second;
+    return text + text_;
+  }
+
+ private:
+  static py::tuple tuple_of(const std::vector<std::string>& texts) {
+    py::list all;
+    for (const std::string& text : texts) all.append(text);
+    return py::tuple(all);
+  }
+
+  py::module_ module_;
+  std::map<std::string, std::string> texts_;
+  std::string text_;
+};
+
+}  // namespace
+
+void Module::add(const char* name, AnyFunction function, Call call, std::vector<const Type*> parameters,
+                 const Type* result, const Type* machine) {
+  std::vector<const Type*> given = parameters;
+  if (machine != nullptr) {
+    const bool two = given.size() > 1 && given[given.size() - 2] == &type_of<Isa>();
+    if (machine == &type_of<Cpu>()) given.resize(given.size() - (two ? 2 : 1));
+    if (machine == &type_of<Cuda>() && given.back() == &type_of<void*>()) given.pop_back();
+    given.push_back(machine);
+  }
+  size_t bytes = 0;
+  for (const Type* type : given) bytes += type->size + alignof(std::max_align_t);
+  if (bytes > kMostBytes || given.size() >= kMostParameters) throw std::logic_error(name);
+  Function& all = functions()[name];
+  all.name = name;
+  all.overloads.push_back({function, call, std::move(given), std::move(parameters), result, machine});
+}
+
+void load_struct(const Type& type, PyObject* given, void* place) {
+  Frame frame;
+  if (!frame.load(type, given, place)) throw std::invalid_argument(type.exact);
+}
+
+void bind_all(PyObject* python) {
+  auto bound = py::reinterpret_borrow<py::module_>(python);
+  Module module;
+  for (const auto bind : bindings()) bind(module);
+  Declarations declarations(bound);
+  for (const auto& [name, function] : functions()) {
+    declarations.declare(function);
+    bool there = false;
+    for (const Bound& one : function.overloads) there = there || one.function != nullptr;
+    if (!there) continue;
+    bound.def(name.c_str(), [one = &function](const py::args& given) { return call_any(*one, given); });
+  }
+  // The dtypes of tensors, objects of Python that this module knows by name alone.
+  bound.def("name_dtypes", [](const py::dict& names) {
+    for (const auto& entry : names) {
+      dtypes()[py::cast<std::string>(entry.first)] = py::reinterpret_borrow<py::object>(entry.second).release().ptr();
+    }
+  });
+  const std::string text = declarations.stub();
+  bound.attr("stub") = text;
+  bound.attr("interface") = checksum(text);
+}
+
+}  // namespace voronerf
