@@ -177,12 +177,6 @@ class Checked:
         if tensor is not None:
             self.tensor(name, tensor, dtypes, *shape)
 
-    def each_or_all(self, name: str, tensor: Tensor | None, dtypes: Sequence[torch.dtype], *shape: int | str) -> None:
-        """`optional`, of which the first dimension may be missing: the same row for all."""
-        if tensor is not None:
-            check_tensor(self.op, name, tensor)
-            self.tensor(name, tensor, dtypes, *shape[tensor.dim() == len(shape) - 1 :])
-
     def first_float(self) -> Tensor:
         """The first floating-point tensor."""
         assert self._float is not None

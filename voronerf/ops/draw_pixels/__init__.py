@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, Implementation
-from voronerf.ops._core.checks import INDEX, Checked, check_integer, check_same_device
+from voronerf.ops._core.checks import check_same_device
+from voronerf.ops._core.declare import declare
 from voronerf.ops.draw_pixels.reference import Runs
 
-_OP = backends.declare("draw_pixels", native=Implementation(EVERYWHERE, (torch.int32,)))
+
+def _prepare(given: Any) -> Any:
+    runs, below = given.runs, given.below
+    if runs is not None:
+        check_same_device("draw_pixels", seed=given.seed, ends=runs.ends, shift=runs.shift, first=runs.first)
+        if below != runs.total:
+            raise ValueError(f"draw_pixels: below must be the {runs.total} pixels of the runs, got {below}")
+    return given
 
 
+@declare(native=Implementation(EVERYWHERE, (torch.int32,)), prepare=_prepare)
 def draw_pixels(
-    seed: Tensor, count: int, below: int, *, runs: Runs | None = None, backend: str = "auto"
-) -> tuple[Tensor, Tensor]:
+    seed: Annotated[Tensor, "int32 [1]"],
+    count: Annotated[int, "1.."],
+    below: Annotated[int, "1..281474976710656"],
+    *,
+    runs: Runs | None = None,
+    backend: str = "auto",
+) -> tuple[Annotated[Tensor, "int64 [count]"], Annotated[Tensor, "float32 [count, 3]"]]:
     """Pixels, and three uniform numbers for each; all are hashes of the seed and of the number in the batch.
 
     The same on every backend and on any number of threads. Not differentiable.
@@ -37,15 +52,3 @@ def draw_pixels(
         >>> int(pixels.min()), int(pixels.max()), uniforms.shape
         (0, 49, torch.Size([1000, 3]))
     """
-    Checked(_OP).tensor("seed", seed, INDEX, 1)
-    check_integer(_OP, "count", count, 1)
-    check_integer(_OP, "below", below, 1, 2**48)
-    if runs is not None:
-        if not isinstance(runs, Runs):
-            raise TypeError(f"{_OP}: runs must be Runs, got {type(runs).__name__}")
-        check_same_device(_OP, seed=seed, ends=runs.ends, shift=runs.shift, first=runs.first)
-        if below != runs.total:
-            raise ValueError(f"{_OP}: below must be the {runs.total} pixels of the runs, got {below}")
-    run = backends.resolve(_OP, backend=backend, device=seed.device, dtype=seed.dtype)
-    pixels, uniforms = run(seed, count, below, runs)
-    return pixels, uniforms

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import torch
+from typing import Any
+
 from torch import Tensor
 
 from voronerf.ops._core import native
-from voronerf.ops.draw_pixels.reference import Runs
+from voronerf.ops._core.declare import declared
 
 
-def draw_pixels(seed: Tensor, count: int, below: int, runs: Runs | None) -> tuple[Tensor, Tensor]:
+@declared("draw_pixels").plain
+def draw_pixels(given: Any, found: tuple[Tensor, Tensor]) -> None:
     """Pixels, and three uniform numbers for each; see ``voronerf.ops.draw_pixels.reference``."""
-    pixels, uniforms = seed.new_empty(count, dtype=torch.int64), seed.new_empty(count, 3, dtype=torch.float32)
-    ends, shift, first, bits, _ = (None, None, None, 0, below) if runs is None else runs
-    given = native.compiled.DrawPixelsInputs(
+    seed, count, below, runs = given
+    ends, shift, first, bits, _ = runs or (None, None, None, 0, below)
+    inputs = native.compiled.DrawPixelsInputs(
         seed=seed, ends=ends, shift=shift, first=first, bits=bits, below=below, b=count
     )
-    native.compiled.draw_pixels(given, pixels, uniforms, native.machine(seed))
-    return pixels, uniforms
+    native.compiled.draw_pixels(inputs, *found, native.machine(seed))

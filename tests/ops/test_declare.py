@@ -1,0 +1,54 @@
+"""What follows from the signature of an op."""
+
+from __future__ import annotations
+
+import inspect
+from collections import namedtuple
+
+import pytest
+import torch
+
+from voronerf.ops import cell_sort, composite
+from voronerf.ops._core.declare import Shaped, declared
+
+
+def test_the_public_function_has_the_signature_and_the_docstring():
+    assert list(inspect.signature(cell_sort).parameters) == ["cells", "k", "backend"]
+    assert cell_sort.__module__ == "voronerf.ops.cell_sort" and cell_sort.__doc__.startswith("Stable order")
+    with pytest.raises(TypeError, match=r"cell_sort\(\) missing 1 required positional argument: 'k'"):
+        cell_sort(torch.zeros(1, dtype=torch.int32))
+
+
+def test_memory_follows_letters_arguments_and_dtypes():
+    op = declared("cell_sort")
+    order, offsets = op.allocate(op.Inputs(torch.zeros(5, dtype=torch.int32), 3))
+    assert order.shape == (5,) and offsets.shape == (4,) and offsets.dtype == torch.int32
+    sort = declared("nearest_centre")
+    assert sort.allocate(sort.Inputs(torch.zeros(5, 3).double(), torch.zeros(2, 3).double())).dtype == torch.int32
+
+
+def test_letters_of_either_form():
+    op = declared("composite")
+    dense, packed = torch.zeros(2, 7), torch.zeros(14)
+    given = op.Inputs(dense, torch.zeros(2, 7, 3), dense, dense, None, None)
+    assert (given.r, given.s, given.c) == (2, 7, 3)
+    offsets = torch.tensor([0, 4, 9, 14], dtype=torch.int32)
+    given = op.Inputs(packed, torch.zeros(14, 3), packed, packed, offsets, torch.zeros(3))
+    assert (given.r, given.m, given.c, given.s) == (3, 14, 3, 0)
+    assert composite(*given[:4], ray_offsets=offsets, background=torch.zeros(3)).colour.shape == (3, 3)
+
+
+def test_a_struct_with_other_members_is_refused_at_once():
+    kind = namedtuple("CellInputs", ["cells", "n", "threads"])
+    op = declared("cell_sort")
+    with pytest.raises(
+        NameError, match=r"cell_sort: CellInputs must have members of its declaration, got \['threads'\]"
+    ):
+        op.inputs(kind)
+    cells = torch.zeros(5, dtype=torch.int32)
+    assert op.inputs(kind, threads="2 * k")(op.Inputs(cells, 3)) == (cells, 5, 6)
+
+
+def test_what_is_no_shape_is_refused():
+    with pytest.raises(AssertionError, match="a tensor is written as dtypes and a shape, got 'floating n'"):
+        Shaped.parse("floating n")
