@@ -1,6 +1,7 @@
 """The loop of a training on a tiny built-in scene: stages, splits, files, the grid, and that it never dies."""
 
 import math
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import read_json, refuses, trained
+from helpers import read_json, refuses, script, trained
 from tiny_runs import HIERARCHICAL, Each, small, started, steps_of
 
 from voronerf.app import open_run
@@ -332,3 +333,13 @@ def test_callbacks_are_called_in_their_order(scene):
     run(build(small(steps=2, split_at=(1,)), scene), [Says("a"), Says("b")])
     assert said[:2] == [("a", "start"), ("b", "start")] and said[-2:] == [("a", "end"), ("b", "end")]
     assert said[2:-2] == [(name, what) for what in (1, True, 2) for name in "ab"]
+
+
+def test_the_example_is_the_whole_method(scene, monkeypatch):
+    """On the library alone: it learns in a second, and has made its split."""
+    file = Path(__file__).resolve().parents[3] / "examples" / "train.py"
+    lines = file.read_text().splitlines()
+    assert len(lines) <= 45 and not any("voronerf.app.train" in line for line in lines)
+    monkeypatch.setattr("voronerf.app.scenes.load_scene", lambda name: scene)
+    found = re.search(r"(\d+) steps, 16 cells, PSNR ([\d.]+)", script(file, "builtin", 1))
+    assert int(found[1]) > 10 and float(found[2]) > 12
