@@ -109,16 +109,12 @@ def test_similarities(torch_seed) -> None:
     other = Similarity.of((0, 1, 0), (0, 90, 0))
     assert torch.allclose((frame @ other).points(points), frame.points(other.points(points)))
     assert torch.allclose(other.points(torch.tensor([[0.0, 0, 1]])), torch.tensor([[1.0, 1, 0]]), atol=1e-6)
-    matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3], matrix[:3, 3] = frame.scale * frame.rotation, frame.translation
-    assert torch.allclose(Similarity.of_matrix(matrix.tolist()).points(points), frame.points(points))
     mirror = torch.diag(torch.tensor([1.0, 1, -1]))
     refuses("scale must be positive and finite, got 0", lambda: Similarity(0.0))
     refuses("scale must be positive and finite, got -1", lambda: Similarity(-1.0))
     refuses("must not mirror", lambda: Similarity(1.0, mirror))
     refuses("must be orthonormal", lambda: Similarity(1.0, 2 * torch.eye(3)))
     refuses("translation must be [3] finite", lambda: Similarity(translation=torch.tensor([0, math.nan, 0])))
-    refuses("must have shape [4, 4]", lambda: Similarity.of_matrix([[1.0]]))
 
 
 def test_solids_move_with_their_frames(torch_seed) -> None:

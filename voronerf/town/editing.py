@@ -9,8 +9,7 @@ import itertools
 import math
 import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -531,33 +530,21 @@ def check_out(out: Path) -> None:
         raise ConfigError(f"--out must be a new or an empty folder, got {out}")
 
 
-@contextmanager
-def new_folder(out: Path) -> Iterator[Path]:
-    """A folder to write a run into, which becomes ``out`` when all of it is there; else nothing is left.
-
-    Raises:
-        ConfigError: When there is something in ``out``.
-        OSError: When it cannot be written; names ``out``.
-    """
+def _write(source: Source, out: Path) -> Source:
+    """Writes a run of parts into a new folder, whole or not at all."""
     check_out(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.parent / f".{out.name[:100]}.{os.getpid()}.partial"
     try:
         partial.mkdir()
-        yield partial
-        os.replace(partial, out)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror or str(error), str(out)) from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def _write(source: Source, out: Path) -> Source:
-    """Writes a run of parts, whole or not at all."""
-    with new_folder(out) as partial:
         config = replace(source.config, out=out)
         write_parts(partial, config, source.parts, source.grid)
         write_text(partial / TOWN, json_text({"parts": len(source.parts.parts)}) + "\n")
         write_text(partial / "config.json", config.to_json())
         write_scene(partial / "scene.json", source.scene)
+        os.replace(partial, out)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(out)) from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
     return source

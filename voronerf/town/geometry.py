@@ -79,15 +79,6 @@ class Similarity:
             rotation = turn @ rotation
         return cls(float(scale), rotation, torch.tensor(translation, dtype=torch.float64))
 
-    @classmethod
-    def of_matrix(cls, matrix: Any) -> Similarity:
-        """From a matrix [3, 4] or [4, 4]."""
-        matrix = torch.as_tensor(matrix, dtype=torch.float64)
-        if matrix.dim() != 2 or matrix.shape[0] not in (3, 4) or matrix.shape[1] != 4:
-            raise ValueError(f"Similarity: a matrix must have shape [4, 4] or [3, 4], got {list(matrix.shape)}")
-        scale = float(matrix[0, :3].norm())
-        return cls(scale, matrix[:3, :3] / (scale or 1), matrix[:3, 3])
-
     @functools.cached_property
     def is_identity(self) -> bool:
         """Whether it moves nothing, but for rounding."""

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import tyro
@@ -15,7 +15,7 @@ import tyro
 from voronerf.app.cli.display import TrainingDisplay, say
 from voronerf.app.cli.train import stopped_by_signals
 from voronerf.app.evaluate.panels import write_panels
-from voronerf.app.files import json_text, read_json, write_text
+from voronerf.app.files import json_text, write_text
 from voronerf.app.scenes import BUILTIN, load_scene
 from voronerf.app.scenes.record import read_scene
 from voronerf.app.train.build import check_device
@@ -47,7 +47,6 @@ def join(
     /,
     out: Path,
     move: tyro.conf.UseAppendAction[tuple[tuple[str, str], ...]] = (),
-    transforms: Path | None = None,
     align: bool = False,
 ) -> int:
     """Make one run of several. Where they overlap the nearest centre decides; the runs stay as they are.
@@ -57,16 +56,14 @@ def join(
         out: The new run directory.
         move: N "tx ty tz rx ry rz s", once for each run that moves: the run with this number, the first being 1, is
             scaled by s, turned by angles in degrees about x, y, z and moved.
-        transforms: JSON file with such transforms: {"2": {"translation": [..], "degrees": [..], "scale": 1}}, or a
-            matrix of 4 x 4 in the place of an object.
         align: Find the transforms of all runs but the first, from the cameras of images with names that both have.
     """
     check_out(out)
     if len(runs) < 2:
         raise ConfigError(f"join needs two runs or more, got {len(runs)}")
-    frames = given_frames(len(runs), move, transforms)
+    frames = given_frames(len(runs), move)
     if align and frames:
-        raise ConfigError("give --align, or --move and --transforms, not both")
+        raise ConfigError("give --align or --move, not both")
     if align:
         first, *others = (read_scene(run / "scene.json") for run in runs)
         for number, scene in enumerate(others, 1):
@@ -80,42 +77,22 @@ def join(
     return tell(out, editing.join(runs, out, frames=every))
 
 
-def given_frames(runs: int, move: Sequence[tuple[str, str]], transforms: Path | None) -> dict[int, Similarity]:
-    """The transforms of the command line and of a JSON file, by the number of their run from 0."""
+def given_frames(runs: int, move: Sequence[tuple[str, str]]) -> dict[int, Similarity]:
+    """The transforms of --move, by the number of their run from 0."""
     found: dict[int, Similarity] = {}
-    stored: Any = {} if transforms is None else read_json(transforms)
-    if not isinstance(stored, dict):
-        raise ConfigError(f"{transforms}: must be an object with a transform for each run, got {stored!r:.60}")
-    named = [(f"--move {n}", n, text) for n, text in move]
-    for where, number, value in [*named, *((f"{transforms}: {n}", n, value) for n, value in stored.items())]:
+    for number, text in move:
         if not number.isdecimal() or not 1 <= int(number) <= runs:
-            raise ConfigError(f"{where}: must be the number of a run, 1 to {runs}")
+            raise ConfigError(f"--move {number}: must be the number of a run, 1 to {runs}")
         if int(number) - 1 in found:
-            raise ConfigError(f"{where}: must be given once")
+            raise ConfigError(f"--move {number}: must be given once")
         try:
-            found[int(number) - 1] = frame_of(value)
-        except (ValueError, TypeError, KeyError) as error:
-            raise ConfigError(f"{where}: {error}") from None
+            numbers = [float(word) for word in text.replace(",", " ").split()]
+            if len(numbers) != 7:
+                raise ValueError(f"must be {MOVE}, seven numbers, got {len(numbers)}")
+            found[int(number) - 1] = Similarity.of(numbers[:3], numbers[3:6], numbers[6])
+        except ValueError as error:
+            raise ConfigError(f"--move {number}: {error}") from None
     return found
-
-
-def frame_of(value: Any) -> Similarity:
-    """A transform as seven numbers in a text, as an object, or as a matrix.
-
-    Raises:
-        ValueError: For anything else, scale 0 and mirror images among it.
-        TypeError: For what is no number.
-    """
-    if isinstance(value, str):
-        numbers = [float(word) for word in value.replace(",", " ").split()]
-        if len(numbers) != 7:
-            raise ValueError(f"must be {MOVE}, seven numbers, got {len(numbers)}")
-        return Similarity.of(numbers[:3], numbers[3:6], numbers[6])
-    if isinstance(value, list):
-        return Similarity.of_matrix(value)
-    if not isinstance(value, dict) or (odd := sorted(value.keys() - {"translation", "degrees", "scale"})):
-        raise ValueError(f"must have translation, degrees and scale, got {odd if isinstance(value, dict) else value}")
-    return Similarity.of(value.get("translation", (0, 0, 0)), value.get("degrees", (0, 0, 0)), value.get("scale", 1.0))
 
 
 def cut(
