@@ -175,12 +175,11 @@ class Declaration:
         for letter, place in self._letters().items():
             setattr(self.Inputs, letter, property(eval(f"lambda given: {place}")))
         self._pack, self.results = _results(of_result)
-        memory = "".join(f"{self._memory(each)}, " for each in self.results.values())
         self._Results = _named("results", list(self.results))
         self._hint: Any = Tensor if len(self.results) == 1 else tuple[(Tensor,) * len(self.results)]  # type: ignore[misc]
-        text = (
-            memory[:-2] if len(self.results) == 1 else f"({memory})" if "result0" in self.results else f"make({memory})"
-        )
+        text = ", ".join(map(self._memory, self.results.values()))
+        if len(self.results) != 1:  # a named tuple where the results have names
+            text = f"({text})" if "result0" in self.results else f"make({text})"
         self.allocate = eval(f"lambda given: {text}", {"make": self._Results, "torch": torch})
         _DECLARED[name] = self
 
@@ -189,21 +188,21 @@ class Declaration:
 
     def _letters(self) -> dict[str, str]:
         """The expression of each letter that shapes speak of."""
-        found: dict[str, list[str]] = {}
+        names, found = [each.name for each in self.arguments], dict[str, list[tuple[str, str]]]()
         for name, _, optional, rule in self._tensors():
-            for shape, condition in ((rule.shape, rule.condition), (rule.otherwise, f"not {rule.condition}")):
-                known = [f"given.{rule.condition} is {'' if condition.startswith('not') else 'not '}None"]
-                known = known if rule.condition else [f"given.{name} is not None"] if optional else []
-                for place, entry in enumerate(() if rule.either else shape):
-                    if isinstance(entry, str) and entry not in [argument.name for argument in self.arguments]:
+            forms = [(rule.shape, f"given.{name} is not None" if optional else "")]
+            if rule.condition:
+                there = f"given.{rule.condition} is"
+                forms = [(rule.shape, f"{there} not None"), (rule.otherwise, f"{there} None")]
+            for shape, known in [] if rule.either else forms:
+                for place, entry in enumerate(shape):
+                    if isinstance(entry, str) and entry not in names:
                         letter, _, one = entry.partition("+")
                         size = f"given.{name}.shape[{place}]{' - 1' if one else ''}"
-                        found.setdefault(letter, []).append(" if ".join([size, *known]))
-        for ways in found.values():
-            ways.sort(key=lambda way: " if " in way)  # those that need no question first
-        return {
-            letter: ways[0] if " if " not in ways[0] else " else ".join([*ways, "0"]) for letter, ways in found.items()
-        }
+                        found.setdefault(letter, []).append((size, known))
+        sure = {letter: size for letter, ways in found.items() for size, known in reversed(ways) if not known}
+        asked = {letter: [f"{size} if {known}" for size, known in ways] for letter, ways in found.items()}
+        return {letter: sure.get(letter, " else ".join([*asked[letter], "0"])) for letter in found}
 
     def _memory(self, result: Shaped) -> str:
         """The expression of new memory for a result."""
