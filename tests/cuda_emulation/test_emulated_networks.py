@@ -34,7 +34,7 @@ from voronerf.ops.grouped_mlp import network as layer_table
 from voronerf.ops.grouped_mlp.network import _choose_way, using_way
 
 HALVES = ("bfloat16", "float16")
-FUSED = (227, 99, 64, 40, 20)
+FUSED = (227, 64, 40, 20)
 """KiB of shared memory: the smaller, the more warps share it, down to weights that pass through."""
 SMALL = 1
 """KiB that no fused network fits, so that it goes layer by layer."""
@@ -59,12 +59,12 @@ def of_width(width: int) -> Case:
     return Case(layers, [50], width, HALVES[:1])
 
 
-WIDTHS = (1, 8, 9, 16, 17, 32, 33, 48, 64, 65, 80, 128)
+WIDTHS = (1, 8, 9, 17, 32, 33, 64, 65, 128)
 EVERY = tuple(ALLOWED)
 WHOLE = {
-    "branched": Case(BRANCHED, [70, 0, 1, 150], 3, EVERY, FUSED[:-1], seeds=(1, 2)),
-    "branched, little memory": Case(BRANCHED, [70, 0, 1, 150], 3, HALVES, FUSED[-1:], seeds=(1, 2)),
-    "wide": Case(WIDE, [37, 3], 7, EVERY, FUSED[:2], "tiles"),
+    "branched": Case(BRANCHED, [70, 0, 1, 150], 3, EVERY, FUSED[:-1], seeds=(1,)),
+    "branched, little memory": Case(BRANCHED, [70, 0, 1, 150], 3, HALVES, FUSED[-1:], seeds=(2,)),
+    "wide": Case(WIDE, [37, 3], 7, EVERY, (227, 99), "tiles"),
     "gaussians": Case(GAUSSIANS, [20, 33], 6, EVERY),
     "harmonics": Case(HARMONICS, [37, 3], 3, EVERY, way="tiles"),
     # sm_75 multiplies float16 on tensor cores, and everything else exactly; results are stored in 16 bits.
@@ -72,7 +72,6 @@ WHOLE = {
     "layers, slabs that cells cross": Case(BRANCHED, [70, 0, 401, 150], 3, EVERY, (SMALL,), "layers", (1, 2)),
     "layers, broad": Case(BROAD, [66, 4], 3, EVERY, way="layers"),
     "layers, dense": Case(DENSE, [37, 3], 7, EVERY[:1], (SMALL,), "layers"),
-    "layers, wide": Case(WIDE, [37, 3], 7, EVERY[:1], (SMALL,), "layers"),
     "layers, gaussians": Case(GAUSSIANS, [37, 3], 6, EVERY[:1], (SMALL,), "layers"),
     "layers, harmonics": Case(HARMONICS, [37, 3], 3, EVERY[:1], (SMALL,), "layers"),
     "layers, before Ampere": Case(BRANCHED, [70, 5], 3, HALVES, (SMALL,), "layers", capability=75),

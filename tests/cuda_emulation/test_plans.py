@@ -14,12 +14,9 @@ MIB = 1024 * KIB
 # Capability, shared memory that a block may ask for, multiprocessors, second-level cache.
 GPUS = {
     "GTX 1650": (75, 64 * KIB, 14, 1 * MIB),
-    "RTX 2080 Ti": (75, 64 * KIB, 68, 5632 * KIB),
     "A100": (80, 163 * KIB, 108, 40 * MIB),
-    "RTX 3090": (86, 99 * KIB, 82, 6 * MIB),
     "RTX 4090": (89, 99 * KIB, 128, 72 * MIB),
     "H200": (90, 227 * KIB, 132, 50 * MIB),
-    "B200": (100, 227 * KIB, 148, 126 * MIB),
     "RTX 5090": (120, 99 * KIB, 170, 96 * MIB),
     "H200, code of sm_75": (75, 227 * KIB, 132, 50 * MIB),
 }
