@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from voronerf.app.scenes import Scene
-from voronerf.app.scenes.scene import Split
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
@@ -33,13 +32,11 @@ class Territories:
         centres: float32 [T, 3].
         boxes: float32 [T, 2, 3], around each territory, lowest and highest corner.
         train: int64 [c], the territory of each training view.
-        test: int64, that of each test view.
     """
 
     centres: Tensor
     boxes: Tensor
     train: Tensor
-    test: Tensor
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -55,7 +52,7 @@ class Territories:
         kept = sorted([number, *numbers])
         own = torch.full((len(kept),), -1, dtype=torch.int32)
         own[kept.index(number)] = 0
-        return Place(number, self.boxes[number], self.centres[kept], own)
+        return Place(self.boxes[number], self.centres[kept], own)
 
     def views(self, number: int) -> Tensor:
         """The training views of a territory, int64, ascending."""
@@ -74,39 +71,35 @@ class Place:
     """Where a territory is.
 
     Attributes:
-        number: Among all.
         box: [2, 3], around it.
         centres: [l, 3], its own and those whose territories may reach into its box, by their numbers.
         own: int32 [l], 0 for its own centre and -1 for the others.
     """
 
-    number: int
     box: Tensor
     centres: Tensor
     own: Tensor
 
     def cells(self, positions: Tensor, backend: str) -> Tensor:
         """The nearest of the centres, int32 [n], of positions [n, 3]; where it is the own one, see ``own``."""
-        return nearest_centre(positions, self.centres, backend=backend)
+        return nearest_centre(positions, self.centres.to(positions.device), backend=backend)
 
     def outside(self, grid: OccupancyGrid) -> Tensor:
         """Voxels of a grid that the territory does not reach, bool [v]."""
         half = (grid.box[1] - grid.box[0]) / torch.tensor(grid.occupied.shape, device=grid.box.device) / 2
-        number = int((self.own == 0).nonzero())
-        slack = 2.002 * ((self.centres - self.centres[number]).abs() * half).sum(-1)
+        number, centres = int((self.own == 0).nonzero()), self.centres.to(grid.box.device)
+        slack = 2.002 * ((centres - centres[number]).abs() * half).sum(-1)
         found = []
         for voxels in torch.arange(grid.occupied.numel(), device=grid.box.device).split(1 << 16):
-            squares = (grid.points(voxels)[:, None] - self.centres).square().sum(-1)
+            squares = (grid.points(voxels)[:, None] - centres).square().sum(-1)
             found.append((squares + slack < squares[:, number, None]).any(1))
         return torch.cat(found)
 
-    def bounds(self, grid: OccupancyGrid | None) -> Tensor:
+    def bounds(self, grid: OccupancyGrid) -> Tensor:
         """[2, 3], a box around all that is not empty; all of space where rays are bent by a contraction.
 
         Nothing at all is a box whose first corner is above the second.
         """
-        if grid is None:
-            return self.box
         if grid.contraction is not None:
             return torch.tensor([[-torch.inf] * 3, [torch.inf] * 3])
         if not bool(grid.occupied.any()):
@@ -140,13 +133,13 @@ def cut_space(scene: Scene, count: int, contraction: Contraction | Perspective |
     if box is None:
         raise ValueError(f"--territories needs a scene with a box or --contraction, {scene.name} has no box")
     width = float((box[1] - box[0]).prod() / count) ** (1 / 3)
-    places, tested = (_places(scene, split, width, contraction) for split in (scene.train, scene.test))
+    places = _places(scene, width, contraction)
     homes = halve(places, count)
     sizes = torch.bincount(homes, minlength=count)
     centres = torch.zeros(count, 3).index_add(0, homes, places) / sizes[:, None]
     if len(centres.unique(dim=0)) < count:
         raise ValueError(f"--territories must be at most the places that views of {scene.name} look at, got {count}")
-    return Territories(centres, _boxes(centres, box), homes, nearest_centre(tested, centres).long())
+    return Territories(centres, _boxes(centres, box), homes)
 
 
 def halve(places: Tensor, count: int) -> Tensor:
@@ -180,9 +173,9 @@ def halve(places: Tensor, count: int) -> Tensor:
     return part
 
 
-def _places(scene: Scene, split: Split, width: float, contraction: Contraction | Perspective | None) -> Tensor:
-    """Where each view lies, [c, 3]."""
-    cameras, views = split.cameras, len(split)
+def _places(scene: Scene, width: float, contraction: Contraction | Perspective | None) -> Tensor:
+    """Where each training view lies, [c, 3]."""
+    cameras, views = scene.train.cameras, len(scene.train)
     share = (torch.arange(LATTICE) + 0.5) / LATTICE
     y, x = (values.reshape(-1) for values in torch.meshgrid(share, share, indexing="ij"))
     sizes = torch.tensor([cameras.size(view) for view in range(views)]).reshape(-1, 2)

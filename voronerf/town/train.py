@@ -98,8 +98,14 @@ class Town:
         """All territories tell what of them is not empty."""
         bounds = torch.zeros_like(self.bounds)
         for number, state in self.states.items():
-            bounds[number] = self.members[number].place.bounds(state.renderer.occupancy)
+            bounds[number] = self.members[number].place.bounds(sampler_of(state).grid)
         self.bounds = self.group.total(bounds)
+
+
+def sampler_of(state: State) -> Occupancy:
+    """The sampler of a territory, which skips what is empty."""
+    assert isinstance(state.sampler, Occupancy)
+    return state.sampler
 
 
 def check_territories(config: TrainConfig, count: int, ranks: int) -> None:
@@ -158,8 +164,7 @@ def build_town(
         state = states[number] = build(own, territories.scene(scene, number), batches=batches, on_event=on_event)
         if (obstacle := state.ray_loss.why_not_fused()) is not None:
             raise ConfigError(f"--field {config.field} cannot be trained in territories: {obstacle}")
-        sampler = state.renderer.sampler
-        assert isinstance(sampler, Occupancy)
+        sampler = sampler_of(state)
         if contraction is None:
             state.renderer.sampler = Occupancy(
                 sampler.grid,
@@ -227,9 +232,8 @@ def train(
             saved_at = first.seconds
     if first.fraction >= 1:
         for state in town.states.values():
-            assert isinstance(state.sampler, Occupancy)
             with state.averaged():
-                state.sampler.fill_holes(state.renderer.field, state.config.seed)
+                sampler_of(state).fill_holes(state.renderer.field, state.config.seed)
     save(town)
 
 
@@ -284,7 +288,13 @@ def save(town: Town) -> None:
         failure = error
     if group.any(failure is not None):
         raise failure or RankLost("another rank could not write the checkpoint")
-    own = {n: (s.router.diagram.state_dict(), s.renderer.occupancy) for n, s in town.states.items()}
+    own = {
+        number: [
+            {k: v.cpu() for k, v in each.state_dict().items()}
+            for each in (state.router.diagram, sampler_of(state).grid)
+        ]
+        for number, state in town.states.items()
+    }
     found = {number: told for each in group.gather(own) for number, told in each.items()}
     if group.rank == 0:
         if not (town.out / TOWN).is_file():
@@ -306,15 +316,16 @@ def _names(path: Path) -> list[str]:
         return [each.name for each in path.parent.glob("networks-*.safetensors")]
 
 
-def _index(town: Town, names: list[str], found: Sequence[tuple[dict[str, Tensor], OccupancyGrid]]) -> Checkpoint:
+def _index(town: Town, names: list[str], found: Sequence[Sequence[dict[str, Tensor]]]) -> Checkpoint:
     """The checkpoint that names the files of all territories; with it the run is opened as a run of one part."""
-    diagrams = [VoronoiDiagram.from_state(state) for state, _ in found]
+    diagrams = [VoronoiDiagram.from_state(diagram) for diagram, _ in found]
+    grids = [OccupancyGrid.from_state(grid) for _, grid in found]
     sizes = torch.tensor([diagram.num_cells for diagram in diagrams])
     diagram = diagrams[0]
     if len(found) > 1:
         diagram, _ = VoronoiDiagram(town.territories.centres).refine(dict(enumerate(diagrams)))
-    owner, grids = torch.repeat_interleave(torch.arange(len(found)), sizes), [grid for _, grid in found]
-    sphere, grid = grids[0].contraction, None
+    owner = torch.repeat_interleave(torch.arange(len(found)), sizes)
+    sphere, grid = town.scene.space(town.drawn.contraction).contraction, None
     assert not isinstance(sphere, Perspective)
     if sphere is None:
         grid = _whole_grid(make_grid(town.drawn, town.scene, "cpu", 1), grids)
@@ -362,7 +373,7 @@ def resume(town: Town) -> None:
 def _whole_grid(like: OccupancyGrid, grids: Sequence[OccupancyGrid]) -> OccupancyGrid:
     """One grid over the box of another; occupied where that of any territory is, too much rather than too little."""
     box = like.box
-    sizes = torch.stack([((g.box[1] - g.box[0]) / torch.tensor(g.occupied.shape)).cpu() for g in grids]).amax(0)
+    sizes = torch.stack([(g.box[1] - g.box[0]) / torch.tensor(g.occupied.shape) for g in grids]).amax(0)
     shape = ((box[1] - box[0]) / sizes).floor().clamp(1, 512)
     shape = (shape * min(1.0, (VOXELS / float(shape.prod())) ** (1 / 3))).floor().clamp(min=1).long()
     whole = OccupancyGrid(box, shape.tolist(), threshold=like.threshold)
@@ -371,7 +382,7 @@ def _whole_grid(like: OccupancyGrid, grids: Sequence[OccupancyGrid]) -> Occupanc
     for grid in grids:
         full = grid.occupied.view(-1).nonzero()[:, 0]
         for corner in corners:
-            points = grid.points(full, corner.expand(len(full), 3).to(full.device)).cpu()
+            points = grid.points(full, corner.expand(len(full), 3))
             whole.occupied.view(-1)[whole.cells(points).long()] = True
     whole.density = torch.where(whole.occupied, 2 * whole.threshold, 0.0)
     return whole
