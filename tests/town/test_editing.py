@@ -295,9 +295,9 @@ def test_pictures_are_where_the_joined_run_has_their_cameras(opened, scene, tmp_
 
 def test_a_run_of_parts_is_neither_opened_nor_trained_as_one_of_a_training(opened, tmp_path, scene) -> None:
     path = joined_run(opened, tmp_path / "joined").path
-    refuses("unknown parts", lambda: open_run(path, scene=scene), error=CheckpointError)
+    refuses("must be the checkpoint of one training", lambda: open_run(path, scene=scene), error=CheckpointError)
     config = replace(opened[0].config, out=path)
-    refuses("unknown parts", lambda: trained(config, scene, resume=True), error=CheckpointError)
+    refuses("checkpoint of one training", lambda: trained(config, scene, resume=True), error=CheckpointError)
 
 
 def test_runs_are_aligned_by_shared_images(scene) -> None:

@@ -67,18 +67,13 @@ def test_broken_files_are_named(tmp_path):
 
 
 def test_tensors_are_pages_of_files(tmp_path):
-    """Also those of parts, which lie in files of their own."""
     x, y = torch.randn(4, 5 << 19), torch.arange(4)  # 40 MiB, which malloc gives back when they are free
     save_checkpoint(tmp_path / "whole", Checkpoint({"x": x, "y": y}, {}))
-    save_checkpoint(tmp_path / "part-a-0.safetensors", Checkpoint({"x": x, "y": y}, {}))
-    save_checkpoint(tmp_path / "index", Checkpoint({}, {"parts": [{"routers": [{"file": "part-a-0.safetensors"}]}]}))
-    for name, prefix in (("whole", ""), ("index", "part-0.router-0.")):
-        before = anonymous_memory()
-        found = load_checkpoint(tmp_path / name).tensors
-        assert anonymous_memory() - before < x.nbytes / 4
-        assert found[f"{prefix}x"].equal(x) and found[f"{prefix}y"].equal(y)
+    before = anonymous_memory()
+    found = load_checkpoint(tmp_path / "whole").tensors
+    assert anonymous_memory() - before < x.nbytes / 4
+    assert found["x"].equal(x) and found["y"].equal(y)
     assert load_checkpoint(tmp_path / "whole", keep=lambda entry: entry != "x").tensors.keys() == {"y"}
-    assert load_checkpoint(tmp_path / "index", keep=lambda entry: not entry.startswith("part-")).tensors == {}
 
 
 def test_a_single_changed_bit_is_found(tmp_path):

@@ -119,6 +119,8 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
         CheckpointError: When a value is missing or of another type.
     """
     source, values = checkpoint.source, dict(checkpoint.values)
+    if "step" not in values:
+        raise CheckpointError(f"{source}: must be the checkpoint of one training, as voronerf train writes it")
     try:
         if isinstance(values.get("stages"), list):
             values["stages"] = tuple(values["stages"])
