@@ -87,23 +87,35 @@ def _encode_backward_kernel(
 
 @_FREQUENCY.custom_op("frequency_encode_warp")
 def _frequency(given: Any, out: Tensor) -> None:
-    launch(_encode_kernel, given.x.shape, [*_inputs(given.x, None, *given[1:]), array(out, out)], out)
+    launch(
+        _encode_kernel,
+        given.x.shape,
+        [*_inputs(given.x, None, given.octaves, given.include_input), array(out, out)],
+        out,
+    )
 
 
 @_FREQUENCY.backward_op("frequency_encode_warp_backward", _frequency, reference.frequency_encode)
 def _frequency_backward(given: Any, arriving: Any, gradients: Any) -> None:
-    _fill_gradients(arriving.result, *gradients, None, _inputs(given.x, None, *given[1:]))
+    _fill_gradients(arriving.result, gradients.x, None, _inputs(given.x, None, given.octaves, given.include_input))
 
 
 @_INTEGRATED.custom_op("integrated_encode_warp")
 def _integrated(given: Any, out: Tensor) -> None:
-    launch(_encode_kernel, given.means.shape, [*_inputs(*given, False), array(out, out)], out)
+    launch(
+        _encode_kernel,
+        given.means.shape,
+        [*_inputs(given.means, given.variances, given.octaves, False), array(out, out)],
+        out,
+    )
 
 
 @_INTEGRATED.backward_op("integrated_encode_warp_backward", _integrated, integrated.integrated_encode)
 def _integrated_backward(given: Any, arriving: Any, gradients: Any) -> None:
     of_means, of_variances = (given.means.new_empty(given.means.shape) if part is None else part for part in gradients)
-    _fill_gradients(arriving.result, of_means, of_variances, _inputs(*given, False))
+    _fill_gradients(
+        arriving.result, of_means, of_variances, _inputs(given.means, given.variances, given.octaves, False)
+    )
 
 
 def _fill_gradients(gradient: Tensor, of_x: Tensor, of_variances: Tensor | None, inputs: list[object]) -> None:

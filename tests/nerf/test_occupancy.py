@@ -361,9 +361,9 @@ def ends(rays):
     return torch.ones(len(rays)), torch.full((len(rays),), 5.0)
 
 
-@pytest.mark.parametrize(("full_gradient", "sightings"), [(None, 0), (4.0, 0), (None, 0.1), (4.0, 0.1)])
+@pytest.mark.parametrize(("full_gradient", "sparse_depth"), [(None, 0), (4.0, 0), (None, 0.1), (4.0, 0.1)])
 @pytest.mark.parametrize("field", [NeRF(width=16, depth=2), HashGridField(width=16, levels=2, log2_entries=10)])
-def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sightings):
+def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse_depth):
     """With the loss on points that the last rays end at, before, in and behind the grid."""
     grid = tight_grid()
     router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **getattr(field, "router_options", {}))
@@ -372,11 +372,11 @@ def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sighti
     options = {"samples": 24, "occupancy": grid, "full_gradient": full_gradient}
     renderer = renderer_of({"field": router}, **options)
 
-    seen = torch.linspace(1.5, 4.5, 200) if sightings else None
+    seen = torch.linspace(1.5, 4.5, 200) if sparse_depth else None
 
     def compare(renderer):
         batch = Batch(rays, *ends(rays), target, background, seen)
-        found = RayLoss(renderer, sparse_depth=sightings)(batch, torch.Generator().manual_seed(3))
+        found = RayLoss(renderer, sparse_depth=sparse_depth)(batch, torch.Generator().manual_seed(3))
         return found, torch.autograd.grad(found.loss, list(router.parameters()))
 
     found, gradients = compare(renderer)

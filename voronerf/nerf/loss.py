@@ -18,8 +18,8 @@ from voronerf.nerf.volume import Samples, gradient_shares
 from voronerf.ops._core import backends
 from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.ops.render_loss import render_loss_gradient
-from voronerf.ops.sighting_gradient import sighting_gradient
-from voronerf.ops.sighting_gradient.reference import seen_there, sighting_loss
+from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
+from voronerf.ops.sparse_depth_gradient.reference import near_point, sparse_depth_loss
 from voronerf.router import VoronoiRouter
 
 
@@ -165,7 +165,7 @@ class RayLoss:
             first = len(batch.rays) - len(depths)
             begin, factor = int(samples.ray_offsets[first]), self.sparse_depth / len(depths)
             density = found.density[begin:]
-            of_depth, slope = sighting_gradient(
+            of_depth, slope = sparse_depth_gradient(
                 density,
                 samples.depths[begin:],
                 samples.deltas[begin:],
@@ -192,9 +192,9 @@ class RayLoss:
             begin, end = (int(samples.ray_offsets[ray]) for ray in (others, -1))
             depths, deltas, weights = (values[begin:end] for values in (samples.depths, samples.deltas, last.weights))
             ray = samples.ray_index[begin:end].long() - others
-            there = weights * seen_there(depths, deltas, batch.sparse_depths[ray])
+            there = weights * near_point(depths, deltas, batch.sparse_depths[ray])
             light = torch.zeros_like(batch.sparse_depths).index_add(0, ray, there)
-            loss = loss + self.sparse_depth * sighting_loss(light).mean()
+            loss = loss + self.sparse_depth * sparse_depth_loss(light).mean()
         for first in before:
             loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
         error = (last.colour.detach() - batch.target).square().sum(-1)

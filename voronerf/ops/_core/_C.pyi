@@ -358,7 +358,7 @@ class SeeRule(NamedTuple):
     opaque: float  # float32
     wave: int  # int64
 
-class Sightings(NamedTuple):
+class SparseDepth(NamedTuple):
     density: Tensor | None  # const float32*
     depths: Tensor | None  # const float32*
     deltas: Tensor | None  # const float32*
@@ -585,8 +585,8 @@ def run_gradients(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3
 # RenderLossInputs, const float32*, const int32*, float32*, float32*, Cpu
 def run_sums(_0: RenderLossInputs, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Tensor | None, _5: Cpu) -> None: ...
 
-# Sightings, float32*, float32*, float32*, Cpu
-def sighting_gradient(_0: Sightings, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Cpu) -> None: ...
+# SparseDepth, float32*, float32*, float32*, Cpu
+def sparse_depth_gradient(_0: SparseDepth, _1: Tensor | None, _2: Tensor | None, _3: Tensor | None, _4: Cpu) -> None: ...
 
 # const float32*, float32*, int64, int64, Cpu
 @overload

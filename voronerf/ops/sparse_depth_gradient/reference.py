@@ -1,4 +1,4 @@
-"""How little of a ray's light comes from where a point was seen, with its gradient. s rays, m samples (packed)."""
+"""How little of a ray's light comes from near a known point, with its gradient. s rays, m samples (packed)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from torch import Tensor
 NEARBY = 0.03
 
 
-def seen_there(depths: Tensor, deltas: Tensor, distances: Tensor) -> Tensor:
-    """Which samples lie where a point was seen: within `NEARBY` of its distance and their own length.
+def near_point(depths: Tensor, deltas: Tensor, distances: Tensor) -> Tensor:
+    """Which samples lie near a known point: within `NEARBY` of its distance and their own length.
 
     Args:
         depths: [...], of samples.
@@ -20,31 +20,31 @@ def seen_there(depths: Tensor, deltas: Tensor, distances: Tensor) -> Tensor:
     return (depths - distances).abs() <= NEARBY * distances + deltas
 
 
-def sighting_loss(light: Tensor) -> Tensor:
-    """The loss [s] of rays, from the sums [s] of the weights of their samples that were `seen_there`."""
+def sparse_depth_loss(light: Tensor) -> Tensor:
+    """The loss [s] of rays, from the sums [s] of the weights of their samples that are `near_point`."""
     return -torch.log(light.clamp(1e-3, 1))
 
 
 @torch.no_grad()
-def sighting_gradient(
+def sparse_depth_gradient(
     density: Tensor, depths: Tensor, deltas: Tensor, weights: Tensor, ray_offsets: Tensor, distances: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The sum of the `sighting_loss`, and its gradient; see ``voronerf.ops.sighting_gradient``."""
+    """The sum of the `sparse_depth_loss`, and its gradient; see ``voronerf.ops.sparse_depth_gradient``."""
     counts = ray_offsets.diff()
     if density.is_cpu and len(counts) and (int(counts.min()) < 0 or int(counts.sum()) != len(density)):
         last, first = int(ray_offsets[-1]), int(ray_offsets[0])
         raise ValueError(
-            f"sighting_gradient: ray_offsets must rise, by the number of samples, {len(density)}, got offsets from "
+            f"sparse_depth_gradient: ray_offsets must rise, by the number of samples, {len(density)}, got offsets from "
             f"{first} to {last}"
         )
     ray = torch.repeat_interleave(counts)
-    near = seen_there(depths, deltas, distances[ray])
+    near = near_point(depths, deltas, distances[ray])
     there = weights * near
     # Sums along each ray are differences of sums along all of them, which float32 would round too much.
     optical, light = (_sums_along(values, ray, counts) for values in (density * deltas, there))
     total = torch.zeros_like(distances).index_add(0, ray, there)
     known = torch.where(total > 1e-3, -1 / total, 0)
-    return sighting_loss(total).sum(), known[ray] * deltas * (torch.exp(-optical) * near - (total[ray] - light))
+    return sparse_depth_loss(total).sum(), known[ray] * deltas * (torch.exp(-optical) * near - (total[ray] - light))
 
 
 def _sums_along(values: Tensor, ray: Tensor, counts: Tensor) -> Tensor:

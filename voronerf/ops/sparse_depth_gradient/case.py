@@ -1,4 +1,4 @@
-"""The case of ``sighting_gradient``."""
+"""The case of ``sparse_depth_gradient``."""
 
 from __future__ import annotations
 

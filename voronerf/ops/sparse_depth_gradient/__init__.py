@@ -1,4 +1,4 @@
-"""How little of a ray's light comes from where a point was seen, with its gradient. s rays, m samples (packed)."""
+"""How little of a ray's light comes from near a known point, with its gradient. s rays, m samples (packed)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from voronerf.ops._core.declare import declare
 
 
 @declare(native=Implementation(("cpu",), (torch.float32,)))
-def sighting_gradient(
+def sparse_depth_gradient(
     density: Annotated[Tensor, "float32|float64 [m]"],
     depths: Annotated[Tensor, "same [m]"],
     deltas: Annotated[Tensor, "same [m]"],
@@ -24,11 +24,11 @@ def sighting_gradient(
 ) -> tuple[Annotated[Tensor, "same []"], Annotated[Tensor, "same [m]"]]:
     """The sum of the loss of rays that end at known points, and its gradient to the densities of their samples.
 
-    A sample was seen there if it lies within 0.03 of the distance of the point and its own length of it. The loss of a
-    ray is ``-log`` of the sum of the weights of these samples, from 0.001 to 1: the likelihood of Deng et al. 2022,
+    A sample is near the point if it lies within 0.03 of the distance of the point and its own length of it. The loss of
+    a ray is ``-log`` of the sum of the weights of these samples, from 0.001 to 1: the likelihood of Deng et al. 2022,
     "Depth-supervised NeRF", with a box in the place of their Gaussian. Fog before the point takes from them. With the
     transmittance T behind a sample and the light S from points that lie behind it, the derivative of the sum by its
-    density is ``delta (T there - S)``. Nothing is differentiable further.
+    density is ``delta (T near - S)``. Nothing is differentiable further.
 
     Args:
         density: float32 or float64 [m], of the samples.
@@ -48,11 +48,11 @@ def sighting_gradient(
 
     Examples:
         >>> import torch
-        >>> from voronerf.ops import sighting_gradient
-        >>> depths, deltas = torch.tensor([1.0, 2.0]), torch.full((2,), 0.1)  # fog, and a wall that was seen
+        >>> from voronerf.ops import sparse_depth_gradient
+        >>> depths, deltas = torch.tensor([1.0, 2.0]), torch.full((2,), 0.1)  # fog, and a wall with a point
         >>> weights, offsets = torch.tensor([0.5, 0.5]), torch.tensor([0, 2], dtype=torch.int32)
         >>> given = torch.tensor([6.93, 1e3]), depths, deltas, weights, offsets, torch.tensor([2.0])
-        >>> loss, gradient = sighting_gradient(*given)
+        >>> loss, gradient = sparse_depth_gradient(*given)
         >>> loss, gradient.abs().round(decimals=3)  # less fog is better
         (tensor(0.6931), tensor([0.1000, 0.0000]))
     """

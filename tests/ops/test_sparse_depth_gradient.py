@@ -7,10 +7,10 @@ import torch
 from helpers import on_any_number_of_threads
 from op_cases import need
 
-from voronerf.ops import composite, sighting_gradient
-from voronerf.ops.sighting_gradient.reference import NEARBY
+from voronerf.ops import composite, sparse_depth_gradient
+from voronerf.ops.sparse_depth_gradient.reference import NEARBY
 
-pytestmark = pytest.mark.op("sighting_gradient")
+pytestmark = pytest.mark.op("sparse_depth_gradient")
 
 
 def case(counts, dtype=torch.float32, first=0):
@@ -45,9 +45,9 @@ def slow(density, depths, deltas, offsets, distances):
 
 @pytest.mark.parametrize("first", [0, 7])
 def test_equals_autograd_through_a_slow_loop(device, backend, first):
-    need("sighting_gradient", backend, device, torch.float32)
+    need("sparse_depth_gradient", backend, device, torch.float32)
     given = case((5, 0, 1, 12, 33, 2), first=first)
-    loss, gradient = sighting_gradient(*(tensor.to(device) for tensor in given), backend=backend)
+    loss, gradient = sparse_depth_gradient(*(tensor.to(device) for tensor in given), backend=backend)
     density, depths, deltas, _, offsets, distances = given
     exact = density.double().requires_grad_()
     expected = slow(exact, depths.double(), deltas.double(), offsets, distances.double())
@@ -58,22 +58,22 @@ def test_equals_autograd_through_a_slow_loop(device, backend, first):
 
 
 def test_a_ray_whose_point_gets_no_light_has_no_gradient(device, backend):
-    need("sighting_gradient", backend, device, torch.float32)
+    need("sparse_depth_gradient", backend, device, torch.float32)
     density, depths, deltas, weights, offsets, distances = case((6, 6, 6))
     weights[6:12] = 0
     distances[2] = torch.nan
     given = density, depths, deltas, weights, offsets, distances
-    loss, gradient = sighting_gradient(*(tensor.to(device) for tensor in given), backend=backend)
+    loss, gradient = sparse_depth_gradient(*(tensor.to(device) for tensor in given), backend=backend)
     assert bool(loss.isfinite()) and bool(gradient[:6].any()) and not bool(gradient[6:].any())
 
 
 def test_no_rays(device, backend):
-    need("sighting_gradient", backend, device, torch.float32)
-    loss, gradient = sighting_gradient(*(tensor.to(device) for tensor in case(())), backend=backend)
+    need("sparse_depth_gradient", backend, device, torch.float32)
+    loss, gradient = sparse_depth_gradient(*(tensor.to(device) for tensor in case(())), backend=backend)
     assert float(loss) == 0 and gradient.shape == (0,)
 
 
 def test_does_not_depend_on_the_number_of_threads():
-    need("sighting_gradient", "native", torch.device("cpu"), torch.float32)
+    need("sparse_depth_gradient", "native", torch.device("cpu"), torch.float32)
     given = case((9,) * 700)
-    on_any_number_of_threads(lambda: sighting_gradient(*given, backend="native"))
+    on_any_number_of_threads(lambda: sparse_depth_gradient(*given, backend="native"))

@@ -1,5 +1,5 @@
 // Each ray depends on itself alone, and one thread sums their losses, so results do not depend on the threads.
-#include "rays/sightings.h"
+#include "rays/sparse_depth.h"
 
 #include <algorithm>
 #include <cmath>
@@ -14,13 +14,13 @@ namespace {
 
 constexpr float kLeast = 1e-3f;  // light of a ray whose loss has a gradient
 
-bool seen_there(const Sightings& in, int64_t i, float distance) {
+bool near_point(const SparseDepth& in, int64_t i, float distance) {
   return std::fabs(in.depths[i] - distance) <= in.nearby * distance + in.deltas[i];
 }
 
-float learn_ray(const Sightings& in, int64_t begin, int64_t end, float distance, float* gradient) {
+float learn_ray(const SparseDepth& in, int64_t begin, int64_t end, float distance, float* gradient) {
   double sum = 0.0;
-  for (int64_t i = begin; i < end; ++i) sum += seen_there(in, i, distance) ? static_cast<double>(in.weights[i]) : 0.0;
+  for (int64_t i = begin; i < end; ++i) sum += near_point(in, i, distance) ? static_cast<double>(in.weights[i]) : 0.0;
   const float total = static_cast<float>(sum);
   if (!(total > kLeast)) {
     std::fill(gradient + begin, gradient + end, 0.0f);
@@ -28,7 +28,7 @@ float learn_ray(const Sightings& in, int64_t begin, int64_t end, float distance,
   }
   double optical = 0.0, light = 0.0;
   for (int64_t i = begin; i < end; ++i) {
-    const bool there = seen_there(in, i, distance);
+    const bool there = near_point(in, i, distance);
     optical += static_cast<double>(in.density[i] * in.deltas[i]);
     light += there ? static_cast<double>(in.weights[i]) : 0.0;
     const float through = there ? std::exp(-static_cast<float>(optical)) : 0.0f;
@@ -39,13 +39,13 @@ float learn_ray(const Sightings& in, int64_t begin, int64_t end, float distance,
 
 }  // namespace
 
-void sighting_gradient_cpu(const Sightings& in, float* loss, float* of_rays, float* gradient, int threads) {
+void sparse_depth_gradient_cpu(const SparseDepth& in, float* loss, float* of_rays, float* gradient, int threads) {
   constexpr int64_t kRays = 64;  // of a task
   bool rising = true;
   for (int64_t i = 0; i < in.s; ++i) rising &= in.offsets[i] <= in.offsets[i + 1];
   const int64_t first = in.offsets[0];
   if (!rising || in.offsets[in.s] - first != in.m) {
-    throw std::invalid_argument("sighting_gradient: ray_offsets must rise, by the number of samples, " +
+    throw std::invalid_argument("sparse_depth_gradient: ray_offsets must rise, by the number of samples, " +
                                 std::to_string(in.m) + ", got offsets from " + std::to_string(first) + " to " +
                                 std::to_string(in.offsets[in.s]));
   }
