@@ -88,7 +88,7 @@ attack: $(VENV)/.built
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/attack $(ATTACK_ARGS)
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info voronerf/ops/_core/_C.*.so .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist *.egg-info voronerf/ops/_core/_C.* .mypy_cache .pytest_cache .ruff_cache
 
 # What is more than `make demo` needs: Warp, pycolmap, viser, mypy, a browser's driver, ...
 test test-all bench paper check docs emulate-cuda sanitize attack $(addprefix isa-check-,$(ISAS)): $(VENV)/.tools

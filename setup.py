@@ -24,6 +24,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import zlib
 from pathlib import Path
 
 from setuptools import Extension, find_packages, setup
@@ -68,6 +69,7 @@ class NinjaBuildExt(build_ext):
         if stub := stub_of(module):
             for folder in (ROOT / "voronerf/ops/_core", target.parent):
                 write_if_changed(folder / "_C.pyi", stub)
+                write_if_changed(folder / "interface.txt", f"{zlib.crc32(stub.encode())}\n")
         print(f"voronerf: {cuda.outcome}")
 
 
@@ -282,7 +284,7 @@ def pybind11_headers() -> str:
 
 
 def stub_of(module: Path) -> str:
-    """What a module binds, as it says itself; nothing of one for another machine, which keeps the stub that is there.
+    """What a module binds, as it says itself; nothing of one for another machine, which keeps the files that are there.
 
     In a process of its own, with some OpenMP runtime in the place of torch's.
     """
@@ -297,7 +299,7 @@ print(module.stub, end="")
 """
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     if found.returncode != 0:
-        print(f"voronerf: voronerf/ops/_core/_C.pyi is left as it is: {found.stderr.strip()}")
+        print(f"voronerf: _C.pyi and interface.txt in voronerf/ops/_core are left as they are: {found.stderr.strip()}")
     return found.stdout
 
 
@@ -321,10 +323,7 @@ if __name__ == "__main__":
     setup(
         packages=[*find_packages(include=["voronerf", "voronerf.*"]), "voronerf.kernels"],
         package_dir={"voronerf": "voronerf", "voronerf.kernels": "kernels"},
-        package_data={
-            "voronerf.ops._core": ["_C.pyi"],
-            "voronerf": ["py.typed"],
-        },  # which the compiled module is compared with
+        package_data={"voronerf.ops._core": ["_C.pyi", "interface.txt"], "voronerf": ["py.typed"]},
         ext_modules=[Extension("voronerf.ops._core._C", sources=[])],
         cmdclass={"build_ext": NinjaBuildExt},
     )

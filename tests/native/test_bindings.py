@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,11 @@ pytestmark = pytest.mark.native
 native = pytest.importorskip("voronerf.ops._core.native")
 
 
-def test_the_stub_is_what_the_build_bound() -> None:
-    stub = Path(voronerf.__file__).with_name("ops").joinpath("_core", "_C.pyi").read_text()
-    assert native.compiled.stub == stub, "build the extension again and commit voronerf/ops/_core/_C.pyi"
+def test_the_interface_is_the_checksum_of_what_the_build_bound() -> None:
+    folder = Path(voronerf.__file__).with_name("ops") / "_core"
+    assert (folder / "_C.pyi").read_text() == native.compiled.stub
+    checksum = zlib.crc32(native.compiled.stub.encode())
+    assert (folder / "interface.txt").read_text() == f"{checksum}\n" == f"{native.compiled.interface}\n"
 
 
 def test_enumerations_have_the_names_that_users_write() -> None:

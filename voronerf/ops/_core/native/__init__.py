@@ -16,7 +16,6 @@ import functools
 import os
 import sys
 import warnings
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,9 +44,9 @@ def _bind_openmp() -> None:
 
 
 def _interface() -> int | None:
-    """Checksum of the stub, which lists every bound signature; the module has that of the stub it was built with."""
-    stub = Path(__file__).resolve().parent.parent / "_C.pyi"
-    return zlib.crc32(stub.read_text().encode()) if stub.exists() else None
+    """Checksum of all signatures that the sources bind, which the module has of those it was built with."""
+    file = Path(__file__).resolve().parent.parent / "interface.txt"
+    return int(file.read_text()) if file.exists() else None
 
 
 try:
