@@ -10,7 +10,7 @@
     rivals     a network by torch.compile, Triton and tiny-cuda-nn, where they are
     step       what surrounds the networks in a training step, beside the same in plain torch
     profile    launches and waits of a default step
-    training   short trainings, and ones whose steps are replayed from a CUDA graph
+    training   short trainings
 
 Each leaves what it has found in OUT/PART.json as well, after every case, and ``gpu_check.py`` takes it from there.
 """
@@ -41,7 +41,12 @@ from gpu_timings import profile, rivals, roofs, sizes, step  # noqa: E402
 
 FILE_SECONDS = 60.0
 """For one file of the tests."""
-OTHER_TESTS = ("training/test_graphs.py", "training/test_trainer.py", "rendering/test_rays_and_sampling.py")
+OTHER_TESTS = (
+    "app/train/test_training.py",
+    "diagram/test_diagram.py",
+    "native/test_native.py",
+    "nerf/test_rays_and_sampling.py",
+)
 """Of tests/, beside those of the operations."""
 
 
@@ -181,21 +186,20 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
 def training(out: Path, data: str, again: Again, device: str = "cuda", seconds: float = 6.0) -> int:
     """Steps, milliseconds of one and PSNR of short trainings of the same number of seconds."""
     from voronerf.app.scenes import load_scene
-    from voronerf.app.train.config import TrainConfig
-    from voronerf.app.train.trainer import Trainer
+    from voronerf.app.train import Scores, TrainConfig, build, run
 
     journal = Journal(out, "training", begun=again.start > 0)
     # Lego at 100 x 100 and at 400 x 400; the built-in scene has one size.
     scenes = {size: load_scene(data, downscale=by) for size, by in ([("", 1)] if data == "builtin" else SIZES)}
     common: dict[str, Any] = {"data": data, "device": device, "budget": seconds, "cells": (12,), "rays": 4096}
-    common |= {"evaluations": 4, "eval_views": 2, "final_views": 5, "evaluation_share": 0.0, "panels": 0}
+    common |= {"evaluations": 4, "eval_views": 5}
 
     def train(name: str, size: str, options: dict[str, Any]) -> str:
-        settings = {**common, **options}
-        trainer = Trainer(TrainConfig(**settings, out=out / "runs" / name), scenes[size])
-        summary = trainer.run()
-        milliseconds = 1e3 * settings["rays"] / summary["rays_per_second"]
-        over = [(round(row["seconds"], 2), row["psnr"]) for row in trainer.metrics]
+        scores = Scores(None)
+        run(build(TrainConfig(**{**common, **options}), scenes[size]), [scores])
+        summary = scores.summary
+        milliseconds = 1e3 * summary["seconds"] / summary["steps"]
+        over = [(row["seconds"], row["psnr"]) for row in scores.metrics]
         found = {"name": name, "settings": options, "milliseconds": milliseconds, "psnr over seconds": over}
         journal.add("trainings", {**found, **summary})
         return f"{summary['steps']} steps of {milliseconds:.2f} ms, PSNR {summary['psnr']:.2f} on 5 views"
@@ -204,7 +208,6 @@ def training(out: Path, data: str, again: Again, device: str = "cuda", seconds: 
         (name + size, functools.partial(train, name + size, size, options))
         for size in scenes
         for name, options in TRAININGS.items()
-        if device != "cpu" or not options.get("cuda_graph")
     ]
     return one_by_one(cases, again, settling(device), journal)
 
@@ -215,12 +218,10 @@ NERF: dict[str, Any] = {"field": "nerf", "occupancy": False}
 TRAININGS: dict[str, dict[str, Any]] = {
     "default": {},
     "default, every sample": {"occupancy": False},
-    "default in a graph": {"cuda_graph": True},
-    "default in a graph, bf16": {"cuda_graph": True, "precision": "bf16"},
+    "default, bf16": {"precision": "bf16"},
     "nerf": NERF,
     "nerf, bf16": {**NERF, "precision": "bf16"},
-    "nerf in a graph, bf16": {**NERF, "precision": "bf16", "cuda_graph": True},
-    "nerf in a graph, fp16": {**NERF, "precision": "fp16", "cuda_graph": True},
+    "nerf, fp16": {**NERF, "precision": "fp16"},
 }
 """What each training sets."""
 

@@ -288,39 +288,40 @@ def profile(out: Path, again: Again, device: str = "cuda", steps: int = 10) -> i
     from torch.profiler import profile as profiled
 
     from voronerf.app.scenes import load_scene
-    from voronerf.app.train.config import TrainConfig
-    from voronerf.app.train.trainer import Trainer
+    from voronerf.app.train import TrainConfig, build
+    from voronerf.app.train import train as steps_of
 
     journal, cuda = Journal(out, "profile", begun=again.start > 0), device == "cuda"
     scene = load_scene("builtin")
 
     def train(name: str, options: dict[str, Any]) -> str:
-        config = TrainConfig(out=out / name, device=device, steps=10_000, cells=(16,), evaluations=1, **options)
-        trainer = Trainer(config, scene)
-        for trainer.step in range(2 * steps):
-            trainer.train_step()
-        settle = settling(device)
+        config = TrainConfig(device=device, steps=10_000, cells=(16,), evaluations=1, **options)
+        state, settle = build(config, scene), settling(device)
+
+        def train_steps(count: int) -> None:
+            """A second of this clock is a step."""
+            steps_of(state, until=state.seconds + count, clock=itertools.count().__next__)
+
+        train_steps(2 * steps)
         settle()
         with warnings.catch_warnings(record=True) as waits:
             warnings.simplefilter("always")
             if cuda:
                 torch.cuda.set_sync_debug_mode("warn")
             begin = time.perf_counter()
-            for _ in range(steps):
-                trainer.train_step()
+            train_steps(steps)
             if cuda:
                 torch.cuda.set_sync_debug_mode("default")
             settle()
             seconds = (time.perf_counter() - begin) / steps
         with profiled(activities=[ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]) as seen:
-            for _ in range(steps):
-                trainer.train_step()
+            train_steps(steps)
             settle()
         kernels = [event for event in seen.events() if event.device_type == torch.autograd.DeviceType.CUDA]
         row = {
             "name": name,
             "seconds": seconds,
-            "nanoseconds": 1e9 * seconds / (trainer.rays * trainer.config.samples),
+            "nanoseconds": 1e9 * seconds / (state.rays * state.config.samples[0]),
             "launches": len(kernels) // steps,
             "waits": sum("synchroniz" in str(warning.message) for warning in waits) // steps,
             "busy": sum(event.device_time for event in kernels) / 1e6 / steps / seconds,
@@ -334,7 +335,7 @@ def profile(out: Path, again: Again, device: str = "cuda", steps: int = 10) -> i
     kinds: dict[str, dict[str, Any]] = {"default": {}, "default, 4,096 rays": {"rays": 4096}}
     kinds["default, 4,096 rays, bf16"] = {"rays": 4096, "precision": "bf16"}
     if not cuda:
-        kinds = {"default": {"rays": 32, "samples": 8, "width": 16}}
+        kinds = {"default": {"rays": 32, "samples": (8,), "width": 16}}
     cases: list[Case] = [(name, functools.partial(train, name, options)) for name, options in kinds.items()]
     return one_by_one(cases, again, settling(device), journal)
 
@@ -381,7 +382,7 @@ def step(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
             rows.add(f"{name} by {other}", prepare, "copy", size, captured=False)
 
     compare(f"pixel_rays b={n}", functools.partial(pixel_work, n), "torch, rays by matmul")
-    compare(f"render_loss b={rays} m={n}", functools.partial(loss_work, rays, n), "torch, sums over all samples")
+    compare(f"render_loss b={rays} m={n}", functools.partial(loss_work, rays, n), "activations, composite, mse_loss")
     compare(f"observe_occupancy m={n}", functools.partial(observe_work, n), "torch, as nerfacc")
     for entries, touched in ((n >> 4, 1.0), (n, 1 / 64)):
         name = f"adam {2 * entries} numbers, {touched:.0%} with a gradient"

@@ -1,6 +1,6 @@
 """What a training step asks of a GPU, counted without one: launches, and reads of the host, which wait for it."""
 
-from dataclasses import replace
+import itertools
 
 import pytest
 import torch
@@ -9,8 +9,7 @@ from launches import asked
 
 import voronerf
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.trainer import Trainer
+from voronerf.app.train import State, TrainConfig, build, train
 
 LAUNCHES, READS = 26, 0
 """Of a default step. The launches go down only."""
@@ -31,55 +30,59 @@ def test_what_is_asked_is_counted():
 
 @pytest.fixture
 def on_device(monkeypatch):
-    """Tensors of the emulation say that they are on a CPU; here the sampler does not believe them."""
-    monkeypatch.setattr("voronerf.nerf.samplers._on_host", lambda tensor: False)
+    """Tensors of the emulation say that they are on a GPU."""
+    monkeypatch.setattr(torch.Tensor, "is_cpu", False)
+    monkeypatch.setattr(torch.Tensor, "is_cuda", True)
 
 
-def trained(out, steps, *, empty=False):
-    """A trainer of a small default run on the emulated device, after some steps; the split is before the fifth.
+def trained(steps, monkeypatch, *, empty=False):
+    """A small default run after some steps, and the output of the last; the split is before the fifth step.
 
-    ``empty``: most of space is, and steps have as many rays as at first.
+    ``empty``: most of space is. What a GPU's host reads at every fiftieth step alone is never read.
     """
     config = TrainConfig(
-        out=out, steps=16, field_options=("levels=2", "log2_entries=10"), cells=(4,), split_at=(0.25,), width=16,
-        rays=32, samples=8, evaluations=1, reservoir=200, reservoir_batches=8, ray_growth=1.0 if empty else None,
+        steps=16, field_options=("levels=2", "log2_entries=10"), cells=(4,), split_at=(0.25,), width=16,
+        rays=32, samples=(8,), evaluations=1,
     )  # fmt: skip
-    with emulated():
-        trainer = Trainer(config, builtin_scene(12))
+    state, outputs = build(config, builtin_scene(12)), []
+    with monkeypatch.context() as patch:
+        patch.setattr(State, "read", lambda state, output: outputs.append(output))
         if empty:
-            for table in (trainer.occupancy.density, trainer.occupancy.occupied):
+            for table in (state.sampler.grid.density, state.sampler.grid.occupied):
                 table[:, :, 8:] = 0
-        for trainer.step in range(int(empty), steps):  # none is looked at again
-            if trainer.split_is_due():
-                trainer.split()
-            trainer.train_step()
-    return trainer
+            state.step = 1  # voxels are evaluated again at the first step
+        train(state, until=steps - state.step, clock=itertools.count().__next__)
+    return state, outputs[-1]
 
 
 @pytest.mark.native
-def test_rows_beyond_the_samples_change_nothing(tmp_path, monkeypatch):
+def test_rows_beyond_the_samples_change_nothing(monkeypatch, request):
     """With one cell and with four: the host knows the number of samples, or the device alone."""
     found = []
     for known in (True, False):
-        monkeypatch.setattr("voronerf.nerf.samplers._on_host", lambda tensor, known=known: known)
-        trainer = trained(tmp_path / str(known), 6, empty=True)
-        rows = trainer._rows
-        assert (rows is None) == known and trainer.router.num_cells == 4
-        found.append([*trainer.router.parameters(), trainer.occupancy.density, trainer.cells.reservoir.samples()[1]])
+        if not known:
+            request.getfixturevalue("on_device")
+        with emulated():
+            state, output = trained(6, monkeypatch, empty=True)
+        rows = output.samples.rows
+        assert (rows is None) == known and state.router.num_cells == 4
+        reservoir = state.strategy.reservoir.samples()[1]
+        found.append([*state.router.parameters(), state.sampler.grid.density, reservoir])
     assert 0 < int(rows) < 32 * 8  # some rows were beyond
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
-    trainer.config = replace(trainer.config, ray_growth=4.0)
-    trainer._read(torch.zeros(()))
-    assert 32 < trainer.rays <= 128  # as many more as the samples left out allow
+    state.read(output)
+    assert 32 < state.rays <= 256  # as many more as the samples left out allow
 
 
 @pytest.mark.native
-def test_a_default_step(tmp_path, on_device):
+def test_a_default_step(monkeypatch, on_device):
     """After the last split, without the cells that are looked at again every sixteenth step."""
-    trainer = trained(tmp_path, 6)
+    with emulated():
+        state, _ = trained(6, monkeypatch)
+    monkeypatch.setattr(State, "read", lambda state, output: None)
     with asked() as counted:
-        trainer.train_step()
+        train(state, until=state.seconds + 1, clock=itertools.count().__next__)
     told = f"{counted.kernels} {counted.operations} {counted.reads}"
     assert counted.launches <= LAUNCHES and counted.reads.total() <= READS, told
     assert not counted.on_cpu
