@@ -12,6 +12,7 @@ from voronerf.nerf import Adam, Occupancy, PlannedSplit, RayBatches, RayLoss, Re
 from voronerf.nerf.samplers import usual_samples
 from voronerf.nerf.schedule import learning_rate, next_rays
 
+torch.manual_seed(0)
 scene, seconds = load_scene(sys.argv[1]), float(sys.argv[2])
 space, views, random = scene.space(), scene.train, torch.Generator().manual_seed(0)
 cube, pixel, contracted = scene.cube(space), scene.pixel(space), space.contraction is not None
