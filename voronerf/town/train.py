@@ -32,7 +32,6 @@ from voronerf.app.train.checkpoint import (
     save_checkpoint,
 )
 from voronerf.app.train.defaults import resolve
-from voronerf.app.train.loop import stage_of
 from voronerf.app.train.resume import snapshot
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Perspective, RenderOutput
@@ -219,8 +218,9 @@ def train(
             seconds, stop = group.total(agreed).tolist()
             passed = 0.0
             for state in town.states.values():
-                state.seconds += seconds
-                state.stopped |= stop > 0
+                state.pass_time(seconds)
+                if stop > 0:
+                    state.stop()
                 if state.skipped_in_a_row >= PATIENCE:
                     raise diverged(
                         town.out, f"gradients of {state.skipped_in_a_row} steps in a row not finite", state.step
@@ -243,7 +243,7 @@ def _prepare(state: State) -> Batch:
     if strategy.splits or len(strategy.reservoir) >= (strategy.planned.children if strategy.planned else 0):
         done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
         if done is not None:
-            state.stages.append(stage_of(state, done))
+            state.begin_stage(done)
             if not strategy.inherit:
                 optimizer.drop_averages()
     optimizer.set_learning_rate(state.learning_rate())
@@ -259,8 +259,7 @@ def _learn(state: State, batch: Batch, output: RenderOutput) -> None:
     state.optimizer.update(state.guard, output.loss)
     state.optimizer.after_step(state.step)
     state.strategy.step_post_backward(output)
-    state.rays_done += len(batch.rays)
-    state.step += 1
+    state.count_step(batch)
     state.read(output)
 
 

@@ -16,9 +16,9 @@ from rich.progress import (
     track,
 )
 
-from voronerf.app.train.build import State
 from voronerf.app.train.callbacks import Scores
 from voronerf.app.train.loop import Callback
+from voronerf.app.train.state import State
 
 LONGEST_LINE = 900
 

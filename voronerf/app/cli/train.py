@@ -24,7 +24,7 @@ from voronerf.app.evaluate.lpips import find_lpips
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.run import open_run
 from voronerf.app.scenes import Scene, SceneError, load_scene
-from voronerf.app.train.build import State, build, check_device
+from voronerf.app.train.build import build, check_device
 from voronerf.app.train.callbacks import CHECKPOINT_EVERY, Checkpoints, Divergence, Scores, TensorBoard
 from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
@@ -41,6 +41,7 @@ from voronerf.app.train.run_directory import (
     stored_config,
     write_curve,
 )
+from voronerf.app.train.state import State
 
 #: Bytes of a picture's name without its end, which most file systems take.
 LONGEST_NAME = 255 - len(".png")

@@ -1,11 +1,12 @@
 """A training: settings, a state made by one function, one loop, and callbacks beside it."""
 
-from voronerf.app.train.build import State, build
+from voronerf.app.train.build import build
 from voronerf.app.train.callbacks import Checkpoints, Divergence, Scores, TensorBoard
 from voronerf.app.train.checkpoint import Checkpoint, CheckpointError, last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.loop import Callback, TrainingError, run, train
 from voronerf.app.train.resume import load, snapshot
+from voronerf.app.train.state import State
 
 __all__ = [
     "Callback",

@@ -5,10 +5,8 @@ from __future__ import annotations
 import fnmatch
 import functools
 import inspect
-import math
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -17,15 +15,15 @@ from voronerf.app.scenes import Scene
 from voronerf.app.scenes.store import Pages
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.defaults import resolve, why_no_occupancy
+from voronerf.app.train.state import State
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.field import DirectionPerSample, Field
-from voronerf.nerf.loss import RayLoss, RenderOutput
+from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.occupancy import PICTURE_OPACITY, TRAINING_OPACITY, OccupancyGrid
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import SAMPLERS, Occupancy, Sampler
-from voronerf.nerf.schedule import learning_rate, next_rays
 from voronerf.nerf.split import SplitStrategy
 from voronerf.ops import Guard
 from voronerf.ops._core import backends
@@ -38,155 +36,6 @@ TEMPERATURE = 0.05
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
 SAMPLE_BYTES = 64
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A period of training on one diagram.
-
-    ``balance_before`` and ``balance_after`` are std(W / max W) over the new cells of a parent, and of these the median
-    over the parents that were split; None for the coarse stage.
-    """
-
-    cells: int
-    started_at_second: float
-    started_at_step: int
-    balance_before: float | None
-    balance_after: float | None
-    split_cells: int
-
-
-@dataclass
-class State:
-    """A training between two steps; :func:`build` makes it, :func:`voronerf.app.train.train` moves it on.
-
-    Attributes:
-        config: The settings, with every default filled in.
-        scene: The scene.
-        routers: The networks by name; "field" gives the colours.
-        renderer: Networks and sampler.
-        ray_loss: From a batch of rays to a loss.
-        optimizer: Of all networks.
-        strategy: When and how cells split.
-        batches: Of rays.
-        generator: Of random choices on the host.
-        draws: Of random choices on the device; the same on a CPU.
-        scaler: Of the loss in float16.
-        guard: Of steps whose loss or gradients are not finite.
-        on_event: Called with a line of text for what happens; None for nobody.
-        step: Steps done.
-        seconds: Training time.
-        scoring: Seconds of evaluations so far that count towards the budget.
-        reserved: Seconds of the budget for the last evaluation.
-        rays: Of the next step.
-        rays_done: Of all steps.
-        loss: Of the last step that the host has read.
-        skipped_in_a_row: Steps that the guard has left out since the last good one.
-        stages: Periods of training, one more than splits.
-        stopped: Whether somebody asked to end the training.
-    """
-
-    config: TrainConfig
-    scene: Scene
-    routers: dict[str, VoronoiRouter]
-    renderer: Renderer
-    ray_loss: RayLoss
-    optimizer: Adam
-    strategy: SplitStrategy
-    batches: RayBatches
-    generator: torch.Generator
-    draws: torch.Generator
-    scaler: torch.amp.GradScaler
-    guard: Guard
-    rays: int
-    on_event: Callable[[str], None] | None = None
-    step: int = 0
-    seconds: float = 0.0
-    scoring: float = 0.0
-    reserved: float = 0.0
-    rays_done: int = 0
-    loss: float = math.nan
-    skipped_in_a_row: int = 0
-    stages: list[Stage] = field(default_factory=lambda: [Stage(1, 0.0, 0, None, None, 0)])
-    stopped: bool = False
-
-    @property
-    def device(self) -> torch.device:
-        """Of the networks."""
-        return torch.device(self.config.device)
-
-    @property
-    def router(self) -> VoronoiRouter:
-        """The router whose colours count."""
-        return self.routers["field"]
-
-    @property
-    def sampler(self) -> Sampler:
-        """Where along rays the networks are asked."""
-        return self.renderer.sampler
-
-    @property
-    def fraction(self) -> float:
-        """How much of the training is done, 0..1."""
-        if self.config.steps is not None:
-            return min(1.0, self.step / self.config.steps)
-        training = float(self.config.budget or 1.0) - self.scoring - self.reserved
-        return min(1.0, self.seconds / max(training, 1e-9))
-
-    @property
-    def skipped(self) -> int:
-        """Steps that were left out, since a loss or gradients were not finite; waits for the device."""
-        return int(self.guard.skipped)
-
-    @property
-    def parameter_count(self) -> int:
-        """Parameters of all networks of all cells."""
-        return sum(p.numel() for router in self.routers.values() for p in router.parameters())
-
-    @property
-    def thread_deterministic(self) -> bool:
-        """Whether native ops compute all networks: then steps are the same bits on any number of threads."""
-        chosen = backends.chosen("routed_mlp", self.device, torch.float32, backend=self.config.backend)
-        native = self.device.type == "cpu" and chosen == "native"
-        return native and all(router.by_table for router in self.routers.values())
-
-    def learning_rate(self) -> float:
-        """Of the next step."""
-        hold = self.config.field_type.lr_hold
-        return learning_rate(float(self.config.lr or 0), self.fraction, self.step, hold=hold)
-
-    def averaged(self) -> AbstractContextManager[None]:
-        """A context in which the networks have their averaged weights, for pictures; not for training."""
-        return self.optimizer.averaged()
-
-    def read(self, output: RenderOutput) -> None:
-        """Reads loss, guard and number of samples of a step, which waits for the device; finds the rays of the next."""
-        rows = [] if output.samples.rows is None else [output.samples.rows[0].float()]
-        found = torch.stack([output.loss.detach().float(), self.guard.in_a_row, *rows]).tolist()
-        self.loss, self.skipped_in_a_row = found[0], int(found[1])
-        if isinstance(self.sampler, Occupancy):
-            samples = int(found[2]) if rows else len(output.weights)
-            self.rays = next_rays(
-                self.rays,
-                samples,
-                rays=self.config.rays,
-                samples=self.sampler.samples,
-                growth=self.config.field_type.ray_growth,
-                contracted=self.config.contraction != "none",
-            )
-
-    def count_scores(self, seconds: float, reserved: float) -> None:
-        """Takes seconds of an evaluation from the budget, and reserves some of it for the last one."""
-        self.scoring, self.reserved = self.scoring + seconds, reserved
-
-    def stop(self) -> None:
-        """Ends the training after the step or the view in hand, with a checkpoint, as Ctrl-C does."""
-        self.stopped = True
-
-    def say(self, line: str) -> None:
-        """Calls ``on_event``, if set."""
-        if self.on_event is not None:
-            self.on_event(line)
 
 
 def build(

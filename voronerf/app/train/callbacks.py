@@ -20,12 +20,12 @@ from voronerf.app.evaluate.scores import ViewScore, evaluate, mean_scores, view_
 from voronerf.app.files import json_text, write_bytes, write_text
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import write_scene
-from voronerf.app.train.build import State
 from voronerf.app.train.checkpoint import CheckpointWriter, checkpoint_paths
 from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.loop import Callback, TrainingError
 from voronerf.app.train.resume import snapshot
 from voronerf.app.train.run_directory import read_metrics
+from voronerf.app.train.state import State
 from voronerf.nerf.split import MIN_SAMPLES, SplitDone
 
 #: Seconds of training between checkpoints, and how many are kept.
@@ -172,7 +172,7 @@ class Scores(Callback):
     def on_end(self, state: State) -> None:
         """Scores the test views of a finished training, and writes the summary."""
         if state.fraction >= 1:
-            state.stopped = False  # a stop that came in the last step has nothing to end
+            state.finish()
             left = len(state.strategy.plan) - state.strategy.splits
             if left:
                 state.say(f"Run ended before {left} of {len(state.strategy.plan)} planned splits.")

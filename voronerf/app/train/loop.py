@@ -9,7 +9,7 @@ from contextlib import nullcontext
 
 import torch
 
-from voronerf.app.train.build import Stage, State
+from voronerf.app.train.state import State
 from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.split import SplitDone
 from voronerf.ops._core import backends
@@ -75,7 +75,7 @@ def train(
         with backends.torch_on_one_thread() if alone else nullcontext():
             done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
             if done is not None:
-                state.stages.append(stage_of(state, done))
+                state.begin_stage(done)
                 if not strategy.inherit:
                     optimizer.drop_averages()
                 for callback in callbacks:
@@ -100,18 +100,17 @@ def train(
                 optimizer.update(state.guard, output.loss.detach())
             optimizer.after_step(state.step)
             strategy.step_post_backward(output)
-        state.rays_done += len(batch.rays)
-        state.step += 1
+        state.count_step(batch)
         if state.device.type == "cpu" or state.step % READ_EVERY == 0:
             state.read(output)
-        state.seconds += clock() - started
+        state.pass_time(clock() - started)
         for callback in callbacks:
             callback.after_step(state)
     if state.step > before and state.fraction >= 1 and isinstance(sampler, Occupancy):
         started = clock()
         with state.averaged():
             sampler.fill_holes(state.renderer.field, config.seed)
-        state.seconds += clock() - started
+        state.pass_time(clock() - started)
 
 
 def run(state: State, callbacks: Sequence[Callback] = (), *, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -141,13 +140,3 @@ def run(state: State, callbacks: Sequence[Callback] = (), *, clock: Callable[[],
     train(state, callbacks, clock=clock)
     for callback in callbacks:
         callback.on_end(state)
-
-
-def stage_of(state: State, done: SplitDone) -> Stage:
-    """The period of training that a split begins."""
-    balances = list(done.split.balances.values())
-    before, after = (
-        float(torch.tensor([getattr(balance, name) for balance in balances]).median()) if balances else None
-        for name in ("imbalance_before", "imbalance_after")
-    )
-    return Stage(state.router.num_cells, state.seconds, state.step, before, after, len(balances))

@@ -10,13 +10,13 @@ from typing import Any
 
 import torch
 
-from voronerf.app.train.build import Stage, State, parameter_shapes
+from voronerf.app.train.build import parameter_shapes
 from voronerf.app.train.checkpoint import Checkpoint, CheckpointError, load_optimizer_tensors, optimizer_tensors
 from voronerf.app.train.config import TrainConfig, differences
 from voronerf.app.train.schema import check_types
+from voronerf.app.train.state import Stage, State
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.samplers import SAMPLERS, Occupancy
-from voronerf.ops import Guard
 from voronerf.router import VoronoiRouter
 
 
@@ -105,11 +105,8 @@ def load(state: State, checkpoint: Checkpoint) -> None:
             f"not bit for bit: {checkpoint.source} was written on {stored.threads} threads, now there are {threads}"
             ", and torch computes these networks"
         )
-    state.step, state.seconds = stored.step, stored.seconds
-    state.scoring, state.reserved = stored.scoring, stored.reserved
-    state.rays, state.rays_done = stored.rays, stored.rays_done
-    state.stages = [Stage(**stage) for stage in stored.stages]
-    state.guard = Guard.on(state.device, stored.skipped)
+    names = ("step", "seconds", "scoring", "reserved", "rays", "rays_done", "skipped", "stages")
+    state.restore(**{name: getattr(stored, name) for name in names})
 
 
 def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from voronerf.app.train.build import State
 from voronerf.app.train.callbacks import Scores
 from voronerf.app.train.loop import Callback
+from voronerf.app.train.state import State
 from voronerf.app.viewer.pictures import Subject
 from voronerf.app.viewer.viewer import Viewer
 
