@@ -28,14 +28,16 @@ for backend in ("native", "reference"):
 TRAINING = """
 import sys, tempfile, pathlib, torch
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.trainer import Trainer
+from voronerf.app.train import Checkpoints, Scores, TrainConfig, build, last_checkpoint, load, run
 torch.set_num_threads(1)
 scene = builtin_scene(16, train_views=4, test_views=2)
 with tempfile.TemporaryDirectory() as folder:
     for steps in (4, 8):
-        small = {"cells": (4,), "width": 8, "depth": 1, "rays": 64}
-        Trainer(TrainConfig(out=pathlib.Path(folder), steps=steps, resume=steps > 4, **small), scene).run()
+        out = pathlib.Path(folder)
+        state = build(TrainConfig(steps=steps, cells=(4,), width=8, depth=1, rays=64), scene)
+        if steps > 4:
+            load(state, last_checkpoint(out))
+        run(state, [Checkpoints(out), Scores(out)])
 assert not {"torch._dynamo", "sympy"} & sys.modules.keys()
 """
 
