@@ -107,9 +107,9 @@ def test_points_lie_in_their_cells():
         points = grid.points(every, torch.rand(24, 3))
         place = (points - grid.box[0]).long()
         assert torch.equal((place[:, 0] * 3 + place[:, 1]) * 4 + place[:, 2], every)
-        assert torch.equal(grid.cells(points), every.int())
+        assert torch.equal(grid.voxels(points), every.int())
     border = torch.tensor([[-1.0, 10.5, -3.5], [2.0, 13.0, 0.0], [9.0, 99.0, torch.nan]])
-    assert grid.cells(border).tolist() == [0, 23, 20] and grid.cells(border).dtype == torch.int32
+    assert grid.voxels(border).tolist() == [0, 23, 20] and grid.voxels(border).dtype == torch.int32
 
 
 def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
@@ -137,7 +137,7 @@ def test_samples_of_a_batch_teach_what_is_empty_and_what_is_hidden():
     render_rays(ball, rays[hit], near[hit], far[hit], samples=Occupancy(grid, 64))
     assert (ball.asked - before) * 5 < 64 * int(hit.sum())
     # A cell comes back when a look finds something there, and fades no further by it.
-    inside = grid.cells(torch.zeros(1, 3))
+    inside = grid.voxels(torch.zeros(1, 3))
     grid.update(ball, inside, decay=1.0)
     assert float(grid.density.reshape(-1)[inside]) == 200.0
     # What is not a number counts as dense.
@@ -341,7 +341,7 @@ def test_refuses_what_is_no_grid():
     # 2**32 would be cell 0 in the lowest 32 bits.
     update = OccupancyGrid(BOX, 4, threshold=0.1).update
     for cell in (-1, 64, 2**32):
-        refuses("cells must lie in 0 to 63, got", update, Ball(), torch.tensor([cell]))
+        refuses("voxels must lie in 0 to 63, got", update, Ball(), torch.tensor([cell]))
     refuses("decay must lie in 0..1, got 2", update, Ball(), decay=2)
 
 

@@ -153,7 +153,7 @@ def test_the_grid_has_all_that_the_grids_of_the_runs_have(opened, tmp_path) -> N
         own = editing.Source.of(run.path).grid
         full = own.occupied.view(-1).nonzero()[:, 0]
         points = own.points(full, torch.rand(len(full), 3))
-        assert grid.occupied.view(-1)[grid.cells(frame.points(points)).long()].all()
+        assert grid.occupied.view(-1)[grid.voxels(frame.points(points)).long()].all()
     assert grid.share < 1
 
 

@@ -73,7 +73,7 @@ def test_voxels_outside_of_a_territory():
     outside = territories.place(1).outside(grid)
     points = torch.lerp(BOX[0], BOX[1], torch.rand(50_000, 3, generator=seeded()))
     mine = VoronoiDiagram(territories.centres).locate(points) == 1
-    assert not outside[grid.cells(points[mine]).long()].any()
+    assert not outside[grid.voxels(points[mine]).long()].any()
     assert outside.view(8, 4, 4)[0].all() and not outside.view(8, 4, 4)[3:5].any()
     grid.occupied.zero_()
     assert (territories.place(1).bounds(grid)[0] > territories.place(1).bounds(grid)[1]).all()

@@ -1,9 +1,9 @@
-"""An occupancy grid: which cells of the box of a scene are empty, so that rays can skip them.
+"""An occupancy grid: which voxels of the box of a scene are empty, so that rays can skip them.
 
-x, y, z cells of the grid along each axis, q cells to update, r rays, s strata of a ray. Densities are per world unit;
-with a contraction, those that a grid remembers are per unit of contracted space, so that a far cell counts as dense as
+x, y, z voxels of the grid along each axis, q voxels to update, r rays, s strata of a ray. Densities are per world unit;
+with a contraction, those that a grid remembers are per unit of contracted space, so that a far voxel counts as dense as
 a near one that takes as much light.
-Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (cells keep the largest recent density,
+Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", appendix C (voxels keep the largest recent density,
 which decays). Learning it from the samples of a batch, and emptying what is hidden, are additions of this project.
 """
 
@@ -23,7 +23,7 @@ from voronerf.nerf.fields.radiance import activate_density, activate_radiance
 from voronerf.ops._core.checks import check_range
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
-from voronerf.ops.observe_occupancy.reference import cells_of
+from voronerf.ops.observe_occupancy.reference import cells_of as voxels_of
 from voronerf.ops.render_opaque import RaySums, render_opaque
 from voronerf.router import VoronoiRouter
 
@@ -42,19 +42,19 @@ PATIENCE, CONTRACTED_PATIENCE = 8, 4
 DECAY = 0.8
 CHUNK = 1 << 17  # points that a field evaluates at a time
 HIDDEN = 1e-3  # a sample is hidden if less than this share of the light reaches it
-# An empty cell is a hole if so many of the 27 around and in it are occupied, and so many random points in it are all
+# An empty voxel is a hole if so many of the 27 around and in it are occupied, and so many random points in it are all
 # denser than so many thresholds.
 HOLE_NEIGHBOURS, HOLE_POINTS, HOLE_DENSITY = 9, 2, 2.0
 
 
 class OccupancyGrid:
-    """The largest recent density of every cell of a box, and which cells count as occupied.
+    """The largest recent density of every voxel of a box, and which voxels count as occupied.
 
-    A new grid is occupied everywhere. `update` and `observe` empty cells.
+    A new grid is occupied everywhere. `update` and `observe` empty voxels.
 
     Attributes:
         box: float32 [2, 3], lowest and highest corner.
-        density: float32 [x, y, z], the remembered density of each cell.
+        density: float32 [x, y, z], the remembered density of each voxel.
         occupied: bool [x, y, z], density >= threshold.
         threshold: per world unit.
         contraction: of the space that the box is in, or None.
@@ -86,9 +86,9 @@ class OccupancyGrid:
 
         Args:
             box: [2, 3], the second corner above the first.
-            resolution: cells along each axis, one number for all or three.
-            threshold: density from which a cell is occupied, per world unit, > 0 and finite.
-            remembered: density of a new cell, in thresholds, >= 1. The larger it is, the more often a cell has to be
+            resolution: voxels along each axis, one number for all or three.
+            threshold: density from which a voxel is occupied, per world unit, > 0 and finite.
+            remembered: density of a new voxel, in thresholds, >= 1. The larger it is, the more often a voxel has to be
                 found empty before it counts as empty.
             contraction: of the space that the box and the positions are in. Rays stay those of the world.
             device: of the grid; default that of the box.
@@ -159,22 +159,22 @@ class OccupancyGrid:
 
     @property
     def share(self) -> float:
-        """Share of the cells that are occupied, 0..1. Waits for the device."""
+        """Share of the voxels that are occupied, 0..1. Waits for the device."""
         return float(self.occupied.float().mean())
 
-    def points(self, cells: Tensor, uniforms: Tensor | None = None) -> Tensor:
-        """Points in cells.
+    def points(self, voxels: Tensor, uniforms: Tensor | None = None) -> Tensor:
+        """Points in voxels.
 
         Args:
-            cells: int [q], flat numbers of cells.
-            uniforms: [q, 3] in 0..1, where in the cell; None for the middle.
+            voxels: int [q], flat numbers of voxels.
+            uniforms: [q, 3] in 0..1, where in the voxel; None for the middle.
 
         Returns:
             float32 [q, 3], world.
         """
         shape = torch.tensor(self.occupied.shape, device=self.box.device)
         _, y, z = self.occupied.shape
-        place = torch.stack((cells // (y * z), cells // z % y, cells % z), dim=-1).float()
+        place = torch.stack((voxels // (y * z), voxels // z % y, voxels % z), dim=-1).float()
         place = place + (0.5 if uniforms is None else uniforms)
         return torch.lerp(self.box[0], self.box[1], place / shape)
 
@@ -182,36 +182,35 @@ class OccupancyGrid:
     def update(
         self,
         field: Field,
-        cells: Tensor | None = None,
+        voxels: Tensor | None = None,
         *,
         decay: float = 0.0,
         generator: torch.Generator | None = None,
         backend: str = "auto",
     ) -> None:
-        """Evaluates a field at a random point of each cell, and keeps the larger of the new density and the decayed old
-        one.
+        """Evaluates a field at a random point of each voxel, and keeps the larger of new and decayed old density.
 
         Args:
             field: called without gradients.
-            cells: int32 or int64 [q], flat numbers of the cells to update; None for all.
-            decay: factor on the old densities of these cells, 0..1; 0 forgets them.
+            voxels: int32 or int64 [q], flat numbers of the voxels to update; None for all.
+            decay: factor on the old densities of these voxels, 0..1; 0 forgets them.
             generator: of the points, on any device.
             backend: of the op.
 
         Raises:
-            ValueError: a decay out of range; on the CPU cells out of range.
+            ValueError: a decay out of range; on the CPU voxels out of range.
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.update: decay must lie in 0..1, got {decay}")
         device = self.box.device
-        if cells is None:
-            cells = torch.arange(self.occupied.numel(), device=device)
-        check_range("OccupancyGrid.update", "cells", cells, self.occupied.numel())
+        if voxels is None:
+            voxels = torch.arange(self.occupied.numel(), device=device)
+        check_range("OccupancyGrid.update", "voxels", voxels, self.occupied.numel())
         drawn_on = device if generator is None else generator.device
         # All points before the first is entered: `decay` is of the densities from before.
         points = [
             self.points(part, torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device))
-            for part in cells.split(CHUNK)
+            for part in voxels.split(CHUNK)
         ]
         found = [density_of(field, part) for part in points]
         if found:
@@ -230,18 +229,18 @@ class OccupancyGrid:
         decay: float,
         backend: str = "auto",
     ) -> None:
-        """Updates cells, in place, from samples that were rendered anyway.
+        """Updates voxels, in place, from samples that were rendered anyway.
 
         A sample that receives less than the share `HIDDEN` of the light counts as density 0. So the inside of an opaque
         object becomes empty like the space around it, which changes no picture. A surface that only few of the rays
-        through its cell see fades too, until `update` evaluates it again.
+        through its voxel see fades too, until `update` evaluates it again.
 
         Args:
-            positions: float32 [m, 3] in the box; a position outside counts for the nearest cell at the border.
+            positions: float32 [m, 3] in the box; a position outside counts for the nearest voxel at the border.
             density: [m], at the positions; NaN counts as infinite.
             deltas: [m], lengths of the strata of the samples.
             weights: [m], contributions of the samples to their rays, from `composite`.
-            decay: factor on the old densities of the cells of these samples, 0..1.
+            decay: factor on the old densities of the voxels of these samples, 0..1.
             backend: "auto", "reference", "native" or "warp".
 
         Raises:
@@ -253,10 +252,10 @@ class OccupancyGrid:
 
     @torch.no_grad()
     def fill_holes(self, field: Field, *, generator: torch.Generator | None = None) -> None:
-        """Occupies empty cells among occupied ones in which a field is dense: holes in surfaces that few rays meet.
+        """Occupies empty voxels among occupied ones in which a field is dense: holes in surfaces that few rays meet.
 
-        For a field that learns no more: before, each of these cells would cost samples in every step. Where no ray asks
-        a field any more, it can be dense by chance. Cells that stand alone, or are thin in places, stay empty for that.
+        For a field that learns no more: before, each of these voxels would cost samples in every step. Where no ray
+        asks a field any more, it can be dense by chance. So voxels that stand alone, or are thin in places, stay empty.
 
         Args:
             field: called without gradients.
@@ -286,9 +285,9 @@ class OccupancyGrid:
         samples = positions, density.float(), deltas.float(), weights.float()
         observe_occupancy(self.density, self.occupied, self.box, *samples, threshold=self.threshold, **rule)
 
-    def cells(self, points: Tensor) -> Tensor:
-        """Flat numbers int32 [n] of the cells that points [n, 3] lie in; outside the box the nearest at its border."""
-        return cells_of(points, self.box, self.occupied.shape)
+    def voxels(self, points: Tensor) -> Tensor:
+        """Flat numbers int32 [n] of the voxels that points [n, 3] lie in; outside the box the nearest at its border."""
+        return voxels_of(points, self.box, self.occupied.shape)
 
     def march(
         self,
@@ -304,7 +303,7 @@ class OccupancyGrid:
         capacity: int | None = None,
         backend: str = "auto",
     ) -> March:
-        """The samples of rays that lie in occupied cells; see `voronerf.ops.march_rays`."""
+        """The samples of rays that lie in occupied voxels; see `voronerf.ops.march_rays`."""
         return march_rays(
             rays.origins,
             rays.directions,

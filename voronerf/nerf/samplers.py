@@ -316,7 +316,7 @@ class Occupancy(Sampler):
         most: int | None = None,
         picture: bool = False,
     ) -> tuple[Samples, Tensor]:
-        """Samples of rays in occupied cells, and the stratum [r] behind the last of each; see `ops.march_rays`.
+        """Samples of rays in occupied voxels, and the stratum [r] behind the last of each; see `ops.march_rays`.
 
         Args:
             rays: r rays.

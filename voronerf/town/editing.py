@@ -325,7 +325,7 @@ def _join_grids(sources: Sequence[Source], frames: Sequence[Similarity]) -> Occu
         places = torch.linspace(1e-3, 1 - 1e-3, steps)
         for offset in itertools.product(places.tolist(), repeat=3):
             inside = torch.tensor([offset]).expand(len(full), 3)
-            voxels = grid.cells(frame.points(source.points(full, inside))).long()
+            voxels = grid.voxels(frame.points(source.points(full, inside))).long()
             marked[voxels] = True
             density.scatter_reduce_(0, voxels, source.density.view(-1)[full] / frame.scale, "amax")
         found, values = marked.view(grid.density.shape), density.view(grid.density.shape)

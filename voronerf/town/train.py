@@ -382,7 +382,7 @@ def _whole_grid(like: OccupancyGrid, grids: Sequence[OccupancyGrid]) -> Occupanc
         full = grid.occupied.view(-1).nonzero()[:, 0]
         for corner in corners:
             points = grid.points(full, corner.expand(len(full), 3))
-            whole.occupied.view(-1)[whole.cells(points).long()] = True
+            whole.occupied.view(-1)[whole.voxels(points).long()] = True
     whole.density = torch.where(whole.occupied, 2 * whole.threshold, 0.0)
     return whole
 

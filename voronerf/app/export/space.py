@@ -103,7 +103,7 @@ def ask(
         grid = renderer.occupancy
         places = points.to(renderer.device)
         places = places if renderer.contraction is None else renderer.contraction.points(places)
-        rows = rows[grid.occupied.view(-1)[grid.cells(places).long()].cpu()]
+        rows = rows[grid.occupied.view(-1)[grid.voxels(places).long()].cpu()]
     for part in rows.split(CHUNK):
         positions = points[part].to(renderer.device)
         along = (directions if len(directions) == 1 else directions[part]).to(renderer.device)
