@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import FLOATING, INDEX, Checked, check_choice, check_same_dtype
+from voronerf.ops._core.checks import check_same_dtype
+from voronerf.ops._core.declare import declare
 from voronerf.ops._core.layers import ACTIVATIONS
 
-_OP = backends.declare("grouped_linear", native=Implementation(EVERYWHERE, FLOATS))
+
+def _prepare(given: Any) -> Any:
+    if 0 in given.weight.shape:
+        raise ValueError(f"grouped_linear: weight must have no empty dimension, got {list(given.weight.shape)}")
+    if not torch.is_autocast_enabled(given.x.device.type):
+        check_same_dtype("grouped_linear", x=given.x, weight=given.weight, bias=given.bias)
+    return given
 
 
+@declare(native=Implementation(EVERYWHERE, FLOATS), smooth=["x", "weight", "bias"], prepare=_prepare)
 def grouped_linear(
-    x: Tensor,
-    offsets: Tensor,
-    weight: Tensor,
-    bias: Tensor | None = None,
+    x: Annotated[Tensor, "floating [n, i]"],
+    offsets: Annotated[Tensor, "int32 [k+1]"],
+    weight: Annotated[Tensor, "floating [k, o, i]"],
+    bias: Annotated[Tensor | None, "floating [k, o]"] = None,
     *,
-    activation: str = "none",
+    activation: Annotated[str, "|".join(ACTIVATIONS)] = "none",
     backend: str = "auto",
-) -> Tensor:
+) -> Annotated[Tensor, "floating [n, o]"]:
     """A linear layer for each cell: ``activation(W_c x + b_c)``, where c is the cell of the sample.
 
     Gradients of every order to x, weight and bias. Products are accumulated in float32 at least. Under
@@ -53,17 +62,3 @@ def grouped_linear(
         >>> grouped_linear(x, offsets, weight, activation="relu").flatten()
         tensor([10., 20.,  0.])
     """
-    given = Checked(_OP)
-    given.tensor("x", x, FLOATING, "n", "i")
-    given.tensor("weight", weight, FLOATING, "k", "o", "i")
-    given.tensor("offsets", offsets, INDEX, "k+1")
-    given.optional("bias", bias, FLOATING, "k", "o")
-    given.no_inference()
-    check_choice(_OP, "activation", activation, ACTIVATIONS)
-    if 0 in weight.shape:
-        raise ValueError(f"{_OP}: weight must have no empty dimension, got {list(weight.shape)}")
-    if not torch.is_autocast_enabled(x.device.type):
-        check_same_dtype(_OP, x=x, weight=weight, bias=bias)
-    run = backends.resolve(_OP, backend=backend, device=x.device, dtype=x.dtype)
-    y: Tensor = run(x, offsets, weight, bias, activation=activation)
-    return y

@@ -17,11 +17,11 @@ _STORED = (torch.float32, torch.bfloat16)
 
 
 def grouped_linear(
-    x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, *, activation: str = "none"
+    x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
 ) -> Tensor:
     """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``."""
     if native.on_cuda(x):
-        return grouped_mlp.grouped_linear(x, offsets, weight, bias, activation=activation)
+        return grouped_mlp.grouped_linear(x, offsets, weight, bias, activation)
     dtype = x.dtype
     if torch.is_autocast_enabled(x.device.type) and dtype != torch.float64:
         dtype = torch.get_autocast_dtype(x.device.type)

@@ -23,7 +23,7 @@ _PIECE = 1024
 
 
 def grouped_linear(
-    x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, *, activation: str = "none"
+    x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
 ) -> Tensor:
     """Every sample through the layer of its cell; see ``voronerf.ops.grouped_linear``."""
     dtype = x.dtype

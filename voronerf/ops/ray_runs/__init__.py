@@ -13,32 +13,22 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import Implementation
-from voronerf.ops._core.checks import (
-    INDEX,
-    LIKE_FIRST,
-    Checked,
-    check_number,
-    check_positive,
-    check_range,
-)
+from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_range, check_shape
 from voronerf.ops._core.declare import declare
 from voronerf.ops.composite.reference import check_ray_offsets
 from voronerf.ops.ray_runs.reference import OwnSamples
 
-_FLOATS = (torch.float32, torch.float64)
 _NATIVE = Implementation(("cpu",), (torch.float32,), file="ray_runs")
 _REFERENCE = Implementation(file="ray_runs")
-_SUMS, _GRADIENTS = (backends.declare(op, native=_NATIVE, reference=_REFERENCE) for op in ("run_sums", "run_gradients"))
 
 
-def _prepare(given: Any) -> Any:
+def _check_cells(given: Any) -> Any:
     check_range("own_samples", "cells", given.cells, len(given.own))
     return given
 
 
-@declare(native=_NATIVE, reference=_REFERENCE, prepare=_prepare)
+@declare(native=_NATIVE, reference=_REFERENCE, prepare=_check_cells)
 def own_samples(
     positions: Annotated[Tensor, "float32|float64 [n, 3]"],
     ray_index: Annotated[Tensor, "int32 [n]"],
@@ -82,7 +72,14 @@ def own_samples(
     """
 
 
-def run_sums(raw: Tensor, samples: OwnSamples, *, density_scale: float, backend: str = "auto") -> tuple[Tensor, Tensor]:
+@declare(native=_NATIVE, reference=_REFERENCE, prepare=lambda given: _check_samples("run_sums", given))
+def run_sums(
+    raw: Annotated[Tensor, "float32|float64 [m, 4]"],
+    samples: OwnSamples,
+    *,
+    density_scale: Annotated[float, "positive"],
+    backend: str = "auto",
+) -> tuple[Annotated[Tensor, "same [len(samples.run_offsets) - 1, 6]"], Annotated[Tensor, "same [m]"]]:
     """Partial sums of runs, from what the networks put out for their samples.
 
     Args:
@@ -103,10 +100,6 @@ def run_sums(raw: Tensor, samples: OwnSamples, *, density_scale: float, backend:
         >>> run_sums(torch.tensor([[0.0, 0, 0, 50.0]]), mine, density_scale=1.0)[0]  # half grey, opaque, at 1, of ray 7
         tensor([[ 0.5000,  0.5000,  0.5000, 50.0000,  1.0000,  7.0000]])
     """
-    _check_outputs(_SUMS, raw, samples, density_scale)
-    run = backends.resolve(_SUMS, backend=backend, device=raw.device, dtype=raw.dtype)
-    sums, density = run(raw.detach(), samples, float(density_scale))
-    return sums, density
 
 
 @declare(native=_NATIVE, reference=_REFERENCE)
@@ -146,15 +139,23 @@ def compose_runs(
     """
 
 
+def _check_answers(given: Any) -> Any:
+    runs = len(_check_samples("run_gradients", given).samples.run_offsets) - 1
+    if len(given.answers) != runs:
+        check_shape("run_gradients", "answers", given.answers, ("q", 6), {"q": runs})
+    return given
+
+
+@declare(native=_NATIVE, reference=_REFERENCE, prepare=_check_answers)
 def run_gradients(
-    raw: Tensor,
+    raw: Annotated[Tensor, "float32|float64 [m, 4]"],
     samples: OwnSamples,
-    answers: Tensor,
+    answers: Annotated[Tensor, "same [q, 6]"],
     *,
-    density_scale: float,
-    hidden: float = 0.0,
+    density_scale: Annotated[float, "positive"],
+    hidden: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Annotated[Tensor, "same [m, 4]"], Annotated[Tensor, "same [m]"]]:
     """Gradient of the loss to what the networks put out, from what the runs were told of their rays.
 
     Args:
@@ -178,32 +179,20 @@ def run_gradients(
         >>> run_gradients(raw, mine, answers, density_scale=1.0)[0][:, :3].round(decimals=4)  # lighter
         tensor([[-0.0833, -0.0833, -0.0833]])
     """
-    given = _check_outputs(_GRADIENTS, raw, samples, density_scale)
-    given.tensor("answers", answers, LIKE_FIRST, "q", 6)
-    check_number(_GRADIENTS, "hidden", hidden)
-    if not 0 <= hidden < 1:
-        raise ValueError(f"{_GRADIENTS}: hidden must lie in [0, 1), got {hidden}")
-    run = backends.resolve(_GRADIENTS, backend=backend, device=raw.device, dtype=raw.dtype)
-    gradient, weights = run(raw.detach(), samples, answers, float(density_scale), float(hidden))
-    return gradient, weights
 
 
-def _check_outputs(op: str, raw: Tensor, samples: OwnSamples, density_scale: float) -> Checked:
-    if not isinstance(samples, OwnSamples):
-        raise TypeError(f"{op}: samples must be OwnSamples, got {type(samples).__name__}")
-    given = Checked(op)
-    given.tensor("raw", raw, _FLOATS, "m", 4)
+def _check_samples(op: str, given: Any) -> Any:
+    raw, samples = given.raw, given.samples
     floats, whole = (samples.deltas, samples.depths), (samples.ray_index, samples.run_offsets)
     rows = len(raw), len(raw), len(raw), None
-    if all(map(_is_plain, (*floats, *whole), (raw.dtype,) * 2 + INDEX * 2, rows)) and raw.is_cpu:
-        given.sizes["q"] = len(samples.run_offsets) - 1
-    else:  # which says what is wrong
-        given.tensor("deltas", samples.deltas, LIKE_FIRST, "m")
-        given.tensor("depths", samples.depths, LIKE_FIRST, "m")
-        given.tensor("ray_index", samples.ray_index, INDEX, "m")
-        given.tensor("run_offsets", samples.run_offsets, INDEX, "q+1")
+    if not raw.is_cpu or not all(map(_is_plain, (*floats, *whole), (raw.dtype,) * 2 + INDEX * 2, rows)):
+        checked = Checked(op)  # which says what is wrong
+        checked.tensor("raw", raw, (raw.dtype,), "m", 4)
+        checked.tensor("deltas", samples.deltas, LIKE_FIRST, "m")
+        checked.tensor("depths", samples.depths, LIKE_FIRST, "m")
+        checked.tensor("ray_index", samples.ray_index, INDEX, "m")
+        checked.tensor("run_offsets", samples.run_offsets, INDEX, "q+1")
     check_ray_offsets(op, samples.run_offsets, len(raw))
-    check_positive(op, "density_scale", density_scale)
     return given
 
 

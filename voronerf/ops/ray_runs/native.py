@@ -13,12 +13,15 @@ from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 from voronerf.ops.ray_runs.reference import OwnSamples
 
-_OWN, _COMPOSE = declared("own_samples"), declared("compose_runs")
-_known, _own = (
-    _OWN.inputs(native.compiled.KnownSamples),
-    _OWN.outputs(native.compiled.OwnSamples, offsets="run_offsets"),
-)
+_OWN, _SUMS, _COMPOSE = declared("own_samples"), declared("run_sums"), declared("compose_runs")
+_GRADIENTS = declared("run_gradients")
+_known = _OWN.inputs(native.compiled.KnownSamples)
+_own = _OWN.outputs(native.compiled.OwnSamples, offsets="run_offsets")
 _runs = _COMPOSE.inputs(native.compiled.RunsOfRays)
+_NO_RAYS = {"deltas": "samples.deltas", "offsets": "samples.run_offsets", "r": "len(samples.run_offsets) - 1"}
+_NO_RAYS |= {"target": "None", "background": "None", "background_per_ray": "False"}
+_outputs_of_sums = _SUMS.inputs(native.compiled.RenderLossInputs, **_NO_RAYS, hidden="0.0")
+_outputs = _GRADIENTS.inputs(native.compiled.RenderLossInputs, **_NO_RAYS)
 
 
 def own_samples(*flat: Any) -> OwnSamples:
@@ -30,12 +33,12 @@ def own_samples(*flat: Any) -> OwnSamples:
     return OwnSamples._make([*(part[:m] for part in found[:5]), offsets])
 
 
-def run_sums(raw: Tensor, samples: OwnSamples, density_scale: float) -> tuple[Tensor, Tensor]:
+@_SUMS.plain
+def run_sums(given: Any, found: tuple[Tensor, Tensor]) -> None:
     """Partial sums [q, 6] and densities [m]; see ``voronerf.ops.run_sums``."""
-    density, sums = raw.new_empty(len(raw)), raw.new_empty(len(samples.run_offsets) - 1, 6)
-    given = _inputs(raw, samples, density_scale, 0.0)
-    native.compiled.run_sums(given, samples.depths, samples.ray_index, density, sums, native.cpu())
-    return sums, density
+    sums, density = found
+    samples = given.samples
+    native.compiled.run_sums(_outputs_of_sums(given), samples.depths, samples.ray_index, density, sums, native.cpu())
 
 
 @_COMPOSE.plain
@@ -45,26 +48,9 @@ def compose_runs(given: Any, found: tuple[Tensor, Tensor]) -> None:
     loss.fill_(native.compiled.compose_runs(_runs(given), answers, native.cpu()))
 
 
-def run_gradients(
-    raw: Tensor, samples: OwnSamples, answers: Tensor, density_scale: float, hidden: float
-) -> tuple[Tensor, Tensor]:
+@_GRADIENTS.plain
+def run_gradients(given: Any, found: tuple[Tensor, Tensor]) -> None:
     """Gradient of the loss to the outputs [m, 4], and weights [m]; see ``voronerf.ops.run_gradients``."""
-    gradient, (weights, importance) = raw.new_empty(raw.shape), raw.new_empty(2, len(raw))
-    given = _inputs(raw, samples, density_scale, hidden)
-    native.compiled.run_gradients(given, answers, gradient, weights, importance, native.cpu())
-    return gradient, weights
-
-
-def _inputs(raw: Tensor, samples: OwnSamples, density_scale: float, hidden: float) -> native.compiled.RenderLossInputs:
-    return native.compiled.RenderLossInputs(
-        raw=raw,
-        deltas=samples.deltas,
-        offsets=samples.run_offsets,
-        target=None,
-        background=None,
-        background_per_ray=False,
-        density_scale=density_scale,
-        hidden=hidden,
-        r=len(samples.run_offsets) - 1,
-        m=len(raw),
-    )
+    gradient, weights = found
+    importance = weights.new_empty(given.m)
+    native.compiled.run_gradients(_outputs(given), given.answers, gradient, weights, importance, native.cpu())
