@@ -9,10 +9,7 @@ from emulated import emulated
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, TrainConfig, build, train
 
-SMALL = {
-    "nerf": {"depth": 2, "occupancy": False},
-    "hashgrid": {"field_options": ("levels=2", "log2_entries=10")},
-}
+SMALL = {"nerf": {"depth": 2, "occupancy": False}, "hashgrid": {"field_options": ("levels=2", "log2_entries=10")}}
 
 
 class Losses(Callback):

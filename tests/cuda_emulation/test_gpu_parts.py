@@ -342,10 +342,7 @@ def test_calls_fit_their_time_and_leave_two_files(check, monkeypatch, tmp_path):
 def test_what_loses_is_to_be_deleted(check):
     times = {"nerf64 k=16 forward": 1.0, "nerf64 k=16 forward by tiles": 1.6}
     times |= {f"cell_sort k={k} by {way}": 1.0 + (way == "radix") for k in (16, 1022) for way in ("counting", "radix")}
-    assert check.ruled(times) == [
-        "chain is 1.60 x the tiles: keep it",
-        "sort: counting up to 1,022 cells stays",
-    ]
+    assert check.ruled(times) == ["chain is 1.60 x the tiles: keep it", "sort: counting up to 1,022 cells stays"]
     assert check.ruled({}) == []
 
 

@@ -116,12 +116,7 @@ def test_points_that_are_not_finite_take_the_first_centre_at_every_level(device)
     # Here the first centre of the root is refined too.
     child = torch.tensor([1, -1, 2, -6, -3, -4, 3, -5, -2, -7], dtype=torch.int32, device=device)
     leaves = draw_cell(
-        points,
-        centres,
-        CHILD_OFFSETS.to(device),
-        child,
-        uniforms[:, None].expand(3, DEPTH),
-        temperature=0.2,
+        points, centres, CHILD_OFFSETS.to(device), child, uniforms[:, None].expand(3, DEPTH), temperature=0.2
     )
     assert leaves.tolist() == [5, 5, 5]
 

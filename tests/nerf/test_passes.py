@@ -20,13 +20,7 @@ from voronerf.nerf import (
     Stratified,
     render_rays,
 )
-from voronerf.nerf.sampling import (
-    PADDING,
-    blurred_weights,
-    strata_uniforms,
-    stratified_edges,
-    union_depths,
-)
+from voronerf.nerf.sampling import PADDING, blurred_weights, strata_uniforms, stratified_edges, union_depths
 
 WHITE = torch.ones(3)
 

@@ -126,11 +126,7 @@ SPECTRAL = nn.utils.parametrizations.spectral_norm
 Errors = list[tuple[Callable[[], Any], type[Exception], str]]
 MODULES: Errors = [
     (lambda: single(3), TypeError, "module must be an nn.Module, got int"),
-    (
-        lambda: single(nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4))),
-        TypeError,
-        "`1`, a BatchNorm1d, mixes",
-    ),
+    (lambda: single(nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4))), TypeError, "`1`, a BatchNorm1d, mixes"),
     (lambda: single(nn.Sequential(nn.Linear(3, 4), nn.SyncBatchNorm(4))), TypeError, "`1`, a SyncBatchNorm, mixes"),
     (lambda: single(nn.LSTM(3, 4)), TypeError, "a LSTM is recurrent"),
     (lambda: single(SPECTRAL(nn.Linear(3, 4))), TypeError, "keeps a state for each weight"),

@@ -18,13 +18,7 @@ from voronerf.app import open_run
 from voronerf.app.cli.main import main
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.scenes.record import read_scene, write_scene
-from voronerf.app.train.checkpoint import (
-    Checkpoint,
-    CheckpointError,
-    checkpoint_path,
-    load_checkpoint,
-    save_checkpoint,
-)
+from voronerf.app.train.checkpoint import Checkpoint, CheckpointError, checkpoint_path, load_checkpoint, save_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.town import Similarity, Solid, editing
 from voronerf.town.parts import Parts
@@ -53,15 +47,7 @@ def runs(tmp_path_factory, scene):
     folder = tmp_path_factory.mktemp("runs")
     shared = {"steps": 60, "rays": 128, "samples": (16,), "evaluations": 1}
     first = TrainConfig(out=folder / "first", cells=(4,), width=8, field_options=SMALL, **shared)
-    second = TrainConfig(
-        out=folder / "second",
-        cells=(4,),
-        width=12,
-        depth=2,
-        field="nerf",
-        occupancy=False,
-        **shared,
-    )
+    second = TrainConfig(out=folder / "second", cells=(4,), width=12, depth=2, field="nerf", occupancy=False, **shared)
     for config in (first, second):
         trained(config, scene)
     return first.out, second.out

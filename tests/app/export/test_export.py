@@ -108,11 +108,7 @@ def diagrams():
     centres = 2 * torch.rand(8, 3, generator=seeded(1)) - 1
     nested, _ = VoronoiDiagram(centres).refine({i: centres[i] + 0.2 * torch.randn(4, 3) for i in (1, 5)})
     far = torch.cat((centres, torch.tensor([[50.0, 0, 0]])))
-    return {
-        "nested": nested,
-        "one": VoronoiDiagram(torch.zeros(1, 3)),
-        "far": VoronoiDiagram(far),
-    }
+    return {"nested": nested, "one": VoronoiDiagram(torch.zeros(1, 3)), "far": VoronoiDiagram(far)}
 
 
 @pytest.mark.parametrize("name", ["nested", "one", "far"])

@@ -279,10 +279,7 @@ def broken(path, at, layout, *values):
         (lambda model: broken(model / "points3D.bin", 0, "<Q", 10**6), "points3D.bin: is cut short or broken: 1000000"),
         (lambda model: broken(model / "images.bin", 12, "<d", np.nan), "image 08.jpg: its pose must be a unit"),
         (lambda model: broken(model / "cameras.bin", 12, "<i", 77), "camera 1 has model number 77"),
-        (
-            lambda model: broken(model / "cameras.bin", 32, "<d", -1.0),
-            "camera 1 must have a size, finite parameters",
-        ),
+        (lambda model: broken(model / "cameras.bin", 32, "<d", -1.0), "camera 1 must have a size, finite parameters"),
         (lambda model: broken(model / "images.bin", 44, "<d", 1e300), "its pose must be a unit quaternion and a"),
         (lambda model: broken(model / "images.bin", 8 + 60, "<I", 99), "has camera 99, which cameras.bin has not"),
         (lambda model: broken(model / "images.bin", 8 + 64, "<6s", b"../../"), "must lie in the folder"),

@@ -60,10 +60,7 @@ def test_json_of_something_else(text):
         ),
         ({"parameters": 0}, "--parameters must be at least 1, got 0"),
         ({"samples": (0,)}, r"--samples must be one number of at least 1, got \(0,\)"),
-        (
-            {"samples": (8,), "sampling": "hierarchical"},
-            "--samples must be 2 numbers, one for each pass of at least 1",
-        ),
+        ({"samples": (8,), "sampling": "hierarchical"}, "--samples must be 2 numbers, one for each pass of at least 1"),
         ({"field": "mip-nerf"}, "--field must be nerf, mipnerf, kilonerf or hashgrid; .*, got 'mip-nerf'"),
         ({"sampling": "hierachical"}, "--sampling must be stratified or hierarchical, got 'hierachical'"),
         ({"init": "inherited"}, "--init must be inherit or random, got 'inherited'"),

@@ -172,10 +172,7 @@ def test_options_reach_the_field(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (
-            {"field": "siren"},
-            "--field must be nerf, mipnerf, kilonerf, hashgrid, table, own-encoding, fourier, fo",
-        ),
+        ({"field": "siren"}, "--field must be nerf, mipnerf, kilonerf, hashgrid, table, own-encoding, fourier, fo"),
         ({"field": "table", "depth": 3}, "--depth must not come with --field table, got 3"),
         ({"field_options": ("gain",)}, "--field-options must be NAME=VALUE, got 'gain'"),
         *(
