@@ -1,6 +1,5 @@
 """What the scripts under benchmarks/ share, and that the throughput table compares like with like."""
 
-import json
 import re
 import subprocess
 import sys
@@ -37,14 +36,6 @@ COLUMNS = [
     *("op", "case", "backend", "device", "dtype", "direction", "n", "k", "threads"),
     *("median_ms", "iqr_ms", "throughput", "unit", "percent_of_peak", "alternatives", "speedup_over_best", "max_error"),
 ]
-
-
-def test_metadata_says_what_was_measured_where():
-    metadata = json.loads(json.dumps(harness.metadata(benchmark="balance", seeds=3)))
-    assert (metadata["benchmark"], metadata["seeds"]) == ("balance", 3)
-    assert (metadata["voronerf"], metadata["torch"]) == (voronerf.__version__, torch.__version__)
-    assert metadata["threads"] == torch.get_num_threads() and metadata["machine"] and metadata["python"]
-    assert "available" in metadata["native"]
 
 
 def test_contenders_take_turns_and_slow_ones_are_capped():
@@ -92,12 +83,6 @@ def test_other_processes_are_noticed():
     assert most > 0.3
 
 
-def test_quartiles():
-    timing = harness.Timing([0.001, 0.002, 0.003, 0.004, 0.1])
-    assert timing.median_ms == pytest.approx(3) and timing.iqr_ms == pytest.approx(2)
-    assert harness.Timing([0.5]).iqr_ms is None
-
-
 @pytest.mark.native
 def test_instruction_set_is_forced_and_put_back():
     before = native.describe()["instruction set"]
@@ -124,14 +109,6 @@ def test_foreign_fields_have_rows_of_their_own():
     assert len({case.key for case in cases}) == len(cases) and {case.op for case in cases} == {"foreign"}
     assert len(quick) == len(cases_foreign.FIELDS) == len({case.case.split(" n=")[0] for case in cases})
     assert {(case.n, case.k, case.threads) for case in quick} == {(1024, 16, 1)}
-
-
-def test_foreign_rows_as_markdown():
-    row = {"case": "siren n=1024 k=16 threads=2", "direction": "forward", "median_ms": 5.0, "k": 16}
-    row["alternatives"] = {"masks": 10.0, "fused": 4.0}
-    header, rule, line = table.foreign_markdown([{**row, "n": 1024, "threads": 2}])
-    assert line == "| siren, 2 threads | 1,024 | 16 | forward | 10.0 | **2.00** | 2.50 |"
-    assert header.count("|") == rule.count("|") == line.count("|")
 
 
 @pytest.mark.parametrize("name", ["nerf-pytorch w64", "appearance", "siren laplacian", "nerfacto table", "k-planes"])
@@ -313,15 +290,6 @@ def test_throughput_runs_and_table_reads_its_result(tmp_path, capsys):
             assert f"`resample` {row['case']}" in table.markdown([row])[-1]
     with pytest.raises(SystemExit, match=r"must be a result of throughput\.py"):
         table.load(BENCHMARKS / "results" / "time_to_quality_lego.json")
-
-
-def test_processors_have_names():
-    text = "vendor_id\t: {}\ncpu family\t: {}\nmodel\t\t: {}\nmodel name\t: A name\n"
-    assert harness.processor(text.format("AuthenticAMD", 26, 2)) == "A name (Zen 5)"
-    assert harness.processor(text.format("AuthenticAMD", 25, 17)) == "A name (Zen 4)"
-    assert harness.processor(text.format("GenuineIntel", 6, 207)) == "A name (Emerald Rapids)"
-    assert harness.processor(text.format("GenuineIntel", 6, 1)) == "A name (family 6, model 1)"
-    assert harness.processor("model name: Arm\n") == "Arm"
 
 
 def test_the_table_shows_rows_that_the_benchmark_has():

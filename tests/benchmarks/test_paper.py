@@ -21,7 +21,7 @@ from paper.report import ABOUT
 from PIL import Image
 
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.train import ConfigError, TrainingError
+from voronerf.app.train import ConfigError
 from voronerf.app.train.build import count_parameters, solve_width
 from voronerf.app.train.defaults import resolve
 
@@ -44,14 +44,12 @@ def settings(tmp_path):
 
 
 class Fake:
-    """A training of steps of equal length, which fails beyond a limit."""
+    """A training of steps of equal length."""
 
-    def __init__(self, name, seconds, step, limit=99.0, log=None):
-        self.name, self.seconds, self.step, self.limit, self.log = name, seconds, step, limit, log
+    def __init__(self, name, seconds, step, log=None):
+        self.name, self.seconds, self.step, self.log = name, seconds, step, log
 
     def advance(self, until):
-        if until > self.limit:
-            raise TrainingError("the loss is nan")
         while self.seconds < until:
             self.seconds += self.step
         if self.log is not None:
@@ -81,14 +79,6 @@ def test_turns():
     stops, on_stop = lambda fake: (3.0, 4.5, 5.0), lambda fake, second: looks.append(second)
     turns.take_turns([Fake("a", 4.7, 0.5)], budget=6.0, turn=2.0, stops=stops, on_stop=on_stop)
     assert looks == [4.5, 5.0]
-
-
-def test_one_that_fails_leaves_the_turns():
-    failing, other, failed = Fake("a", 0.0, 0.5, limit=1.0), Fake("b", 0.0, 0.5), []
-    turns.take_turns([failing, other], budget=3, turn=1, on_failure=lambda *told: failed.append(told))
-    assert [(fake, str(error)) for fake, error in failed] == [(failing, "the loss is nan")] and other.seconds == 3
-    with pytest.raises(TrainingError):
-        turns.take_turns([failing, other], budget=4, turn=1)
 
 
 def test_experiments_write_their_files_and_are_not_run_again(settings, capsys, monkeypatch):

@@ -167,24 +167,11 @@ struct Case {
     result.directions = poisoned(inputs ? directions.size() : 0);
     result.features = poisoned(inputs ? features.size() : 0);
     Array<float> hashed = poisoned(table.grid.levels.empty() ? 0 : n * ((table.position.size + 15) / 16 * 16));
-    const voronerf::MlpInputs in{positions.data(),
-                                 directions.data(),
-                                 index.empty() ? nullptr : index.data(),
-                                 offsets.data(),
-                                 w.data(),
-                                 b.data(),
-                                 n,
-                                 rays,
-                                 k,
-                                 order.empty() ? nullptr : order.data(),
-                                 features.data(),
-                                 voronerf::TableType::float32,
-                                 tables,
-                                 hashed.data()};
+    const voronerf::MlpInputs in{positions.data(), directions.data(), index.empty() ? nullptr : index.data(),
+                                 offsets.data(), w.data(), b.data(), n, rays, k, order.empty() ? nullptr : order.data(),
+                                 features.data(), voronerf::TableType::float32, tables, hashed.data()};
     voronerf::grouped_mlp_cpu(table, in, result.out.data(), isa, threads);
-    const voronerf::MlpGradients gradients{gradient.data(),
-                                           parameters ? grad_w.data() : nullptr,
-                                           grad_b.data(),
+    const voronerf::MlpGradients gradients{gradient.data(), parameters ? grad_w.data() : nullptr, grad_b.data(),
                                            inputs ? result.positions.data() : nullptr,
                                            inputs ? result.directions.data() : nullptr,
                                            inputs && !features.empty() ? result.features.data() : nullptr};

@@ -117,17 +117,8 @@ void composite(Isa isa) {
   }
   const Array<float> sigma = uniform<float>(m), rgb = uniform<float>(m * c), depths = uniform<float>(m);
   const Array<float> deltas = uniform<float>(m), behind = uniform<float>(background ? (per_ray ? r * c : c) : 0);
-  const voronerf::CompositeInputs in{sigma.data(),
-                                     rgb.data(),
-                                     depths.data(),
-                                     deltas.data(),
-                                     or_null(offsets),
-                                     background ? behind.data() : nullptr,
-                                     per_ray,
-                                     r,
-                                     s,
-                                     m,
-                                     c};
+  const voronerf::CompositeInputs in{sigma.data(), rgb.data(), depths.data(), deltas.data(), or_null(offsets),
+                                     background ? behind.data() : nullptr, per_ray, r, s, m, c};
   const Array<float> to_colour = uniform<float>(r * c), to_opacity = uniform<float>(r), to_depth = uniform<float>(r);
   const Array<float> to_weights = uniform<float>(m);
   const int64_t asked = below(16);
@@ -140,13 +131,9 @@ void composite(Isa isa) {
     const voronerf::CompositeGradients gradients{asked & 1 ? to_colour.data() : nullptr,
                                                  asked & 2 ? to_opacity.data() : nullptr,
                                                  asked & 4 ? to_depth.data() : nullptr,
-                                                 asked & 8 ? to_weights.data() : nullptr,
-                                                 out[4].data(),
-                                                 out[5].data(),
-                                                 out[6].data(),
-                                                 asked & 1 ? out[7].data() : nullptr,
-                                                 background ? out[8].data() : nullptr,
-                                                 out[9].data()};
+                                                 asked & 8 ? to_weights.data() : nullptr, out[4].data(), out[5].data(),
+                                                 out[6].data(), asked & 1 ? out[7].data() : nullptr,
+                                                 background ? out[8].data() : nullptr, out[9].data()};
     voronerf::composite_backward_cpu(in, gradients, isa, 1 + 2 * i);
   }
   for (int j = 0; j < 9; ++j) {
@@ -235,16 +222,8 @@ void linear(Isa isa) {
   const int64_t n = offsets.back() + below(3);
   const Array<T> x = stored<T>(n * i), weight = stored<T>(k * o * i), bias = stored<T>(below(2) * k * o),
                  gradient = stored<T>(n * o);
-  const voronerf::LinearInputs in{x.data(),
-                                  offsets.data(),
-                                  weight.data(),
-                                  or_null(bias),
-                                  n,
-                                  k,
-                                  i,
-                                  o,
-                                  static_cast<voronerf::Activation>(below(5)),
-                                  sizeof(T) == 2};
+  const voronerf::LinearInputs in{x.data(), offsets.data(), weight.data(), or_null(bias), n, k, i, o,
+                                  static_cast<voronerf::Activation>(below(5)), sizeof(T) == 2};
   const bool to_x = below(4) > 0, to_weight = below(4) > 0;
   Array<T> results[2][4];
   for (int j = 0; j < 2; ++j) {
@@ -286,23 +265,9 @@ void march(Isa isa) {
   Array<uint8_t> occupied(x * y * z);
   for (uint8_t& cell : occupied) cell = static_cast<uint8_t>(below(2));
   const bool hashed = uniforms.empty() && below(2) == 0, disparity = below(2) == 0, contracted = below(2) == 0;
-  const voronerf::MarchInputs in{origins.data(),
-                                 directions.data(),
-                                 near.data(),
-                                 far.data(),
-                                 occupied.data(),
-                                 box,
-                                 or_null(uniforms),
-                                 hashed ? &seed : nullptr,
-                                 nullptr,
-                                 r,
-                                 s,
-                                 x,
-                                 y,
-                                 z,
-                                 disparity,
-                                 1 + below(s),
-                                 {contracted ? sphere : nullptr, nullptr}};
+  const voronerf::MarchInputs in{origins.data(), directions.data(), near.data(), far.data(), occupied.data(), box,
+                                 or_null(uniforms), hashed ? &seed : nullptr, nullptr, r, s, x, y, z, disparity,
+                                 1 + below(s), {contracted ? sphere : nullptr, nullptr}};
   Array<float> depths[2];
   for (int i = 0; i < 2; ++i) {
     const int threads = 1 + 2 * i;

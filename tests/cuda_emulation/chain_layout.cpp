@@ -30,7 +30,6 @@ py::dict layer_of(const voronerf::MlpChainPlan& plan, const voronerf::MlpChainLa
   told["index"] = layer.index;
   told["piece"] = layer.piece;
   told["region"] = layer.region;
-  told["read"] = layer.read;
   told["held"] = layer.held;
   told["among"] = layer.among;
   py::list sources, pieces;
@@ -71,9 +70,6 @@ void bind_chain_layout(py::module_& module) {
                told["shared_bytes"] = plan.shared_bytes;
                told["pieces"] = plan.pieces;
                told["packed_bytes"] = plan.packed_bytes;
-               told["task_rows"] = plan.task_rows;
-               told["tasks"] = plan.tasks;
-               told["workspace"] = voronerf::mlp_chain_workspace(plan, k).bytes;
                py::list layers;
                for (int l = 0; l < plan.layer_count; ++l) layers.append(layer_of(plan, plan.layers[l]));
                told["layers"] = layers;

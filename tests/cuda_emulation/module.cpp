@@ -43,17 +43,9 @@ PYBIND11_MODULE(voronerf_emulation, module) {
         plan["precision"] = static_cast<int>(by_layers ? choice.layers.precision : choice.fused.precision);
         plan["task_rows"] = choice.fused.task_rows;
         plan["tasks"] = choice.fused.tasks;
-        plan["shared_bytes"] = choice.fused.shared_bytes;
-        plan["block_rows"] = choice.fused.rows();
-        plan["resident"] = choice.fused.resident;
-        plan["block_warps"] = choice.fused.warps;
-        plan["warps"] = by_layers ? 0 : voronerf::mlp_cuda_warps(choice.fused, voronerf::mlp_cuda_device());
-        plan["slab"] = choice.layers.slab;
         plan["slabs"] = choice.layers.slabs;
-        plan["tiles"] = choice.layers.tiles;
         plan["splits"] = choice.layers.splits;
         plan["partial_bytes"] = 4 * k * choice.layers.partial;
-        plan["bytes_of_row"] = choice.layers.columns * choice.layers.element;
         plan["workspace"] = voronerf::mlp_layers_workspace(choice.layers, k, backward).bytes;
         return plan;
       },

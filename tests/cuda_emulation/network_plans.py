@@ -11,9 +11,6 @@ from voronerf.ops.grouped_mlp import network as grouped_mlp
 PRECISIONS = compiled.MlpPrecision
 WAYS = grouped_mlp.WAYS
 MANY = 1 << 22
-SHARED = {75: 64 * KIB, 80: 163 * KIB, 86: 99 * KIB, 90: 227 * KIB, 120: 99 * KIB}
-"""Shared memory that a block may ask for, by compute capability."""
-SIZES = ((0, 1), (1, 1), (1000, 7), (4_000_000, 4096))
 
 
 def nerf(width, depth):
@@ -56,10 +53,3 @@ def chain(layers, *, d=None, precision="bfloat16", n=MANY, k=16, **device):
     known = {"capability": 90, "shared_bytes": 227 * KIB, "multiprocessors": 132} | device
     operands = PRECISIONS.index(precision)
     return module().chain_plan(table(layers, d), operands, n, k, *known.values())
-
-
-def assert_covers(found, n, k):
-    """There are at least as many tasks as the worst offsets make."""
-    rows, tasks = found["task_rows"], found["tasks"]
-    assert tasks >= sum(-(-part // rows) for part in (n // k,) * (k - 1) + (n - n // k * (k - 1),))
-    assert tasks >= (k if n >= k else n)

@@ -1,15 +1,12 @@
 """The programs of ``make gpu-check`` on the CPU, so that their first run on a GPU does not end in a slip of theirs."""
 
-import contextlib
 import functools
 import importlib.util
 import itertools
-import os
 import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -76,21 +73,6 @@ def test_steps_to_capture_are_right_on_the_emulated_device(parts, monkeypatch):
     assert len(ways) == len(parts.captured_steps("cpu", 1)) == 6
 
 
-def test_a_wrong_result_is_told(parts, monkeypatch, capsys, tmp_path):
-    def wrong():
-        raise ValueError("not what it should be")
-
-    monkeypatch.setattr(parts, "small_cases", lambda device: [("fine", lambda: None), ("bad", wrong)])
-    monkeypatch.setattr("torch.cuda.synchronize", lambda: None)
-    assert parts.main(["small", str(tmp_path)]) == 1
-    said = capsys.readouterr().out
-    assert "right  fine" in said and "WRONG  bad: ValueError: not what it should be" in said
-    assert said.endswith("1 of 2 cases are right\n")
-    kept = read_json(tmp_path / "small.json")["cases"]
-    expected = [("fine", True, ""), ("bad", False, "ValueError: not what it should be")]
-    assert [(row["name"], row["right"], row["said"]) for row in kept] == expected
-
-
 AFTER_FAULTS = """
 import sys, threading, types
 sys.path.insert(0, {ci!r})
@@ -133,68 +115,6 @@ def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(tmp_path):
     kept = read_json(tmp_path / "out" / "small.json")["cases"]
     names = [line.split()[1].removesuffix(":") for line in told]
     assert [(row["name"], row["right"]) for row in kept] == list(zip(names, (True, False) * 2 + (True,), strict=False))
-
-
-@pytest.fixture
-def fake_cuda(monkeypatch):
-    """Graphs that keep what is called between the ends of a capture; a list of what was called outside of any."""
-    called, capturing = [], []
-
-    class Graph:
-        def __init__(self):
-            self.calls: list[str] = []
-
-        def replay(self):
-            called.extend(self.calls)
-
-    @contextlib.contextmanager
-    def graph(of):
-        capturing.append(of)
-        yield
-        capturing.pop()
-
-    def call():
-        (capturing[-1].calls if capturing else called).append("call")
-
-    called.append(call)
-    stream = SimpleNamespace(wait_stream=lambda other: None)
-    fakes = {"CUDAGraph": Graph, "graph": graph, "Stream": lambda: stream, "current_stream": lambda: stream}
-    for name, fake in {**fakes, "stream": lambda stream: contextlib.nullcontext()}.items():
-        monkeypatch.setattr(f"torch.cuda.{name}", fake)
-    return called
-
-
-class Ticks:
-    """A stopwatch by which a call takes a millisecond, and what the host does another ten."""
-
-    cuda = True
-
-    def __init__(self, called):
-        self.called = called
-
-    def __call__(self, run, first, count):
-        before = len(self.called)
-        run(first)
-        return 0.010 + 0.001 * (len(self.called) - before)
-
-
-def test_kernels_are_timed_without_the_host(timings, fake_cuda):
-    call = fake_cuda.pop()
-    found = timings.clock(call, Ticks(fake_cuda))
-    assert found["graph"] == "captured" and found["launched"] == pytest.approx(0.011)
-    assert found["seconds"] == pytest.approx((0.010 + 0.001 * timings.CALLS) / timings.CALLS)
-
-
-def test_what_cannot_be_captured_is_timed_as_it_is(timings, fake_cuda, monkeypatch):
-    def refused(graph):
-        raise RuntimeError("operation not permitted when stream is capturing")
-
-    monkeypatch.setattr("torch.cuda.graph", refused)
-    call = fake_cuda.pop()
-    found = timings.clock(call, Ticks(fake_cuda))
-    assert found["seconds"] == found["launched"] == pytest.approx(0.011)
-    assert found["graph"] == "RuntimeError: operation not permitted when stream is capturing"
-    assert timings.clock(call, Ticks(fake_cuda), captured=False) == {**found, "graph": "no graph"}
 
 
 @pytest.mark.native
@@ -241,13 +161,6 @@ def test_training(parts, tmp_path, capsys, monkeypatch):
     assert all(row["psnr"] > 0 and row["milliseconds"] > 0 for row in kept)
 
 
-def test_machine(parts, capsys, tmp_path):
-    parts.main(["machine", str(tmp_path)])
-    assert "missing: " in capsys.readouterr().out
-    kept = read_json(tmp_path / "machine.json")
-    assert kept["torch"] == torch.__version__ and isinstance(kept["missing"], list)
-
-
 def test_a_file_of_tests_that_hangs_fails_alone(parts, tmp_path, capsys):
     (tmp_path / "conftest.py").write_text("def pytest_addoption(parser):\n    parser.addoption('--require')\n")
     bodies = {
@@ -289,17 +202,6 @@ def test_a_part_that_hangs_is_ended_with_all_that_it_started(check, monkeypatch,
     raise AssertionError("the child of the part still runs")
 
 
-def test_what_a_part_says_is_kept_whatever_it_is(check, monkeypatch, tmp_path):
-    monkeypatch.setenv("PYTHONPATH", "/somewhere/else")
-    script = "import os, sys; print(os.environ['PYTHONPATH'], os.environ['GIVEN'], flush=True); "
-    script += r"sys.stdout.buffer.write(b'\xff\xfe not text\n')"
-    part = check.Part([sys.executable, "-c", script], 20, (("GIVEN", "1"),))
-    result = check.run("bytes", part, tmp_path, 100.0)
-    assert result["outcome"] == "passed" and result["last"].endswith(" not text")
-    assert (tmp_path / "bytes.txt").read_bytes().startswith(f"{ROOT}{os.pathsep}/somewhere/else 1".encode())
-    assert check.run("none", check.Part(["/not/there"], 20), tmp_path, 100.0)["outcome"] == "failed"
-
-
 def test_the_summary_has_all_that_a_part_has_found(check, monkeypatch, tmp_path):
     """And nothing of an earlier run, nor less than it can where a part was ended in the middle of a line."""
     (tmp_path / "old.json").write_text('{"cases": ["of an earlier run"]}')
@@ -339,13 +241,6 @@ def test_calls_fit_their_time_and_leave_two_files(check, monkeypatch, tmp_path):
     )
 
 
-def test_what_loses_is_to_be_deleted(check):
-    times = {"nerf64 k=16 forward": 1.0, "nerf64 k=16 forward by tiles": 1.6}
-    times |= {f"cell_sort k={k} by {way}": 1.0 + (way == "radix") for k in (16, 1022) for way in ("counting", "radix")}
-    assert check.ruled(times) == ["chain is 1.60 x the tiles: keep it", "sort: counting up to 1,022 cells stays"]
-    assert check.ruled({}) == []
-
-
 @pytest.mark.native
 def test_large_cases(parts, monkeypatch):
     """Each way beside the others, small, on the emulated device; and a way that is wrong is found."""
@@ -380,22 +275,6 @@ def test_sizes_and_a_profiled_step(parts, timings, monkeypatch, tmp_path):
     assert timings.profile(tmp_path, parts.Again(("profile",), case_seconds=60.0), "cpu", 2) == 0
     (row,) = read_json(tmp_path / "profile.json")["steps"]
     assert row["seconds"] > 0 and row["launches"] == row["waits"] == 0
-
-
-def test_rivals_that_are_absent_are_left_out_with_the_reason(parts, timings, monkeypatch, tmp_path):
-    import harness
-
-    monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
-    tool = tmp_path / "tcnn"
-    tool.write_text("#!/bin/sh\necho 7 ns\n")
-    tool.chmod(0o755)
-    monkeypatch.setenv("VORONERF_TCNN", str(tool))
-    assert timings.rivals(tmp_path, parts.Again(("rivals",), case_seconds=60.0), "cpu", 1 << 10) == 0
-    kept = read_json(tmp_path / "rivals.json")
-    assert [row["said"] for row in kept["cases"]] == ["7 ns\n"]
-    assert [(row["name"].rsplit(" by ")[-1], row["reason"]) for row in kept["skipped"]] == [
-        (name, "not on CUDA") for name in ("torch.compile", "Triton", "tiny-cuda-nn")
-    ]
 
 
 def test_the_summary_says_what_was_reached_and_what_is_wrong(check):
@@ -450,17 +329,3 @@ print("imported")
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert result.stdout.endswith("imported\n"), result.stderr
-
-
-def test_the_sanitizer_sees_every_allocation(check, monkeypatch, tmp_path):
-    tool = tmp_path / "compute-sanitizer"
-    tool.write_text("#!/bin/sh\n")
-    tool.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    monkeypatch.setattr(check, "capability", lambda: "90")
-    known = check.parts(tmp_path, None)
-    assert ("VORONERF_CUDA_ARCHITECTURES", "90") in known["build"].environment
-    assert dict(known["memcheck"].environment) == {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
-    assert known["racecheck"].environment == () and known["racecheck"].command[0] == str(tool)
-    monkeypatch.setattr(check, "capability", lambda: None)
-    assert {name for name, part in check.parts(tmp_path, None).items() if isinstance(part.command, list)} == {"machine"}

@@ -268,13 +268,6 @@ def test_a_ray_that_ends_has_the_colour_before_its_end():
     assert asked[0] < 200 + 64 and 0.1 < float(seen.depth[0]) < 0.125
 
 
-def test_pictures_have_twice_the_strata_of_a_training_up_to_a_bound():
-    grid = OccupancyGrid(BOX, 4, threshold=0.1)
-    found = {samples: Occupancy(grid, samples).picture_samples for samples in (64, 128, 256, 512)}
-    assert found == {64: 128, 128: 256, 256: 384, 512: 512}
-    assert Occupancy(grid, 64, picture_samples=300).picture_samples == 300
-
-
 @pytest.mark.parametrize("backend", ["auto", "reference"])
 def test_training_samples_and_gradients_are_those_of_the_dense_form(backend):
     rays = cameras(9).image_rays(0)

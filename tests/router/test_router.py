@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import pickle
 
 import pytest
@@ -78,22 +77,6 @@ def test_random_initialisation_is_fresh_and_reproducible(field: NeRF, generator:
     assert not torch.equal(weights[0][0], weights[0][1])
 
 
-def test_state_dict_round_trips_across_subdivisions(field: NeRF, generator: torch.Generator) -> None:
-    inner = VoronoiDiagram(torch.randn(6, 3, generator=generator))
-    diagram, _ = inner.refine({2: torch.randn(3, 3, generator=generator)})
-    source = perturb(VoronoiRouter(field, diagram), generator)
-    buffer = io.BytesIO()
-    torch.save(source.state_dict(), buffer)
-    buffer.seek(0)
-    positions, directions = samples(80, generator)
-    for k in (1, 8, 20):
-        target = VoronoiRouter(field, torch.randn(k, 3, generator=generator))
-        buffer.seek(0)
-        target.load_state_dict(torch.load(buffer, weights_only=True))
-        assert target.num_cells == 8
-        assert torch.equal(target(positions, directions)[0], source(positions, directions)[0])
-
-
 def test_copies_and_the_wrapped_field_are_independent(field: NeRF, generator: torch.Generator) -> None:
     router = VoronoiRouter(field, torch.randn(3, 3, generator=generator))
     positions, directions = samples(20, generator)
@@ -134,12 +117,3 @@ def test_stochastic_assignment_is_for_training_only(field: NeRF, generator: torc
     assert 0.1 < (drawn != nearest).float().mean() < 0.9
     assert not torch.equal(router.assign(positions), drawn)
     assert torch.equal(router.eval().assign(positions), nearest)
-
-
-def test_frozen_parameters_stay_frozen(field: NeRF) -> None:
-    field.density.requires_grad_(False)
-    router = VoronoiRouter(field, torch.zeros(1, 3))
-    diagram, parents = router.diagram.refine({0: torch.randn(2, 3)})
-    router.subdivide(diagram, parents)
-    frozen = {name for name, p in router.named_parameters() if not p.requires_grad}
-    assert frozen == {"module.density.weight", "module.density.bias"}

@@ -17,7 +17,7 @@ from convention_rules import Encoded, Scales, seen
 from router_fields import SkipNet, masked_loop, perturb, tensors
 from torch import Tensor, nn
 
-from voronerf import NeRF, VoronoiRouter
+from voronerf import VoronoiRouter
 from voronerf.router import register
 
 
@@ -135,13 +135,6 @@ def test_shared_parameters_are_one_copy() -> None:
         cell.get_parameter(first).add_(1)
     with pytest.raises(ValueError, match=f"module's {first} must be that of the routed one, since cells share it"):
         router.load_cell(0, cell)
-
-
-def test_a_field_with_a_table_may_share(generator: torch.Generator) -> None:
-    router = VoronoiRouter(NeRF(width=16, depth=2), centres(), share=["trunk.*"])
-    x, d = uniform((40,)), F.normalize(uniform((40,)), dim=1)
-    router(x, d)[0].sum().backward()
-    assert router.module.trunk[0].weight.grad.shape == router.cell(0).trunk[0].weight.shape
 
 
 # layout ---------------------------------------------------------------------------------------------------------------

@@ -47,17 +47,17 @@ class Added(nn.Module):
 class TensorVM(nn.Module):
     """nerfstudio's TensoRF: three planes and three lines stacked in one parameter each."""
 
-    def __init__(self, padding: str = "zeros") -> None:
+    def __init__(self, padding: str = "zeros", align: bool = True) -> None:
         super().__init__()
         self.plane_coef = nn.Parameter(0.3 * torch.randn(3, 4, 9, 7))
         self.line_coef = nn.Parameter(0.3 * torch.randn(3, 4, 8, 1))
-        self.basis, self.padding = nn.Linear(12, 2, bias=False), padding
+        self.basis, self.padding, self.align = nn.Linear(12, 2, bias=False), padding, align
 
     def forward(self, x: Tensor) -> Tensor:
         plane = torch.stack([x[..., [0, 1]], x[..., [0, 2]], x[..., [1, 2]]])
         line = torch.stack([x[..., 2], x[..., 1], x[..., 0]])
         line = torch.stack([torch.zeros_like(line), line], dim=-1)
-        options: Any = {"align_corners": True, "padding_mode": self.padding}
+        options: Any = {"align_corners": self.align, "padding_mode": self.padding}
         planes = F.grid_sample(self.plane_coef, plane.view(3, -1, 1, 2), **options)
         lines = F.grid_sample(self.line_coef, line.view(3, -1, 1, 2), **options)
         return self.basis((planes * lines).view(12, *x.shape[:-1]).moveaxis(0, -1))
@@ -111,6 +111,8 @@ MODULES: dict[str, Callable[[], nn.Module]] = {
     "FiLM": FiLM,
     "stacked planes": TensorVM,
     "stacked planes, border": lambda: TensorVM("border"),
+    "stacked planes, not aligned": lambda: TensorVM(align=False),
+    "stacked planes, border, not aligned": lambda: TensorVM("border", align=False),
     "stacked planes, reflection": lambda: TensorVM("reflection"),
     "data of a parameter": BARF,
     "complex layers": Gabor,

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
-import torch.nn.functional as F
 from convention_rules import Corners
 from router_fields import masked_loop, perturb
 from torch import Tensor, nn
@@ -30,40 +27,6 @@ def _gradients(out: Tensor, parameters: list[Tensor], k: int, weights: Tensor) -
     """Of a router, [k, ...], or of the modules of a loop."""
     found = torch.autograd.grad(out, parameters, weights, retain_graph=True, materialize_grads=True, allow_unused=True)
     return list(found) if k == 0 else [torch.stack(found[i : i + k]) for i in range(0, len(found), k)]
-
-
-class Factors(nn.Module):
-    """A plane and a line, as TensoRF has them, read beyond their borders too."""
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__()
-        self.plane, self.line = nn.Parameter(torch.randn(1, 3, 5, 4)), nn.Parameter(torch.randn(1, 3, 6, 1))
-        self.options = options
-
-    def forward(self, x: Tensor) -> Tensor:
-        plane = F.grid_sample(self.plane, x[:, :2].view(1, -1, 1, 2), **self.options)
-        at = torch.stack([torch.zeros_like(x[:, 2]), x[:, 2]], -1)
-        line = F.grid_sample(self.line, at.view(1, 1, -1, 2), **self.options)
-        return torch.cat([plane[0, :, :, 0], line[0, :, 0] * plane[0, :, :, 0]]).T
-
-
-@pytest.mark.parametrize("n", [60, 7000], ids=["few samples a cell", "many"])
-@pytest.mark.parametrize("align", [True, False])
-@pytest.mark.parametrize("padding", ["zeros", "border"])
-def test_planes_and_lines_are_those_of_grid_sample(padding: str, align: bool, n: int) -> None:
-    torch.manual_seed(n)
-    router = _router(Factors(padding_mode=padding, align_corners=align), 4)
-    x = torch.rand(n, 3) * 3 - 1.5
-    x[:8] = torch.tensor([[-1.0, 1, 0.2], [1, -1, -1], [0, 0, 1], [9, -9, 9]]).repeat(2, 1)  # at borders and far beyond
-    given = [x.clone().requires_grad_() for _ in range(2)]
-    found, (expected, leaves) = router(given[0]), _loop(router, given[1])
-    assert router.explain() == "forward: grouped"
-    torch.testing.assert_close(found, expected)
-    weights = torch.randn(found.shape)
-    ours = [*_gradients(found, list(router.parameters()), 0, weights), *torch.autograd.grad(found, given[0], weights)]
-    theirs = [*_gradients(expected, leaves, 4, weights), *torch.autograd.grad(expected, given[1], weights)]
-    for a, b in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
 def test_indices_outside_of_a_table_are_refused() -> None:

@@ -80,15 +80,6 @@ def test_methods_share_an_assignment(generator: torch.Generator, monkeypatch: py
     assert len(drawn) == 3
 
 
-def test_a_module_may_call_its_arguments_as_the_router_calls_its_own(generator: torch.Generator) -> None:
-    class Named(nn.Linear):
-        def forward(self, x: Tensor, name: str, method: str) -> Tensor:
-            return super().forward(x) * len(name + method)
-
-    router, x = VoronoiRouter(Named(3, 2), uniform(generator, 4, 3), coords="first3"), uniform(generator, 20, 3)
-    torch.testing.assert_close(router(x, name="a", method="b"), 2 * router(x, "a", ""))
-
-
 # Optimisers -----------------------------------------------------------------------------------------------------------
 
 OPTIMIZERS: dict[str, Callable[[Any], torch.optim.Optimizer]] = {
@@ -174,9 +165,6 @@ def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
     stranger = torch.optim.SGD([nn.Parameter(torch.zeros(1))])
     with pytest.raises(ValueError, match="optimizer must hold the router's parameters"):
         router.subdivide(router.diagram, optimizer=stranger)
-
-
-# Cells ----------------------------------------------------------------------------------------------------------------
 
 
 # Modes and wrappers ---------------------------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ from voronerf.app.scenes import builtin_scene, load_scene, rich_scene
 from voronerf.app.scenes.builtin.caster import Caster
 from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, shaded
 from voronerf.app.scenes.builtin.plain import SOLIDS
-from voronerf.app.scenes.builtin.rich import SOLIDS as RICH
 from voronerf.app.scenes.builtin.solids import Box, Cylinder, Sphere, Torus, rotation
 from voronerf.app.scenes.carving import carve_box
 from voronerf.nerf.cameras import Cameras
@@ -128,17 +127,6 @@ def test_shape_and_determinism(scene):
     assert float(nearest.min()) > 0.02  # no test view is a training view
 
 
-def test_views_differ_by_highlights():
-    """The same point of a glossy solid has another colour from elsewhere."""
-    point = np.array([[0.62, 0.30, -0.10 + 0.359]], dtype=np.float32)
-    colours = []
-    for eye in ((-0.6, 1.9, 2.6), (2.6, 0.3, 2.6)):
-        origin = np.array([eye], dtype=np.float32)
-        aim = point - origin
-        colours.append(cast(origin, aim / np.linalg.norm(aim))[0])
-    assert np.abs(colours[0] - colours[1]).max() > 0.02
-
-
 def test_shadows_are_cast_by_the_same_solids():
     """A patch of floor behind a wall, seen from the lamp's side and from above: dark only where the wall stands."""
     floor = Box((0, 0, -0.1), lambda p, n: np.ones_like(p), gloss=0.0, half=(2.0, 2.0, 0.1))
@@ -159,13 +147,6 @@ def test_sizes():
     refuses("at least one view", builtin_scene, 4, train_views=0)
 
 
-def test_the_rich_scene_has_every_kind_often_and_stands_on_the_plinth():
-    for kind, least in ((Box, 190), (Sphere, 100), (Cylinder, 35), (Torus, 30)):
-        assert sum(isinstance(solid, kind) for solid in RICH) >= least
-    lows = [float(solid.bounds()[0, 2]) for solid in RICH[1:]]
-    assert min(lows) >= -0.4605, "nothing sinks into the plinth's top at -0.46"
-
-
 def test_the_rich_scene_is_of_the_usual_form():
     scene = rich_scene(24, train_views=2, test_views=1)
     assert scene.name == "builtin-rich" and scene.train.images.shape == (2, 24, 24, 4) and len(scene.test) == 1
@@ -175,13 +156,6 @@ def test_the_rich_scene_is_of_the_usual_form():
     assert float(seen.std(0).mean()) > 25, "many colours"
     assert scene.box is not None and bool((scene.box[1] > scene.box[0]).all())
     refuses("builtin-rich: size must be >= 1, got 0", rich_scene, 0)
-
-
-def test_the_rich_scene_is_named_on_the_command_line(monkeypatch):
-    import voronerf.app.scenes as data
-
-    monkeypatch.setitem(data.BUILTIN, "builtin-rich", lambda size: size)
-    assert load_scene("builtin-rich", downscale=4) == 25
 
 
 def test_carved_box_holds_the_scene_and_is_tight(scene):

@@ -92,14 +92,6 @@ def test_val_stands_in_for_test(tmp_path):
     assert len(load_scene(tmp_path).test) == 3
 
 
-def test_truth_composites():
-    split = builtin_scene(10, train_views=1, test_views=1).test
-    colour, alpha = split.images[0, ..., :3] / 255, split.images[0, ..., 3:] / 255
-    found = split.truth(0, torch.tensor((0.0, 0.5, 1.0)))[..., 1:2]
-    torch.testing.assert_close(found, colour[..., 1:2] * alpha + 0.5 * (1 - alpha))
-    torch.testing.assert_close(split.truth(0, None), colour * alpha)
-
-
 def test_capture(tmp_path, caplog):
     orbit = orbit_cameras(20, radius=7, elevation=15, width=12, height=10, focal=20, centre=(5, -2, 3))
     write_capture(tmp_path / "room", orbit, cx=5.5, cy=6.5, k1=0.02, p2=-0.001)

@@ -196,13 +196,6 @@ def test_empty_space_is_skipped_wherever_that_works(scene):
         assert resolved.occupancy == (resolved.contraction != "none")
 
 
-def test_a_hash_grid_in_a_scene_without_bounds_is_contracted(scene):
-    unbounded = replace(scene, box=None)
-    assert resolve(TrainConfig(), unbounded).contraction == "sphere"
-    assert resolve(TrainConfig(), scene).contraction == "none"
-    assert resolve(TrainConfig(field="nerf"), unbounded).contraction == "none"
-
-
 # --- the occupancy grid ----------------------------------------------------------------------------------------------
 
 
