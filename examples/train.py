@@ -14,7 +14,7 @@ from voronerf.nerf.schedule import learning_rate, next_rays
 
 torch.manual_seed(0)
 scene, seconds = load_scene(sys.argv[1]), float(sys.argv[2])
-space, views, random = scene.space(), scene.train, torch.Generator().manual_seed(0)
+space, views, generator = scene.space(), scene.train, torch.Generator().manual_seed(0)
 cube, pixel, contracted = scene.cube(space), scene.pixel(space), space.contraction is not None
 samples = usual_samples((cube[1][0] - cube[0][0]) / pixel, contracted=contracted, seconds=seconds)
 field = HashGridField(**HashGridField.scene_options(pixel, cube, contracted, seconds))
@@ -23,23 +23,23 @@ sampler = Occupancy(OccupancyGrid.for_training(scene.box, samples, contraction=s
 renderer = Renderer({"field": router}, sampler)
 loss = RayLoss(renderer, sparse_depth=0.003)
 optimizer = Adam.of({"field": router}, lr=0.02, views=len(views), sparse=["features"])
-strategy = SplitStrategy({"field": router}, [PlannedSplit(at=0.2, children=16)], generator=random)
+strategy = SplitStrategy({"field": router}, [PlannedSplit(at=0.2, children=16)], generator=generator)
 where = {"near": scene.near, "far": scene.far, "box": scene.box, "background": scene.background_colour()}
 batches = RayBatches(views.cameras, views.images, masks=views.masks, sparse=views.sparse_depth, **where)
 rays, step, start = 512, 0, time.perf_counter()
-while (done := (time.perf_counter() - start) / seconds) < 1:
-    strategy.step_pre_backward(optimizer, done, step)  # 16 cells, whose networks start as copies of the coarse one
-    sampler.step_pre_backward(router.train(), step, random)
-    optimizer.set_learning_rate(learning_rate(0.02, done, step, hold=0.25))
+while (fraction := (time.perf_counter() - start) / seconds) < 1:
+    strategy.step_pre_backward(optimizer, fraction, step)  # into 16 cells, each with a copy of the coarse network
+    sampler.step_pre_backward(router.train(), step, generator)
+    optimizer.set_learning_rate(learning_rate(0.02, fraction, step, hold=0.25))
     optimizer.zero_grad()
-    output = loss(batches.draw(rays, random), random, backward=True)
+    output = loss(batches.draw(rays, generator), generator, backward=True)
+    sampler.step_post_backward(output)
     optimizer.update()
     optimizer.after_step(step)
-    sampler.step_post_backward(output)
     strategy.step_post_backward(output)
     rays = next_rays(rays, len(output.weights), rays=512, samples=samples, growth=8, contracted=contracted)
     step += 1
 with optimizer.averaged():
-    sampler.fill_holes(router, seed=0)
+    sampler.finish(router, seed=0)
     psnr = mean_scores(evaluate(renderer, scene, views=20))["psnr"]
 print(f"{step} steps, {router.num_cells} cells, PSNR {psnr:.2f}")

@@ -71,7 +71,7 @@ def test_rows_beyond_the_samples_change_nothing(monkeypatch, request):
     assert 0 < int(rows) < 32 * 8  # some rows were beyond
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
-    state.read(output)
+    state.read_output(output)
     assert 32 < state.rays <= 256  # as many more as the samples left out allow
 
 

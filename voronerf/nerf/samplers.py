@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 #: Share of the first pass in the loss if one network is evaluated in two passes (mip-NeRF, section 3.2).
 COARSE_SHARE = 0.1
-#: One in so many strata is left while an occupancy grid settles.
+#: While an occupancy grid settles, a quarter of the strata are used.
 SETTLING_PART = 4
 #: In a contracted sphere, the first steps of a training, in which the grid learns nothing. A young field is thin
 #: everywhere: a grid would take it for empty, and what is emptied no longer learns.
@@ -42,7 +42,7 @@ SETTLING_STEPS = 400
 #: Steps between evaluations of random voxels of the occupancy grid, the share of all that are evaluated, and how many
 #: at most: as many as a few steps have samples.
 REVISIT_EVERY, REVISITED, MOST_REVISITED = 16, 1 / 8, 32_768
-#: Samples of a ray of a picture, for each of training: those are at random places, and meet all of a stratum in time.
+#: Samples of a ray of a picture for each of training, whose samples are jittered and so cover each stratum over time.
 #: At most so many: of the 256 of a long training, twice as many would make no picture more than 0.05 dB better.
 PICTURE_SAMPLES, MOST_PICTURE_SAMPLES = 2, 384
 #: Samples of a ray through contracted space whose empty part is skipped, and those of a training of at least `LONG`
@@ -60,6 +60,7 @@ class Sampler:
 
     Attributes:
         passes: How often a ray is sampled, each time with a number of samples of its own.
+        skips: Whether `Occupancy` takes its place where there is a grid.
         samples: s, of the first pass.
         space: How the field sees the scene.
         backend: Of the ops.
@@ -86,6 +87,7 @@ class Sampler:
     """
 
     passes: ClassVar[int] = 1
+    skips: ClassVar[bool] = False
 
     def __init__(self, samples: int, *, space: Space | None = None, backend: str = "auto") -> None:
         if samples < 1:
@@ -165,6 +167,14 @@ class Sampler:
             output: What :class:`voronerf.nerf.RayLoss` gave.
         """
 
+    def finish(self, field: Field, seed: int) -> None:
+        """Called after the last step of a training.
+
+        Args:
+            field: The field that was trained.
+            seed: Of random choices.
+        """
+
 
 class Stratified(Sampler):
     """One sample in each of s strata of a ray (NeRF, section 4).
@@ -177,6 +187,8 @@ class Stratified(Sampler):
         >>> samples.positions.shape, samples.ray_offsets
         (torch.Size([40, 3]), tensor([ 0,  8, 16, 24, 32, 40], dtype=torch.int32))
     """
+
+    skips = True
 
     def sample(
         self,
@@ -277,8 +289,8 @@ class Occupancy(Sampler):
             found = samples.positions, output.density, samples.deltas, output.weights
             self.grid.observe(*found, decay=DECAY, backend=self.backend)
 
-    def fill_holes(self, field: Field, seed: int) -> None:
-        """After the last step, occupies voxels that were emptied in the middle of surfaces; see `OccupancyGrid`.
+    def finish(self, field: Field, seed: int) -> None:
+        """Occupies voxels that were emptied in the middle of surfaces; see `OccupancyGrid`.
 
         In a contracted sphere alone: objects in a box and forward-facing scenes gain nothing by it.
 
@@ -301,7 +313,7 @@ class Occupancy(Sampler):
         generator: torch.Generator | None = None,
     ) -> Samples:
         """Samples of the occupied strata of each ray; arguments and result as in `Stratified.sample`."""
-        # A ray's jitter follows from the sum of the seed and of its number.
+        # The jitter of each ray is seeded with the seed plus its number.
         seed = draw_seed(near.device, generator) if jitter else None
         return self.march(rays, near, far, seed=seed)[0]
 
@@ -358,6 +370,7 @@ class Hierarchical(Stratified):
     """
 
     passes = 2
+    skips = False
 
     def __init__(self, samples: int, fine_samples: int, *, space: Space | None = None, backend: str = "auto") -> None:
         super().__init__(samples, space=space, backend=backend)
@@ -402,8 +415,8 @@ class Hierarchical(Stratified):
         return (COARSE_SHARE if self.space.cones else 1.0) * colour_loss(before.colour, target)
 
 
-#: By the names of ``--sampling``. `Occupancy` takes the place of `Stratified` where there is a grid.
-SAMPLERS: dict[str, type[Stratified]] = {"stratified": Stratified, "hierarchical": Hierarchical}
+#: By the names of ``--sampling``.
+SAMPLERS: dict[str, type[Sampler]] = {"stratified": Stratified, "hierarchical": Hierarchical}
 
 
 @contextmanager

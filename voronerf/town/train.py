@@ -218,7 +218,7 @@ def train(
             seconds, stop = group.total(agreed).tolist()
             passed = 0.0
             for state in town.states.values():
-                state.pass_time(seconds)
+                state.add_seconds(seconds)
                 if stop > 0:
                     state.stop()
                 if state.skipped_in_a_row >= PATIENCE:
@@ -233,7 +233,7 @@ def train(
     if first.fraction >= 1:
         for state in town.states.values():
             with state.averaged():
-                sampler_of(state).fill_holes(state.renderer.field, state.config.seed)
+                state.sampler.finish(state.renderer.field, state.config.seed)
     save(town)
 
 
@@ -260,7 +260,7 @@ def _learn(state: State, batch: Batch, output: RenderOutput) -> None:
     state.optimizer.after_step(state.step)
     state.strategy.step_post_backward(output)
     state.count_step(batch)
-    state.read(output)
+    state.read_output(output)
 
 
 # Files ----------------------------------------------------------------------------------------------------------------
@@ -363,7 +363,7 @@ def resume(town: Town) -> None:
                 load(state, parts[number])
             town.bounds = index.tensors["bounds"].clone()
             if errors:
-                town.first.say(f"{errors[0]}; {path.name} takes its place")
+                town.first.report(f"{errors[0]}; {path.name} takes its place")
             return
         errors.append(failure or CheckpointError(f"{path}: another rank cannot read it"))
     raise errors[0] if errors else CheckpointError(f"{town.out}: there is no checkpoint")

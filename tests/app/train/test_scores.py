@@ -30,10 +30,10 @@ def test_evaluations_are_part_of_the_budget(tmp_path, scene, views):
     state, scores = build(config, scene), Scores(None, clock=clock)
     run(state, [scores], clock=clock)
     if views is None:
-        assert state.scoring <= 2 and 36 <= state.seconds + state.scoring <= 42
+        assert state.evaluation_seconds <= 2 and 36 <= state.seconds + state.evaluation_seconds <= 42
         assert scores.summary["complete"] and scores.summary["views"] >= 1
     else:
-        assert state.scoring == 0 and 40 <= state.seconds <= 44
+        assert state.evaluation_seconds == 0 and 40 <= state.seconds <= 44
         assert [line["views"] for line in scores.metrics] == [2, 2, 2, 2]
 
 

@@ -176,7 +176,7 @@ def make_renderer(
         config: The settings, resolved.
         scene: Whose space is sampled.
         routers: The networks by name.
-        grid: Of what is empty; None to take every sample.
+        grid: Which space is empty; None to take every sample.
         samples: Samples per ray of each pass, in pictures too; None for those of the configuration.
         backend: Of the operations; None for that of the configuration.
 
@@ -308,7 +308,7 @@ def check_memory(config: TrainConfig) -> None:
 
 
 def _parameter_bytes(config: TrainConfig) -> int:
-    """Of a parameter, its gradient, Adam's two moments and its average."""
+    """Bytes for a parameter, its gradient, Adam's two moments and its average."""
     return 20 if config.average else 16
 
 

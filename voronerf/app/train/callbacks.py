@@ -66,12 +66,12 @@ class Checkpoints(Callback):
         write_bytes(self.out / "samples" / f"level-{state.strategy.splits}.npz", kept.getvalue())
         when = f"at {state.seconds:.0f} s, step {state.step}"
         if stage.split_cells:
-            state.say(
+            state.report(
                 f"{stage.cells} cells {when}, imbalance of their importance {stage.balance_before:.3f} -> "
                 f"{stage.balance_after:.4f}"
             )
         else:
-            state.say(f"no cell split {when}: none holds {MIN_SAMPLES} of the {len(done.points)} samples kept")
+            state.report(f"no cell split {when}: none holds {MIN_SAMPLES} of the {len(done.points)} samples kept")
 
     def after_step(self, state: State) -> None:
         """Begins to write a checkpoint when it is time, unless one is being written."""
@@ -172,10 +172,10 @@ class Scores(Callback):
     def on_end(self, state: State) -> None:
         """Scores the test views of a finished training, and writes the summary."""
         if state.fraction >= 1:
-            state.finish()
+            state.clear_stop()
             left = len(state.strategy.plan) - state.strategy.splits
             if left:
-                state.say(f"Run ended before {left} of {len(state.strategy.plan)} planned splits.")
+                state.report(f"Run ended before {left} of {len(state.strategy.plan)} planned splits.")
             self._evaluate(state, last=True)
         now = self.metrics[-1] if self.metrics else {}
         self.summary = {
@@ -204,7 +204,11 @@ class Scores(Callback):
             budget, probed = float(config.budget or 0), 0.0
             if self.view_seconds == 0 or lpips is not None:
                 probed = self._score(state, 1, lpips, counted=not last)[1]
-            left = SHARE * budget - state.scoring - probed if last else SHARE / 2 * state.seconds - state.scoring
+            left = (
+                SHARE * budget - state.evaluation_seconds - probed
+                if last
+                else SHARE / 2 * state.seconds - state.evaluation_seconds
+            )
             wanted = min(wanted, max(int(left / max(self.view_seconds, 1e-9)), int(last)))
         scores = self._score(state, wanted, lpips, counted=counted and not last)[0] if wanted else []
         if scores and not state.stopped:
@@ -220,7 +224,7 @@ class Scores(Callback):
         if counted:
             budget = float(state.config.budget or 0)
             last = min(self.view_seconds * len(state.scene.test), SHARE / 2 * budget)
-            state.count_scores(passed, last)
+            state.count_evaluation(passed, last)
         return scores, passed
 
     def _record(self, state: State, scores: list[ViewScore]) -> None:
@@ -236,7 +240,7 @@ class Scores(Callback):
         self.metrics = [line for line in self.metrics if line["step"] < state.step] + [now]
         if self.out is not None:
             write_text(self.out / "metrics.jsonl", "".join(json_text(line) + "\n" for line in self.metrics))
-        state.say(
+        state.report(
             f"{state.seconds:7.1f} s  step {state.step:6d}  {now['cells']:4d} cells  "
             f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} view{'s' * (len(scores) != 1)})"
         )
@@ -245,7 +249,7 @@ class Scores(Callback):
         settled = state.step >= SETTLED and state.fraction >= 0.5
         poor = why_scores_are_poor(self.metrics, state.config, self.one_colour, settled=settled)
         if poor is not None:
-            state.say(poor)
+            state.report(poor)
 
 
 def one_colour_psnr(scene: Scene, views: int = 5) -> float:

@@ -73,7 +73,7 @@ def why_no_occupancy(config: TrainConfig) -> str | None:
     """What keeps a run from skipping samples in empty space, whatever its scene; None if nothing does."""
     if config.field_type.cones:
         return f"--field {config.field}, which takes cones"
-    return None if SAMPLERS[config.sampling].passes == 1 else f"--sampling {config.sampling}"
+    return None if SAMPLERS[config.sampling].skips else f"--sampling {config.sampling}"
 
 
 def octaves_for(pixel: float) -> int:

@@ -10,7 +10,6 @@ from contextlib import nullcontext
 import torch
 
 from voronerf.app.train.state import State
-from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.split import SplitDone
 from voronerf.ops._core import backends
 from voronerf.ops.adam.reference import judge
@@ -68,30 +67,32 @@ def train(
         clock: Counts seconds.
     """
     config, strategy, sampler, optimizer = state.config, state.strategy, state.sampler, state.optimizer
-    half, alone = HALVES.get(config.precision), state.thread_deterministic
+    autocast, one_thread = HALVES.get(config.precision), state.thread_deterministic
     before = state.step
     while state.fraction < 1 and state.seconds < until and not state.stopped:
         started = clock()
-        with backends.torch_on_one_thread() if alone else nullcontext():
-            done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
-            if done is not None:
-                state.begin_stage(done)
-                if not strategy.inherit:
+        with backends.torch_on_one_thread() if one_thread else nullcontext():
+            split = strategy.step_pre_backward(optimizer, state.fraction, state.step)
+            if split is not None:
+                state.begin_stage(split)
+                if not strategy.inherit:  # the averages are of networks that are no more
                     optimizer.drop_averages()
                 for callback in callbacks:
-                    callback.after_split(state, done)
+                    callback.after_split(state, split)
             optimizer.set_learning_rate(state.learning_rate())
             sampler.step_pre_backward(state.renderer.field, state.step, state.generator)
             if not state.router.training:
                 state.renderer.train()
             batch = state.batches.draw(state.rays, state.draws)
             optimizer.zero_grad(set_to_none=True)
-            with nullcontext() if half is None else torch.autocast(state.device.type, half, cache_enabled=False):
-                output = state.ray_loss(batch, state.draws, backward=half is None)
-            if half is not None:
+            with (
+                nullcontext() if autocast is None else torch.autocast(state.device.type, autocast, cache_enabled=False)
+            ):
+                output = state.ray_loss(batch, state.draws, backward=autocast is None)
+            if autocast is not None:
                 state.scaler.scale(output.loss).backward()
             sampler.step_post_backward(output)
-            # Nothing is read on the host: the optimiser leaves out a step by what is found on the device.
+            # The optimiser skips a step that is not finite by a flag on the device, so the host need not wait for it.
             if state.scaler.is_enabled():
                 judge(state.guard, output.loss.detach(), [])
                 state.scaler.step(optimizer)
@@ -102,15 +103,15 @@ def train(
             strategy.step_post_backward(output)
         state.count_step(batch)
         if state.device.type == "cpu" or state.step % READ_EVERY == 0:
-            state.read(output)
-        state.pass_time(clock() - started)
+            state.read_output(output)
+        state.add_seconds(clock() - started)
         for callback in callbacks:
             callback.after_step(state)
-    if state.step > before and state.fraction >= 1 and isinstance(sampler, Occupancy):
+    if state.fraction >= 1 and state.step > before:  # once, however often this is called
         started = clock()
         with state.averaged():
-            sampler.fill_holes(state.renderer.field, config.seed)
-        state.pass_time(clock() - started)
+            sampler.finish(state.renderer.field, config.seed)
+        state.add_seconds(clock() - started)
 
 
 def run(state: State, callbacks: Sequence[Callback] = (), *, clock: Callable[[], float] = time.perf_counter) -> None:

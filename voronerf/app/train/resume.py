@@ -27,8 +27,8 @@ class Stored:
     config: dict[str, Any]
     step: int
     seconds: float
-    scoring: float
-    reserved: float
+    evaluation_seconds: float
+    reserved_seconds: float
     rays: int
     rays_done: int
     stages: tuple[dict[str, Any], ...]
@@ -38,7 +38,7 @@ class Stored:
 
 def snapshot(state: State) -> Checkpoint:
     """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
-    names = ("step", "seconds", "scoring", "reserved", "rays", "rays_done", "skipped")
+    names = ("step", "seconds", "evaluation_seconds", "reserved_seconds", "rays", "rays_done", "skipped")
     values = {name: getattr(state, name) for name in names}
     values |= {"config": state.config.to_values(), "threads": torch.get_num_threads()}
     values |= {"stages": [asdict(stage) for stage in state.stages]}
@@ -101,11 +101,11 @@ def load(state: State, checkpoint: Checkpoint) -> None:
         raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
     threads = torch.get_num_threads()
     if stored.threads != threads and state.device.type == "cpu" and not state.thread_deterministic:
-        state.say(
+        state.report(
             f"not bit for bit: {checkpoint.source} was written on {stored.threads} threads, now there are {threads}"
             ", and torch computes these networks"
         )
-    names = ("step", "seconds", "scoring", "reserved", "rays", "rays_done", "skipped", "stages")
+    names = ("step", "seconds", "evaluation_seconds", "reserved_seconds", "rays", "rays_done", "skipped", "stages")
     state.restore(**{name: getattr(stored, name) for name in names})
 
 
@@ -125,7 +125,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
         for number, stage in enumerate(values["stages"]):
             check_types(f"{source}: stage {number}", Stage, stage)
         stored = Stored(**values)
-        times = [stored.seconds, stored.scoring, stored.reserved]
+        times = [stored.seconds, stored.evaluation_seconds, stored.reserved_seconds]
         if not (stored.step >= 0 and all(0 <= each < math.inf for each in times) and stored.stages):
             came = f"got {stored.step}, {times} and {len(stored.stages)}"
             raise ValueError(f"{source}: step, times and stages must be counts, {came}")

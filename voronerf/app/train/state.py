@@ -59,11 +59,11 @@ class State:
         draws: Of random choices on the device; the same on a CPU.
         scaler: Of the loss in float16.
         guard: Of steps whose loss or gradients are not finite.
-        on_event: Called with a line of text for what happens; None for nobody.
+        on_event: Called with a line of text for what happens; None for no calls.
         step: Steps done.
         seconds: Training time.
-        scoring: Seconds of evaluations so far that count towards the budget.
-        reserved: Seconds of the budget for the last evaluation.
+        evaluation_seconds: Of evaluations so far that count towards the budget.
+        reserved_seconds: Of the budget, for the last evaluation.
         rays: Of the next step.
         rays_done: Of all steps.
         loss: Of the last step that the host has read.
@@ -88,8 +88,8 @@ class State:
     on_event: Callable[[str], None] | None = None
     step: int = 0
     seconds: float = 0.0
-    scoring: float = 0.0
-    reserved: float = 0.0
+    evaluation_seconds: float = 0.0
+    reserved_seconds: float = 0.0
     rays_done: int = 0
     loss: float = math.nan
     skipped_in_a_row: int = 0
@@ -98,12 +98,12 @@ class State:
 
     @property
     def device(self) -> torch.device:
-        """Of the networks."""
+        """The device of the networks."""
         return torch.device(self.config.device)
 
     @property
     def router(self) -> VoronoiRouter:
-        """The router whose colours count."""
+        """The router of the network that gives the colours."""
         return self.routers["field"]
 
     @property
@@ -116,7 +116,7 @@ class State:
         """How much of the training is done, 0..1."""
         if self.config.steps is not None:
             return min(1.0, self.step / self.config.steps)
-        training = float(self.config.budget or 1.0) - self.scoring - self.reserved
+        training = float(self.config.budget or 1.0) - self.evaluation_seconds - self.reserved_seconds
         return min(1.0, self.seconds / max(training, 1e-9))
 
     @property
@@ -137,7 +137,7 @@ class State:
         return native and all(router.by_table for router in self.routers.values())
 
     def learning_rate(self) -> float:
-        """Of the next step."""
+        """The learning rate of the next step."""
         hold = self.config.field_type.lr_hold
         return learning_rate(float(self.config.lr or 0), self.fraction, self.step, hold=hold)
 
@@ -145,7 +145,7 @@ class State:
         """A context in which the networks have their averaged weights, for pictures; not for training."""
         return self.optimizer.averaged()
 
-    def read(self, output: RenderOutput) -> None:
+    def read_output(self, output: RenderOutput) -> None:
         """Reads loss, guard and number of samples of a step, which waits for the device; finds the rays of the next."""
         rows = [] if output.samples.rows is None else [output.samples.rows[0].float()]
         found = torch.stack([output.loss.detach().float(), self.guard.in_a_row, *rows]).tolist()
@@ -161,9 +161,9 @@ class State:
                 contracted=self.config.contraction != "none",
             )
 
-    def count_scores(self, seconds: float, reserved: float) -> None:
+    def count_evaluation(self, seconds: float, reserved: float) -> None:
         """Takes seconds of an evaluation from the budget, and reserves some of it for the last one."""
-        self.scoring, self.reserved = self.scoring + seconds, reserved
+        self.evaluation_seconds, self.reserved_seconds = self.evaluation_seconds + seconds, reserved
 
     def begin_stage(self, done: SplitDone) -> None:
         """Counts a split, after which a new stage of training begins."""
@@ -179,7 +179,7 @@ class State:
         self.step += 1
         self.rays_done += len(batch.rays)
 
-    def pass_time(self, seconds: float) -> None:
+    def add_seconds(self, seconds: float) -> None:
         """Counts seconds of training."""
         self.seconds += seconds
 
@@ -190,15 +190,15 @@ class State:
         for name, value in counters.items():
             setattr(self, name, value)
 
-    def finish(self) -> None:
-        """Takes back a stop that came in the last step, when there is nothing left to end."""
+    def clear_stop(self) -> None:
+        """Forgets a request to stop that came during the last step."""
         self.stopped = False
 
     def stop(self) -> None:
         """Ends the training after the step or the view in hand, with a checkpoint, as Ctrl-C does."""
         self.stopped = True
 
-    def say(self, line: str) -> None:
+    def report(self, line: str) -> None:
         """Calls ``on_event``, if set."""
         if self.on_event is not None:
             self.on_event(line)
