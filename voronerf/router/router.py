@@ -142,7 +142,6 @@ class VoronoiRouter(nn.Module):
         self.diagram = own if first is None or first.is_meta else own.to(first.device)
         self.module: nn.Module = clone_module(module)
         stack_parameters(self.module, own.num_cells, share)
-        #: What a file needs to make the module again, if whoever made it has said so.
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
         self._watch: Any = None  # of optimisers that hold the state of other cells
         self.assignment, self.temperature = assignment, temperature
@@ -252,7 +251,7 @@ class VoronoiRouter(nn.Module):
             cells: Numbers of cells, or bool [k]; None for all. Cells that were frozen before stay frozen.
 
         Raises:
-            ValueError: For a cell that there is not, or a mask of another length.
+            ValueError: For a cell number out of range, or a mask of another length.
             TypeError: For what are neither numbers of cells nor a mask.
 
         Examples:
@@ -586,7 +585,7 @@ class VoronoiRouter(nn.Module):
     def _group(self, method: str, positions: Tensor) -> Grouping:
         """The samples in their cells; other methods that are called with the same positions share it."""
         drawn, centres = self.assignment == "stochastic" and self.training, self.diagram.centres
-        version = object() if centres.is_inference() else centres._version  # of those changes are not told
+        version = object() if centres.is_inference() else centres._version  # inference tensors have no version
         key = self.diagram, version, drawn, self.temperature, self.backend
         known = self._assigned
         if known is not None and known.serves(method, positions, key, drawn):

@@ -43,7 +43,7 @@ from voronerf.town.run import TOWN, index_of
 from voronerf.town.territories import Territories, cut_space
 
 #: Steps after which territories tell all others what of them is not empty; sooner at first.
-SURVEY_EVERY = 64
+EXCHANGE_EVERY = 64
 #: Steps after which ranks agree on the time and on stops.
 AGREE_EVERY = 8
 #: The most voxels of the grid that a finished run is drawn with.
@@ -56,19 +56,19 @@ class Town:
 
     Attributes:
         config: The settings of a territory.
-        drawn: The settings with which the run is drawn as a whole: strata are as long as those of its territories.
+        render_config: The settings with which the whole run is rendered: strata are as long as in its territories.
         scene: The whole scene.
         group: The ranks.
         territories: All of them.
         owner: The rank of each, [T].
         states: Of the territories of this rank, by their numbers.
-        members: The same, as rays see them.
+        members: The same territories, with renderer and generator, for the exchange of rays.
         bounds: [T, 2, 3], around what of each is not empty.
         stopping: Whether somebody asked this rank to end the training.
     """
 
     config: TrainConfig
-    drawn: TrainConfig
+    render_config: TrainConfig
     scene: Scene
     group: Group
     territories: Territories
@@ -93,8 +93,8 @@ class Town:
         """Ends the training on all ranks some steps later, with a checkpoint."""
         self.stopping = True
 
-    def survey(self) -> None:
-        """All territories tell what of them is not empty."""
+    def exchange_bounds(self) -> None:
+        """Exchanges the bounds of occupied space between ranks."""
         bounds = torch.zeros_like(self.bounds)
         for number, state in self.states.items():
             bounds[number] = self.members[number].place.bounds(sampler_of(state).grid)
@@ -173,12 +173,12 @@ def build_town(
                 backend=sampler.backend,
             )
         members[number] = Territory(place, state.renderer, state.draws)
-    drawn = whole
+    render_config = whole
     if contraction is None and scene.box is not None:
         lengths = [float((box[1] - box[0]).norm()) for box in (scene.box, territories.boxes[0])]
         samples = resolve(config, territories.scene(scene, 0)).samples or (64,)
-        drawn = replace(whole, samples=(math.ceil(samples[0] * lengths[0] / lengths[1]),))
-    return Town(config, drawn, scene, group, territories, owner, states, members, territories.boxes.clone())
+        render_config = replace(whole, samples=(math.ceil(samples[0] * lengths[0] / lengths[1]),))
+    return Town(config, render_config, scene, group, territories, owner, states, members, territories.boxes.clone())
 
 
 def train(
@@ -206,8 +206,8 @@ def train(
     while first.fraction < 1 and not first.stopped:
         started = clock()
         with backends.torch_on_one_thread() if alone else nullcontext():
-            if first.step % SURVEY_EVERY == 0 or (first.step < SURVEY_EVERY and first.step & (first.step - 1) == 0):
-                town.survey()
+            if first.step % EXCHANGE_EVERY == 0 or (first.step < EXCHANGE_EVERY and first.step & (first.step - 1) == 0):
+                town.exchange_bounds()
             batches = {number: _prepare(state) for number, state in town.states.items()}
             outputs = step_together(group, town.members, town.owner, town.bounds, batches)
             for number, state in town.states.items():
@@ -324,10 +324,10 @@ def _index(town: Town, names: list[str], found: Sequence[Sequence[dict[str, Tens
     if len(found) > 1:
         diagram, _ = VoronoiDiagram(town.territories.centres).refine(dict(enumerate(diagrams)))
     owner = torch.repeat_interleave(torch.arange(len(found)), sizes)
-    sphere, grid = town.scene.space(town.drawn.contraction).contraction, None
+    sphere, grid = town.scene.space(town.render_config.contraction).contraction, None
     assert not isinstance(sphere, Perspective)
     if sphere is None:
-        grid = _whole_grid(make_grid(town.drawn, town.scene, "cpu", 1), grids)
+        grid = _whole_grid(make_grid(town.render_config, town.scene, "cpu", 1), grids)
     place = {
         "networks": names,
         "frame": Similarity().to_values(),
@@ -335,7 +335,7 @@ def _index(town: Town, names: list[str], found: Sequence[Sequence[dict[str, Tens
         "layer": 0,
         "contraction": None if sphere is None else {"centre": sphere.centre.tolist(), "radius": sphere.radius},
     }
-    index = index_of(town.drawn, [(diagram, owner.int())], [place], grid)
+    index = index_of(town.render_config, [(diagram, owner.int())], [place], grid)
     return replace(index, tensors={**index.tensors, "bounds": town.bounds.clone()})
 
 
@@ -405,6 +405,6 @@ def summary_of(town: Town) -> dict[str, Any]:
         "cells": cells,
         "splits_left": left,
         "skipped_steps": skipped,
-        "width": town.drawn.width,
+        "width": town.render_config.width,
         "territories": len(town.owner),
     }
