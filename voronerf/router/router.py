@@ -17,9 +17,10 @@ from torch import Tensor, nn
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import finer_diagram
 from voronerf.ops._core.backends import BACKENDS
+from voronerf.ops._core.checks import of_one_dtype
 from voronerf.ops._core.compiler import not_compiled
 from voronerf.ops._core.layers import for_last_output
-from voronerf.ops.routed_mlp import of_one_dtype, routed_mlp
+from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.router.cells import (
     check_module,
     clone_module,

@@ -127,6 +127,16 @@ def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) 
     return _FUNCTIONS[op, _choose(op, backend, device.type, device.index, dtype)]
 
 
+def resolve_composed(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) -> Callable[..., Any]:
+    """`resolve` of an op whose reference calls other ops, and takes their ``backend``.
+
+    With "auto" it calls them where no other implementation runs, each on the backend that "auto" gives it.
+    """
+    name = _choose(op, backend, device.type, device.index, dtype)
+    run = _FUNCTIONS[op, name]
+    return functools.partial(run, backend="auto") if name == "reference" and backend == "auto" else run
+
+
 def folder(op: str) -> str:
     """The folder of ``voronerf.ops`` that has an op."""
     return _TABLE[op, "reference"].file or op

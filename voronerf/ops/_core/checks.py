@@ -48,6 +48,14 @@ def detached(tensor: Tensor | None) -> Tensor | None:
     return tensor.detach() if tensor is not None and tensor.requires_grad else tensor
 
 
+def of_one_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+    """What is compared, in one type for all backends: float64 where either is, float32 otherwise."""
+    if points.dtype is centres.dtype is torch.float32 and not (points.requires_grad or centres.requires_grad):
+        return points, centres
+    dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
+    return points.detach().to(dtype), centres.detach().to(dtype)
+
+
 def check_shape(
     op: str, name: str, tensor: Tensor, shape: Sequence[int | str], sizes: dict[str, int] | None = None
 ) -> None:

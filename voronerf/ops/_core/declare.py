@@ -56,6 +56,7 @@ def declare(
     smooth: Sequence[str] = (),
     small: Sequence[str] = (),
     prepare: Callable[[Any], Any] | None = None,
+    composed: bool = False,
 ) -> Callable[[F], F]:
     """Makes the public function of an op from its signature, and puts its row into the table of backends.
 
@@ -67,11 +68,12 @@ def declare(
         small: the arguments whose elements an int32 must number.
         prepare: takes the checked arguments, as a named tuple, and gives those of the implementations; it checks what
             the signature cannot say.
+        composed: whether the reference takes the ``backend`` of other ops that it calls (`resolve_composed`).
     """
 
     def of(function: F) -> F:
         name = backends.declare(function.__name__, native=native, warp=warp, reference=reference or Implementation())
-        made: F = Declaration(name, function, smooth, small, prepare).public(function)
+        made: F = Declaration(name, function, smooth, small, prepare, composed).public(function)
         return made
 
     return of
@@ -165,8 +167,10 @@ class Declaration:
         smooth: Sequence[str],
         small: Sequence[str],
         prepare: Callable[[Any], Any] | None,
+        composed: bool,
     ) -> None:
         self.name, self.smooth, self._small, self._prepare = name, smooth, small, prepare
+        self._resolve = backends.resolve_composed if composed else backends.resolve
         hints = typing.get_type_hints(function, include_extras=True)
         of_result = hints.pop("return")
         hints.pop("backend")
@@ -244,7 +248,7 @@ class Declaration:
             **{f"{each.name}_kind": each.kind for each in self.arguments},
             **{f"{each.name}_dtypes": each.rule.dtypes for each in self._tensors()},
             "Checked": checks.Checked,
-            "resolve": backends.resolve,
+            "resolve": self._resolve,
             "Inputs": self.Inputs,
             "prepare": self._prepare,
             "pack": self._pack,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from typing import Any
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops.forward_with_tape.reference import Tape
-from voronerf.ops.routed_mlp import check_routed, routed_mlp
+from voronerf.ops.grouped_mlp.checks import check_routed
 
 _OP = backends.declare("forward_with_tape", native=Implementation(EVERYWHERE, FLOATS))
 _NEEDED = ("positions", "weights", "biases", "layers")
@@ -50,8 +49,5 @@ def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> T
         raise ValueError(f"{_OP}: network must hold positions, weights, biases and layers, got {came}")
     network = check_routed(_OP, **network)
     device, dtype = network["positions"].device, network["weights"][0].dtype
-    run = backends.resolve(_OP, backend=backend, device=device, dtype=dtype)
-    if backend == "auto" and backends.chosen(_OP, device, dtype) == "reference":
-        run = functools.partial(run, evaluate=routed_mlp)  # whose operations have backends of their own
-    tape: Tape = run(network)
+    tape: Tape = backends.resolve_composed(_OP, backend=backend, device=device, dtype=dtype)(network)
     return tape

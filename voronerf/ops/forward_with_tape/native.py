@@ -27,7 +27,7 @@ def forward_with_tape(network: Mapping[str, Any]) -> Tape:
     floats = (network["positions"], *network["weights"], *network["biases"], network.get("features"))
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in floats)
     if not plain or torch.is_autocast_enabled(network["positions"].device.type) or not torch.is_grad_enabled():
-        return reference.forward_with_tape(network, routed_mlp.routed_mlp)
+        return reference.forward_with_tape(network, "native")
     names = routed_mlp.Where._fields
     where = routed_mlp.Where(**{name: network[name] for name in names if name in network})
     rest = {name: value for name, value in network.items() if name not in (*names, "frozen")}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_flag, check_shape, detached
-from voronerf.ops.routed_mlp import of_samples
-from voronerf.ops.routed_mlp.reference import routed_mlp
+from voronerf.ops.routed_mlp import of_samples, routed_mlp
 
 
 class Tape(ABC):
@@ -59,11 +58,11 @@ class Tape(ABC):
     def _backward(self, loss: Tensor, gradient: Tensor, defer: bool) -> Tensor: ...
 
 
-def forward_with_tape(network: Mapping[str, Any], evaluate: Callable[..., tuple[Tensor, Tensor]] = routed_mlp) -> Tape:
+def forward_with_tape(network: Mapping[str, Any], backend: str = "reference") -> Tape:
     """The outputs and their tape; see ``voronerf.ops.forward_with_tape``."""
     network = dict(network)
     frozen = network.pop("frozen", None)
-    out, cells = evaluate(**network)
+    out, cells = routed_mlp(**network, backend=backend)
     return _Graph(out.detach().float(), out, cells, frozen)
 
 

@@ -1,15 +1,35 @@
-"""Checks that the operations on whole networks share. n samples, r rays, k cells, p and q features of a position and a
-direction."""
+"""Checks that the operations on whole networks share. n samples, r rays, k cells, m centres of all diagrams together, g
+diagrams, p and q features of a position and a direction."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.checks import FLOATING, INDEX, check_dtype, check_same_dtype, check_shape, check_tensor
+from voronerf.ops._core.checks import (
+    FLOATING,
+    INDEX,
+    check_count,
+    check_dtype,
+    check_integer,
+    check_no_inference,
+    check_same_device,
+    check_same_dtype,
+    check_shape,
+    check_tensor,
+    of_one_dtype,
+)
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
+
+_DEFAULTS: dict[str, Any] = {
+    **dict.fromkeys(("centres", "child_offsets", "child", "cells", "coords", "rows")),
+    **dict.fromkeys(("layers", "directions", "direction_index", "features", "frozen")),
+    "depth": 1,
+}
+"""Of the arguments of `routed_mlp` that are given by name."""
 
 
 def check_network(
@@ -91,3 +111,94 @@ def _check_features(op: str, features: Tensor | None, layers: MLP, sizes: dict[s
     check_tensor(op, "features", features)
     check_shape(op, "features", features, ("k", *shape) if features.dim() == 3 else shape, sizes)
     check_dtype(op, "features", features)
+
+
+def check_routed(
+    op: str, positions: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor | None], **given: Any
+) -> dict[str, Any]:
+    """All arguments of `routed_mlp` but for the backend, checked; what is compared has one dtype."""
+    network = {**_DEFAULTS, **given}
+    if network.keys() != _DEFAULTS.keys():
+        raise TypeError(f"{op}: unknown arguments {', '.join(network.keys() - _DEFAULTS.keys())}")
+    tables = {name: network[name] for name in ("centres", "child_offsets", "child", "cells")}
+    frozen = network["frozen"]
+    read = {name: network[name] for name in ("directions", "direction_index", "features")}
+    coords, centres = network["coords"], network["centres"]
+    sizes: dict[str, int] = {}
+    check_shape(op, "positions", positions, ("n", "p"), sizes)
+    check_dtype(op, "positions", positions)
+    check_count(op, "positions", sizes["n"])
+    check_network(op, weights, biases, network["layers"], **read, sizes=sizes)
+    _check_tables(op, **tables, depth=network["depth"], sizes=sizes)
+    if frozen is not None:
+        check_shape(op, "frozen", frozen, ("k",), sizes)
+        check_dtype(op, "frozen", frozen, (torch.bool,))
+    rows = network["rows"]
+    if rows is not None:
+        check_shape(op, "rows", rows, (1,))
+        check_dtype(op, "rows", rows, INDEX)
+    if coords is not None:
+        if centres is None:
+            raise ValueError(f"{op}: coords must come with centres, got none to compare them with")
+        check_shape(op, "coords", coords, ("n", 3), sizes)
+        check_dtype(op, "coords", coords)
+    elif centres is not None and sizes["p"] < 3:
+        raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {sizes['p']}")
+    device, tables["rows"] = positions.device, rows
+    every = positions, coords, frozen, *tables.values(), *read.values(), *weights, *biases
+    if torch.compiler.is_compiling() or any(t is not None and (t.device != device or t.is_inference()) for t in every):
+        tensors = {  # named for an error alone
+            "positions": positions,
+            "coords": coords,
+            "frozen": frozen,
+            **tables,
+            **read,
+            **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
+            **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
+        }
+        check_same_device(op, **tensors)
+        check_no_inference(op, **tensors)
+    if centres is not None:
+        points = positions[:, :3] if coords is None else coords
+        network["coords"], network["centres"] = of_one_dtype(points, centres)
+    return {"positions": positions, "weights": weights, "biases": biases, **network}
+
+
+def _check_tables(
+    op: str,
+    centres: Tensor | None,
+    child_offsets: Tensor | None,
+    child: Tensor | None,
+    depth: int,
+    cells: Tensor | None,
+    sizes: dict[str, int],
+) -> None:
+    if cells is not None:
+        if centres is not None:
+            raise ValueError(f"{op}: centres must be None where cells are given, got both")
+        check_shape(op, "cells", cells, ("n",), sizes)
+        check_dtype(op, "cells", cells, INDEX)
+    if centres is None:
+        for name, value in (("child_offsets", child_offsets), ("child", child)):
+            if value is not None:
+                raise ValueError(f"{op}: {name} must come with centres, got no centres")
+        if cells is None and sizes["k"] != 1:
+            raise ValueError(f"{op}: centres or cells must be given for {sizes['k']} cells, got neither")
+        return
+    if (child_offsets is None) != (child is None):
+        missing = "child_offsets" if child_offsets is None else "child"
+        raise ValueError(f"{op}: child_offsets and child must come together, got no {missing}")
+    check_shape(op, "centres", centres, ("k" if child is None else "m", 3), sizes)
+    check_dtype(op, "centres", centres)
+    check_integer(op, "depth", depth, 1)
+    if child_offsets is None or child is None:
+        if depth != 1:
+            raise ValueError(f"{op}: depth must be 1 for a flat diagram, got {depth}")
+        return
+    check_shape(op, "child_offsets", child_offsets, ("g+1",), sizes)
+    check_dtype(op, "child_offsets", child_offsets, INDEX)
+    check_shape(op, "child", child, ("m",), sizes)
+    check_dtype(op, "child", child, INDEX)
+    if sizes["m"] < 1 or sizes["g"] < 1:
+        count = f"{sizes['m']} centres in {sizes['g']} diagrams"
+        raise ValueError(f"{op}: centres must hold at least one centre of one diagram, got {count}")

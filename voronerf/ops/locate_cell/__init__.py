@@ -8,8 +8,8 @@ from typing import Annotated, Any
 from torch import Tensor
 
 from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
+from voronerf.ops._core.checks import of_one_dtype
 from voronerf.ops._core.declare import declare
-from voronerf.ops.nearest_centre import of_one_dtype
 
 
 def _prepare(given: Any) -> Any:

@@ -25,14 +25,15 @@ def _space(given: Any) -> native.compiled.MarchSpace:
 
 
 _OP = declared("march_rays")
-inputs_of = _OP.inputs(
-    native.compiled.MarchInputs,
-    occupied="occupied.view(torch.uint8)",
-    s="samples",
-    disparity="spacing == 'disparity'",
-    most="samples if most is None else most",
-    space=_space,
-)
+INPUTS: dict[str, Any] = {
+    "occupied": "occupied.view(torch.uint8)",
+    "s": "samples",
+    "disparity": "spacing == 'disparity'",
+    "most": "samples if most is None else most",
+    "space": _space,
+}
+"""Members of the struct that are no arguments."""
+inputs_of = _OP.inputs(native.compiled.MarchInputs, **INPUTS)
 
 
 def _march_rays(*flat: Any) -> March:

@@ -4,19 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
+from voronerf.ops._core.checks import of_one_dtype
 from voronerf.ops._core.declare import declare
-
-
-def of_one_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
-    """What is compared, in one type for all backends: float64 where either is, float32 otherwise."""
-    if points.dtype is centres.dtype is torch.float32 and not (points.requires_grad or centres.requires_grad):
-        return points, centres
-    dtype = torch.promote_types(torch.promote_types(points.dtype, centres.dtype), torch.float32)
-    return points.detach().to(dtype), centres.detach().to(dtype)
 
 
 def _prepare(given: Any) -> tuple[Tensor, Tensor]:

@@ -2,53 +2,56 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import backends
 from voronerf.ops._core.backends import Implementation
-from voronerf.ops._core.checks import (
-    LIKE_FIRST,
-    Checked,
-    check_choice,
-    check_count,
-    check_flag,
-    check_integer,
-    check_number,
-    check_positive,
-    detached,
-)
-from voronerf.ops._core.declare import declared
-from voronerf.ops.composite import composite
-from voronerf.ops.march_rays.reference import March
-from voronerf.ops.render_opaque.reference import Operations, RaySums, Rule
-from voronerf.ops.routed_mlp import check_routed, routed_mlp
+from voronerf.ops._core.checks import check_count
+from voronerf.ops._core.declare import declare
+from voronerf.ops.grouped_mlp.checks import check_routed
+from voronerf.ops.render_opaque.reference import RaySums
 
-_OP = backends.declare("render_opaque", native=Implementation(("cpu",), (torch.float32,)))
 #: Names of the arguments of `routed_mlp` that a network has; the others are of the samples, or of the backward pass.
 NETWORK = ("weights", "biases", "layers", "features", "centres", "child_offsets", "child", "depth")
-_MOST_WAVE = 1024
 
 
+def _prepare(given: Any) -> Any:
+    op, network, occupied = "render_opaque", given.network, given.occupied
+    check_count(op, "samples of all rays", given.near.shape[0] * given.samples)
+    if occupied.numel() < 1:
+        raise ValueError(f"{op}: occupied must have at least one cell, got {list(occupied.shape)}")
+    if not isinstance(network, Mapping) or not {"weights", "biases", "layers"} <= network.keys():
+        raise ValueError(f"{op}: network must hold weights, biases and layers, got {network!r:.60}")
+    if unknown := [name for name in network if name not in NETWORK]:
+        raise TypeError(f"{op}: network must hold {', '.join(NETWORK)} alone, got {', '.join(unknown)}")
+    reads = getattr(network["layers"], "uses_directions", False)
+    table = check_routed(op, given.origins, **network, directions=given.directions if reads else None)
+    table.pop("frozen")
+    outputs = sum(table["weights"][output].shape[1] for output in table["layers"].outputs)
+    if outputs != 4:
+        raise ValueError(f"{op}: layers must put out 4 numbers, colour and density, got {outputs}")
+    return *given[:7], table, *given[8:]
+
+
+@declare(native=Implementation(("cpu",), (torch.float32,)), small=["occupied"], prepare=_prepare, composed=True)
 def render_opaque(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    samples: int,
+    origins: Annotated[Tensor, "float32|float64 [r, 3]"],
+    directions: Annotated[Tensor, "same [r, 3]"],
+    near: Annotated[Tensor, "same [r]"],
+    far: Annotated[Tensor, "same [r]"],
+    occupied: Annotated[Tensor, "bool [x, y, z]"],
+    box: Annotated[Tensor, "same [2, 3]"],
+    samples: Annotated[int, "1..65535"],
     network: Mapping[str, Any],
     *,
-    density_scale: float,
-    wave: int = 8,
-    opaque: float = 0.02,
-    spacing: str = "linear",
-    contraction: Tensor | None = None,
+    density_scale: Annotated[float, "positive"],
+    wave: Annotated[int, "1..1024"] = 8,
+    opaque: Annotated[float, "[0, 1)"] = 0.02,
+    spacing: Annotated[str, "linear|disparity"] = "linear",
+    contraction: Annotated[Tensor | None, "same [4] or [5, 3]"] = None,
     heaviest: bool = True,
     backend: str = "auto",
 ) -> RaySums:
@@ -92,62 +95,3 @@ def render_opaque(
         >>> seen.colour.round(decimals=2), (seen.depth / seen.opacity).round(decimals=2), float(seen.light) < 0.02
         (tensor([[0.5000, 0.5000, 0.5000]]), tensor([1.0600]), True)
     """
-    check_integer(_OP, "samples", samples, 1, 65_535)
-    check_integer(_OP, "wave", wave, 1, _MOST_WAVE)
-    given = Checked(_OP)
-    given.tensor("origins", origins, (torch.float32, torch.float64), "r", 3)
-    given.tensor("directions", directions, LIKE_FIRST, "r", 3)
-    given.tensor("near", near, LIKE_FIRST, "r")
-    given.tensor("far", far, LIKE_FIRST, "r")
-    given.tensor("occupied", occupied, (torch.bool,), "x", "y", "z")
-    given.tensor("box", box, LIKE_FIRST, 2, 3)
-    sphere = isinstance(contraction, Tensor) and contraction.dim() == 1
-    given.optional("contraction", contraction, LIKE_FIRST, *((4,) if sphere else (5, 3)))
-    check_choice(_OP, "spacing", spacing, ("linear", "disparity"))
-    check_flag(_OP, "heaviest", heaviest)
-    check_positive(_OP, "density_scale", density_scale)
-    check_number(_OP, "opaque", opaque)
-    if not 0 <= opaque < 1:
-        raise ValueError(f"{_OP}: opaque must be 0 or more and below 1, got {opaque}")
-    check_count(_OP, "occupied", occupied.numel())
-    check_count(_OP, "samples of all rays", len(near) * samples)
-    if occupied.numel() < 1:
-        raise ValueError(f"{_OP}: occupied must have at least one cell, got {list(occupied.shape)}")
-    if not isinstance(network, Mapping) or not {"weights", "biases", "layers"} <= network.keys():
-        raise ValueError(f"{_OP}: network must hold weights, biases and layers, got {network!r:.60}")
-    if unknown := [name for name in network if name not in NETWORK]:
-        raise TypeError(f"{_OP}: network must hold {', '.join(NETWORK)} alone, got {', '.join(unknown)}")
-    reads = getattr(network["layers"], "uses_directions", False)
-    table = check_routed(_OP, origins, **network, directions=directions if reads else None)
-    table.pop("frozen")
-    outputs = sum(table["weights"][output].shape[1] for output in table["layers"].outputs)
-    if outputs != 4:
-        raise ValueError(f"{_OP}: layers must put out 4 numbers, colour and density, got {outputs}")
-    device = origins.device
-    run = backends.resolve(_OP, backend=backend, device=device, dtype=origins.dtype)
-    if backend == "auto" and backends.chosen(_OP, device, origins.dtype) == "reference":
-        run = functools.partial(run, operations=_operations(device, origins.dtype))
-    rays = declared("march_rays").Inputs(
-        origins=detached(origins),
-        directions=detached(directions),
-        near=detached(near),
-        far=detached(far),
-        occupied=occupied,
-        box=detached(box),
-        samples=samples,
-        uniforms=None,
-        seed=None,
-        spacing=spacing,
-        start=None,
-        most=None,
-        capacity=None,
-        contraction=detached(contraction),
-    )
-    found = run(rays, table, Rule(density_scale, opaque, wave, heaviest))
-    return RaySums(*found)
-
-
-def _operations(device: torch.device, dtype: torch.dtype) -> Operations:
-    """Each operation on the backend that "auto" gives it."""
-    march = backends.resolve("march_rays", backend="auto", device=device, dtype=dtype)
-    return Operations(lambda *rays: March(*march(*rays)), routed_mlp, composite)

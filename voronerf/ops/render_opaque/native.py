@@ -5,52 +5,56 @@ No custom op: nothing that is traced or differentiated renders pictures.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
-from voronerf.ops.composite.native import composite
+from voronerf.ops._core.declare import declared
 from voronerf.ops.grouped_mlp import network as grouped_mlp
 from voronerf.ops.grouped_mlp.network import Given, in_float32, table_of
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
-from voronerf.ops.march_rays.native import inputs_of, march_rays
-from voronerf.ops.march_rays.reference import March
+from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.render_opaque import reference
-from voronerf.ops.render_opaque.reference import Operations, RaySums, Rule
-from voronerf.ops.routed_mlp.native import routed_mlp
+from voronerf.ops.render_opaque.reference import RaySums
 
-_APART = Operations(march_rays=lambda *given: March(*march_rays(*given)), routed_mlp=routed_mlp, composite=composite)
+_OP = declared("render_opaque")
+_rays = _OP.inputs(
+    native.compiled.MarchInputs, **{**INPUTS, "uniforms": "None", "seed": "None", "start": "None", "most": "samples"}
+)
+_rule, _outputs = _OP.inputs(native.compiled.SeeRule), _OP.outputs(native.compiled.SeeOutputs)
 
 
 @torch.no_grad()
-def render_opaque(rays: Any, network: Mapping[str, Any], rule: Rule) -> RaySums:
+def render_opaque(*flat: Any) -> RaySums:
     """Every ray up to the first surface, in float32; see ``voronerf.ops.render_opaque``."""
-    weights, biases, centres = network["weights"], network["biases"], network["centres"]
-    floats = (*weights, *biases, centres, network["features"], network["directions"])
+    given = _OP.Inputs._make(flat)
+    network = given.network
+    weights, biases, centres, features = network["weights"], network["biases"], network["centres"], network["features"]
+    floats = (*weights, *biases, centres, features, network["directions"])
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in floats)
     if not plain or torch.is_autocast_enabled("cpu"):
-        return reference.render_opaque(rays, network, rule, _APART)
-    features, (r,) = network["features"], rays.near.shape
+        narrow = network | {name: [_narrow(part) for part in network[name]] for name in ("weights", "biases")}
+        narrow["features"] = _narrow(features)
+        composed: RaySums = partial(reference.render_opaque, backend="native")(*given._replace(network=narrow))
+        return composed
     if features is not None and features.dim() == 3 and weights[0].shape[0] == 1:
         features = features[0]
-    given = Given(rays.origins, weights, biases, network["layers"], network["directions"], None, features)
-    taken, _ = in_float32(given, network["layers"].text, "routed_mlp")
+    samples = Given(given.origins, weights, biases, network["layers"], network["directions"], None, features)
+    taken, _ = in_float32(samples, network["layers"].text, "routed_mlp")
     child_offsets, child, depth = network["child_offsets"], network["child"], network["depth"]
     if weights[0].shape[0] == 1:
         centres = child_offsets = child = None
     if child_offsets is not None:
         check_tree(child_offsets, child, len(centres), "render_opaque")
-    near = rays.near
-    colour, opacity, depths, light = near.new_empty(r, 3), near.new_empty(r), near.new_empty(r), near.new_empty(r)
-    heaviest = near.new_empty(r) if rule.heaviest else rays.far
-    compiled = native.compiled
+    found: RaySums = _OP.allocate(given)
+    outputs, compiled = _outputs(found), native.compiled
     sound = compiled.render_opaque(
         table_of(*grouped_mlp.key_of(taken)),
-        grouped_mlp.inputs_of(taken, _no_offsets(weights[0]), None, near.new_empty(0)),
-        inputs_of(rays),
+        grouped_mlp.inputs_of(taken, _no_offsets(weights[0]), None, given.near.new_empty(0)),
+        _rays(given),
         compiled.SeeCells(
             centres=centres,
             child_offsets=child_offsets,
@@ -58,15 +62,18 @@ def render_opaque(rays: Any, network: Mapping[str, Any], rule: Rule) -> RaySums:
             m=0 if centres is None else len(centres),
             depth=depth,
         ),
-        compiled.SeeRule(density_scale=rule.density_scale, opaque=rule.opaque, wave=rule.wave),
-        compiled.SeeOutputs(
-            colour=colour, opacity=opacity, depth=depths, light=light, heaviest=heaviest if rule.heaviest else None
-        ),
+        _rule(given),
+        outputs if given.heaviest else outputs._replace(heaviest=None),
         native.cpu(),
     )
     if not sound:
         raise too_shallow(depth, "render_opaque")
-    return RaySums(colour, opacity, depths, light, heaviest)
+    return found if given.heaviest else found._replace(heaviest=given.far)
+
+
+def _narrow(tensor: Tensor | None) -> Tensor | None:
+    """Not float64, in which no network of the compiled module is."""
+    return tensor.float() if tensor is not None and tensor.dtype == torch.float64 else tensor
 
 
 def _no_offsets(weight: Tensor) -> Tensor:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from voronerf.ops.composite.reference import Composite, composite
-from voronerf.ops.march_rays.reference import march_rays
-from voronerf.ops.routed_mlp.reference import routed_mlp
+from voronerf.ops.composite import Composite, composite
+from voronerf.ops.march_rays import march_rays
+from voronerf.ops.routed_mlp import routed_mlp
 
 
 class RaySums(NamedTuple):
@@ -30,20 +29,11 @@ class RaySums(NamedTuple):
         ('colour', 'opacity', 'depth', 'light', 'heaviest')
     """
 
-    colour: Tensor
-    opacity: Tensor
-    depth: Tensor
-    light: Tensor
-    heaviest: Tensor
-
-
-class Rule(NamedTuple):
-    """How rays are walked; ``voronerf.ops.render_opaque`` says what each is."""
-
-    density_scale: float
-    opaque: float
-    wave: int
-    heaviest: bool
+    colour: Annotated[Tensor, "same [r, 3]"]
+    opacity: Annotated[Tensor, "same [r]"]
+    depth: Annotated[Tensor, "same [r]"]
+    light: Annotated[Tensor, "same [r]"]
+    heaviest: Annotated[Tensor, "same [r]"]
 
 
 class Wave(NamedTuple):
@@ -64,40 +54,49 @@ class Wave(NamedTuple):
     stop: Tensor
 
 
-@dataclass(frozen=True)
-class Operations:
-    """The operations that a wave is made of."""
-
-    march_rays: Callable[..., Any] = march_rays
-    routed_mlp: Callable[..., tuple[Tensor, Tensor]] = routed_mlp
-    composite: Callable[..., Any] = composite
-
-
-REFERENCE = Operations()
-
-
 @torch.no_grad()
-def render_opaque(rays: Any, network: Mapping[str, Any], rule: Rule, operations: Operations = REFERENCE) -> RaySums:
-    """Every ray up to the first surface; see ``voronerf.ops.render_opaque``."""
-    centres, directions = network.get("centres"), network.get("directions")
+def render_opaque(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    samples: int,
+    network: Mapping[str, Any],
+    density_scale: float,
+    wave: int,
+    opaque: float,
+    spacing: str,
+    contraction: Tensor | None,
+    heaviest: bool,
+    backend: str = "reference",
+) -> RaySums:
+    """Every ray up to the first surface; see ``voronerf.ops.render_opaque``.
+
+    ``backend`` is that of the operations it is made of.
+    """
+    centres, seen_by = network.get("centres"), network.get("directions")
     of_samples = ("positions", "coords", "directions", "direction_index")
     given = {name: value for name, value in network.items() if name not in of_samples}
+    space: dict[str, Any] = {"spacing": spacing, "most": wave, "contraction": contraction, "backend": backend}
 
     def look(live: Tensor, start: Tensor | None) -> Wave:
-        of_rays = {name: getattr(rays, name)[live] for name in ("origins", "directions", "near", "far")}
-        march = operations.march_rays(*rays._replace(**of_rays, start=start, most=rule.wave))
+        of_rays = origins[live], directions[live], near[live], far[live]
+        march = march_rays(*of_rays, occupied, box, samples, start=start, **space)
         positions = march.positions.to(network["positions"].dtype)
         coords = None if centres is None else positions.to(centres.dtype)
         seen_from: dict[str, Any] = {"directions": None, "direction_index": None}
-        if directions is not None:
-            seen_from = {"directions": directions[live], "direction_index": march.ray_index}
-        raw, _ = operations.routed_mlp(positions=positions, coords=coords, **seen_from, **given)
-        raw = raw.to(rays.near.dtype)
-        density = torch.nn.functional.softplus(raw[:, 3]) * rule.density_scale
-        seen = operations.composite(density, raw[:, :3].sigmoid(), march.depths, march.deltas, march.ray_offsets, None)
-        return Wave(Composite(*seen), march.ray_index, march.ray_offsets, march.depths, march.stop)
+        if seen_by is not None:
+            seen_from = {"directions": seen_by[live], "direction_index": march.ray_index}
+        raw, _ = routed_mlp(positions=positions, coords=coords, **seen_from, **given, backend=backend)
+        raw = raw.to(near.dtype)
+        density = torch.nn.functional.softplus(raw[:, 3]) * density_scale
+        packed: dict[str, Any] = {"ray_offsets": march.ray_offsets, "backend": backend}
+        seen = composite(density, raw[:, :3].sigmoid(), march.depths, march.deltas, **packed)
+        return Wave(seen, march.ray_index, march.ray_offsets, march.depths, march.stop)
 
-    return walk(look, rays.far, rays.samples, rule.wave, rule.opaque, rule.heaviest)
+    return walk(look, far, samples, wave, opaque, heaviest)
 
 
 @torch.no_grad()

@@ -6,8 +6,7 @@ direction.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -15,23 +14,11 @@ from torch import Tensor
 
 from voronerf.ops._core.checks import check_range
 from voronerf.ops._core.layers import MLP
-from voronerf.ops.cell_sort.reference import cell_sort
-from voronerf.ops.grouped_mlp.reference import check_direction_index, grouped_mlp
-from voronerf.ops.locate_cell.reference import locate_cell
-from voronerf.ops.nearest_centre.reference import nearest_centre
-
-
-@dataclass(frozen=True)
-class Operations:
-    """The operations that a route is made of."""
-
-    nearest_centre: Callable[..., Tensor] = nearest_centre
-    locate_cell: Callable[..., Tensor] = locate_cell
-    cell_sort: Callable[..., Any] = cell_sort
-    grouped_mlp: Callable[..., Tensor] = grouped_mlp
-
-
-REFERENCE = Operations()
+from voronerf.ops.cell_sort import cell_sort
+from voronerf.ops.grouped_mlp import grouped_mlp
+from voronerf.ops.grouped_mlp.reference import check_direction_index
+from voronerf.ops.locate_cell import locate_cell
+from voronerf.ops.nearest_centre import nearest_centre
 
 
 class Where(NamedTuple):
@@ -55,32 +42,35 @@ def routed_mlp(
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
     features: Tensor | None = None,
-    operations: Operations = REFERENCE,
+    backend: str = "reference",
     **where: Any,
 ) -> tuple[Tensor, Tensor]:
-    """Output [n, out] in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
+    """Output [n, out] in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``.
+
+    ``backend`` is that of the operations it is made of.
+    """
     centres, child_offsets, child, depth, cells, coords, rows = Where(**where)
     k, n = weights[0].shape[0], positions.shape[0]
     check_direction_index("routed_mlp", directions, direction_index)
     read: dict[str, Any] = {"layers": layers, "directions": directions, "direction_index": direction_index}
-    read["features"] = features
+    read |= {"features": features, "backend": backend}
     if cells is None and k == 1:
         offsets = torch.tensor([0, n], dtype=torch.int32, device=positions.device)
-        out = operations.grouped_mlp(positions, offsets, weights, biases, **read)
+        out = grouped_mlp(positions, offsets, weights, biases, **read)
         return first_rows(out, torch.zeros(n, dtype=torch.int32, device=positions.device), rows)
     if cells is None:
         assert coords is not None and centres is not None
         if child_offsets is None or child is None:
-            cells = operations.nearest_centre(coords, centres)
+            cells = nearest_centre(coords, centres, backend=backend)
         else:
-            cells = operations.locate_cell(coords, centres, child_offsets, child, depth)
+            cells = locate_cell(coords, centres, child_offsets, child, depth=depth, backend=backend)
     check_range("routed_mlp", "cells", cells, k)
-    order, offsets = operations.cell_sort(cells, k)
+    order, offsets = cell_sort(cells, k, backend=backend)
     if direction_index is not None:
         read["direction_index"] = direction_index[order]
     elif directions is not None:
         read["directions"] = directions[order]
-    out = operations.grouped_mlp(positions[order], offsets, weights, biases, **read)
+    out = grouped_mlp(positions[order], offsets, weights, biases, **read)
     # The backward of index_copy is a gather, where that of an index would be a scatter that adds.
     return first_rows(torch.zeros_like(out).index_copy(0, order.long(), out), cells, rows)
 
