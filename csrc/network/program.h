@@ -1,5 +1,6 @@
-// A program of steps on the rows of each cell, with the values of a tile of rows in cache; see voronerf/ops/_core/program.py for
-// the steps. The gradient of a program is a program, so there is one function for all derivatives.
+// A program of steps on the rows of each cell, with the values of a tile of rows in cache; see
+// voronerf/ops/_core/program.py for the steps. The gradient of a program is a program, so there is one function for all
+// derivatives.
 //
 // n rows, k cells, w columns. All tensors are float32 and contiguous. Rows outside all cells (before offsets[0], from
 // offsets[k] on) give 0. Results do not depend on the number of threads. With `order` [n], the row i that the offsets

@@ -209,7 +209,7 @@ class Pool {
 }  // namespace
 
 bool render_opaque_cpu(const MlpTable& table, const MlpInputs& network, const MarchInputs& march, const SeeCells& cells,
-                  const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads) {
+                       const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads) {
   if (march.r == 0) return true;
   std::unique_ptr<uint8_t[]> memory;
   const uint8_t* room = nullptr;

@@ -34,6 +34,6 @@ struct SeeOutputs {
 // The march has no uniforms, seed or start. The network has positions [r,3], which are not read, and directions [r,q]
 // or none. False if a place is not at a leaf after `depth` levels.
 bool render_opaque_cpu(const MlpTable& table, const MlpInputs& network, const MarchInputs& march, const SeeCells& cells,
-                  const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads);
+                       const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads);
 
 }  // namespace voronerf

@@ -1,4 +1,5 @@
-// Samples of several rays at once, from the networks' outputs to their weights: what render_loss and render_opaque share.
+// Samples of several rays at once, from the networks' outputs to their weights: what render_loss and render_opaque
+// share.
 //
 // `In` has raw [m,4], deltas [m], offsets [r+1] and density_scale.
 #pragma once
