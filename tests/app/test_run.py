@@ -17,16 +17,8 @@ from voronerf.app.train.checkpoint import CheckpointError
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.nerf import turntable_cameras
 
-SIZE = {
-    "field": "nerf",
-    "occupancy": False,
-    "width": 8,
-    "depth": 1,
-    "rays": 64,
-    "samples": (8,),
-    "evaluations": 1,
-    "eval_views": 3,
-}
+SIZE = {"field": "nerf", "occupancy": False, "width": 8, "depth": 1, "rays": 64, "samples": (8,)}
+SIZE |= {"evaluations": 1, "eval_views": 3}
 
 
 @pytest.fixture(scope="module")

@@ -8,35 +8,12 @@ import random
 from typing import Any
 
 NUMBERS = (
-    0,
-    -1,
-    1,
-    2,
-    1e308,
-    -1e308,
-    1e-300,
-    1e38,
-    float("nan"),
-    float("inf"),
-    2**31,
-    2**63,
-    10**30,
-    10**400,
-    -0.0,
-    0.5,
+    *(0, -1, 1, 2, 1e308, -1e308, 1e-300, 1e38, float("nan"), float("inf")),
+    *(2**31, 2**63, 10**30, 10**400, -0.0, 0.5),
 )
 TEXTS = (
-    "",
-    "x",
-    "\x1b]0;owned\x07",
-    "../../outside",
-    "/etc/passwd",
-    "a\0b",
-    "é" * 3000,
-    "\u202e",
-    "-1",
-    "None",
-    "builtin",
+    *("", "x", "\x1b]0;owned\x07", "../../outside", "/etc/passwd", "a\0b", "é" * 3000, "\u202e"),
+    *("-1", "None", "builtin"),
 )
 VALUES = (*NUMBERS, *TEXTS, None, True, False, [], {}, [[]], [1, "a", None], {"a": {"b": 1}}, [0] * 3000)
 

@@ -24,15 +24,8 @@ from voronerf.ops.grouped_mlp.case import layer_table
 from voronerf.ops.hash_encode.case import hash_grid
 
 DTYPES = (
-    torch.float16,
-    torch.float32,
-    torch.float64,
-    torch.bfloat16,
-    torch.int32,
-    torch.int64,
-    torch.uint8,
-    torch.bool,
-    torch.complex64,
+    *(torch.float16, torch.float32, torch.float64, torch.bfloat16, torch.complex64),
+    *(torch.int32, torch.int64, torch.uint8, torch.bool),
 )
 CASES = cases()
 

@@ -68,14 +68,13 @@ def hostile_client(rng: random.Random, folder: Path, given: Path) -> str:
 
 def message(rng: random.Random, gui: dict[str, Any]) -> dict[str, Any]:
     """A message of which something is odd."""
+    from tab import CAMERA, CLICK
+
     part = rng.choice([part for part in gui.values() if part.get("value") is not None or "options" in part] or [{}])
-    camera = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.0] * 3, "fov": 1.0, "near": 0.01, "far": 1000.0}
-    camera |= {"image_height": 48, "image_width": 48, "look_at": [0.0, 0.0, 1.0], "up_direction": [0.0, 0.0, 1.0]}
-    click = {"event_type": "click", "ray_origin": [0.0] * 3, "ray_direction": [0.0, 0.0, 1.0], "modifier": None}
     kinds = {
         "GuiUpdateMessage": {"uuid": part.get("uuid"), "updates": {"value": value(rng)}},
-        "ViewerCameraMessage": camera,
-        "ScenePointerMessage": {**click, "screen_pos": [[0.5, 0.5]]},
+        "ViewerCameraMessage": CAMERA,
+        "ScenePointerMessage": {**CLICK, "screen_pos": [[0.5, 0.5]]},
         "FileTransferStartUpload": {"size_bytes": 2**60, "part_count": 2**60, "filename": "x", "mime_type": "x"},
         "ShareUrlRequest": {},
     }

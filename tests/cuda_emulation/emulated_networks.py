@@ -108,16 +108,9 @@ def run(given: dict, layers: MLP, dtype: torch.dtype, backend: str) -> list[Tens
         return leaves[-1]
 
     named = {name: leaf(given[name]) for name in ("positions", "weights", "biases", "directions")}
-    out = voronerf.grouped_mlp(
-        named["positions"],
-        given["offsets"],
-        named["weights"],
-        named["biases"],
-        layers=layers,
-        directions=named["directions"],
-        direction_index=given["direction_index"],
-        backend=backend,
-    )
+    options = {"layers": layers, "directions": named["directions"], "direction_index": given["direction_index"]}
+    parameters = named["weights"], named["biases"]
+    out = voronerf.grouped_mlp(named["positions"], given["offsets"], *parameters, **options, backend=backend)
     gradient = torch.linspace(-1, 1, out.numel()).reshape(out.shape).sin().to(dtype)
     return [out, *torch.autograd.grad(out, leaves, gradient, allow_unused=True, materialize_grads=True)]
 

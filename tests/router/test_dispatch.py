@@ -57,7 +57,6 @@ def test_what_is_about_as_fast_and_more_promising_is_taken(monkeypatch: pytest.M
         ("fused", False, "grouped"),
         ("grouped", True, "grouped"),
         ("loop", True, "cell by cell"),
-        ("loop", False, "cell by cell"),
     ],
 )
 def test_a_way_by_name_is_not_measured(monkeypatch: pytest.MonkeyPatch, way: Any, fuse: bool, taken: str) -> None:

@@ -319,16 +319,8 @@ def on_a_line(cameras):
 
 def test_an_unbounded_run_is_cut_and_gets_an_object(tmp_path, scene) -> None:
     open_space = replace(scene, box=None, kind="unbounded", near=0.05, far=20.0)
-    config = TrainConfig(
-        out=tmp_path / "wide",
-        cells=(4,),
-        steps=40,
-        width=8,
-        rays=128,
-        samples=(16,),
-        evaluations=1,
-        field_options=SMALL,
-    )
+    small = {"steps": 40, "width": 8, "rays": 128, "samples": (16,), "evaluations": 1, "field_options": SMALL}
+    config = TrainConfig(out=tmp_path / "wide", cells=(4,), **small)
     trained(config, open_space)
     wide = altered(tmp_path / "wide", tmp_path / "dense", bias=4)  # so that there is something to cut
     run = open_run(wide, scene=open_space)

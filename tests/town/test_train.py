@@ -20,6 +20,10 @@ train-territories --data builtin --downscale 8 --width 8 --field-options levels=
 """
 
 
+def slow(*row):
+    return pytest.param(*row, marks=pytest.mark.slow)
+
+
 def command(out, *more):
     return [*ARGUMENTS.split(), "--out", str(out), *more]
 
@@ -82,7 +86,7 @@ def test_a_run_of_territories_is_opened_as_one_field(whole):
     assert opened.renderer.occupancy is not None
 
 
-@pytest.mark.parametrize("size", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("size", [2, slow(3)])
 def test_any_number_of_ranks_trains_the_same_run(tmp_path, whole, size):
     assert on_ranks(main, command(tmp_path / "run"), folder=tmp_path, size=size)[0] == [0] * size
     assert same(whole, tmp_path / "run")
@@ -103,7 +107,7 @@ def test_a_rank_that_is_killed(tmp_path, whole):
     assert same(whole, tmp_path / "run")
 
 
-@pytest.mark.parametrize("harm", [pytest.param("cut short", marks=pytest.mark.slow), "changed", "missing"])
+@pytest.mark.parametrize("harm", ["changed", slow("cut short"), slow("missing")])
 def test_a_damaged_part(tmp_path, whole, resumed, harm):
     """All ranks take the checkpoint before, and say which file was no good."""
     shutil.copytree(resumed, tmp_path / "run")
@@ -142,9 +146,9 @@ def test_a_full_disk(tmp_path):
     ("more", "said"),
     [
         (["--sampling", "hierarchical"], "--sampling must be stratified: no territory sees whole rays"),
-        (["--no-occupancy"], "--occupancy must be on, in territories, got False"),
         (["--territories", "1"], "--territories must be at least the 2 ranks, got 1"),
-        (["--territories", "999"], "--territories must be at most the"),
+        slow(["--no-occupancy"], "--occupancy must be on, in territories, got False"),
+        slow(["--territories", "999"], "--territories must be at most the"),
     ],
 )
 def test_settings_that_territories_do_not_support(tmp_path, more, said):

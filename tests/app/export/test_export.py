@@ -1,6 +1,7 @@
 """Points, meshes and cells of runs whose field is a formula, loaded again."""
 
 import itertools
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -195,12 +196,13 @@ def seen(columns, camera):
         ]
         colour = [max(0.5 + sum(h[i] * value for h, value in zip(harmonics, row)), 0) for row in coefficients]
         opacity = 1 / (1 + np.exp(-columns["opacity"][i]))
-        gaussians.append((np.array((fx * x / z + cx, fy * y / z + cy)), inverse, opacity, np.array(colour)))
+        numbers = fx * x / z + cx, fy * y / z + cy, inverse[0, 0], inverse[0, 1], inverse[1, 1], opacity
+        gaussians.append((*map(float, numbers), np.array(colour)))
     for row, column in itertools.product(range(camera.height), range(camera.width)):
         left, image[row, column] = 1.0, 0
-        for middle, inverse, opacity, colour in gaussians:
-            d = np.array((column + 0.5, row + 0.5)) - middle
-            alpha = min(opacity * np.exp(-d @ inverse @ d / 2), 0.99)
+        for u, v, across, mixed, down, opacity, colour in gaussians:
+            x, y = column + 0.5 - u, row + 0.5 - v
+            alpha = min(opacity * math.exp(-(across * x * x + 2 * mixed * x * y + down * y * y) / 2), 0.99)
             if alpha >= 1 / 255 and left > 1e-3:
                 image[row, column] += left * alpha * colour
                 left *= 1 - alpha

@@ -63,17 +63,13 @@ def write_images(folder, sizes, **save):
 
 def quaternion(turn):
     """(w, x, y, z) of a rotation."""
-    values, vectors = np.linalg.eigh(
-        np.array(
-            [
-                [turn[0, 0] - turn[1, 1] - turn[2, 2], 0, 0, 0],
-                [turn[0, 1] + turn[1, 0], turn[1, 1] - turn[0, 0] - turn[2, 2], 0, 0],
-                [turn[0, 2] + turn[2, 0], turn[1, 2] + turn[2, 1], turn[2, 2] - turn[0, 0] - turn[1, 1], 0],
-                [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1], np.trace(turn)],
-            ]
-        )
-        / 3
+    rows = (
+        [turn[0, 0] - turn[1, 1] - turn[2, 2], 0, 0, 0],
+        [turn[0, 1] + turn[1, 0], turn[1, 1] - turn[0, 0] - turn[2, 2], 0, 0],
+        [turn[0, 2] + turn[2, 0], turn[1, 2] + turn[2, 1], turn[2, 2] - turn[0, 0] - turn[1, 1], 0],
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1], np.trace(turn)],
     )
+    values, vectors = np.linalg.eigh(np.array(rows) / 3)
     x, y, z, w = vectors[:, values.argmax()]
     return np.array([w, x, y, z])
 

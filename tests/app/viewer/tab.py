@@ -16,6 +16,10 @@ from websockets.sync.client import connect
 
 from voronerf.app.viewer.cameras import FLIP
 
+CAMERA = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.0] * 3, "fov": 1.0, "near": 0.01, "far": 1000.0}
+CAMERA |= {"image_height": 48, "image_width": 48, "look_at": [0.0, 0.0, 1.0], "up_direction": [0.0, 0.0, 1.0]}
+CLICK = {"event_type": "click", "ray_origin": [0.0] * 3, "ray_direction": [0.0, 0.0, 1.0], "modifier": None}
+
 
 def found(value, buffers):
     """A value of a message, which may be the number of a buffer behind it."""
@@ -56,18 +60,10 @@ class Tab:
         """Goes to a camera; the angle of view is the camera's."""
         pose = cameras.poses[index].double().numpy()
         fov = 2 * math.atan(cameras.height / 2 / float(cameras.intrinsics[index, 1]))
-        self.send(
-            "ViewerCameraMessage",
-            wxyz=SO3.from_matrix(pose[:3, :3] @ FLIP).wxyz.tolist(),
-            position=pose[:3, 3].tolist(),
-            fov=fov,
-            near=0.01,
-            far=1000.0,
-            image_height=self.size[1],
-            image_width=self.size[0],
-            look_at=(pose[:3, 3] - pose[:3, 2]).tolist(),
-            up_direction=[0.0, 0.0, 1.0],
-        )
+        place = {"position": pose[:3, 3].tolist(), "look_at": (pose[:3, 3] - pose[:3, 2]).tolist(), "fov": fov}
+        place |= {"wxyz": SO3.from_matrix(pose[:3, :3] @ FLIP).wxyz.tolist()}
+        place |= {"image_width": self.size[0], "image_height": self.size[1]}
+        self.send("ViewerCameraMessage", **{**CAMERA, **place})
 
     def set(self, label, value) -> None:
         """Changes a part of the panel, or presses a button."""
@@ -82,14 +78,7 @@ class Tab:
         self.send("TransformControlsDragEndMessage", **node)
 
     def click(self, x, y) -> None:
-        self.send(
-            "ScenePointerMessage",
-            event_type="click",
-            ray_origin=[0.0, 0.0, 0.0],
-            ray_direction=[0.0, 0.0, 1.0],
-            screen_pos=[[x, y]],
-            modifier=None,
-        )
+        self.send("ScenePointerMessage", **CLICK, screen_pos=[[x, y]])
 
     def read(self) -> None:
         """Takes what has come."""
@@ -123,12 +112,8 @@ class Tab:
             }
         elif kind.startswith("Gui") and "uuid" in message:
             label = props.get("label") or props.get("_markdown", kind)[:20]
-            self.gui[label] = {
-                "uuid": message["uuid"],
-                "folder": message.get("container_uuid"),
-                "value": message.get("value"),
-                **props,
-            }
+            own = {"uuid": message["uuid"], "folder": message.get("container_uuid"), "value": message.get("value")}
+            self.gui[label] = own | props
         elif kind == "RemoveSceneNodeMessage":
             self.nodes = {name: node for name, node in self.nodes.items() if not name.startswith(message["name"])}
         elif "name" in message and props:

@@ -21,7 +21,7 @@ from PIL import Image
 pytest.importorskip("viser", reason="viser is not installed")
 
 import viser
-from tab import Tab
+from tab import CAMERA, Tab
 from websockets.exceptions import ConnectionClosed
 
 from voronerf.app import open_run
@@ -345,8 +345,6 @@ ODD = {
     "a thin canvas": lambda tab: tab.send("ViewerCameraMessage", **{**CAMERA, "image_width": 10**9}),
     "a click far away": lambda tab: tab.click(1e300, float("inf")),
 }
-CAMERA = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.0] * 3, "fov": 1.0, "near": 0.01, "far": 1000.0}
-CAMERA |= {"image_height": 48, "image_width": 48, "look_at": [0.0, 0.0, 1.0], "up_direction": [0.0, 0.0, 1.0]}
 
 
 def test_a_client_harms_itself_at_most(viewer, scene, caplog, capfd) -> None:
