@@ -28,15 +28,17 @@ def forward_with_tape(network: Mapping[str, Any]) -> Tape:
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in floats)
     if not plain or torch.is_autocast_enabled(network["positions"].device.type) or not torch.is_grad_enabled():
         return reference.forward_with_tape(network, "native")
-    names = routed_mlp.Where._fields
-    where = routed_mlp.Where(**{name: network[name] for name in names if name in network})
-    rest = {name: value for name, value in network.items() if name not in (*names, "frozen")}
-    call, _ = routed_mlp.prepared(**rest, where=where)
+    given = dict(network)
+    frozen = given.pop("frozen", None)
+    call, _ = routed_mlp.prepared(**given)
     with torch.no_grad():
         out, cells, order, offsets, encoded = routed_mlp.forward.inside(*call)
+        if call.where.cells is not None:
+            cells = call.where.cells
         rows = None if native.on_cuda(out) else call.where.rows  # CUDA has left out the others
-        out, cells = routed_mlp.first_rows(out, cells if call.where.cells is None else call.where.cells, rows)
-    return _Kept(out, call, rows, cells, order, offsets, encoded, network.get("frozen"))
+        if rows is not None:
+            out, cells = routed_mlp.first_rows(out, cells, rows)
+    return _Kept(out, call, rows, cells, order, offsets, encoded, frozen)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ _PIECE = 8192
 def keep_network(ctx: Any, network: Network, *others: Tensor) -> None:
     """Saves a network and other tensors for the backward pass."""
     ctx.table, ctx.count = network.table, len(network.weights)
-    positions, weights, biases, _, *rest = network
+    positions, weights, biases, _, *rest, _ = network
     ctx.save_for_backward(positions, *weights, *biases, *rest, *others)
 
 
@@ -41,7 +41,7 @@ def kept_network(ctx: Any) -> tuple[Network, Sequence[Tensor]]:
     saved, count = ctx.saved_tensors, ctx.count
     weights, biases = saved[1 : 1 + count], saved[1 + count : 1 + 2 * count]
     directions, index, features, *others = saved[1 + 2 * count :]
-    return Network(saved[0], weights, biases, ctx.table, directions, index, features), others
+    return Network(saved[0], weights, biases, ctx.table, directions, index, features, False), others
 
 
 def gradients_of_network(
@@ -50,15 +50,17 @@ def gradients_of_network(
     """Gradients in the place of what they are of, None where there is none; ``ctx``: whom the engine asks for them."""
     count = ctx.count
     if gradient is None:
-        return Network(*cast(Any, (None, [None] * count, [None] * count, None, None, None, None)))
-    positions, weights, biases, _, directions, index, features = network
+        return Network(*cast(Any, (None, [None] * count, [None] * count, *[None] * 5)))
+    positions, weights, biases, _, directions, index, features, _ = network
     asked = asked_for(ctx, (positions, *weights, *biases, directions, index, features))
     to_positions, *to_parameters, to_directions, _, to_features = asked
     wanted = *to_parameters, to_positions, to_directions, to_features
     *found, of_positions, of_directions, of_features = _gradients(
         gradient, network, offsets, order, encoded, asked=wanted
     )
-    return Network(*cast(Any, (of_positions, found[:count], found[count:], None, of_directions, None, of_features)))
+    return Network(
+        *cast(Any, (of_positions, found[:count], found[count:], None, of_directions, None, of_features, None))
+    )
 
 
 def _gradients(
@@ -87,7 +89,7 @@ def _layer_by_layer(
         order: int32 [n] that sorts the rows by cell, or None where they are sorted.
         asked: which gradients, in the order of the results.
     """
-    positions, weights, biases, text, directions, direction_index, features = network
+    positions, weights, biases, text, directions, direction_index, features, _ = network
     layers = Table.parse(text).with_widths(weights)
     count = len(weights)
     present = [bias if bias.numel() else None for bias in biases]

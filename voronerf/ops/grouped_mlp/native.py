@@ -15,10 +15,8 @@ from voronerf.ops.grouped_mlp.network import (
     Network,
     hashes_before,
     in_float32,
-    keeps_encoded,
     network,
-    new_encoded,
-    new_output,
+    new_results,
     run,
 )
 from voronerf.ops.grouped_mlp.reference import cells_of
@@ -47,7 +45,7 @@ def grouped_mlp(
     cells = cells_of(offsets, positions) if own and before else None
     taken, dtype = network(given, cells, hashed_before=before)
     out: Tensor
-    out, _ = _forward(taken, offsets, keeps_encoded(taken))
+    out, _ = _forward(taken, offsets)
     return out.to(dtype)
 
 
@@ -61,20 +59,20 @@ def grouped_linear(
     layers = _LINEAR[activation]
     taken, dtype = in_float32(Given(x, [weight], [bias], layers), layers.text, "grouped_linear")
     out: Tensor
-    out, _ = _forward(taken, offsets, False)
+    out, _ = _forward(taken, offsets)
     return out.to(dtype)
 
 
 @custom_op("grouped_mlp_native")
-def _forward(network: Network, offsets: Tensor, keep: bool) -> Iterator[tuple[Tensor, Tensor]]:
-    """Output, and for the backward pass what `new_encoded` says."""
-    out, encoded = new_output(network), new_encoded(network, keep)
+def _forward(network: Network, offsets: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """See `new_results`."""
+    out, encoded = new_results(network)
     yield out, encoded
     run(out, encoded, network, offsets, None)
 
 
-def _forward_setup(ctx: Any, inputs: tuple[Network, Tensor, bool], output: tuple[Tensor, Tensor]) -> None:
-    network, offsets, _ = inputs
+def _forward_setup(ctx: Any, inputs: tuple[Network, Tensor], output: tuple[Tensor, Tensor]) -> None:
+    network, offsets = inputs
     ctx.mark_non_differentiable(output[1])
     ctx.set_materialize_grads(False)
     keep_network(ctx, network, offsets, output[1])
@@ -82,7 +80,7 @@ def _forward_setup(ctx: Any, inputs: tuple[Network, Tensor, bool], output: tuple
 
 def _forward_backward(ctx: Any, gradient: Tensor | None, _of_encoded: None) -> tuple[Any, ...]:
     network, (offsets, encoded) = kept_network(ctx)
-    return gradients_of_network(ctx, gradient, network, offsets, None, encoded), None, None
+    return gradients_of_network(ctx, gradient, network, offsets, None, encoded), None
 
 
 _forward.register_autograd(_forward_backward, setup_context=_forward_setup)

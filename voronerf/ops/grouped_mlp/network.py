@@ -81,6 +81,8 @@ class Network(NamedTuple):
         directions: [n, q] or [r, q], or None.
         direction_index: int32 [n] or None.
         features: of a hash grid, unless positions are encoded already; not in float32. Or None.
+        keep: whether the forward pass keeps hashed positions for the backward pass. To look 16 features of 8 levels up
+            again takes some 70 ns a sample, to write them 9 (Zen 4, one thread).
     """
 
     positions: Tensor
@@ -90,6 +92,7 @@ class Network(NamedTuple):
     directions: Tensor | None
     direction_index: Tensor | None
     features: Tensor | None
+    keep: bool
 
 
 def network(
@@ -127,18 +130,17 @@ def in_float32(given: Given, text: str, caller: str, encoded: str = "") -> tuple
     No number is written into it, since it may be symbolic under ``torch.compile``; widths are those of the weights.
     ``encoded``: what is encoded already, whatever ``text`` says.
     """
-    positions, weights, directions = given.positions, given.weights, given.directions
-    dtype = storage(positions, weights)
-    found = Network(
-        positions.float(),
-        [weight.float() for weight in weights],
-        [positions.new_empty(0, dtype=torch.float32) if bias is None else bias.float() for bias in given.biases],
-        table_text(text, caller, operands(positions, dtype), encoded),
-        None if directions is None else directions.float(),
-        given.direction_index,
-        given.features,
-    )
-    return found, dtype
+    dtype = storage(given.positions, given.weights)
+    text = table_text(text, caller, operands(given.positions, dtype), encoded)
+    positions, directions, features = given.positions.float(), given.directions, given.features
+    weights = [weight.float() for weight in given.weights]
+    biases = [positions.new_empty(0) if bias is None else bias.float() for bias in given.biases]
+    directions = None if directions is None else directions.float()
+    keep = False
+    if features is not None and torch.is_grad_enabled():
+        inputs = (positions, directions, features, *weights, *biases)
+        keep = any(tensor is not None and tensor.requires_grad for tensor in inputs)
+    return Network(positions, weights, biases, text, directions, given.direction_index, features, keep), dtype
 
 
 def table_text(layers: str, caller: str, multiplied: str, encoded: str) -> str:
@@ -259,29 +261,16 @@ def _hashes(key: Key, precision: str, way: str, machine: native.compiled.Cuda) -
     return native.compiled.grouped_mlp_hashes(table_of(*key), precision, way, machine)
 
 
-def keeps_encoded(given: Network) -> bool:
-    """Whether the forward pass of a network keeps hashed positions for the backward pass.
+def new_results(network: Network) -> tuple[Tensor, Tensor]:
+    """Outputs [n, features of all of them], and hashed positions in the order of their cells.
 
-    To look 16 features of 8 levels up again takes some 70 ns a sample, to write them 9 (Zen 4, one thread).
+    These are [n, features rounded up to 16], empty if they are not kept.
     """
-    inputs = (given.positions, given.directions, given.features, *given.weights, *given.biases)
-    differentiable = any(tensor is not None and tensor.requires_grad for tensor in inputs)
-    return given.features is not None and torch.is_grad_enabled() and differentiable
-
-
-def new_encoded(network: Network, keep: bool) -> Tensor:
-    """For hashed positions in the order of their cells, [n, features rounded up to 16]; empty if they are not kept."""
-    grid, positions = Table.parse(network.table).layers.grid, network.positions
-    if grid is None or not keep:
-        return positions.new_empty(0)
-    return positions.new_empty(positions.shape[0], -(-grid.out_features // 16) * 16)
-
-
-def new_output(network: Network) -> Tensor:
-    """[n, features of all outputs]."""
-    outputs = Table.parse(network.table).layers.outputs
-    features = sum(network.weights[output].shape[1] for output in outputs)
-    return network.positions.new_empty(network.positions.shape[0], features)
+    layers, (n, _), new = Table.parse(network.table).layers, network.positions.shape, network.positions.new_empty
+    out = new(n, sum(network.weights[output].shape[1] for output in layers.outputs))
+    if layers.grid is None or not network.keep:
+        return out, new(0)
+    return out, new(n, -(-layers.grid.out_features // 16) * 16)
 
 
 def run(out: Tensor, encoded: Tensor, network: Network, offsets: Tensor, order: Tensor | None) -> None:
@@ -305,7 +294,7 @@ def backward(
 
     They are empty unless wanted: (parameters, positions, directions, features).
     """
-    positions, weights, biases, _, directions, direction_index, features = network
+    positions, weights, biases, _, directions, direction_index, features, _ = network
     count = len(weights)
     chosen = [wanted[0]] * (2 * count) + list(wanted[1:])
     results = [

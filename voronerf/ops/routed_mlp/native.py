@@ -28,19 +28,10 @@ from voronerf.ops.routed_mlp.reference import Where, first_rows
 
 
 def routed_mlp(
-    positions: Tensor,
-    weights: Sequence[Tensor],
-    biases: Sequence[Tensor | None],
-    *,
-    layers: MLP,
-    directions: Tensor | None = None,
-    direction_index: Tensor | None = None,
-    features: Tensor | None = None,
-    **given: Any,
+    positions: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor | None], **given: Any
 ) -> tuple[Tensor, Tensor]:
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
-    where = Where(**given)
-    call, dtype = prepared(positions, weights, biases, layers, where, directions, direction_index, features)
+    call, dtype = prepared(positions, weights, biases, **given)
     out, found, *_ = forward(*call)
     if call.where.cells is not None:
         found = call.where.cells
@@ -53,20 +44,21 @@ class Call(NamedTuple):
 
     network: Network
     where: Where
-    keep: bool
 
 
 def prepared(
     positions: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor | None],
+    *,
     layers: MLP,
-    where: Where,
     directions: Tensor | None = None,
     direction_index: Tensor | None = None,
     features: Tensor | None = None,
+    **places: Any,
 ) -> tuple[Call, torch.dtype]:
-    """The arguments of ``forward``, and the type of the result."""
+    """The arguments of ``forward``, and the type of the result; ``places`` are those of `Where`."""
+    where = Where(**places)
     centres, child_offsets, child, depth, cells, coords, rows = where
     own = features is not None and features.dim() == 3
     given = Given(positions, weights, biases, layers, directions, direction_index, features)
@@ -87,11 +79,11 @@ def prepared(
         where = Where(depth=depth, rows=rows)
     elif cells is not where.cells:
         where = where._replace(centres=None, cells=cells)
-    return Call(taken, where, grouped_mlp.keeps_encoded(taken)), dtype
+    return Call(taken, where), dtype
 
 
 @custom_op("routed_mlp_native")
-def forward(network: Network, where: Where, keep: bool) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+def forward(network: Network, where: Where) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
     """Output, cells (empty where they are given), order (empty where there is one cell), offsets, encoded positions.
 
     With neither cells nor centres there is one cell.
@@ -100,11 +92,10 @@ def forward(network: Network, where: Where, keep: bool) -> Iterator[tuple[Tensor
     positions = network.positions
     n, k = positions.shape[0], network.weights[0].shape[0]
     alone = cells is None and centres is None
-    out = grouped_mlp.new_output(network)
+    out, encoded = grouped_mlp.new_results(network)
     found = positions.new_empty(n if cells is None else 0, dtype=torch.int32)
     order = positions.new_empty(0 if alone else n, dtype=torch.int32)
     offsets = positions.new_empty(k + 1, dtype=torch.int32)
-    encoded = grouped_mlp.new_encoded(network, keep)
     yield out, found, order, offsets, encoded
     if alone:
         if rows is None or not native.on_cuda(positions):
@@ -125,7 +116,7 @@ def forward(network: Network, where: Where, keep: bool) -> Iterator[tuple[Tensor
 
 
 def _setup(ctx: Any, inputs: Call, output: tuple[Tensor, ...]) -> None:
-    network, where, _ = inputs
+    network, where = inputs
     _, found, order, offsets, encoded = output
     ctx.alone = where.cells is None and where.centres is None
     ctx.mark_non_differentiable(found, order, offsets, encoded)
@@ -137,7 +128,7 @@ def _backward(ctx: Any, gradient: Tensor | None, *_others: None) -> tuple[Any, .
     network, (order, offsets, encoded) = kept_network(ctx)
     sorted_by = None if ctx.alone else order
     found = gradients_of_network(ctx, gradient, network, offsets, sorted_by, encoded)
-    return found, Where(*cast(Any, (None,) * len(Where._fields))), None
+    return found, Where(*cast(Any, (None,) * len(Where._fields)))
 
 
 forward.register_autograd(_backward, setup_context=_setup)
