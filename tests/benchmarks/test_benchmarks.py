@@ -121,6 +121,14 @@ def test_foreign_contenders_compute_what_masks_do(name):
         assert work.error(work.alternatives["masks"]().run(0)[:1]) == 0
 
 
+@pytest.mark.parametrize("name", [name for name in cases_foreign.FIELDS if not re.search("2.19|torch-ngp", name)])
+def test_fused_foreign_fields_compute_what_masks_do(name):
+    """Values and gradients of every parameter; of those with second derivatives those too."""
+    work = cases_foreign.foreign_work(cases_foreign.FIELDS[name], 300, 4, "forward+backward", CPU)
+    fused = work.alternatives["fused"]()
+    assert work.error(fused.adapt(fused.run(0))) < 1e-3
+
+
 def test_cost_counts_products():
     w64d4 = networks.cost(networks.NETS["w64d4"])
     hidden, head = 2 * 64 * 64 * 3, 2 * 64 * 4

@@ -110,13 +110,6 @@ def test_a_neighbourhood_without_importance_stays():
     assert torch.equal(still, torch.eye(3))
 
 
-def test_float64_and_strided_samples_are_taken():
-    points, importance = surface_samples(8, m=500)
-    expected = balance(points, importance, 4, steps=20, generator=seeded(2))
-    strided = balance(points.T.contiguous().T.double(), importance.double(), 4, steps=20, generator=seeded(2))
-    assert torch.equal(strided.centres, expected.centres)
-
-
 def test_imbalance_is_the_population_deviation_of_the_normalised_weights():
     assert imbalance(torch.tensor([2.0, 4.0])) == pytest.approx(0.25)
     assert imbalance(torch.tensor([3.0, 3.0, 3.0])) == 0.0

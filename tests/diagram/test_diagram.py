@@ -41,13 +41,6 @@ def integer_points(n):
     return torch.randint(-9, 10, (n, 3), generator=seeded(5)).float()
 
 
-def test_flat_diagram_gives_the_nearest_centre_with_ties_to_the_first():
-    diagram = VoronoiDiagram(torch.tensor([[1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]))
-    cells = diagram.locate(torch.tensor([[2.0, 0, 0], [-2, 0, 0], [0, 5, 0]]))
-    assert (cells.dtype, cells.tolist()) == (torch.int32, [0, 1, 0])
-    assert (diagram.depth, diagram.num_cells) == (1, 3) and torch.equal(diagram.leaf_centres, diagram.centres)
-
-
 def test_nested_locate_equals_a_slow_descent():
     diagram, points = uneven_diagram(), integer_points(400)
     assert (diagram.depth, diagram.num_cells) == (3, 10)

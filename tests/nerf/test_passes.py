@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers import refuses, renderer_of, same, seeded
+from helpers import refuses, renderer_of, seeded
 from torch import Tensor
 
 from voronerf.nerf import (
@@ -18,9 +18,8 @@ from voronerf.nerf import (
     Renderer,
     Space,
     Stratified,
-    render_rays,
 )
-from voronerf.nerf.sampling import PADDING, blurred_weights, strata_uniforms, stratified_edges, union_depths
+from voronerf.nerf.sampling import PADDING, blurred_weights, stratified_edges, union_depths
 
 WHITE = torch.ones(3)
 
@@ -70,14 +69,6 @@ def test_who_is_asked_about_what():
         renderer_of(fields, samples=8, **options).render(rays(), 0.0, 4.0)
         assert [list(p.shape) for p in other.asked] == of_first
         assert [list(p.shape) for p in field.asked] == of_field
-
-
-def test_one_pass_is_render_rays():
-    options = {"background": WHITE, "jitter": True}
-    sampler = Stratified(9, space=Space(spacing="disparity"))
-    (got,) = Renderer({"field": Slab()}, sampler).render(rays(), 1.0, 3.0, generator=seeded(4), **options)
-    other = render_rays(Slab(), rays(), 1.0, 3.0, samples=sampler, generator=seeded(4), **options)
-    assert same(got[:-1], other[:-1]) and same(got.samples, other.samples)
 
 
 def test_union_against_slow_loop():
@@ -141,13 +132,6 @@ def test_jittered_edges_cover_the_ray(spacing, samples):
         assert (edges.diff(dim=1) >= 0).all()
         if samples > 1:
             assert not torch.equal(edges, even)
-
-
-def test_uniforms_are_one_in_each_stratum():
-    u = strata_uniforms(500, 7, torch.zeros(()), True, seeded(0))
-    assert u is not None and torch.equal((u * 7).floor(), torch.arange(7.0).expand(500, 7))
-    assert float((u * 7 % 1).mean()) == pytest.approx(0.5, abs=0.02)
-    assert strata_uniforms(5, 7, torch.zeros(()), False, None) is None
 
 
 def test_training_draws_differ_and_pictures_do_not():

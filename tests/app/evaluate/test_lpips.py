@@ -13,7 +13,7 @@ from pictures_by_formula import FIGURES, pictures_by_formula
 from safetensors.torch import save_file
 
 from voronerf.app.evaluate import lpips as module
-from voronerf.app.evaluate.lpips import CONVOLUTIONS, SHAPES, Lpips, LpipsError, find_lpips, read_weights
+from voronerf.app.evaluate.lpips import SHAPES, Lpips, LpipsError, find_lpips, read_weights
 
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
 Weights = dict[str, torch.Tensor]
@@ -188,8 +188,3 @@ def test_bad_files(tmp_path, weights):
     assert "lin2.model.1.weight must have shape [1, 384, 1, 1], got [1, 3, 1, 1]" in error("shape.safetensors")
     (tmp_path / "empty").mkdir()
     assert "holds no file of weights" in error("empty")
-
-
-def test_the_table_is_alexnets():
-    assert sum(math.prod(shape) for shape in SHAPES.values()) == 2_469_696 + 1_152
-    assert [o for _, (o, _, _), *_ in CONVOLUTIONS] == [64, 192, 384, 256, 256]

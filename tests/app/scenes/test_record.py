@@ -7,12 +7,10 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from helpers import refuses, trained
+from helpers import refuses
 
-from voronerf.app import open_run
 from voronerf.app.scenes import SceneError, builtin_scene
 from voronerf.app.scenes.record import read_scene, write_scene
-from voronerf.app.train.config import TrainConfig
 from voronerf.nerf import Contraction
 from voronerf.nerf.contraction import Perspective
 
@@ -56,13 +54,6 @@ def test_what_is_written_is_read(tmp_path, scene, contraction) -> None:
         if read.contraction is not None:
             assert_same(written.contraction, read.contraction)
         assert (read.box is None) == (written.box is None) and (read.box is None or torch.equal(read.box, written.box))
-
-
-def test_a_run_is_rendered_from_its_record(tmp_path, scene) -> None:
-    trained(TrainConfig(out=tmp_path, steps=10, cells=(), rays=64, samples=(8,), evaluations=1), scene)
-    record = read_scene(tmp_path / "scene.json")
-    without, whole = open_run(tmp_path, scene=record).render(1), open_run(tmp_path, scene=scene).render(1)
-    assert torch.equal(without.colour, whole.colour)
 
 
 @pytest.mark.parametrize(

@@ -116,11 +116,6 @@ def test_differences_name_what_cannot_change():
     assert differences(a, changed) == ["--width None -> 64", "--average 0.98 -> 0.5"]
 
 
-def test_final_cells():
-    assert [TrainConfig(cells=cells).final_cells for cells in ((), (12,), (4, 4))] == [1, 12, 16]
-    assert TrainConfig(cells=(4, 3), max_cells=15).final_cells == 15
-
-
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
