@@ -17,7 +17,6 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import overload
 
 import torch
 from torch import Tensor
@@ -37,15 +36,6 @@ def check_tensor(op: str, name: str, value: object) -> None:
     if value.layout is not torch.strided or value.is_nested or value.is_quantized:
         kind = "nested" if value.is_nested else "quantized" if value.is_quantized else str(value.layout)
         raise TypeError(f"{op}: {name} must be a dense tensor, got a {kind.removeprefix('torch.')} one")
-
-
-@overload
-def detached(tensor: Tensor) -> Tensor: ...
-@overload
-def detached(tensor: None) -> None: ...
-def detached(tensor: Tensor | None) -> Tensor | None:
-    """A tensor without gradients, which is itself where it has none: `detach` takes half a microsecond. None stays."""
-    return tensor.detach() if tensor is not None and tensor.requires_grad else tensor
 
 
 def of_one_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
@@ -179,11 +169,6 @@ class Checked:
         if shape and tensor.shape[0] > MAX_COUNT:
             check_count(self.op, name, tensor.shape[0])
         self.tensors[name] = tensor
-
-    def optional(self, name: str, tensor: Tensor | None, dtypes: Sequence[torch.dtype], *shape: int | str) -> None:
-        """`tensor`, where None is passed over."""
-        if tensor is not None:
-            self.tensor(name, tensor, dtypes, *shape)
 
     def first_float(self) -> Tensor:
         """The first floating-point tensor."""

@@ -22,9 +22,7 @@ _LISTENERS = [
 _PLAIN = (Tensor, torch.nn.Parameter)
 
 
-def custom_op(
-    name: str, *, devices: tuple[str, ...] = ("cpu", "cuda"), fake: Callable[..., Any] | None = None
-) -> Callable[[Callable[..., Iterator[Any]]], Op]:
+def custom_op(name: str, *, devices: tuple[str, ...] = ("cpu", "cuda")) -> Callable[[Callable[..., Iterator[Any]]], Op]:
     """Makes a function that allocates, yields its results, and then fills them the custom op ``voronerf::name``.
 
     ::
@@ -43,7 +41,6 @@ def custom_op(
     Args:
         name: of the op.
         devices: device types that it runs on.
-        fake: of an op whose sizes depend on values, and which yields when it knows them.
     """
 
     def declare(steps: Callable[..., Iterator[Any]]) -> Op:
@@ -57,8 +54,7 @@ def custom_op(
         signature = inspect.signature(steps, eval_str=True)
         (results,) = typing.get_args(signature.return_annotation)
         structs = Structs(signature.replace(return_annotation=results))
-        made = fake or (lambda *flat: next(steps(*structs.packed(flat))))
-        return make_op(name, run, made, structs, steps, devices=devices)
+        return make_op(name, run, lambda *flat: next(steps(*structs.packed(flat))), structs, steps, devices=devices)
 
     return declare
 
@@ -155,6 +151,9 @@ class Op:
     The dispatcher and the autograd of ``torch.library`` take some 130 us for a forward and a backward pass, as long as
     a layer of width 64 takes for a thousand samples, and more for lists of tensors. Modes, transforms, tracers and
     profilers are given the custom op.
+
+    Attributes:
+        inside: gives what the op does, for a node of autograd that has looked at the arguments itself.
     """
 
     def __init__(
@@ -162,7 +161,7 @@ class Op:
     ) -> None:
         self._op, self._run, self._on_cuda, self.structs, self._listed = op, run, "cuda" in devices, structs, listed
         self._function: Any = None
-        self.__name__ = ""
+        self.__name__, self.inside = "", run
 
     def __call__(self, *arguments: Any) -> Any:
         """What the op gives."""
@@ -189,10 +188,6 @@ class Op:
         entries, lengths = _flattened(flat) if self.structs.lists else (flat, None)
         results = self._function.apply(*entries, lengths)
         return list(results) if self._listed else results
-
-    def inside(self, *arguments: Any) -> Any:
-        """What the op gives, for a node of autograd that has looked at its arguments itself."""
-        return self._run(*arguments)
 
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
         """The op's backward, as of ``torch.library.custom_op``; inputs and gradients are packed like the arguments."""

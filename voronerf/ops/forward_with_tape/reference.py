@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.checks import check_flag, check_shape, detached
+from voronerf.ops._core.checks import check_flag, check_shape
 from voronerf.ops.routed_mlp import of_samples, routed_mlp
 
 
@@ -52,7 +52,7 @@ class Tape(ABC):
         check_shape("forward_with_tape", "loss", loss, ())
         check_shape("forward_with_tape", "gradient", gradient, self.raw.shape)
         check_flag("forward_with_tape", "defer", defer)
-        return self._backward(detached(loss), detached(gradient), defer)
+        return self._backward(loss.detach(), gradient.detach(), defer)
 
     @abstractmethod
     def _backward(self, loss: Tensor, gradient: Tensor, defer: bool) -> Tensor: ...

@@ -12,12 +12,10 @@ from voronerf.ops._core.checks import (
     INDEX,
     check_count,
     check_dtype,
-    check_no_inference,
-    check_same_device,
     check_shape,
 )
 from voronerf.ops._core.layers import MLP
-from voronerf.ops.grouped_mlp.checks import check_network
+from voronerf.ops.grouped_mlp.checks import check_network, check_together
 
 _OP = backends.declare("grouped_mlp", native=Implementation(EVERYWHERE, FLOATS))
 
@@ -84,27 +82,9 @@ def grouped_mlp(
     if sizes["k"] < 1:
         raise ValueError(f"{_OP}: offsets must have at least two entries, got [{sizes['k'] + 1}]")
     check_network(_OP, weights, biases, layers, directions, direction_index, features, sizes)
-    tensors = {
-        "positions": positions,
-        "offsets": offsets,
-        "directions": directions,
-        "direction_index": direction_index,
-        "features": features,
-        **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
-        **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
-    }
-    check_same_device(_OP, **tensors)
-    check_no_inference(_OP, **tensors)
+    read = {"directions": directions, "direction_index": direction_index, "features": features}
+    check_together(_OP, weights, biases, {"positions": positions, "offsets": offsets, **read})
     check_count(_OP, "positions", sizes["n"])
     run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=weights[0].dtype)
-    out: Tensor = run(
-        positions,
-        offsets,
-        weights,
-        biases,
-        layers=layers,
-        directions=directions,
-        direction_index=direction_index,
-        features=features,
-    )
+    out: Tensor = run(positions, offsets, weights, biases, layers=layers, **read)
     return out

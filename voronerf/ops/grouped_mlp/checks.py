@@ -73,6 +73,18 @@ def check_network(
         raise ValueError(f"{op}: weights[0] must hold at least one cell, got {list(weights[0].shape)}")
 
 
+def check_together(
+    op: str, weights: Sequence[Tensor], biases: Sequence[Tensor | None], tensors: dict[str, Tensor | None]
+) -> None:
+    """Checks that all are on one device, and that autograd can keep them where it has to."""
+    every, device = (*tensors.values(), *weights, *biases), weights[0].device
+    if torch.compiler.is_compiling() or any(t is not None and (t.device != device or t.is_inference()) for t in every):
+        for name, parameters in (("weights", weights), ("biases", biases)):  # named for an error alone
+            tensors |= {f"{name}[{index}]": parameter for index, parameter in enumerate(parameters)}
+        check_same_device(op, **tensors)
+        check_no_inference(op, **tensors)
+
+
 def _fits(tensor: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> bool:
     """Whether a parameter keeps all rules; its name for a message is not made."""
     if not isinstance(tensor, Tensor) or tensor.layout is not torch.strided or tensor.is_nested:
@@ -144,20 +156,8 @@ def check_routed(
         check_dtype(op, "coords", coords)
     elif centres is not None and sizes["p"] < 3:
         raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {sizes['p']}")
-    device, tables["rows"] = positions.device, rows
-    every = positions, coords, frozen, *tables.values(), *read.values(), *weights, *biases
-    if torch.compiler.is_compiling() or any(t is not None and (t.device != device or t.is_inference()) for t in every):
-        tensors = {  # named for an error alone
-            "positions": positions,
-            "coords": coords,
-            "frozen": frozen,
-            **tables,
-            **read,
-            **{f"weights[{index}]": weight for index, weight in enumerate(weights)},
-            **{f"biases[{index}]": bias for index, bias in enumerate(biases)},
-        }
-        check_same_device(op, **tensors)
-        check_no_inference(op, **tensors)
+    tensors = {"positions": positions, "coords": coords, "frozen": frozen, **tables, "rows": rows, **read}
+    check_together(op, weights, biases, tensors)
     if centres is not None:
         points = positions[:, :3] if coords is None else coords
         network["coords"], network["centres"] = of_one_dtype(points, centres)

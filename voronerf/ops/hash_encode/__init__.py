@@ -57,7 +57,8 @@ def hash_encode(
     given = Checked(_OP)
     given.tensor("positions", positions, FLOATING, "n", 3)
     given.tensor("table", table, FLOATING, *(() if cells is None else ("k",)), *grid.table_shape)
-    given.optional("cells", cells, INDEX, "n")
+    if cells is not None:
+        given.tensor("cells", cells, INDEX, "n")
     given.no_inference()
     dtype = torch.promote_types(positions.dtype, table.dtype)
     run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=dtype)
