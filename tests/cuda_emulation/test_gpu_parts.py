@@ -43,6 +43,7 @@ def check():
     return program("gpu_check")
 
 
+@pytest.mark.slow
 def test_every_small_case_is_right_on_the_emulated_device(parts):
     with emulated():
         for name, run in parts.small_cases("cpu"):
