@@ -46,7 +46,7 @@ def trained(steps, monkeypatch, *, empty=False):
     )  # fmt: skip
     state, outputs = build(config, builtin_scene(12)), []
     with monkeypatch.context() as patch:
-        patch.setattr(State, "read", lambda state, output: outputs.append(output))
+        patch.setattr(State, "read_output", lambda state, output: outputs.append(output))
         if empty:
             for table in (state.sampler.grid.density, state.sampler.grid.occupied):
                 table[:, :, 8:] = 0
@@ -80,7 +80,7 @@ def test_a_default_step(monkeypatch, on_device):
     """After the last split, without the cells that are looked at again every sixteenth step."""
     with emulated():
         state, _ = trained(6, monkeypatch)
-    monkeypatch.setattr(State, "read", lambda state, output: None)
+    monkeypatch.setattr(State, "read_output", lambda state, output: None)
     with asked() as counted:
         train(state, until=state.seconds + 1, clock=itertools.count().__next__)
     told = f"{counted.kernels} {counted.operations} {counted.reads}"
