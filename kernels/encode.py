@@ -87,12 +87,8 @@ def _encode_backward_kernel(
 
 @_FREQUENCY.custom_op("frequency_encode_warp")
 def _frequency(given: Any, out: Tensor) -> None:
-    launch(
-        _encode_kernel,
-        given.x.shape,
-        [*_inputs(given.x, None, given.octaves, given.include_input), array(out, out)],
-        out,
-    )
+    inputs = _inputs(given.x, None, given.octaves, given.include_input)
+    launch(_encode_kernel, given.x.shape, [*inputs, array(out, out)], out)
 
 
 @_FREQUENCY.backward_op("frequency_encode_warp_backward", _frequency, reference.frequency_encode)
@@ -102,20 +98,15 @@ def _frequency_backward(given: Any, arriving: Any, gradients: Any) -> None:
 
 @_INTEGRATED.custom_op("integrated_encode_warp")
 def _integrated(given: Any, out: Tensor) -> None:
-    launch(
-        _encode_kernel,
-        given.means.shape,
-        [*_inputs(given.means, given.variances, given.octaves, False), array(out, out)],
-        out,
-    )
+    inputs = _inputs(given.means, given.variances, given.octaves, False)
+    launch(_encode_kernel, given.means.shape, [*inputs, array(out, out)], out)
 
 
 @_INTEGRATED.backward_op("integrated_encode_warp_backward", _integrated, integrated.integrated_encode)
 def _integrated_backward(given: Any, arriving: Any, gradients: Any) -> None:
     of_means, of_variances = (given.means.new_empty(given.means.shape) if part is None else part for part in gradients)
-    _fill_gradients(
-        arriving.result, of_means, of_variances, _inputs(given.means, given.variances, given.octaves, False)
-    )
+    inputs = _inputs(given.means, given.variances, given.octaves, False)
+    _fill_gradients(arriving.result, of_means, of_variances, inputs)
 
 
 def _fill_gradients(gradient: Tensor, of_x: Tensor, of_variances: Tensor | None, inputs: list[object]) -> None:
