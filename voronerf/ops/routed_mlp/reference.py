@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from voronerf.ops._core import backends
 from voronerf.ops._core.checks import check_range
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.cell_sort import cell_sort
@@ -81,3 +82,8 @@ def first_rows(out: Tensor, cells: Tensor, rows: Tensor | None) -> tuple[Tensor,
         return out, cells
     beyond = torch.arange(cells.shape[0], device=cells.device) >= rows
     return out.masked_fill(beyond[:, None], 0), cells.masked_fill(beyond, -1)
+
+
+# A compiler that traces this finds only the implementations that are loaded before.
+for _op in ("nearest_centre", "locate_cell", "cell_sort", "grouped_mlp"):
+    backends.chosen(_op, torch.device("cpu"), torch.float32, backend="reference")
