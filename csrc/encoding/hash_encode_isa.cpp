@@ -56,21 +56,13 @@ VN_INLINE void for_blocks(const HashEncoding& in, int64_t begin, int64_t end, co
   }
 }
 
-// The rarer corners are compiled once, not in every loop.
-template <bool kAlong, bool kSlopes>
-__attribute__((noinline)) void other_corners(const HashEncoding& in, const GridLevel& level, const HashPlaces& places,
-                                             int64_t rows, HashCorners& corners) {
-  hash_corners<kAlong, kSlopes>(in, level, places, rows, corners);
-}
 template <bool kSlopes>
 VN_INLINE void corners_of(const HashEncoding& in, const GridLevel& level, const HashPlaces& places, int64_t rows,
                           HashCorners& corners) {
   if (in.in.direction != nullptr) {
-    other_corners<true, kSlopes>(in, level, places, rows, corners);
-  } else if (kSlopes) {
-    other_corners<false, true>(in, level, places, rows, corners);
+    hash_corners<true, kSlopes>(in, level, places, rows, corners);
   } else {
-    hash_corners<false, false>(in, level, places, rows, corners);
+    hash_corners<false, kSlopes>(in, level, places, rows, corners);
   }
 }
 

@@ -38,8 +38,7 @@ VN_INLINE const float* whole_block(const float* from, int64_t rows, float* padde
 }
 
 // Points `first` to `first + rows`, at most a block.
-[[maybe_unused]] __attribute__((noinline)) void hash_places(const HashEncoding& in, int64_t first, int64_t rows,
-                                                            HashPlaces& to) {
+VN_INLINE void hash_places(const HashEncoding& in, int64_t first, int64_t rows, HashPlaces& to) {
   alignas(64) float padded[3 * kHashBlock], padded_direction[3 * kHashBlock];
   const float* points = whole_block(in.in.positions + 3 * first, rows, padded);
   const float* directions = in.in.direction;
