@@ -12,36 +12,28 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-constexpr int64_t kSpread = 64;  // columns that a number is written to where it stands for all of them
-
 // Columns of a value or of a vector: rows of `stride` floats, 0 where they are all the same.
 struct Rows {
   const float* data;
   int64_t stride;
   bool spread;
-  const float* row(int64_t row, float* same) const {
-    const float* from = data + row * stride;
-    if (!spread) return from;
-    for (int64_t c = 0; c < kSpread; c += kLanes) store(same + c, splat(*from));
-    return same;
+  VN_INLINE F32 vector(const Rows& rows, int64_t row, int64_t column) {
+    const float* from = rows.data + row * rows.stride;
+    return rows.spread ? splat(*from) : load(from + column);
   }
 };
 
-// to = body(x, y), for `width` columns rounded up to whole vectors. One loop for all layouts: a body may be long.
+// to = body(x, y), for `width` columns rounded up to whole vectors.
 template <typename Body>
 VN_INLINE void each(float* to, int64_t stride, int64_t rows, const Rows& x, const Rows& y, const Body& body) {
-  const bool spread = x.spread || y.spread, flat = !spread && x.stride == stride && y.stride == stride;
-  const int64_t columns = flat ? rows * stride : stride;
-  float x_same[kSpread], y_same[kSpread];
-  for (int64_t row = 0; row < (flat ? 1 : rows); ++row) {
-    const float *from_x = x.row(row, x_same), *from_y = y.row(row, y_same);
-    for (int64_t left = columns; left > 0; left -= kSpread) {
-      const int64_t count = spread ? smaller(left, kSpread) : columns;
-      for (int64_t c = 0; c < count; c += kLanes) store(to + c, body(load(from_x + c), load(from_y + c)));
-      to += count;
-      if (!spread) break;
-      from_x += x.spread ? 0 : count;
-      from_y += y.spread ? 0 : count;
+  const bool flat = !x.spread && !y.spread && x.stride == stride && y.stride == stride;
+  if (flat) {
+    for (int64_t i = 0; i < rows * stride; i += kLanes) store(to + i, body(load(x.data + i), load(y.data + i)));
+    return;
+  }
+  for (int64_t row = 0; row < rows; ++row) {
+    for (int64_t c = 0; c < stride; c += kLanes) {
+      store(to + row * stride + c, body(Rows::vector(x, row, c), Rows::vector(y, row, c)));
     }
   }
 }
