@@ -10,15 +10,7 @@ from torch import Tensor
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer
 from voronerf.ops.grouped_mlp.gradients import gradients_of_network, keep_network, kept_network
-from voronerf.ops.grouped_mlp.network import (
-    Given,
-    Network,
-    hashes_before,
-    in_float32,
-    network,
-    new_results,
-    run,
-)
+from voronerf.ops.grouped_mlp.network import Given, Network, as_network, hashes_before, in_float32, new_results, run
 from voronerf.ops.grouped_mlp.reference import cells_of
 
 # Of one layer, whose width does not matter here.
@@ -43,7 +35,7 @@ def grouped_mlp(
     given = Given(positions, weights, biases, layers, directions, direction_index, features)
     own, before = features is not None and features.dim() == 3, hashes_before(given)
     cells = cells_of(offsets, positions) if own and before else None
-    taken, dtype = network(given, cells, hashed_before=before)
+    taken, dtype = as_network(given, cells, hashed_before=before)
     out: Tensor
     out, _ = _forward(taken, offsets)
     return out.to(dtype)

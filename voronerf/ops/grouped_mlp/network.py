@@ -95,7 +95,7 @@ class Network(NamedTuple):
     keep: bool
 
 
-def network(
+def as_network(
     given: Given, cells: Tensor | None, caller: str = "grouped_mlp", *, hashed_before: bool
 ) -> tuple[Network, torch.dtype]:
     """What the ops take for a layer table, and the storage type of their result (autocast's, where it is on).

@@ -21,7 +21,7 @@ from voronerf.ops._core.layers import MLP
 from voronerf.ops.cell_sort import native as cell_sort
 from voronerf.ops.grouped_mlp import network as grouped_mlp
 from voronerf.ops.grouped_mlp.gradients import gradients_of_network, keep_network, kept_network
-from voronerf.ops.grouped_mlp.network import Given, Network, network
+from voronerf.ops.grouped_mlp.network import Given, Network, as_network
 from voronerf.ops.locate_cell import native as locate_cell
 from voronerf.ops.nearest_centre import native as nearest_centre
 from voronerf.ops.routed_mlp.reference import Where, first_rows
@@ -72,7 +72,7 @@ def prepared(
         centres = None
     if features is not None and own and weights[0].shape[0] == 1:
         given = given._replace(features=features[0])
-    taken, dtype = network(given, cells, "routed_mlp", hashed_before=before)
+    taken, dtype = as_network(given, cells, "routed_mlp", hashed_before=before)
     if rows is not None and cells is not None and native.on_cuda(cells):
         cells = torch.where(torch.arange(cells.shape[0], device=cells.device) < rows, cells, -1)
     if cells is None and weights[0].shape[0] == 1:
