@@ -149,6 +149,7 @@ class ImageFit:
             points,
             importance,
             CHILDREN,
+            centres="balanced",
             min_samples=LEAST_SAMPLES,
             generator=self.generator,
             backend=self.backend,

@@ -31,7 +31,7 @@ def test_the_first_split_replaces_the_single_cell():
 
 def test_every_cell_is_balanced_by_its_own_samples_and_small_cells_stay_leaves():
     points, importance = three_clouds()
-    split = split_diagram(ROOT, points, importance, 8, generator=seeded(1))
+    split = split_diagram(ROOT, points, importance, 8, centres="balanced", generator=seeded(1))
     assert sorted(split.balances) == [0, 1]
     assert split.parents.tolist() == [0] * 8 + [1] * 8 + [2]
     weights = cell_weights(split.diagram.locate(points), importance, split.diagram.num_cells)
@@ -92,7 +92,7 @@ def test_uniform_centres_fill_the_box_of_their_cells_samples():
 
 def test_options_reach_the_balancing_and_depth_grows():
     points, importance = three_clouds()
-    split = split_diagram(ROOT, points, importance, 16, steps=0, cells=[0], generator=seeded(1))
+    split = split_diagram(ROOT, points, importance, 16, centres="balanced", steps=0, cells=[0], generator=seeded(1))
     assert split.balances[0].imbalance_after == split.balances[0].imbalance_before > 0.1
     deeper = split_diagram(split.diagram, points, importance, 3, min_samples=20, steps=30, generator=seeded(1))
     assert deeper.diagram.depth == 3

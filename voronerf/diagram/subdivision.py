@@ -45,7 +45,7 @@ def split_diagram(
     *,
     cells: str | Sequence[int] = "all",
     min_samples: int = 0,
-    centres: str = "balanced",
+    centres: str = "centroidal",
     generator: torch.Generator | None = None,
     backend: str = "auto",
     steps: int = 500,
@@ -63,7 +63,7 @@ def split_diagram(
         cells: "all"; "worst", the one cell with the largest accumulated importance among those that hold enough
             samples; or the numbers of the cells to split.
         min_samples: number of distinct samples that a cell needs to be split.
-        centres: "balanced", "centroidal", "random" or "uniform", see `balance`. Some of the uniform ones may lie
+        centres: "centroidal", "balanced", "random" or "uniform", see `balance`. Some of the uniform ones may lie
             outside of their cell and have no samples. "random" and "uniform" are ablations of the paper.
         generator: CPU generator of all draws; None for torch's global one. Cells draw from it in ascending order.
         backend: of the cell queries, see `voronerf.ops._core.backends`.
