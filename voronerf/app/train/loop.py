@@ -27,6 +27,8 @@ class TrainingError(RuntimeError):
 class Callback:
     """What goes on beside a training: scores, checkpoints, progress. It keeps its own state.
 
+    Its time is not training time, except in :meth:`after_split`.
+
     Examples:
         >>> from voronerf.app.train import Callback
         >>> class Losses(Callback):
