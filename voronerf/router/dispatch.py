@@ -28,6 +28,7 @@ from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters
 from voronerf.router.layout import Call, Results, map_tensors
 from voronerf.router.probe import Options, Probe, check_rays
+from voronerf.router.transforms import aside, recorded
 
 _OP = "VoronoiRouter"
 _FEWEST = 8  # samples; a first call of fewer is not probed and runs cell by cell
@@ -104,10 +105,11 @@ class Dispatch:
         """The plan for calls of this kind, which the first of them makes."""
         layout, key = call.layout, _kind_of(call, grouping.device, options.fuse)
         plan = self.plans.get(key)
-        if plan is not None and not (plan.open and plan.skip == 0 and layout.n >= _FEWEST):
+        if plan is not None and (not (plan.open and plan.skip == 0 and layout.n >= _FEWEST) or recorded()):
             return plan
         call.changed(lambda tensor, kind: tensor)  # arguments that are refused are so before anything is probed
-        with self._lock, torch.random.fork_rng([grouping.device] if grouping.device.type == "cuda" else []):
+        generators = [grouping.device] if grouping.device.type == "cuda" else []
+        with self._lock, torch.random.fork_rng(generators), aside(call) as call:
             if layout.n < _FEWEST:
                 if layout.n:
                     Probe(call, grouping).check_parameters()
@@ -129,14 +131,14 @@ class Dispatch:
         n, k = call.layout.n, grouping.k
         ways = [way for way in plan.ways if k > 1 or not isinstance(way, Grouped)]
         if plan.skip:
-            plan.skip -= 1
+            plan.skip -= not recorded()
             ways = ways[-1:]
         if not plan.measured or len(ways) == 1 or n < _FEWEST:
             return ways[0], ways[0].why
         size = n.bit_length() // 2, k  # batches of up to four times as many samples
         if size not in plan.chosen:
-            with self._lock:
-                times = measure(ways, call, grouping)
+            with self._lock, aside(call) as beside:
+                times = measure(ways, beside, grouping)
             first = next(i for i, time in enumerate(times) if time <= _EQUAL * min(times))
             texts = [f"{way.name} {1e3 * time:.3g} ms" for way, time in zip(ways, times, strict=True)]
             others = ", ".join(texts[:first] + texts[first + 1 :])
@@ -157,7 +159,8 @@ class Dispatch:
                 lacking = (BackendUnavailable, MemoryError, torch.OutOfMemoryError)
                 if isinstance(error, lacking) or "can't allocate memory" in str(error):
                     raise
-                plan.postpone()
+                if not recorded():
+                    plan.postpone()
                 reason = error if isinstance(error, Ungroupable) else f"its forward fails ({error})"
                 way, why, warns = plan.ways[-1], f"for some batches, since {reason}", True
         layout = call.layout

@@ -139,6 +139,8 @@ class Grouping:
 class _Permute(torch.autograd.Function):
     """Rows in another order. The backward is a gather as well, where that of indexing would be a scatter-add."""
 
+    generate_vmap_rule = True
+
     @staticmethod
     def forward(x: Tensor, index: Tensor, inverse: Tensor) -> Tensor:
         return x.index_select(0, index)
@@ -223,6 +225,8 @@ def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
 class _Cells(torch.autograd.Function):
     """The tensors of cells; their gradients are joined in memory of :func:`empty_like`."""
 
+    generate_vmap_rule = True
+
     @staticmethod
     def forward(stacked: Tensor) -> tuple[Tensor, ...]:
         return stacked.unbind(0)
@@ -235,7 +239,7 @@ class _Cells(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> Tensor:
         (stacked,) = ctx.saved_tensors
-        if torch.is_grad_enabled():  # these are differentiated again
+        if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():  # these are differentiated again
             return torch.stack([torch.zeros_like(stacked[0]) if own is None else own for own in gradients])
         result = empty_like(stacked)
         for own, gradient in zip(result.unbind(0), gradients, strict=True):

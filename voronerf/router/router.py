@@ -37,8 +37,9 @@ from voronerf.router.layout import Call, Layout, accepted_names, argument_names,
 from voronerf.router.optimizers import check_optimizer, drop_state, freeze_cells, move_state, watch_optimizers
 from voronerf.router.probe import Options
 from voronerf.router.table import LayeredField, described_by_table, each_direction, parameters_of_table
+from voronerf.router.transforms import outside, refuse_transforms, transformed, unwrapped
 
-_NO_GRAPH = "VoronoiRouter: a routed module runs as it is, between two graphs of torch.compile"
+_NO_GRAPH = "VoronoiRouter: a routed module runs as it is, between two graphs of torch.compile; omit fullgraph=True"
 Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
 
@@ -559,6 +560,7 @@ class VoronoiRouter(nn.Module):
 
     def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
+        refuse_transforms()
         called = getattr(self.module, method)
         if coords is not None and "coords" in (accepted_names([called]) or ()):  # the method's own argument
             kwargs, coords = {**kwargs, "coords": coords}, None
@@ -588,16 +590,18 @@ class VoronoiRouter(nn.Module):
         drawn, centres = self.assignment == "stochastic" and self.training, self.diagram.centres
         version = object() if centres.is_inference() else centres._version  # inference tensors have no version
         key = self.diagram, version, drawn, self.temperature, self.backend
-        known = self._assigned
+        kept = bool(self.methods) and not transformed()
+        known = self._assigned if kept else None
         if known is not None and known.serves(method, positions, key, drawn):
             return known.grouping
-        flat, k = positions.detach().reshape(-1, 3), self.num_cells
-        if flat.shape[0]:
-            cells = None if k == 1 else self.assign(flat)
-        else:  # the module runs on placeholders, since it may not take an empty batch
-            cells = torch.zeros(2, dtype=torch.int32, device=flat.device)
-        grouping = Grouping(cells, flat.shape[0] or 2, k, flat.device, self.backend)
-        if self.methods:
+        with outside():
+            flat, k = unwrapped(positions).detach().reshape(-1, 3), self.num_cells
+            if flat.shape[0]:
+                cells = None if k == 1 else self.assign(flat)
+            else:  # the module runs on placeholders, since it may not take an empty batch
+                cells = torch.zeros(2, dtype=torch.int32, device=flat.device)
+            grouping = Grouping(cells, flat.shape[0] or 2, k, flat.device, self.backend)
+        if kept:
             self._assigned = Assigned(grouping, positions.detach().clone(), key, {method})
         return grouping
 

@@ -20,6 +20,7 @@ from voronerf.ops import grouped_linear
 from voronerf.router.grouped import GroupedRun, PerCell, find, register, writes_in_place
 from voronerf.router.grouping import cells_of, empty_like
 from voronerf.router.layout import map_tensors, tensors_of
+from voronerf.router.transforms import transformed
 
 _ELEMENTWISE = """
     add sub subtract rsub mul multiply div divide true_divide remainder fmod pow maximum minimum atan2 hypot lerp where
@@ -225,6 +226,8 @@ def _found(run: GroupedRun, table: PerCell, c: int, index: Tensor) -> Tensor:
     each look-up has the size of the whole table, so all look-ups of one table add theirs to one buffer.
     """
     stacked, start = table.origin
+    if transformed():  # torch.func would copy the buffer
+        return stacked.reshape(-1, c).index_select(0, index + start * (table.numel() // c))
     key = id(stacked), c, torch.is_grad_enabled()
     if key not in run.tables:
         buffer: list[Tensor] = []

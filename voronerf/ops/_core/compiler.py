@@ -38,4 +38,5 @@ def not_compiled(function: Callable[P, R], reason: str) -> Callable[P, R]:
         result: R = disabled(*args, **kwargs)
         return result
 
+    run._torchdynamo_disable, run._torchdynamo_disable_msg = True, reason  # type: ignore[attr-defined]  # what it reads
     return run

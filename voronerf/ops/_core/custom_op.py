@@ -3,6 +3,7 @@ function."""
 
 from __future__ import annotations
 
+import functools
 import inspect
 import typing
 from collections.abc import Callable, Iterator, Sequence
@@ -10,6 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.library import CustomOpDef
 
 # torch has no public names for these questions; without an answer the custom op is called.
@@ -161,6 +163,7 @@ class Op:
     ) -> None:
         self._op, self._run, self._on_cuda, self.structs, self._listed = op, run, "cuda" in devices, structs, listed
         self._function: Any = None
+        self._setup: Any = None
         self.__name__, self.inside = "", run
 
     def __call__(self, *arguments: Any) -> Any:
@@ -168,9 +171,11 @@ class Op:
         flat = self.structs.flat(arguments)
         if torch.compiler.is_dynamo_compiling():
             return self._op(*flat)
+        if forward_ad._current_level >= 0:
+            self._refuse_tangents(flat)
         for listens in _LISTENERS:
             if listens():
-                return self._op(*flat)
+                return self._listened(flat)
         tensors = [flat[place] for place in self.structs.tensors]
         for place in self.structs.lists:
             tensors += flat[place]
@@ -189,6 +194,50 @@ class Op:
         results = self._function.apply(*entries, lengths)
         return list(results) if self._listed else results
 
+    def _listened(self, flat: Sequence[Any]) -> Any:
+        """The custom op; for torch.func, which does not differentiate those, a function that it does."""
+        if self._setup is None or not torch._C._are_functorch_transforms_active():
+            return self._op(*flat)
+        entries, lengths = _flattened(flat)
+        results = self._transformed.apply(*entries, lengths)
+        return list(results) if self._listed else results
+
+    @functools.cached_property
+    def _transformed(self) -> Any:
+        """The op with its gradients, as ``torch.func`` takes it."""
+
+        def forward(*flat: Any) -> Any:
+            *given, lengths = flat
+            result = self._run(*self.structs.packed(_nested(given, lengths)))
+            return tuple(result) if self._listed else result
+
+        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+            *given, ctx.lengths = inputs
+            self._setup(ctx, self.structs.packed(_nested(given, ctx.lengths)), output)
+
+        def vmap(*_: Any) -> Any:
+            raise NotImplementedError(self._no_batches)
+
+        parts = {"forward": forward, "setup_context": setup_context, "vmap": vmap}
+        parts = {name: staticmethod(part) for name, part in parts.items()}
+        return type("Transformed", (torch.autograd.Function,), {**parts, "backward": self._function.backward})
+
+    @property
+    def _no_batches(self) -> str:
+        return (
+            f"{self._op._name.removesuffix('_native')}: torch.func.vmap, jacrev, hessian, is_grads_batched=True and "
+            "vectorize=True are not supported; ask torch.autograd.grad for one gradient at a time"
+        )
+
+    def _refuse_tangents(self, flat: Sequence[Any]) -> None:
+        """Raises NotImplementedError for tensors with a tangent, which would be lost."""
+        for tensor in _flattened(flat)[0]:
+            if isinstance(tensor, Tensor) and forward_ad.unpack_dual(tensor).tangent is not None:
+                raise NotImplementedError(
+                    f"{self._op._name.removesuffix('_native')}: has no forward-mode derivative (jvp, jacfwd, dual "
+                    "numbers); take torch.func.vjp or torch.autograd.grad"
+                )
+
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
         """The op's backward, as of ``torch.library.custom_op``; inputs and gradients are packed like the arguments."""
         structs = self.structs
@@ -201,6 +250,7 @@ class Op:
             return tuple(structs.flat(found if isinstance(found, tuple) else (found,)))
 
         self._op.register_autograd(unpacked, setup_context=setup)
+        self._setup = setup_context
 
         def forward(ctx: Any, *flat: Any) -> Any:  # with a setup_context of its own it takes 20 us longer
             *given, lengths = flat
@@ -210,6 +260,8 @@ class Op:
             return tuple(result) if self._listed else result  # autograd.Function knows no lists
 
         def gradients(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
+            if any(own is not None and torch._C._functorch.is_legacy_batchedtensor(own) for own in of_results):
+                raise NotImplementedError(self._no_batches)
             found = unpacked(ctx, of_results) if self._listed else unpacked(ctx, *of_results)
             if ctx.lengths is None:
                 return (*found, None)

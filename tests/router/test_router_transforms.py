@@ -1,0 +1,204 @@
+"""VoronoiRouter within checkpoints, transforms of functions, tracers and compilers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from router_fields import Heads, perturb
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
+from torch.utils.checkpoint import checkpoint
+
+from voronerf import NeRF, grouped_linear
+from voronerf.router import VoronoiRouter
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")
+
+WAYS: dict[str, dict[str, Any]] = {
+    "fused": {"fuse": True, "way": "fused"},
+    "grouped": {"way": "grouped"},
+    "loop": {"way": "loop"},
+    "fastest": {"fuse": True},
+}
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(5)
+
+
+class Looked(nn.Module):
+    """A table of each cell, looked up twice, and layers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.table = nn.Embedding(32, 4)
+        self.out = nn.Sequential(nn.Linear(7, 16), nn.Tanh(), nn.Linear(16, 3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        row = (x[:, 0] * 31).long().clamp(0, 31)
+        return self.out(torch.cat([x, self.table(row) * self.table(31 - row)], -1))
+
+
+def net() -> nn.Module:
+    return nn.Sequential(nn.Linear(3, 32), nn.Softplus(), nn.Linear(32, 32), nn.Tanh(), nn.Linear(32, 4))
+
+
+def router_of(module: nn.Module, generator: torch.Generator, **options: Any) -> VoronoiRouter:
+    options = {"coords": "first3", **options}
+    return perturb(VoronoiRouter(module, torch.rand(8, 3, generator=generator), **options), generator)
+
+
+def gradients(run: Callable[[Tensor], Tensor], router: VoronoiRouter, x: Tensor) -> list[Tensor]:
+    x = x.clone().requires_grad_()
+    return list(torch.autograd.grad(run(x).square().sum(), [x, *router.parameters()]))
+
+
+# Checkpoints ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("make", [net, Looked])
+def test_a_checkpoint_around_first_calls_and_new_sizes(
+    way: str, make: Callable[[], nn.Module], generator: torch.Generator
+) -> None:
+    router = router_of(make(), generator, **WAYS[way])
+    for n in (500, 5000, 40, 3):
+        x = torch.rand(n, 3, generator=generator)
+        found = gradients(lambda x: checkpoint(router, x, use_reentrant=False), router, x)
+        torch.testing.assert_close(found, gradients(router, router, x), rtol=1e-4, atol=1e-5)
+
+
+class Picky(nn.Module):
+    """Batches with negative positions cannot be grouped."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b = nn.Linear(3, 8), nn.Linear(8, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = torch.sin(self.a(x))
+        if (x[:, 0] < 0).any():
+            h = h * 1.5
+        return self.b(h)
+
+
+def test_a_checkpoint_around_batches_of_which_some_cannot_be_grouped(generator: torch.Generator) -> None:
+    router = router_of(Picky(), generator, way="grouped")
+    for sign in (1, -1, -1, 1, -1, 1, 1, -1):
+        x = torch.rand(200, 3, generator=generator)
+        x[::7, 0] *= sign
+        found = gradients(lambda x: checkpoint(router, x, use_reentrant=False), router, x)
+        torch.testing.assert_close(found, gradients(router, router, x), rtol=1e-4, atol=1e-5)
+
+
+# torch.func -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cold", [True, False])
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("make", [net, Looked])
+def test_func_grad_and_vjp_give_what_autograd_gives(
+    way: str, make: Callable[[], nn.Module], cold: bool, generator: torch.Generator, recwarn: pytest.WarningsRecorder
+) -> None:
+    router, x = router_of(make(), generator, **WAYS[way]), torch.rand(300, 3, generator=generator)
+    if not cold:
+        router(x.clone().requires_grad_())
+    parameters = dict(router.named_parameters())
+
+    def loss(x: Tensor, parameters: dict[str, Tensor]) -> Tensor:
+        return functional_call(router, parameters, (x,)).square().sum()
+
+    by_x, by_parameters = grad(loss, argnums=(0, 1))(x, parameters)
+    expected = gradients(router, router, x)
+    torch.testing.assert_close([by_x, *by_parameters.values()], expected, rtol=1e-4, atol=1e-5)
+    assert not recwarn.list, recwarn.list[0].message
+
+    y, back = vjp(router, x)
+    torch.testing.assert_close(y, router(x))
+    torch.testing.assert_close(back(2 * y)[0], expected[0], rtol=1e-4, atol=1e-5)
+
+    own = x.clone().requires_grad_()
+    (first,) = torch.autograd.grad(router(own).square().sum(), own, create_graph=True)
+    (second,) = torch.autograd.grad(first.square().sum(), own)
+    twice = grad(lambda x: grad(lambda x: router(x).square().sum())(x).square().sum())(x)
+    torch.testing.assert_close(twice, second, rtol=1e-4, atol=1e-5 * float(second.abs().max()))
+
+
+def test_func_grad_of_several_methods(generator: torch.Generator) -> None:
+    router = router_of(Heads(), generator, methods=["density"], way="grouped")
+    x = torch.rand(100, 3, generator=generator)
+    found = grad(lambda x: router.density(x)["sigma"].sum() + router(x).sum())(x)
+    own = x.clone().requires_grad_()
+    (router.density(own)["sigma"].sum() + router(own).sum()).backward()
+    torch.testing.assert_close(found, own.grad)
+    assert router.density(x)["sigma"].shape == (100,)  # nothing of the transform is kept
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("cold", [True, False])
+def test_what_would_be_wrong_is_refused_in_one_line(way: str, cold: bool, generator: torch.Generator) -> None:
+    router, x = router_of(net(), generator, **WAYS[way]), torch.rand(64, 3, generator=generator)
+    if not cold:
+        router(x)
+    ones = torch.ones_like(x)
+    for run, says in [
+        (lambda: vmap(grad(lambda x: router(x[None]).sum()))(x), r"vmap.*call the router on the whole batch"),
+        (lambda: vmap(router)(x.reshape(4, 16, 3)), "vmap"),
+        (lambda: hessian(lambda x: router(x).sum())(x), "hessian"),
+        (lambda: jacfwd(router)(x), "torch.autograd.grad"),
+        (lambda: jvp(router, (x,), (ones,)), r"forward-mode.*torch.func.vjp"),
+        (lambda: torch.jit.trace(router, (x,)), r"jit.trace.*router.cell\(i\)"),
+        (lambda: torch.onnx.export(router, (x,), "/dev/null", dynamo=False), r"onnx.*router.cell\(i\)"),
+    ]:
+        with pytest.raises(NotImplementedError, match=says) as caught:
+            run()
+        assert "\n" not in str(caught.value)
+    with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="forward-mode"):
+        router(forward_ad.make_dual(x, ones))
+    torch.testing.assert_close(router(x), router(x))
+    torch.jit.trace(router.cell(2), (x,))
+
+
+@pytest.mark.parametrize("way", ["fused", "grouped"])
+def test_batches_of_gradients_are_refused_in_one_line(way: str, generator: torch.Generator) -> None:
+    router, x = router_of(net(), generator, **WAYS[way]), torch.rand(64, 3, generator=generator).requires_grad_()
+    y = router(x)
+    with pytest.raises(NotImplementedError, match=r"is_grads_batched=True.*one gradient at a time"):
+        torch.autograd.grad(y, x, torch.ones(2, *y.shape), is_grads_batched=True)
+    with pytest.raises(NotImplementedError, match=r"vectorize=True.*one gradient at a time"):
+        torch.autograd.functional.jacobian(router, x.detach(), vectorize=True)
+    with pytest.raises(NotImplementedError, match=r"jacrev.*one gradient at a time"):
+        jacrev(router)(x.detach())
+
+
+def test_a_table_of_layers_and_an_op_refuse_tangents(generator: torch.Generator) -> None:
+    router, x = VoronoiRouter(NeRF(width=16, depth=2), torch.rand(4, 3)), torch.rand(20, 3, generator=generator)
+    offsets, weight = torch.tensor([0, 8, 20], dtype=torch.int32), torch.rand(2, 4, 3, generator=generator)
+    d = nn.functional.normalize(x, dim=1)
+    for run in (lambda x: router(x, d)[0], lambda x: grouped_linear(x, offsets, weight)):
+        with pytest.raises(NotImplementedError, match="has no forward-mode derivative"):
+            jvp(run, (x,), (x,))
+        own = x.clone().requires_grad_()
+        run(own).square().sum().backward()
+        found = grad(lambda x, run=run: run(x).square().sum())(x)
+        torch.testing.assert_close(found, own.grad)
+
+
+# Compilers ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", ["fused", "grouped"])
+@pytest.mark.parametrize("cold", [True, False])
+def test_fullgraph_says_the_routers_text(way: str, cold: bool, generator: torch.Generator) -> None:
+    router, x = router_of(net(), generator, **WAYS[way]), torch.rand(64, 3, generator=generator)
+    if not cold:
+        router(x)
+    torch._dynamo.reset()
+    with pytest.raises(Exception, match=r"VoronoiRouter: a routed module runs as it is.*omit fullgraph=True"):
+        torch.compile(router, backend="eager", fullgraph=True)(x)
+    torch.testing.assert_close(torch.compile(router, backend="eager")(x), router(x))

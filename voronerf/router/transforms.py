@@ -1,0 +1,93 @@
+"""What PyTorch does around a routed call: transforms of functions, tracers, and hooks on the tensors that it saves."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from voronerf.router.double import Double
+from voronerf.router.grouping import owned_parameters
+from voronerf.router.layout import Call, map_tensors
+
+_OP = "VoronoiRouter"
+_ALONE = "router.cell(i) is a plain module of one cell"
+
+
+def transformed() -> bool:
+    """Whether the call is within a function that ``torch.func`` transforms."""
+    return torch._C._are_functorch_transforms_active()
+
+
+def refuse_transforms() -> None:
+    """Raises NotImplementedError within transforms that a routed call would give wrong results for, or none."""
+    if torch.jit.is_tracing():
+        raise NotImplementedError(
+            f"{_OP}: torch.jit.trace and torch.onnx.export(dynamo=False) would keep the cells of one batch; "
+            f"{_ALONE}, which they take"
+        )
+    within = set[str]()
+    if transformed():
+        within = {interpreter.key().name for interpreter in torch._C._functorch.get_interpreter_stack() or ()}
+    if "Vmap" in within:
+        raise NotImplementedError(
+            f"{_OP}: torch.func.vmap, jacrev and hessian take samples apart, which the cells are sorted by; call the "
+            "router on the whole batch, where torch.autograd.grad(y[:, i].sum(), x, create_graph=True) gives the "
+            "derivative of each sample, and once more the second"
+        )
+    if "Jvp" in within or forward_ad._current_level >= 0:
+        raise NotImplementedError(
+            f"{_OP}: forward-mode derivatives (jvp, jacfwd, dual numbers) are not supported; take torch.func.vjp or "
+            "torch.autograd.grad, twice for a product with the Jacobian"
+        )
+
+
+@contextlib.contextmanager
+def outside() -> Iterator[None]:
+    """Ends the transforms of ``torch.func`` for a while."""
+    if not transformed():
+        yield
+        return
+    from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
+
+    grad = torch.is_grad_enabled()
+    with temporarily_clear_interpreter_stack(), torch.set_grad_enabled(grad):
+        yield
+
+
+def unwrapped(tensor: Tensor) -> Tensor:
+    """A tensor that ``torch.func`` may have wrapped as it is :func:`outside`; a leaf where the wrapper learns."""
+    own = tensor
+    while torch._C._functorch.is_functorch_wrapped_tensor(own):
+        own = torch._C._functorch.get_unwrapped(own)
+    return own if own is tensor else own.detach().requires_grad_(tensor.requires_grad)
+
+
+@contextlib.contextmanager
+def aside(call: Call) -> Iterator[Call]:
+    """A call for what runs beside it, unseen by transforms and by hooks on saved tensors.
+
+    ``torch.utils.checkpoint`` counts what a call saves, and compares it with what the call saves when it runs again.
+    """
+    if not transformed():
+        with torch.autograd.graph.saved_tensors_hooks(_same, _same) if recorded() else contextlib.nullcontext():
+            yield call
+        return
+    with outside():
+        double = Double(call.module)
+        double.fill({id(p): unwrapped(p) for _, _, p in owned_parameters(call.module)})
+        args, kwargs = map_tensors((call.args, call.kwargs), unwrapped)
+        yield replace(call, module=double.module, args=args, kwargs=kwargs)
+
+
+def recorded() -> bool:
+    """Whether hooks see what is saved for a backward pass. The call may then run again, and must go the same way."""
+    return torch._C._autograd._top_saved_tensors_default_hooks(False) is not None
+
+
+def _same(tensor: Tensor) -> Tensor:
+    return tensor
