@@ -130,11 +130,7 @@ class Run:
 
 
 def read_crop(folder: Path) -> Tensor | None:
-    """The box [2, 3] that the viewer has saved in a run directory, or None.
-
-    Raises:
-        ValueError: The file is no box.
-    """
+    """The box [2, 3] that the viewer has saved in a run directory, or None."""
     file = folder / CROP
     return _box(read_json(file), str(file)) if file.is_file() else None
 

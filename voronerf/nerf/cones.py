@@ -44,9 +44,6 @@ def frustum_gaussians(rays: Rays, edges: Tensor, contraction: Contraction | Pers
 
     Returns:
         [r, s, 6].
-
-    Raises:
-        ValueError: rays without radii.
     """
     if rays.radii is None:
         raise ValueError("frustum_gaussians: rays must have radii, got none")

@@ -36,11 +36,7 @@ class DirectionPerSample(nn.Module):
         self.network = network
 
     def forward(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
-        """Evaluates the field; see :class:`Field`.
-
-        Raises:
-            ValueError: When the network returns something else than a colour and a density.
-        """
+        """Evaluates the field; see :class:`Field`."""
         n = len(positions)
         found = self.network(positions, directions.index_select(0, ray_index))
         if not (isinstance(found, (tuple, list)) and len(found) == 2):

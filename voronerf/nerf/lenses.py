@@ -140,9 +140,6 @@ class LensTables:
         lenses: [l, 13], intrinsics, coefficients and model of each.
         width: Of the images, in pixels.
         height: Of the images, in pixels.
-
-    Raises:
-        ValueError: The tables would take more than `MOST_BYTES`.
     """
 
     def __init__(self, lenses: Tensor, width: int, height: int) -> None:

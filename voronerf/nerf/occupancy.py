@@ -92,9 +92,6 @@ class OccupancyGrid:
                 found empty before it counts as empty.
             contraction: of the space that the box and the positions are in. Rays stay those of the world.
             device: of the grid; default that of the box.
-
-        Raises:
-            ValueError: an invalid box, resolution or threshold, or `remembered` below 1.
         """
         shape = (resolution,) * 3 if isinstance(resolution, int) else tuple(resolution)
         if tuple(box.shape) != (2, 3) or not bool((box[1] > box[0]).all()) or not bool(box.isfinite().all()):

@@ -442,11 +442,6 @@ def usual_samples(pixels: float, *, contracted: bool = False, seconds: float = 0
         pixels: Of the training views along the largest side of the box.
         contracted: Whether space is contracted.
         seconds: Of the training.
-
-    Examples:
-        >>> from voronerf.nerf.samplers import usual_samples
-        >>> usual_samples(88.0), usual_samples(353.0), usual_samples(88.0, contracted=True)
-        (64, 128, 128)
     """
     if contracted:
         return LONG_SAMPLES if seconds >= LONG else CONTRACTED_SAMPLES

@@ -25,11 +25,6 @@ def learning_rate(lr: float, fraction: float, step: int, *, hold: float = 0.0) -
         fraction: How much of the training is done, 0..1.
         step: Steps done.
         hold: Fraction of the training after which the rate falls, down to ``lr * FINAL`` at the end.
-
-    Examples:
-        >>> from voronerf.nerf.schedule import learning_rate
-        >>> learning_rate(0.02, 0.1, 500, hold=0.25), round(learning_rate(0.02, 1.0, 9000, hold=0.25), 6)
-        (0.02, 0.001)
     """
     rise = 1.0
     if fraction < WARMUP and step < WARMUP_STEPS:

@@ -63,11 +63,6 @@ def plan_splits(
             None: a single split at 0.2, several evenly spaced from 0.15 to 0.5.
         max_cells: After the first split, the worst cell is split into ``cells[-1]`` at evenly spaced times until there
             are this many cells; the last split may have fewer children.
-
-    Examples:
-        >>> from voronerf.nerf.split import plan_splits
-        >>> [(split.at, split.children) for split in plan_splits((16, 4), (0.1, 0.3))]
-        [(0.1, 16), (0.3, 4)]
     """
     levels = len(cells) if max_cells is None else 2
     if times is None:

@@ -56,12 +56,7 @@ class Source:
 
     @classmethod
     def of(cls, run: Path | str) -> Source:
-        """The source in a run directory. Of its networks the field alone is taken.
-
-        Raises:
-            ConfigError: For a field of cones, or one in normalised device coordinates.
-            CheckpointError: If there is no usable checkpoint.
-        """
+        """The source in a run directory. Of its networks the field alone is taken."""
         run = Path(run)
         name, record = run.name, run / "scene.json"
         if not record.is_file():
@@ -200,9 +195,6 @@ def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_
         sources: At least one. The first gives the settings, the background, and the data.
         frames: From each into the new scene.
         on_top: All but the first are in layers above it; their density comes on top of its.
-
-    Raises:
-        ConfigError: For runs without bounds beside others, or other backgrounds.
     """
     first = sources[0]
     for index, source in enumerate(sources):
@@ -358,9 +350,6 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
     Args:
         source: Of any kind.
         kept: A solid in the scene, or bool [k], the cells.
-
-    Raises:
-        ConfigError: When nothing is left, or the solid reaches out of the sphere of a contraction.
     """
     parts, box = source.parts, source.scene.box
     if isinstance(kept, Tensor):
@@ -416,11 +405,7 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
 
 
 def keep_cells(parts: Parts, kept: Tensor) -> Parts:
-    """Parts with some of the cells alone, bool [k].
-
-    Raises:
-        ConfigError: When there are none left of layer 0.
-    """
+    """Parts with some of the cells alone, bool [k]."""
     pieces = kept.split([part.num_cells for part in parts])
     left = [part.keep(own.nonzero()[:, 0]) for part, own in zip(parts, pieces, strict=True)]
     found = [part for part in left if part is not None]
@@ -491,9 +476,6 @@ def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, in
 
     Returns:
         The similarity, the root of the mean squared distance of camera centres after it, and how many these are.
-
-    Raises:
-        ConfigError: For fewer than three names in common, or centres on a line, which leave a rotation open.
     """
     ours, theirs = (
         {n: place for split in (s.train, s.test) for n, place in zip(split.names, split.cameras.origins, strict=True)}
@@ -519,11 +501,7 @@ def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, in
 
 
 def check_out(out: Path) -> None:
-    """Refuses to write into a folder with something in it.
-
-    Raises:
-        ConfigError: Names it.
-    """
+    """Refuses to write into a folder with something in it."""
     if checkpoint_paths(out):
         raise ConfigError(f"--out must not hold a run already, got {out}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

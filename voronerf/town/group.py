@@ -71,11 +71,7 @@ class Group:
 
     @classmethod
     def join(cls, device: torch.device) -> Group:
-        """Meets the other ranks that torchrun has started.
-
-        Raises:
-            RankLost: When they do not come.
-        """
+        """Meets the other ranks that torchrun has started."""
         if world_size() == 1:
             return cls(device)
         if device.type == "cuda":
@@ -153,11 +149,7 @@ class Group:
         return dict(sorted(zip(keys, found.split([int(counts[key]) for key in keys]), strict=True)))
 
     def check_equal(self, what: dict[str, str]) -> None:
-        """Compares texts of all ranks, each rank naming them alike.
-
-        Raises:
-            ValueError: Names the first that differs, its ranks and both values.
-        """
+        """Compares texts of all ranks, each rank naming them alike."""
         first, *others = self.gather(what)
         for name, value in first.items():
             for rank, other in enumerate(others, 1):
@@ -167,11 +159,7 @@ class Group:
                     )
 
     def check_same(self, config: Any, territories: int) -> None:
-        """Compares the settings, a dataclass, and the code of all ranks.
-
-        Raises:
-            ValueError: Names the first that differs.
-        """
+        """Compares the settings, a dataclass, and the code of all ranks."""
         root, code = Path(__file__).resolve().parents[1], 0
         for path in sorted(root.rglob("*.py")):
             code = zlib.crc32(path.read_bytes(), code)
@@ -181,11 +169,7 @@ class Group:
         self.check_equal({**made, "--territories": str(territories), **settings})
 
     def check_same_scene(self, scene: Scene) -> None:
-        """Compares cameras and the middle row of every image on all ranks; images may not fit into memory.
-
-        Raises:
-            ValueError: When they differ.
-        """
+        """Compares cameras and the middle row of every image on all ranks; images may not fit into memory."""
         views = scene.train
         rows = views.images[:, views.images.shape[1] // 2]
         tensors = (rows, views.cameras.poses, views.cameras.intrinsics, scene.test.cameras.poses)

@@ -29,9 +29,6 @@ class Network:
         checkpoint: Of a training: the group "router" has the cells, "optimizer" may have averages of the weights.
         device: Of the router.
         backend: Of its operations.
-
-    Raises:
-        ValueError: For a checkpoint without cells.
     """
 
     def __init__(self, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> None:
@@ -48,11 +45,7 @@ class Network:
 
     @functools.cached_property
     def router(self) -> VoronoiRouter:
-        """With averaged weights, in evaluation mode.
-
-        Raises:
-            CheckpointError: For other networks than the settings say.
-        """
+        """With averaged weights, in evaluation mode."""
         config = config_of(self.checkpoint)
         check_shapes(config, self.checkpoint)
         routers = make_routers(config, self.device)

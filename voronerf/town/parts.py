@@ -40,19 +40,6 @@ class Part(nn.Module):
         contraction: Of the space that the diagram and the networks are in; None for none.
         region: Solids in the part's frame; it speaks for what lies in all of them.
         layer: 0 for the scene, more for what is on top.
-
-    Raises:
-        ValueError: For owners that are not as many as leaves, or routers of other numbers of cells.
-
-    Examples:
-        >>> import torch
-        >>> from voronerf import NeRF, VoronoiRouter
-        >>>         >>> from voronerf.town.network import Network
-        >>> from voronerf.town.parts import Part
-        >>> part = Part([Network.of(VoronoiRouter(NeRF(width=8, depth=1), torch.rand(4, 3)), TrainConfig())])
-        >>> fewer = part.keep(torch.tensor([0, 2]))
-        >>> fewer.num_cells, fewer.diagram.num_cells, fewer.owner
-        (2, 4, tensor([ 0, -1,  0, -1], dtype=torch.int32))
     """
 
     owner: Tensor
@@ -172,27 +159,6 @@ class Parts(nn.Module):
     Args:
         parts: At least one.
         backend: Of the look-ups.
-
-    Raises:
-        ValueError: No part, or none in layer 0.
-
-    Examples:
-        >>> import torch  # networks of two widths, the second moved by 2 along x and half as large
-        >>> from voronerf import NeRF, VoronoiRouter
-        >>>         >>> from voronerf.town.geometry import Similarity
-        >>> from voronerf.town.network import Network
-        >>> from voronerf.town.parts import Part, Parts
-        >>> first = VoronoiRouter(NeRF(width=16, depth=2), torch.zeros(1, 3))
-        >>> second = VoronoiRouter(NeRF(width=8, depth=1), torch.tensor([[0.0, 0, -1], [0, 0, 1]]))
-        >>> routers = [[Network.of(router, TrainConfig())] for router in (first, second)]
-        >>> both = Parts([Part(routers[0]), Part(routers[1], frame=Similarity.of((2, 0, 0), scale=0.5))])
-        >>> points, up = torch.tensor([[0.1, 0, 0], [1.9, 0, 0.2]]), torch.tensor([[0.0, 0, 1]])
-        >>> [claim.part for claim in both.claims(0, points)]
-        [0, 1]
-        >>> colour, density = both(points, up, torch.zeros(2, dtype=torch.int32))
-        >>> inner = second(torch.tensor([[-0.2, 0, 0.4]]), up, torch.zeros(1, dtype=torch.int32))
-        >>> bool((density[1] - 2 * inner[1][0]).abs() < 1e-5)  # the density for half the length is twice as high
-        True
     """
 
     def __init__(self, parts: Sequence[Part], *, backend: str = "auto") -> None:

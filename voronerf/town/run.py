@@ -49,11 +49,7 @@ def is_town(run: Path) -> bool:
 
 
 def write_parts(run: Path, config: TrainConfig, parts: Parts, grid: OccupancyGrid | None) -> None:
-    """Writes the checkpoint of a run of parts, after the files of their networks, one for those in two places.
-
-    Raises:
-        OSError: When it cannot be written.
-    """
+    """Writes the checkpoint of a run of parts, after the files of their networks, one for those in two places."""
     folder, names = checkpoint_path(run).parent, dict[int, str]()
     for network in (network for part in parts for network in part.networks):
         if id(network) not in names:
@@ -92,11 +88,7 @@ def index_of(
 
 
 def open_parts(run: Path, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> Parts:
-    """The parts that a checkpoint of a run names; a network that stands in several places is one object.
-
-    Raises:
-        CheckpointError: When something is missing, damaged or does not fit.
-    """
+    """The parts that a checkpoint of a run names; a network that stands in several places is one object."""
     made: dict[str, Network] = {}
     found = []
     for index, values in enumerate(checkpoint.values["parts"]):
@@ -186,11 +178,7 @@ def open_run(
 
 
 def _in_place(read: Scene, known: Scene) -> Scene:
-    """The pictures of a scene where the record of a run has their cameras first; others where they were read.
-
-    Raises:
-        SceneError: For pictures of another place.
-    """
+    """The pictures of a scene where the record of a run has their cameras first; others where they were read."""
     splits = {}
     for name in ("train", "test"):
         own, recorded = getattr(read, name), getattr(known, name)

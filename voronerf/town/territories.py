@@ -121,10 +121,6 @@ def cut_space(scene: Scene, count: int, contraction: Contraction | Perspective |
         scene: Of which the cameras alone are read.
         count: T.
         contraction: Of the space of the fields, or None for that of the world.
-
-    Raises:
-        ValueError: For more territories than training views, views that lie in one place, or a scene without a box or
-            contraction.
     """
     views = len(scene.train)
     if count > views:
@@ -151,12 +147,6 @@ def halve(places: Tensor, count: int) -> Tensor:
 
     Returns:
         int64 [n], the part of each place; parts with neighbouring numbers lie together.
-
-    Examples:
-        >>> import torch
-        >>> from voronerf.town.distributed.territories import halve
-        >>> halve(torch.tensor([[0.0, 0, 0], [3.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]]), 2)
-        tensor([0, 1, 0, 1])
     """
     part = torch.zeros(len(places), dtype=torch.int64)
     pending = [(torch.arange(len(places)), 0, count)]

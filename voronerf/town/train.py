@@ -108,11 +108,7 @@ def sampler_of(state: State) -> Occupancy:
 
 
 def check_territories(config: TrainConfig, count: int, ranks: int) -> None:
-    """Rejects settings that a training in territories does not support.
-
-    Raises:
-        ConfigError: Names the setting.
-    """
+    """Rejects settings that a training in territories does not support."""
     rules: dict[str, tuple[bool, str]] = {
         "out": (config.out is not None, "be given: all ranks write there"),
         "sampling": (config.sampling == "stratified", "be stratified: no territory sees whole rays"),
@@ -140,9 +136,6 @@ def build_town(
         count: T.
         group: The ranks.
         on_event: Called with a line of text for what happens.
-
-    Raises:
-        ConfigError: For settings that territories do not support, or that do not fit the scene.
     """
     config = replace(config, sparse_depth=0.0)
     check_territories(config, count, group.size)
@@ -267,13 +260,7 @@ def _learn(state: State, batch: Batch, output: RenderOutput) -> None:
 
 
 def save(town: Town) -> None:
-    """Writes the checkpoints of all territories, and then the one that names them, which counts from then on.
-
-    Raises:
-        TrainingError: When parameters or moments are not finite.
-        OSError: When something cannot be written; the last checkpoint is left as it was.
-        RankLost: When that is so on another rank.
-    """
+    """Writes the checkpoints of all territories, and then the one that names them; until then the last one counts."""
     group, count, folder = town.group, len(town.owner), checkpoint_path(town.out).parent
     token = f"{town.first.step}-{group.gather(secrets.token_hex(4))[0]}"
     names = [f"networks-{token}-{number}.safetensors" for number in range(count)]
@@ -340,11 +327,7 @@ def _index(town: Town, names: list[str], found: Sequence[Sequence[dict[str, Tens
 
 
 def resume(town: Town) -> None:
-    """Puts all territories where they were at the last checkpoint that all ranks can read.
-
-    Raises:
-        CheckpointError: When there is none, or it is of another configuration.
-    """
+    """Puts all territories where they were at the last checkpoint that all ranks can read."""
     errors: list[CheckpointError] = []
     for path in checkpoint_paths(town.out):
         index, parts, failure = Checkpoint({}, {}), dict[int, Checkpoint](), None

@@ -35,13 +35,7 @@ FARTHEST = 1e6
 
 
 def check_export(path: Path, suffixes: tuple[str, ...]) -> None:
-    """Makes the folder of a file.
-
-    Raises:
-        ValueError: A suffix that is not in ``suffixes``.
-        ImportError: A package of the extra is missing.
-        OSError: The folder cannot be made.
-    """
+    """Makes the folder of a file."""
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: the file must end in {' or '.join(suffixes)}")
     for module, package in PACKAGES.items():
@@ -66,11 +60,7 @@ def placed(run: Run, geometry: Any, to_files: bool) -> Any:
 
 
 def box_of(run: Run, box: Tensor | None = None) -> Tensor:
-    """The box [2, 3] that is exported: the one given, the scene's, or one around the sphere of a contraction.
-
-    Raises:
-        ConfigError: The given box is empty or not finite, or the scene has no box.
-    """
+    """The box [2, 3] that is exported: the one given, the scene's, or one around the sphere of a contraction."""
     if box is not None:
         run = run.cropped(box)
     if run.scene.box is not None:

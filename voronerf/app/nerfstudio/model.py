@@ -54,11 +54,7 @@ class VoronerfModelConfig(ModelConfig):
     """Skip empty space, where samples are stratified."""
 
     def train_config(self, *, contracted: bool) -> TrainConfig:
-        """The settings that ``voronerf train`` would have.
-
-        Raises:
-            ConfigError: For a value out of range, or settings that exclude each other.
-        """
+        """The settings that ``voronerf train`` would have."""
         return TrainConfig(
             seed=torch.initial_seed() % 2**31,
             field=self.field,

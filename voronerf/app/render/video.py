@@ -12,13 +12,7 @@ from torch.nn.functional import pad
 
 
 def check_video(path: Path) -> None:
-    """Checks, before any frame is rendered, that :func:`write_video` can write them; makes the folder.
-
-    Raises:
-        ValueError: another suffix than .mp4.
-        ImportError: imageio-ffmpeg, or the ffmpeg that it brings, is not installed.
-        OSError: the folder cannot be written.
-    """
+    """Checks, before any frame is rendered, that :func:`write_video` can write them; makes the folder."""
     if path.suffix.lower() != ".mp4":
         raise ValueError(f"{path}: a video must end in .mp4")
     try:
@@ -46,11 +40,6 @@ def write_video(path: Path, frames: Iterable[Tensor], fps: float) -> None:
         frames: uint8 [h, w, 3] each, at least one; they are taken one by one. An odd size is padded by a copy of its
             last row or column, since the format stores colour for pairs of pixels.
         fps: frames a second.
-
-    Raises:
-        ValueError: shape, rate or suffix.
-        ImportError: imageio-ffmpeg is not installed.
-        OSError: ffmpeg cannot write the file.
     """
     if fps <= 0:
         raise ValueError(f"write_video: fps must be positive, got {fps}")

@@ -38,9 +38,6 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     Returns:
         The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
         the training views; without alpha the box is None. For a capture see `load_transforms`.
-
-    Raises:
-        SceneError: a file is missing, broken or inconsistent.
     """
     train_file = folder / "transforms_train.json"
     choices = [folder / "transforms_test.json", folder / "transforms_val.json"]

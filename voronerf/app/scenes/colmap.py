@@ -77,11 +77,7 @@ def find_model(folder: Path) -> Path | None:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Reads a model; binary files come first where there are both. Without `points3D` it has no points.
-
-    Raises:
-        SceneError: a file is broken, a camera model is not supported, or a pose or point is not finite.
-    """
+    """Reads a model; binary files come first where there are both. Without `points3D` it has no points."""
     suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
     cameras_path, images_path, points_path = (folder / f"{name}{suffix}" for name in FILES)
     binary = suffix == ".bin"
@@ -272,9 +268,6 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     """Loads a capture with a COLMAP model; every 8th image in the order of their names is held out for testing.
 
     The bounds of a view are the depths between which 98 % of its points lie.
-
-    Raises:
-        SceneError: as `read_model`; no image exists; or one is not of the shape of its camera.
     """
     place = find_model(folder)
     if place is None:

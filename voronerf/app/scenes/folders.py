@@ -31,9 +31,6 @@ def choose_images(folder: Path, downscale: int | None, longest: float) -> ImageF
     With `downscale` N, `images_N` is read as it is, else `images`. Where there is no `images`, the largest `images_N`
     is read, which a `downscale` of 1 takes as it is. None reduces the images as far as `least_factor` says; `longest`
     is the longest side of those in `images`.
-
-    Raises:
-        SceneError: no folder of images, or no folder that `downscale` fits.
     """
     sizes = {1: folder / "images"} if (folder / "images").is_dir() else {}
     for path in folder.glob("images_*"):
@@ -60,11 +57,7 @@ def stay_inside(path: Path, folder: Path, allow_outside: bool) -> None:
 
 
 def named_images(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
-    """The files of names in a folder, None for those that are missing; with a warning that says how many.
-
-    Raises:
-        SceneError: no file exists, or a name leads outside of the folder.
-    """
+    """The files of names in a folder, None for those that are missing; with a warning that says how many."""
     found: list[Path | None] = []
     for name in names:
         path = folder / name.replace("\\", "/")

@@ -74,9 +74,6 @@ def read_header(path: Path, factor: int) -> Header:
     Args:
         path: image file, PNG or JPEG.
         factor: of the reduction, >= 1.
-
-    Raises:
-        SceneError: the file is neither PNG nor JPEG, has more than 8 bits a channel or too few pixels.
     """
     with _opened(path) as file:
         size, alpha = file.size, _has_alpha(file)
@@ -99,9 +96,6 @@ def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
 
     Returns:
         [h, w, 3], or [h, w, 4] with an alpha channel.
-
-    Raises:
-        SceneError: the file is no image that can be read, or is truncated.
     """
     with _opened(path) as file:
         width, height = (side // factor for side in file.size)
@@ -142,9 +136,6 @@ def read_images(
         keep: in "memory"; on "disk", see `voronerf.app.scenes.store`; or "auto": on disk what does not fit into memory.
         name: of the scene.
         most_channels: 3 leaves alpha out.
-
-    Raises:
-        SceneError: as `read_header` and `read_image`, more than fit into memory, or a store that cannot be written.
     """
     headers = [read_header(path, factor) for path in paths]
     sizes = torch.tensor([header.size for header in headers])
@@ -213,9 +204,6 @@ def read_masks(
 
     Returns:
         bool [c, h, w], False around smaller images; None if no image has a mask.
-
-    Raises:
-        SceneError: as `read_image`, a mask of another size than its image, or one that leaves nothing.
     """
     if not any(masks):
         return None

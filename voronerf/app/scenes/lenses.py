@@ -46,11 +46,7 @@ COEFFICIENTS = {
 
 
 def colmap_lens(model: str, parameters: Sequence[float]) -> Lens:
-    """The lens of a camera model of COLMAP, with its parameters in COLMAP's order.
-
-    Raises:
-        ValueError: an unknown model, or another number of parameters; a part of a line.
-    """
+    """The lens of a camera model of COLMAP, with its parameters in COLMAP's order."""
     names = {name: text.split() for name, text in MODELS.values()}
     if model not in names:
         raise ValueError(f"camera model {model!s:.60} is not supported, only {', '.join(names)}")

@@ -25,11 +25,7 @@ MOST = 1_000_000
 
 
 def load_llff(folder: Path, reading: Reading) -> Scene:
-    """Loads an LLFF capture; every 8th image is held out for testing.
-
-    Raises:
-        SceneError: the file is broken, or the images are not as many as its rows.
-    """
+    """Loads an LLFF capture; every 8th image is held out for testing."""
     path = folder / FILE
     stay_inside(path, folder, reading.allow_outside)
     rows = _read(path)

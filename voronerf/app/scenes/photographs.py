@@ -120,10 +120,6 @@ def photograph_scene(
         factor: by which the files are still to be reduced.
         notes: what the loader has to say.
         transform: float64 [4, 4], from the original coordinates to those of the poses.
-
-    Raises:
-        SceneError: an image cannot be read or has another shape than its camera, a lens cannot be inverted, or the kind
-            does not fit.
     """
     if len(views) < 2 or not bool(held_out.any()) or bool(held_out.all()):
         raise SceneError(f"{source}: one image is too few, one is held out for testing")
@@ -351,11 +347,7 @@ def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) 
 
 
 def _without_dark_corners(cameras: Cameras, masks: Tensor | None, source: Path, views: Sequence[View]) -> Tensor | None:
-    """The masks without the pixels that no ray of a fisheye or an FOV lens reaches.
-
-    Raises:
-        SceneError: such pixels of a perspective lens, whose model is then a wrong one.
-    """
+    """The masks without the pixels that no ray of a fisheye or an FOV lens reaches."""
     inverts = lens_inverts(cameras)
     if bool(inverts.all()):
         return masks

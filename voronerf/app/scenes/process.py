@@ -115,12 +115,6 @@ def process(
         verbose: show what COLMAP says.
         say: takes a line about each step.
         progress: takes the name of a stage, how much of it is done and how much there is; 0 where that is not known.
-
-    Raises:
-        ValueError: an unknown matching, mapper or model of a lens, or too few features.
-        SceneError: the source is neither, or COLMAP finds no model that is sound.
-        ImportError: pycolmap is not installed.
-        OSError: a file cannot be written.
     """
     names = [name for name, _ in MODELS.values()]
     for argument, value, known in (
@@ -263,11 +257,7 @@ class Stages:
     progress: Progress  # as of :func:`process`
 
     def in_parts(self, name: str, items: Sequence[Item], size: int, work: Callable[[Sequence[Item]], None]) -> None:
-        """Does the work of a stage in parts, so that it can be shown and stopped; COLMAP passes over what is done.
-
-        Raises:
-            SceneError: COLMAP fails.
-        """
+        """Does the work of a stage in parts, so that it can be shown and stopped; COLMAP passes over what is done."""
         for first in range(0, len(items), size):
             self.progress(name, first, len(items))
             with _told(name):

@@ -25,11 +25,7 @@ INTEGERS = {"sizes": torch.int64, "models": torch.int32}
 
 
 def write_scene(path: Path, scene: Scene) -> None:
-    """Writes a scene without its images.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Writes a scene without its images."""
     values = {name: getattr(scene, name) for name in ("name", "near", "far", *WORDS)}
     for name in ("box", "transform"):
         values[name] = _plain(getattr(scene, name))
@@ -47,9 +43,6 @@ def placed(scene: Scene, known: Scene) -> Scene:
 
     Photographs are moved, turned and scaled by what the cameras of their folder say. They are moved here to where the
     other scene's would be.
-
-    Raises:
-        SceneError: they cannot be of one place: one has a background that the other has not, or only one was moved.
     """
     if scene.background != known.background:
         ours, theirs = (each.background or "none" for each in (known, scene))
@@ -70,12 +63,7 @@ def placed(scene: Scene, known: Scene) -> Scene:
 
 
 def read_scene(path: Path) -> Scene:
-    """Reads what :func:`write_scene` has written: a scene whose splits have no images.
-
-    Raises:
-        SceneError: the file is not a record of a scene; the message names it.
-        OSError: it cannot be read.
-    """
+    """Reads what :func:`write_scene` has written: a scene whose splits have no images."""
     try:
         values = read_json(path)
         words = {name: values[name] for name in WORDS}

@@ -41,17 +41,6 @@ def camera_faults(
         origins: [c, 3], their positions.
         bounds: [m, 2], the least and the largest depth of what they see, outliers left out; None if it is unknown.
         lenses: each with the width of its images in pixels.
-
-    Examples:
-        >>> import torch
-        >>> from voronerf.app.scenes.soundness import camera_faults
-        >>> angles = torch.arange(40) * 0.157
-        >>> circle = torch.stack((angles.cos(), angles.sin(), 0 * angles), 1)
-        >>> camera_faults(circle)
-        []
-        >>> circle[:30] *= 1e-5
-        >>> camera_faults(circle)
-        ['the cameras have collapsed: half of them lie within 1.57e-06 of another one, and 0.35 from the middle']
     """
     faults = []
     if len(origins) >= 3:

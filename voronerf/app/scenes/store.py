@@ -59,10 +59,6 @@ def stored(name: str, sources: Sequence[Any], made_of: Any, shape: Sequence[int]
 
     Returns:
         uint8 [c, h, w, channels], which must not be written to.
-
-    Raises:
-        SceneError: the store cannot be written; names it and the space it needs.
-        What `make` raises.
     """
     folder = cache_folder() / "images" / f"{name[:100]}-{_digest([sources, list(shape)])[:12]}"
     each = int(np.prod(shape[1:]))
@@ -198,11 +194,7 @@ class Pages:
             self.advise(first, self.start + images.numel() - first, RANDOM)
 
     def fetch(self, index: Tensor) -> None:
-        """Begins to read the pages of pixels [b], numbered through all images.
-
-        Raises:
-            SceneError: the file was cut short.
-        """
+        """Begins to read the pages of pixels [b], numbered through all images."""
         check_mapped()
         if self.advise is None:
             return

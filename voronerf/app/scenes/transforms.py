@@ -64,10 +64,6 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
 
     Returns:
         (the file's entries, the frames whose image exists, in the file's order).
-
-    Raises:
-        SceneError: the file does not parse, has no frames, no image of any frame exists, one lies outside of the
-            folder, or a matrix is not a pose.
     """
     try:
         entries = read_json(path)
@@ -100,11 +96,7 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
 
 
 def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = False) -> float | None:
-    """A finite number of a transforms file; None if the entry is missing.
-
-    Raises:
-        SceneError: the entry is not a number, out of range, or not positive where it must be.
-    """
+    """A finite number of a transforms file; None if the entry is missing."""
     value = entries.get(key)
     if value is None:
         return None
@@ -129,9 +121,6 @@ def focal_length(entries: dict[str, Any], key: str, side: int, path: Path) -> fl
         key: "fl_x" or "fl_y", "camera_angle_x" or "camera_angle_y".
         side: pixels of the image along that axis.
         path: the file, for messages.
-
-    Raises:
-        SceneError: the entry is no such number, or nothing that a camera has.
     """
     value = number(entries, key, path, positive=True)
     if value is None:
@@ -215,9 +204,6 @@ def load_transforms(folder: Path, reading: Reading) -> Scene:
     Args:
         folder: holds `transforms.json`.
         reading: how it is read.
-
-    Raises:
-        SceneError: the file is broken, its lens model is not supported, or it has fewer than two images.
     """
     path = folder / "transforms.json"
     entries, frames = read_transforms(path, reading.allow_outside)
@@ -283,9 +269,6 @@ def capture_scene(
         frames: its c images.
         held_out: bool [c], the test views.
         reading: how it is read.
-
-    Raises:
-        SceneError: as `load_transforms`.
     """
     path = frames[0].source
     notes = [f"{path.name} of {len(frames)} images"]
@@ -350,12 +333,7 @@ class Shot(NamedTuple):
 
 
 def write_transforms(path: Path, shots: Sequence[Shot], **entries: Any) -> None:
-    """Writes cameras as nerfstudio and instant-ngp read them, with further entries of the file.
-
-    Raises:
-        SceneError: a lens is none that they have.
-        OSError: the file cannot be written.
-    """
+    """Writes cameras as nerfstudio and instant-ngp read them, with further entries of the file."""
     frames = []
     for shot in shots:
         (fx, fy, cx, cy), coefficients, model = shot.lens

@@ -179,9 +179,6 @@ def make_renderer(
         grid: Which space is empty; None to take every sample.
         samples: Samples per ray of each pass, in pictures too; None for those of the configuration.
         backend: Of the operations; None for that of the configuration.
-
-    Raises:
-        SceneError: For a contraction that the scene does not allow.
     """
     device, backend = next(routers["field"].parameters()).device, backend or config.backend
     space = scene.space(config.contraction, cones=config.field_type.cones, device=device)
@@ -208,11 +205,7 @@ def make_grid(
     resolution: int | None = None,
     opacity: float = TRAINING_OPACITY,
 ) -> OccupancyGrid:
-    """A grid over the scene's box, or over the cube of its contraction, that is occupied everywhere.
-
-    Raises:
-        ConfigError: When the scene has no box and is not contracted.
-    """
+    """A grid over the scene's box, or over the cube of its contraction, that is occupied everywhere."""
     contraction = scene.space(config.contraction, device=device).contraction
     if contraction is None and scene.box is None:
         raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
@@ -221,11 +214,7 @@ def make_grid(
 
 
 def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> OccupancyGrid:
-    """The occupancy grid of a field that was trained without one, made by asking the field in every voxel.
-
-    Raises:
-        ConfigError: As `make_grid`, or when the run's sampling has no use for a grid.
-    """
+    """The occupancy grid of a field that was trained without one, made by asking the field in every voxel."""
     obstacle = why_no_occupancy(config)
     if obstacle is not None:
         raise ConfigError(f"--occupancy does not work with {obstacle}")
@@ -262,11 +251,7 @@ def count_parameters(config: TrainConfig, width: int | None = None) -> int:
 
 
 def solve_width(config: TrainConfig, total: int) -> int:
-    """The largest width with which all networks of all final cells have at most ``total`` parameters together.
-
-    Raises:
-        ConfigError: When a width of 2 has more, or the field has no width.
-    """
+    """The largest width with which all networks of all final cells have at most ``total`` parameters together."""
     if "width" not in config.field_type.options:
         raise ConfigError(f"--parameters needs a field with an option width, {config.field} has none")
     _check_fits(config, f"--parameters {total}", _parameter_bytes(config) * total)
@@ -283,11 +268,7 @@ def solve_width(config: TrainConfig, total: int) -> int:
 
 
 def check_backend(config: TrainConfig, device: torch.device) -> None:
-    """Looks up every op of a step: a backend that cannot train should say so before anything is written.
-
-    Raises:
-        BackendUnavailable: Names the op.
-    """
+    """Looks up every op of a step: a backend that cannot train should say so before anything is written."""
     ops = ["pixel_rays", "nearest_centre", "locate_cell", "grouped_mlp", "routed_mlp", "composite", "adam"]
     if config.occupancy:
         ops += ["march_rays", "observe_occupancy", "forward_with_tape", "render_loss_gradient"]

@@ -58,11 +58,7 @@ def checkpoint_paths(run: Path) -> list[Path]:
 
 
 def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
-    """Writes the last checkpoint of a run; the one before becomes ``last-1``, and ``keep`` of them stay.
-
-    Raises:
-        OSError: When it cannot be written; the older ones are then untouched.
-    """
+    """Writes the last checkpoint of a run; the one before becomes ``last-1``; ``keep`` stay, on failure all."""
     last = checkpoint_path(run)
     written = last.with_name("new.safetensors")
     save_checkpoint(written, checkpoint)
@@ -94,11 +90,7 @@ class CheckpointWriter:
         return self._thread is not None and self._thread.is_alive()
 
     def write(self, checkpoint: Checkpoint) -> None:
-        """Begins to write a checkpoint, after the one before; its tensors must not change.
-
-        Raises:
-            OSError: When the one before could not be written.
-        """
+        """Begins to write a checkpoint, after the one before; its tensors must not change."""
         self.wait()
         self._error = MemoryError("no memory for the thread that writes a checkpoint")  # until that has done so
 
@@ -115,11 +107,7 @@ class CheckpointWriter:
         self._thread.start()
 
     def wait(self) -> None:
-        """Returns when the checkpoint is written.
-
-        Raises:
-            OSError: When it could not be.
-        """
+        """Returns when the checkpoint is written."""
         if self._thread is not None:
             self._thread.join()
             self._thread = None
@@ -157,11 +145,7 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Writes a checkpoint atomically.
-
-    Raises:
-        OSError: When it cannot be written; an older checkpoint at ``path`` is then untouched.
-    """
+    """Writes a checkpoint atomically: on failure an older one at ``path`` is untouched."""
     values = json.dumps(checkpoint.values)
     sums = {name: _checksum(tensor) for name, tensor in checkpoint.tensors.items()}
     sums[_VALUES] = zlib.crc32(values.encode())
@@ -177,9 +161,6 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
     Args:
         path: The file.
         keep: Which tensors, by their names, are asked for. All are checked.
-
-    Raises:
-        CheckpointError: When the file is missing, truncated, damaged or no checkpoint of this version.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint")
@@ -217,11 +198,7 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 
 def load_optimizer_tensors(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """The inverse of :func:`optimizer_tensors`; groups and learning rates stay the optimiser's own.
-
-    Raises:
-        ValueError: When a parameter's moments are missing, have another shape, or are of no parameter.
-    """
+    """The inverse of :func:`optimizer_tensors`; groups and learning rates stay the optimiser's own."""
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():

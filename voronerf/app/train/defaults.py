@@ -23,10 +23,6 @@ def resolve(config: TrainConfig, scene: Scene) -> TrainConfig:
     """The settings with every default filled in, but for ``width`` and ``lr`` where ``parameters`` decides them.
 
     They are contraction, occupancy, sparse depth, samples of a ray, and the options of the field.
-
-    Raises:
-        ConfigError: When there are no sparse depths to learn from.
-        SceneError: For a contraction that the scene does not allow, or when there is no space that the field can cover.
     """
     kind, boxed = config.field_type, scene.box is not None
     if config.contraction == "auto":

@@ -110,11 +110,7 @@ def load(state: State, checkpoint: Checkpoint) -> None:
 
 
 def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
-    """The settings of a checkpoint's training, and how far it is.
-
-    Raises:
-        CheckpointError: When a value is missing or of another type.
-    """
+    """The settings of a checkpoint's training, and how far it is."""
     source, values = checkpoint.source, dict(checkpoint.values)
     if "step" not in values:
         raise CheckpointError(f"{source}: must be the checkpoint of one training, as voronerf train writes it")
@@ -139,11 +135,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
 
 
 def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
-    """Compares the networks of a configuration with those in a checkpoint, before memory is taken for either.
-
-    Raises:
-        CheckpointError: For a parameter that is missing, of another shape, or not for as many cells as there are.
-    """
+    """Compares the networks of a configuration with those in a checkpoint, before memory is taken for either."""
     for name in SAMPLERS[config.sampling].networks(config.field_type.cones):
         tensors = checkpoint.group(group(name))
         try:
@@ -168,9 +160,6 @@ def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint
         routers: By name.
         checkpoint: Of networks of the same architecture.
         assign: Takes the checkpoint's tensors in place of copies of them, for routers on the CPU.
-
-    Raises:
-        CheckpointError: When the checkpoint's parameters are of another architecture.
     """
     for name, router in routers.items():
         try:
@@ -181,11 +170,7 @@ def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint
 
 
 def load_averages(parameters: list[torch.nn.Parameter], checkpoint: Checkpoint) -> None:
-    """Replaces weights, in the optimiser's order, by the averages that a checkpoint has of them.
-
-    Raises:
-        CheckpointError: When an average has another shape.
-    """
+    """Replaces weights, in the optimiser's order, by the averages that a checkpoint has of them."""
     for index, parameter in enumerate(parameters):
         name = f"optimizer.{index}.average"
         average = checkpoint.tensors.get(name)

@@ -23,11 +23,7 @@ FOLDERS = ("camera_paths", "checkpoints", "images", "plots", "samples", "tensorb
 
 
 def check_folders(run: Path) -> None:
-    """Refuses a run with a folder that leads out of it, where files that are none of the run would be replaced.
-
-    Raises:
-        ConfigError: names the folder.
-    """
+    """Refuses a run with a folder that leads out of it, where files that are none of the run would be replaced."""
     for name in FOLDERS:
         if leads_outside(run / name, run):
             raise ConfigError(f"{run}: {name} must be in the run directory, got a link to {(run / name).resolve()}")
@@ -46,9 +42,6 @@ def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None
         run: The run directory.
         data: The scene of the settings.
         lpips: The weights of the settings.
-
-    Raises:
-        ConfigError: One lies in no folder of the user's choice.
     """
     paths = {"data": None if is_builtin(data) else data, "lpips": None if str(lpips) == OFF else lpips}
     for option, path in paths.items():
@@ -60,11 +53,7 @@ def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None
 
 
 def choose_directory(config: TrainConfig, scene: Scene, *, resume: bool = False) -> TrainConfig:
-    """The configuration with ``out`` filled in and checked.
-
-    Raises:
-        ConfigError: When ``out`` holds a run already and ``resume`` is off, or ``resume`` has nothing to continue.
-    """
+    """The configuration with ``out`` filled in and checked."""
     out = config.out
     if out is None:
         if resume:
@@ -89,11 +78,7 @@ def _made(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Locks a run directory, so that two processes cannot write it; without effect on file systems without locks.
-
-    Raises:
-        ConfigError: When another process holds it, or a folder of it leads elsewhere.
-    """
+    """Locks a run directory, so that two processes cannot write it; without effect on file systems without locks."""
     check_folders(folder)
     made = _made(folder)
 
@@ -114,22 +99,13 @@ def stored_config(run: Path) -> TrainConfig | None:
     """The settings of the run in a directory, for its continuation; None if it holds no run.
 
     ``allow_outside`` is not among them: whoever made the run may be another than who continues it.
-
-    Raises:
-        ConfigError: When the file is of another version, or text in it would be obeyed by a terminal.
-        ValueError: When it is no JSON.
     """
     path = run / "config.json"
     return replace(read_config(path), out=run) if path.is_file() else None
 
 
 def read_config(path: Path) -> TrainConfig:
-    """The settings in a file, for a training of another person; without directory and --allow-outside.
-
-    Raises:
-        ConfigError: When the file is of another version, or text in it would be obeyed by a terminal.
-        ValueError: When it is no JSON.
-    """
+    """The settings in a file, for a training of another person; without directory and --allow-outside."""
     config = TrainConfig.from_json(json.dumps(read_json(path)), str(path))
     for name, value in vars(config).items():  # they are defaults, which the help prints
         if not "".join(map(str, value if isinstance(value, tuple) else (value,))).isprintable():
@@ -138,11 +114,7 @@ def read_config(path: Path) -> TrainConfig:
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """The evaluations of a run, in order.
-
-    Raises:
-        ValueError: When a line of the file is none; names the file and the line.
-    """
+    """The evaluations of a run, in order."""
     path = run / "metrics.jsonl"
     metrics = read_json_lines(path)
     for number, line in enumerate(metrics, 1):

@@ -16,9 +16,6 @@ def check_types(source: str, kind: type, values: object, *, optional: bool = Fal
         kind: The dataclass.
         values: By name, with tuples for the lists of JSON.
         optional: Fields may be missing.
-
-    Raises:
-        ValueError: For no object, a field that is missing or unknown, or one of another type.
     """
     if not isinstance(values, Mapping):
         raise ValueError(f"{source}: must be an object, got {_short(values)}")

@@ -77,9 +77,6 @@ def run_network(
         directions: [n, 3], or [r, 3] together with `ray_index`; None if no layer reads them.
         ray_index: int32 [n], the row of `directions` of each sample.
         features: the table of the hash encoding, if `layers` have a grid.
-
-    Raises:
-        ValueError: shapes that disagree.
     """
     offsets = torch.tensor([0, positions.shape[0]], dtype=torch.int32, device=positions.device)
     return grouped_mlp(
@@ -124,9 +121,6 @@ class RadianceField(nn.Module):
 
         Returns:
             (colour [n, 3] in 0..1, density [n] per scene unit).
-
-        Raises:
-            ValueError: When view directions are needed and missing, or shapes disagree.
         """
         if self.view_directions and directions is None:
             name = type(self).__name__

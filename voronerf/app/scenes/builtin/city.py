@@ -92,11 +92,7 @@ def city_views(cameras: Cameras, blocks: tuple[int, int]) -> Split:
 
 
 def city_of(size: int, text: str, images: str) -> Scene:
-    """The city of blocks such as "4x4" or "4x8"; in the cache if it is larger than one block.
-
-    Raises:
-        SceneError: other blocks than these.
-    """
+    """The city of blocks such as "4x4" or "4x8"; in the cache if it is larger than one block."""
     found = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", text)
     if found is None or max(int(found[1]), int(found[2])) > MOST:
         raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, 2x4, ... or {MOST}x{MOST}, got {text!r:.60}")

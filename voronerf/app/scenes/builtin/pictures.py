@@ -41,9 +41,6 @@ def hemisphere_scene(name: str, solids: Sequence[Solid], size: int, train_views:
         size: of the square images, pixels.
         train_views: spread over the hemisphere on a spherical Fibonacci lattice.
         test_views: on an orbit that rises and falls twice, apart from the training views.
-
-    Raises:
-        ValueError: a size or number of views below 1.
     """
     if size < 1:
         raise ValueError(f"{name}: size must be >= 1, got {size}")
