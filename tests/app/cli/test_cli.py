@@ -106,9 +106,9 @@ def test_settings_of_a_file(run, tmp_path, fails):
 def test_exports_of_a_run(run, tmp_path, capsys, fails):
     pytest.importorskip("trimesh", reason="trimesh is not installed")
     pytest.importorskip("skimage", reason="scikit-image is not installed")
-    files = [tmp_path / name for name in ("mesh.glb", "cells.glb", "transforms.json")]
+    files = [tmp_path / name for name in ("mesh.glb", "cells.glb")]
     options = "--resolution 8 --density 0.01"  # of a run of a few steps
-    succeeds("export", run, "--mesh", files[0], "--cells", files[1], "--cameras", files[2], options)
+    succeeds("export", run, "--mesh", files[0], "--cells", files[1], options)
     assert all(file.stat().st_size for file in files)
     assert "3 of 3 cells" in capsys.readouterr().out
     fails("no surface in the box", "export", run, "--crop 9 9 9 9.5 9.5 9.5 --points", tmp_path / "points.ply")

@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 import torch
 from helpers import refuses, renderer_of, seeded
-from PIL import Image
 
 from voronerf import VoronoiDiagram
-from voronerf.app.export import cell_meshes, export_cameras, export_cells, export_mesh, export_points, export_splats
+from voronerf.app.export import cell_meshes, export_cells, export_mesh, export_points, export_splats
 from voronerf.app.export.splats import Splats, picture
 from voronerf.app.run import Run
-from voronerf.app.scenes import builtin_scene, load_scene
+from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import ConfigError
 from voronerf.nerf import Contraction, OccupancyGrid
 
@@ -258,21 +257,3 @@ def test_splats_of_a_part_and_what_is_refused(run, tmp_path):
         ({"box": torch.tensor([[5.0, 5, 5], [6.0, 6, 6]])}, "the training views show no surface"),
     ):
         refuses(rule, export_splats, run, tmp_path / "none.ply", error=ConfigError, **options)
-
-
-def test_cameras_are_read_back(run, tmp_path):
-    """With images beside the file, twice as large as those of the training."""
-    move = torch.eye(4, dtype=torch.float64)
-    move[:3] = torch.tensor([[0.0, -2, 0, 1], [2, 0, 0, 0], [0, 0, 2, 3]])
-    moved = replace(run, scene=replace(run.scene, transform=move))
-    (tmp_path / "images").mkdir()
-    for name in (*run.scene.train.names, *run.scene.test.names):
-        Image.new("RGB", (48, 48)).save(tmp_path / "images" / f"{name}.png")
-    assert export_cameras(moved, tmp_path / "transforms.json", to_files=True) == 21
-    found = load_scene(tmp_path, normalise=False)
-    for part in ("train", "test"):
-        expected, read = getattr(run.scene, part), getattr(found, part)
-        assert read.names == expected.names
-        torch.testing.assert_close(read.cameras.intrinsics, 2 * expected.cameras.intrinsics)
-        places = read.cameras.origins @ move[:3, :3].float().T + move[:3, 3].float()
-        torch.testing.assert_close(places, expected.cameras.origins, rtol=0, atol=1e-5)

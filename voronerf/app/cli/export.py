@@ -7,7 +7,6 @@ from typing import Literal
 
 from voronerf.app.cli.display import say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
-from voronerf.app.export import cameras as camera_files
 from voronerf.app.export import cells as cell_files
 from voronerf.app.export import mesh as mesh_files
 from voronerf.app.export import points as point_files
@@ -23,7 +22,6 @@ def export(
     points: Path | None = None,
     mesh: Path | None = None,
     cells: Path | None = None,
-    cameras: Path | None = None,
     count: int | None = None,
     fit: float = 60.0,
     resolution: int | None = None,
@@ -32,7 +30,7 @@ def export(
     coordinates: Literal["scene", "files"] = "scene",
     opening: Opening = AS_IN_TRAINING,
 ) -> int:
-    """Write a trained run as Gaussians, points, a mesh, the cells of its diagram, or its cameras.
+    """Write a trained run as Gaussians, points, a mesh, or the cells of its diagram.
 
     Args:
         run: The run directory.
@@ -40,8 +38,6 @@ def export(
         points: Coloured points with normals on the surface, .ply.
         mesh: The surface as a coloured mesh, .ply, .glb or .obj.
         cells: The cells of the diagram, clipped to the box, an object of its own colour each, .glb.
-        cameras: Training and test cameras as transforms.json. Images in the folder images beside it are named with
-            their sizes.
         count: Points or Gaussians at the most; default 200,000 points, 100,000 Gaussians.
         fit: Seconds for which the Gaussians are fitted.
         resolution: Cubes of the mesh along the longest side of the box; default 256, or what fits into memory.
@@ -59,10 +55,9 @@ def export(
         points: point_files.SUFFIXES,
         mesh: mesh_files.SUFFIXES,
         cells: cell_files.SUFFIXES,
-        cameras: camera_files.SUFFIXES,
     }
-    if not any((splat, points, mesh, cells, cameras)):
-        raise ConfigError("export needs a file: --splat, --points, --mesh, --cells or --cameras")
+    if not any((splat, points, mesh, cells)):
+        raise ConfigError("export needs a file: --splat, --points, --mesh or --cells")
     for file, suffixes in outputs.items():
         if file is not None:
             check_export(file, suffixes)
@@ -87,6 +82,4 @@ def export(
     if cells is not None:
         scene = cell_files.export_cells(opened, cells, box=box, to_files=to_files)
         say(f"wrote {cells}: {len(scene.geometry)} of {opened.diagram.num_cells} cells")
-    if cameras is not None:
-        say(f"wrote {cameras}: {camera_files.export_cameras(opened, cameras, to_files=to_files)} cameras")
     return 0

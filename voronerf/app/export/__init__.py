@@ -1,6 +1,5 @@
-"""A trained run as files for other programs: splats, points, a mesh, cells, cameras, videos."""
+"""A trained run as files for other programs: splats, points, a mesh, cells, videos."""
 
-from voronerf.app.export.cameras import export_cameras
 from voronerf.app.export.cells import cell_meshes, export_cells
 from voronerf.app.export.mesh import export_mesh
 from voronerf.app.export.points import export_points
@@ -9,7 +8,6 @@ from voronerf.app.export.video import export_video
 
 __all__ = [
     "cell_meshes",
-    "export_cameras",
     "export_cells",
     "export_mesh",
     "export_points",

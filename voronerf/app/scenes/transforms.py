@@ -332,8 +332,8 @@ class Shot(NamedTuple):
     height: int
 
 
-def write_transforms(path: Path, shots: Sequence[Shot], **entries: Any) -> None:
-    """Writes cameras as nerfstudio and instant-ngp read them, with further entries of the file."""
+def write_transforms(path: Path, shots: Sequence[Shot]) -> None:
+    """Writes cameras as nerfstudio and instant-ngp read them."""
     frames = []
     for shot in shots:
         (fx, fy, cx, cy), coefficients, model = shot.lens
@@ -347,4 +347,4 @@ def write_transforms(path: Path, shots: Sequence[Shot], **entries: Any) -> None:
         frames.append({"file_path": shot.file, "transform_matrix": shot.pose.tolist(), **lens, **kind})
     shared = {key: value for key, value in frames[0].items() if all(frame.get(key) == value for frame in frames)}
     rest = [{key: value for key, value in frame.items() if key not in shared} for frame in frames]
-    write_text(path, json.dumps({**shared, **entries, "frames": rest}, indent=1))
+    write_text(path, json.dumps({**shared, "frames": rest}, indent=1))
