@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,17 +11,16 @@ import torch
 from torch import Tensor
 
 from voronerf.app.evaluate.lpips import Lpips, find_lpips
-from voronerf.app.evaluate.scores import score_views
+from voronerf.app.evaluate.scores import evaluate, mean_scores
 from voronerf.app.files import json_text, read_json, write_text
 from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene, load_scene
-from voronerf.app.train.build import check_device, make_picture_grid, make_renderer, make_routers
+from voronerf.app.train.build import check_device, make_picture_grid, make_renderer
 from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.resume import check_shapes, load_averages, restore_routers, stored_values
+from voronerf.app.train.resume import open_routers, stored_values
 from voronerf.app.train.run_directory import check_folders, check_stored_paths
 from voronerf.diagram import VoronoiDiagram
-from voronerf.nerf.adam import parameter_groups
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.renderer import RenderedImage, Renderer
@@ -126,7 +125,8 @@ class Run:
         """
         if not isinstance(lpips, Lpips):
             lpips, _ = self.find_lpips(lpips)
-        return score_views(self.renderer, self.scene, views=views, lpips=lpips)
+        scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips)
+        return {**mean_scores(scores), "views": [asdict(score) for score in scores]}
 
 
 def read_crop(folder: Path) -> Tensor | None:
@@ -150,6 +150,27 @@ def _box(value: Any, where: str) -> Tensor:
         got = value.flatten().tolist() if isinstance(value, Tensor) else value
         raise ConfigError(f"{where} must be x y z of a corner and of a larger one, got {got!r:.200}")
     return box
+
+
+def shown_scene(
+    path: Path,
+    config: TrainConfig,
+    scene: Scene | None,
+    data: str | Path | None,
+    downscale: int | None,
+    allow_outside: bool,
+) -> tuple[TrainConfig, Scene]:
+    """The settings of a run with what :func:`open_run` was given, and the scene, loaded where it was not given."""
+    if scene is None and data is None:
+        check_stored_paths(path, data=config.data)
+    config = replace(
+        config,
+        data=config.data if data is None else str(data),
+        downscale=config.downscale if downscale is None else downscale,
+    )
+    if scene is None:
+        scene = load_scene(config.data, **{**config.reading, "allow_outside": allow_outside})
+    return config, scene
 
 
 def _shows(name: str) -> bool:
@@ -218,24 +239,8 @@ def open_run(
     check_folders(path)
     checkpoint = last_checkpoint(path, keep=_shows)
     config, _ = stored_values(checkpoint)
-    if scene is None and data is None:
-        check_stored_paths(path, data=config.data)
-    check_shapes(config, checkpoint)
-    routers = make_routers(config, device)
-    restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
-    dense, tables = parameter_groups(routers, config.field_type.sparse_parameters)
-    load_averages([*dense, *tables], checkpoint)
-    for router in routers.values():
-        router.backend = backend
-        router.eval()
-    config = replace(
-        config,
-        data=config.data if data is None else str(data),
-        downscale=config.downscale if downscale is None else downscale,
-    )
-    if scene is None:
-        reading = {**config.reading, "allow_outside": allow_outside}
-        scene = load_scene(config.data, **reading)
+    routers = open_routers(config, checkpoint, device, backend)
+    config, scene = shown_scene(path, config, scene, data, downscale, allow_outside)
     renderer = make_renderer(config, scene, routers, samples=samples, backend=backend)
     state, grid = checkpoint.group("occupancy"), None
     if state:

@@ -10,12 +10,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from voronerf.app.train.build import make_routers
 from voronerf.app.train.checkpoint import Checkpoint
 from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.resume import check_shapes, load_averages, restore_routers
+from voronerf.app.train.resume import open_routers
 from voronerf.diagram import VoronoiDiagram
-from voronerf.nerf.adam import parameter_groups
 from voronerf.router import VoronoiRouter
 
 
@@ -46,15 +44,7 @@ class Network:
     @functools.cached_property
     def router(self) -> VoronoiRouter:
         """With averaged weights, in evaluation mode."""
-        config = config_of(self.checkpoint)
-        check_shapes(config, self.checkpoint)
-        routers = make_routers(config, self.device)
-        restore_routers(routers, self.checkpoint, assign=torch.device(self.device).type == "cpu")
-        dense, tables = parameter_groups(routers, config.field_type.sparse_parameters)
-        load_averages([*dense, *tables], self.checkpoint)
-        router = routers["field"].eval()
-        router.backend = self.backend
-        return router
+        return open_routers(config_of(self.checkpoint), self.checkpoint, self.device, self.backend)["field"]
 
     def part(self, cells: Sequence[int] | Tensor) -> Network:
         """Those of some of the cells."""

@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.app.run import Run
-from voronerf.app.scenes import Scene, load_scene
+from voronerf.app.run import Run, shown_scene
+from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import placed, read_scene
 from voronerf.app.train.build import check_device
 from voronerf.app.train.checkpoint import (
@@ -28,7 +28,7 @@ from voronerf.app.train.checkpoint import (
     save_checkpoint,
 )
 from voronerf.app.train.config import TrainConfig
-from voronerf.app.train.run_directory import check_folders, check_stored_paths
+from voronerf.app.train.run_directory import check_folders
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.occupancy import OccupancyGrid
@@ -154,15 +154,7 @@ def open_run(
     check_folders(path)
     checkpoint = last_checkpoint(path)
     config = config_of(checkpoint)
-    if scene is None and data is None:
-        check_stored_paths(path, data=config.data)
-    config = replace(
-        config,
-        data=config.data if data is None else str(data),
-        downscale=config.downscale if downscale is None else downscale,
-    )
-    reading = {**config.reading, "allow_outside": allow_outside}
-    scene = load_scene(config.data, **reading) if scene is None else scene
+    config, scene = shown_scene(path, config, scene, data, downscale, allow_outside)
     scene = _in_place(scene, read_scene(path / "scene.json"))
     parts = open_parts(path, checkpoint, device, backend)
     for part in parts:

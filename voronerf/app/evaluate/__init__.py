@@ -5,7 +5,7 @@ Pictures are in ``panels``, ``plots`` and ``video``, which import matplotlib, Pi
 
 from voronerf.app.evaluate.lpips import Lpips, LpipsError, find_lpips
 from voronerf.app.evaluate.metrics import psnr, ssim
-from voronerf.app.evaluate.scores import ViewScore, evaluate, mean_scores, score_views
+from voronerf.app.evaluate.scores import ViewScore, evaluate, mean_scores
 
 __all__ = [
     "Lpips",
@@ -15,6 +15,5 @@ __all__ = [
     "find_lpips",
     "mean_scores",
     "psnr",
-    "score_views",
     "ssim",
 ]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 
@@ -109,22 +108,3 @@ def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:
         "lpips": sum(perceived) / len(scores) if len(perceived) == len(scores) else None,
         "psnr_of_mean_error": math.inf if error == 0 else -10 * math.log10(error),
     }
-
-
-def score_views(
-    renderer: Renderer, scene: Scene, *, views: int | None = None, lpips: Lpips | None = None
-) -> dict[str, Any]:
-    """Scores of test views, one by one and in the mean.
-
-    Examples:
-        >>> from voronerf import NeRF
-        >>> from voronerf.app.scenes import load_scene
-        >>> from voronerf.app.evaluate import score_views
-        >>> from voronerf.nerf import Renderer, Stratified
-        >>> scene = load_scene("builtin", downscale=20)
-        >>> result = score_views(Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8)), scene, views=2)
-        >>> len(result["views"]), result["psnr"] > 0
-        (2, True)
-    """
-    scores = evaluate(renderer, scene, views=views, lpips=lpips)
-    return {**mean_scores(scores), "views": [asdict(score) for score in scores]}

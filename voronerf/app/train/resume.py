@@ -10,12 +10,13 @@ from typing import Any
 
 import torch
 
-from voronerf.app.train.build import parameter_shapes
+from voronerf.app.train.build import make_routers, parameter_shapes
 from voronerf.app.train.checkpoint import Checkpoint, CheckpointError, load_optimizer_tensors, optimizer_tensors
 from voronerf.app.train.config import TrainConfig, differences
 from voronerf.app.train.schema import check_types
 from voronerf.app.train.state import Stage, State
 from voronerf.diagram import VoronoiDiagram
+from voronerf.nerf.adam import parameter_groups
 from voronerf.nerf.samplers import SAMPLERS, Occupancy
 from voronerf.router import VoronoiRouter
 
@@ -169,9 +170,15 @@ def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint
             raise CheckpointError(f"{checkpoint.source}: the checkpoint is of another architecture: {line}") from None
 
 
-def load_averages(parameters: list[torch.nn.Parameter], checkpoint: Checkpoint) -> None:
-    """Replaces weights, in the optimiser's order, by the averages that a checkpoint has of them."""
-    for index, parameter in enumerate(parameters):
+def open_routers(
+    config: TrainConfig, checkpoint: Checkpoint, device: torch.device | str, backend: str
+) -> dict[str, VoronoiRouter]:
+    """The routers of a checkpoint with averaged weights, in evaluation mode; on the CPU they are pages of its file."""
+    check_shapes(config, checkpoint)
+    routers = make_routers(config, device)
+    restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")
+    dense, tables = parameter_groups(routers, config.field_type.sparse_parameters)
+    for index, parameter in enumerate((*dense, *tables)):
         name = f"optimizer.{index}.average"
         average = checkpoint.tensors.get(name)
         if average is None:
@@ -180,6 +187,10 @@ def load_averages(parameters: list[torch.nn.Parameter], checkpoint: Checkpoint) 
             wanted, came = list(parameter.shape), list(average.shape)
             raise CheckpointError(f"{checkpoint.source}: {name} must have shape {wanted}, got {came}")
         parameter.data = average.to(parameter)
+    for router in routers.values():
+        router.backend = backend
+        router.eval()
+    return routers
 
 
 def group(name: str) -> str:
