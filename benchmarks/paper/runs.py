@@ -24,7 +24,7 @@ from paper import looks
 from voronerf.app.evaluate.lpips import find_lpips
 from voronerf.app.evaluate.scores import evaluate, mean_scores
 from voronerf.app.files import write_text
-from voronerf.app.scenes import BUILTIN, BUILTIN_SIZE, Scene, load_scene
+from voronerf.app.scenes import BUILTIN_SIZE, Scene, is_builtin, load_scene
 from voronerf.app.train import ConfigError, TrainConfig
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.diagram.reservoir import SampleReservoir
@@ -123,12 +123,12 @@ def scene_source(name: str) -> str:
     Raises:
         ConfigError: There is no such scene.
     """
-    if name in BUILTIN:
+    if is_builtin(name):
         return name
     for folder in (Path(name), data_folder() / name):
         if folder.is_dir():
             return str(folder)
-    raise ConfigError(f"--scene must be a folder, a name in {data_folder()} or {', '.join(BUILTIN)}, got {name!r}")
+    raise ConfigError(f"--scene must be a folder, a name in {data_folder()} or builtin, got {name!r}")
 
 
 def default_scenes(count: int = 1) -> tuple[str, ...]:
@@ -139,7 +139,7 @@ def default_scenes(count: int = 1) -> tuple[str, ...]:
 
 def factor(name: str, settings: Settings) -> int:
     """The factor by which a scene's own images are made smaller."""
-    if name not in BUILTIN:
+    if not is_builtin(name):
         return settings.downscale
     return max(1, settings.downscale * BUILTIN_SIZE // PUBLISHED_SIZE)
 

@@ -105,7 +105,7 @@ def harmed_ranks(rng: random.Random, folder: Path, _given: Path) -> Counter[str]
     Ranks(part, 2, options, file_size=20_000).is_refused("File too large")
     done = _ended_ranks(rng, folder, whole, options)
     size = rng.choice((2, 3, 4))
-    Ranks(part, size, options, ("--data", "builtin-rich")).is_refused("the scene must be")
+    Ranks(part, size, options, ("--data", "builtin-city")).is_refused("the scene must be")
     Ranks(part, size, options, ("--seed", "1")).is_refused("--seed must be")
     Ranks(part, size, options).ends_well()
     _same_runs(whole, part)

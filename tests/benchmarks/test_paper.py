@@ -171,7 +171,7 @@ def test_failures_of_a_training_are_told(settings):
 def test_runs_are_known_by_what_they_learn(settings):
     same = runs.make_run(runs.Variant("another name", {"cells": ()}), "builtin", 0, replace(settings, turn=3.0))
     others = [one(replace(settings, **change)) for change in ({"budget": 1.0}, {"samples": 9}, {"final_views": 2})]
-    others += [one(settings, 1), one(settings, scene="builtin-rich"), one(settings, width=8)]
+    others += [one(settings, 1), one(settings, scene="builtin-city"), one(settings, width=8)]
     folders = {str(run.folder) for run in (one(settings), *others)}
     assert same.folder == one(settings).folder and len(folders) == 1 + len(others)
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from helpers import refuses
 
-from voronerf.app.scenes import builtin_scene, load_scene, rich_scene
+from voronerf.app.scenes import builtin_scene, load_scene
 from voronerf.app.scenes.builtin.caster import Caster
 from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, shaded
 from voronerf.app.scenes.builtin.plain import SOLIDS
@@ -143,19 +143,7 @@ def test_shadows_are_cast_by_the_same_solids():
 def test_sizes():
     assert load_scene("builtin", downscale=50).train.images.shape == (100, 2, 2, 4)
     assert builtin_scene(1, train_views=1, test_views=1).train.images.shape == (1, 1, 1, 4)
-    refuses("builtin: size must be >= 1, got 0", builtin_scene, 0)
-    refuses("at least one view", builtin_scene, 4, train_views=0)
-
-
-def test_the_rich_scene_is_of_the_usual_form():
-    scene = rich_scene(24, train_views=2, test_views=1)
-    assert scene.name == "builtin-rich" and scene.train.images.shape == (2, 24, 24, 4) and len(scene.test) == 1
-    alpha = scene.test.images[0, ..., 3].float() / 255
-    assert 0.15 < float(alpha.mean()) < 0.8 and bool((alpha > 0.99).any()) and bool((alpha == 0).any())
-    seen = scene.test.images[0][alpha > 0.99][:, :3].float()
-    assert float(seen.std(0).mean()) > 25, "many colours"
-    assert scene.box is not None and bool((scene.box[1] > scene.box[0]).all())
-    refuses("builtin-rich: size must be >= 1, got 0", rich_scene, 0)
+    refuses("size, train_views and test_views must be >= 1, got 0, 100 and 25", builtin_scene, 0)
 
 
 def test_carved_box_holds_the_scene_and_is_tight(scene):

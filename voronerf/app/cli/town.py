@@ -202,7 +202,7 @@ def _train_territories(
     territories_train.check_territories(config, count, group.size)
     out, reading = config.out, dict(config.reading)
     assert out is not None
-    if group.size > 1 and config.data not in BUILTIN:  # each rank reads its own of one copy
+    if group.size > 1 and config.data != BUILTIN:  # each rank reads its own of one copy
         reading["images"] = "disk"
     scene = load_scene(config.data, **reading)
     group.check_same_scene(scene)

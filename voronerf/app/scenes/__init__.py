@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from voronerf.app.scenes.blender import load_blender
-from voronerf.app.scenes.builtin import builtin_scene, city_scene, rich_scene
+from voronerf.app.scenes.builtin import builtin_scene, city_scene
 from voronerf.app.scenes.builtin.city import city_of
 from voronerf.app.scenes.colmap import find_model, load_colmap
 from voronerf.app.scenes.errors import SceneError
@@ -17,11 +17,10 @@ from voronerf.app.scenes.photographs import Reading
 from voronerf.app.scenes.scene import KINDS, Scene, Split
 from voronerf.app.scenes.transforms import load_transforms
 
-__all__ = ["Scene", "SceneError", "Split", "builtin_scene", "city_scene", "load_scene", "rich_scene"]
+__all__ = ["Scene", "SceneError", "Split", "builtin_scene", "city_scene", "load_scene"]
 
 BUILTIN_SIZE = 100
-BUILTIN = {"builtin": builtin_scene, "builtin-rich": rich_scene}
-CITY = "builtin-city"  # of one block, or with their number: builtin-city:4x4
+BUILTIN, CITY = "builtin", "builtin-city"  # of one block, or with their number: builtin-city:4x4
 
 
 class Format(NamedTuple):
@@ -47,7 +46,7 @@ FORMATS = {
 
 def is_builtin(source: str | Path | None) -> bool:
     """Whether a source names a scene that is computed, and no folder."""
-    return source in BUILTIN or str(source).partition(":")[0] == CITY
+    return source == BUILTIN or str(source).partition(":")[0] == CITY
 
 
 def load_scene(
@@ -63,7 +62,7 @@ def load_scene(
     """Loads a scene.
 
     Args:
-        source: "builtin", "builtin-rich", "builtin-city" of one block or "builtin-city:4x4" of 16; or a folder with
+        source: "builtin", "builtin-city" of one block or "builtin-city:4x4" of 16; or a folder with
             `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in
             `sparse/0`, or LLFF's `poses_bounds.npy`.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,
@@ -101,13 +100,13 @@ def load_scene(
         if downscale > BUILTIN_SIZE:
             raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
         name, size = str(source), BUILTIN_SIZE // downscale
-        if name not in BUILTIN:
+        if name != BUILTIN:
             return city_of(size, name.partition(":")[2] or "1x1", images)
         if images == "disk":
             raise SceneError(
                 f"{source}: images must be auto or memory for a built-in scene other than a city, got disk"
             )
-        return BUILTIN[name](size)
+        return builtin_scene(size)
     folder = Path(source)
     if not folder.exists():
         raise SceneError(f"{folder}: there is no such folder")

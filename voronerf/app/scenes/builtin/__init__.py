@@ -2,6 +2,5 @@
 
 from voronerf.app.scenes.builtin.city import city_scene
 from voronerf.app.scenes.builtin.plain import builtin_scene
-from voronerf.app.scenes.builtin.rich import rich_scene
 
-__all__ = ["builtin_scene", "city_scene", "rich_scene"]
+__all__ = ["builtin_scene", "city_scene"]

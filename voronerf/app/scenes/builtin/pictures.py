@@ -1,8 +1,7 @@
-"""Pictures of solids: their light, and the views of a scene. All views are square, with an alpha channel."""
+"""Pictures of solids and their light. All views are square, with an alpha channel."""
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,13 +13,9 @@ from torch import Tensor
 
 from voronerf.app.scenes.builtin.caster import Caster
 from voronerf.app.scenes.builtin.solids import Array, Solid, normalised, turned
-from voronerf.app.scenes.scene import Scene, Split
-from voronerf.nerf.cameras import Cameras, look_at
+from voronerf.app.scenes.scene import Split
+from voronerf.nerf.cameras import Cameras
 
-TRAIN_VIEWS, TEST_VIEWS = 100, 25
-DISTANCE = 4.0
-ANGLE_X = 0.6911112  # horizontal field of view of the Blender scenes, radians
-NEAR, FAR = 2.0, 6.0
 SUPERSAMPLES = 3  # on each side of a pixel
 LIGHT = normalised(np.array(((0.45, -0.55, 0.70),), dtype=np.float32))[0]
 AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.46, 0.64, 0.50
@@ -30,37 +25,6 @@ BOXES = 1 << 13  # of solids that are projected at a time
 
 # from a shape [c, h, w, 4] and a function that makes image i to the images
 Keep = Callable[[tuple[int, int, int, int], Callable[[int], NDArray[np.uint8]]], Tensor]
-
-
-def hemisphere_scene(name: str, solids: Sequence[Solid], size: int, train_views: int, test_views: int) -> Scene:
-    """Solids around the origin, from cameras on the upper hemisphere.
-
-    Args:
-        name: of the scene.
-        solids: what there is.
-        size: of the square images, pixels.
-        train_views: spread over the hemisphere on a spherical Fibonacci lattice.
-        test_views: on an orbit that rises and falls twice, apart from the training views.
-    """
-    if size < 1:
-        raise ValueError(f"{name}: size must be >= 1, got {size}")
-    if train_views < 1 or test_views < 1:
-        raise ValueError(f"{name}: there must be at least one view, got {train_views} and {test_views}")
-    height = (torch.arange(train_views) + 0.5) / train_views
-    golden = math.pi * (3 - math.sqrt(5))
-    turn = 2 * math.pi * torch.arange(test_views) / test_views
-    train = _cameras(torch.asin(0.02 + 0.96 * height), golden * torch.arange(train_views), size)
-    test = _cameras(torch.deg2rad(28 + 16 * torch.sin(2 * turn)), turn + 0.05, size)
-    caster = Caster(solids, LIGHT)
-    parts = render_views(train, "train", caster), render_views(test, "test", caster)
-    return Scene(name, *parts, NEAR, FAR, torch.from_numpy(bounds(solids)), "linear", "white")
-
-
-def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
-    around = torch.stack((elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()), dim=-1)
-    poses = look_at(DISTANCE * around, torch.zeros(3), torch.tensor((0.0, 0.0, 1.0)))
-    focal = 0.5 * size / math.tan(0.5 * ANGLE_X)
-    return Cameras(poses, torch.tensor((focal, focal, size / 2, size / 2)).repeat(len(poses), 1), size, size)
 
 
 def bounds(solids: Sequence[Solid]) -> Array:

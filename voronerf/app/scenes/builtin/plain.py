@@ -10,12 +10,21 @@ from __future__ import annotations
 import colorsys
 import math
 
-from voronerf.app.scenes.builtin.pictures import TEST_VIEWS, TRAIN_VIEWS, hemisphere_scene
+import torch
+from torch import Tensor
+
+from voronerf.app.scenes.builtin.caster import Caster
+from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, render_views
 from voronerf.app.scenes.builtin.solids import Box, Cylinder, Solid, Sphere, Torus, rotation
 from voronerf.app.scenes.builtin.textures import barber_pole, bricks, checker, diagonals, globe, mosaic, plain, spiral
 from voronerf.app.scenes.scene import Scene
+from voronerf.nerf.cameras import Cameras, look_at
 
 FLOOR = -0.46  # height of the plinth's top
+TRAIN_VIEWS, TEST_VIEWS = 100, 25
+DISTANCE = 4.0
+ANGLE_X = 0.6911112  # horizontal field of view of the Blender scenes, radians
+NEAR, FAR = 2.0, 6.0
 
 
 def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views: int = TEST_VIEWS) -> Scene:
@@ -35,7 +44,25 @@ def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views
         >>> scene.train.cameras.width, len(scene.train), len(scene.test)
         (8, 100, 25)
     """
-    return hemisphere_scene("builtin", SOLIDS, size, train_views, test_views)
+    if min(size, train_views, test_views) < 1:
+        raise ValueError(
+            f"builtin: size, train_views and test_views must be >= 1, got {size}, {train_views} and {test_views}"
+        )
+    height = (torch.arange(train_views) + 0.5) / train_views
+    golden = math.pi * (3 - math.sqrt(5))
+    turn = 2 * math.pi * torch.arange(test_views) / test_views
+    train = _cameras(torch.asin(0.02 + 0.96 * height), golden * torch.arange(train_views), size)
+    test = _cameras(torch.deg2rad(28 + 16 * torch.sin(2 * turn)), turn + 0.05, size)
+    caster = Caster(SOLIDS, LIGHT)
+    parts = render_views(train, "train", caster), render_views(test, "test", caster)
+    return Scene("builtin", *parts, NEAR, FAR, torch.from_numpy(bounds(SOLIDS)), "linear", "white")
+
+
+def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
+    around = torch.stack((elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()), dim=-1)
+    poses = look_at(DISTANCE * around, torch.zeros(3), torch.tensor((0.0, 0.0, 1.0)))
+    focal = 0.5 * size / math.tan(0.5 * ANGLE_X)
+    return Cameras(poses, torch.tensor((focal, focal, size / 2, size / 2)).repeat(len(poses), 1), size, size)
 
 
 def _solids() -> tuple[Solid, ...]:
