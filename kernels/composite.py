@@ -158,6 +158,8 @@ def _composite_backward_kernel(arriving: Results, given: Samples, found: Gradien
 
 @_OP.custom_op("composite_warp")
 def _forward(given: Any, found: Any) -> None:
+    if given.ray_offsets is not None:
+        reference.check_ray_offsets("composite", given.ray_offsets, given.m)
     found.weights.zero_()  # samples that belong to no ray
     outputs = filled(Results(), **found._replace(weights=found.weights.view(-1))._asdict())
     launch(_composite_kernel, given.r, [_inputs(given), outputs], given.sigma)

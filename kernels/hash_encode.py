@@ -15,6 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, launch
+from voronerf.ops._core.checks import check_range
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops.hash_encode.autograd import HashDerivatives, Hashed
@@ -26,7 +27,7 @@ _PRIME_Y, _PRIME_Z = wp.constant(wp.uint32(2654435761)), wp.constant(wp.uint32(8
 
 @wp.struct
 class Grid:
-    """Of all levels: the box, the interpolation, the features, the entries of one table, and whether there are several.
+    """Of all levels: the box, the interpolation, the features, the tables, and the entries of one.
 
     ``numbers`` [levels, 2] holds scale and shift, ``sizes`` [levels, 4] side, entries, offset and whether it is hashed.
     """
@@ -37,6 +38,7 @@ class Grid:
     along: wp.bool
     features: wp.int32
     entries: wp.int32
+    tables: wp.int32
     several: wp.bool
     numbers: wp.array2d(dtype=wp.float32)
     sizes: wp.array2d(dtype=wp.int32)
@@ -116,7 +118,7 @@ def _of_corner(upper: wp.vec3, corner: wp.int32, one: wp.float32) -> wp.vec3:
 @wp.func
 def _start(cells: wp.array(dtype=wp.int32), i: wp.int32, grid: Grid) -> wp.int64:
     if grid.several:
-        return wp.int64(cells[i]) * wp.int64(grid.entries)
+        return wp.int64(wp.clamp(cells[i], 0, grid.tables - 1)) * wp.int64(grid.entries)
     return wp.int64(0)
 
 
@@ -225,6 +227,8 @@ def _encode(given: Hashed) -> Iterator[Tensor]:
     yield out
     points, tables, rows = _inputs(given, given.table)
     levels = HashGrid.parse(given.grid).levels
+    if given.cells is not None:
+        check_range("hash_encode", "cells", given.cells, len(given.table))
     launch(_encode_kernel, (len(out), levels), [*points, rows, *tables, array(out, out)], out)
 
 
@@ -251,6 +255,7 @@ def _inputs(given: Hashed, table: Tensor) -> tuple[list[object], list[object], o
     grid.low, grid.inverse = wp.vec3(*low), wp.vec3(*(1 / (b - a) for a, b in zip(low, high)))
     grid.smooth, grid.along = levels.interpolation == "smoothstep", direction is not None
     grid.features, grid.entries, grid.several = levels.features, given.table.shape[-2], cells is not None
+    grid.tables = given.table.shape[0]
     numbers, sizes = _levels(given.grid, positions.device)
     grid.numbers, grid.sizes = array(numbers, positions), array(sizes, positions)
     points: list[object] = [array(positions, positions), array(along, positions)]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from voronerf.kernels._launch import array, launch, of_both_dtypes
 from voronerf.ops._core.declare import declared
+from voronerf.ops.locate_cell.reference import check_leaves, check_tree
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -61,5 +62,7 @@ of_both_dtypes(_locate_cell_kernel)
 def locate_cell(given: Any, leaves: Tensor) -> None:
     """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
     *tables, depth = given
+    check_tree(given.child_offsets, given.child, "locate_cell")
     inputs = [*[array(tensor, leaves) for tensor in tables], depth, array(leaves, leaves)]
     launch(_locate_cell_kernel, given.n, inputs, leaves)
+    check_leaves(leaves, depth, "locate_cell")

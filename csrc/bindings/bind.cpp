@@ -132,7 +132,7 @@ class Frame {
       if (dtype != type.known_dtype) return PyErr_Clear(), false;
     }
     PyObject* const answer = PyObject_CallMethodNoArgs(given, type.constant ? contiguous_word : is_contiguous_word);
-    if (answer == nullptr) return PyErr_Clear(), false;
+    if (answer == nullptr) throw py::error_already_set();  // no memory
     if (type.constant) {
       kept_.push_back(answer);
     } else {

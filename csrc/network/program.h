@@ -34,7 +34,7 @@ struct ProgramSizes {
   int64_t inputs, parameters, outputs, sums;  // how many
 };
 
-// Throws std::invalid_argument for offsets that fall or exceed n.
+// Throws std::invalid_argument for offsets that fall or exceed n, and for an order that leaves the rows.
 void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* const* sums, Isa isa, int threads);
 
 // On CUDA `code` and `constants` are on the device too; strides, turned and widths are not. Both throw

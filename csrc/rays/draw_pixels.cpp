@@ -1,5 +1,4 @@
-// Blocks of pixels over threads; each is a hash of its number alone. The run of a place is looked for from the first
-// that can hold it, a few before.
+// Blocks of pixels over threads; each is a hash of its number alone.
 #include "rays/draw_pixels.h"
 
 #include <algorithm>
@@ -25,15 +24,11 @@ void draw_pixels_cpu(const DrawPixelsInputs& in, int64_t* pixels, float* uniform
     if (in.ends == nullptr) return;
     int64_t run[kPixels];
     for (int64_t i = begin; i < end; ++i) {
-      run[i - begin] = in.first[pixels[i] >> in.bits];
+      run[i - begin] = first_run(in, pixels[i]);
       __builtin_prefetch(in.ends + run[i - begin]);
       __builtin_prefetch(in.shift + run[i - begin]);
     }
-    for (int64_t i = begin; i < end; ++i) {
-      int64_t at = run[i - begin];
-      while (in.ends[at] <= pixels[i]) ++at;
-      pixels[i] += in.shift[at];
-    }
+    for (int64_t i = begin; i < end; ++i) pixels[i] += in.shift[run_of(in, run[i - begin], pixels[i])];
   });
 }
 

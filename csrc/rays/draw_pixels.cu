@@ -1,5 +1,4 @@
-// The pixels of a training step on CUDA, a thread a pixel. The run of a place is looked for from the first that can
-// hold it, a few before, as on the CPU.
+// The pixels of a training step on CUDA, a thread a pixel.
 #include "common/cuda_wrappers.h"
 #include "rays/draw_pixels.h"
 
@@ -14,14 +13,9 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.b) return;
   const uint32_t key = hash_key(*in.seed, i);
-  int64_t place = draw_place(key, in.below);
+  const int64_t place = draw_place(key, in.below);
   for (int channel = 0; channel < 3; ++channel) uniforms[3 * i + channel] = hashed(key, 2 + channel);
-  if (in.ends != nullptr) {
-    int64_t run = in.first[place >> in.bits];
-    while (in.ends[run] <= place) ++run;
-    place += in.shift[run];
-  }
-  pixels[i] = place;
+  pixels[i] = in.ends == nullptr ? place : place + in.shift[run_of(in, first_run(in, place), place)];
 }
 
 }  // namespace

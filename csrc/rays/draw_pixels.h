@@ -13,10 +13,21 @@ struct DrawPixelsInputs {
   const int64_t* ends;   // [n], how many pixels the runs up to each have; or null, for all of 0 to below - 1
   const int64_t* shift;  // [n], added to a place in a run
   const int32_t* first;  // the first run that ends behind place 0, 2^bits, 2 * 2^bits, ...
+  int64_t n, places;     // entries of ends and shift, and of first
   int64_t bits;
   int64_t below;  // places of all runs
   int64_t b;
 };
+
+// The run of a place: looked for from the first that can hold it, within the tables whatever they say.
+VN_HD int64_t first_run(const DrawPixelsInputs& in, int64_t place) {
+  const int64_t at = place >> in.bits, run = in.first[at < in.places ? at : in.places - 1];
+  return run < 0 ? 0 : run < in.n ? run : in.n - 1;
+}
+VN_HD int64_t run_of(const DrawPixelsInputs& in, int64_t run, int64_t place) {
+  while (run + 1 < in.n && in.ends[run] <= place) ++run;
+  return run;
+}
 
 // 48 bits of hashes as a place below a number.
 VN_HD int64_t draw_place(uint32_t key, int64_t below) {

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdio>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -37,13 +38,16 @@ int64_t own_samples_cpu(const KnownSamples& in, const OwnSamples& out, int) {
 float compose_runs_cpu(const RunsOfRays& in, float* answers, int) {
   std::vector<int64_t> ends(in.r + 1), order(in.q);
   const auto ray_of = [&](int64_t run) { return static_cast<int64_t>(in.sums[6 * run + 5]) - in.first; };
+  const double least = static_cast<double>(in.first), beyond = static_cast<double>(in.first + in.r);
   for (int64_t run = 0; run < in.q; ++run) {
-    const int64_t ray = ray_of(run);
-    if (ray < 0 || ray >= in.r) {
+    const double number = in.sums[6 * run + 5];
+    if (!(number >= least && number < beyond)) {  // NaN, too, which is no integer
+      char text[32];
+      std::snprintf(text, sizeof(text), "%g", number);
       throw std::invalid_argument("compose_runs: rays must be " + std::to_string(in.first) + " to " +
-                                  std::to_string(in.first + in.r - 1) + ", got " + std::to_string(ray + in.first));
+                                  std::to_string(in.first + in.r - 1) + ", got " + text);
     }
-    ++ends[ray];
+    ++ends[ray_of(run)];
   }
   for (int64_t ray = 0, sum = 0; ray <= in.r; ++ray) sum += std::exchange(ends[ray], sum);
   for (int64_t run = 0; run < in.q; ++run) order[ends[ray_of(run)]++] = run;  // now each is the end of its ray

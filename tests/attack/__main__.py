@@ -21,22 +21,22 @@ import store_attacks
 import torch
 import training_attacks
 import viewer_attacks
-from attempts import FAILED, REFUSED, RIGHT, Part, Tally, prepare, run_part
+from attempts import FAILED, MEMORY, REFUSED, RIGHT, Part, Tally, prepare, run_part
 
 #: Each part with its attempts in the long form and in the short one.
 PARTS = {
     part.name: (part, long, short)
     for part, long, short in (
         (Part("valid-calls", op_attacks.valid_call, 60, 200), 140_000, 150),
-        (Part("invalid-calls", op_attacks.invalid_call, 60, 200), 60_000, 150),
-        (Part("kills", training_attacks.killed_training, 300, 1, given.prepare_scenes), 20, 1),
+        (Part("invalid-calls", op_attacks.invalid_call, 20, 200, MEMORY // 2), 60_000, 150),
+        (Part("kills", training_attacks.killed_training, 300, 1, prepare=given.prepare_scenes), 20, 1),
         (Part("ranks", rank_attacks.harmed_ranks, 1200), 3, 0),
-        (Part("bits", run_attacks.flipped_bit, 60, 20, given.prepare_runs), 500, 15),
-        (Part("scenes", scene_attacks.stranger_scene, 60, 1, given.prepare_photographs), 150, 4),
-        (Part("runs", run_attacks.stranger_run, 60, 1, given.prepare_runs), 150, 4),
-        (Part("stores", store_attacks.harmed_store, 60, 1, given.prepare_scenes), 150, 4),
-        (Part("clients", viewer_attacks.hostile_client, 60, 1, given.prepare_runs), 150, 2),
-        (Part("stress", training_attacks.stressed_command, 60, 1, given.prepare_scenes), 150, 4),
+        (Part("bits", run_attacks.flipped_bit, 60, 20, prepare=given.prepare_runs), 500, 15),
+        (Part("scenes", scene_attacks.stranger_scene, 60, 1, prepare=given.prepare_photographs), 150, 4),
+        (Part("runs", run_attacks.stranger_run, 60, 1, prepare=given.prepare_runs), 150, 4),
+        (Part("stores", store_attacks.harmed_store, 60, 1, prepare=given.prepare_scenes), 150, 4),
+        (Part("clients", viewer_attacks.hostile_client, 60, 1, prepare=given.prepare_runs), 150, 2),
+        (Part("stress", training_attacks.stressed_command, 60, 1, prepare=given.prepare_scenes), 150, 4),
     )
 }
 

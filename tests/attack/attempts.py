@@ -11,6 +11,7 @@ import contextlib
 import json
 import os
 import random
+import resource
 import selectors
 import shutil
 import signal
@@ -41,6 +42,7 @@ class Part:
         name: In the table and on the command line.
         attempt: What is tried; returns REFUSED or RIGHT, or how many of each there were.
         seconds: Limit of an attempt.
+        memory: Bytes that an attempt may allocate; None where it starts what needs more address space.
         batch: Attempts of a process.
         prepare: Makes, in a process of its own, what the attempts of the part start from.
     """
@@ -49,6 +51,7 @@ class Part:
     attempt: Callable[[random.Random, Path, Path], str | Counter[str]]
     seconds: int
     batch: int = 1
+    memory: int | None = None
     prepare: Callable[[Path], None] | None = None
 
 
@@ -139,6 +142,9 @@ def _attempts(part: Part, seeds: list[int], given: Path, folder: Path, pipe: int
         place.mkdir()
         torch.manual_seed(seed)
         signal.alarm(part.seconds)
+        if part.memory is not None:
+            taken = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+            resource.setrlimit(resource.RLIMIT_AS, (taken + part.memory, resource.RLIM_INFINITY))
         result: dict[str, object] = {"seed": seed}
         try:
             found = part.attempt(random.Random(seed), place, given)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import random
 import re
@@ -16,12 +17,10 @@ from hostile import NUMBERS, TEXTS
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
-from voronerf import MLP, HashGrid, Layer, ops
+from voronerf import ops
 from voronerf.app.cli.main import NO_MEMORY
 from voronerf.ops._core import backends, tolerances
 from voronerf.ops._core.cases import SIZES, Draw, cases
-from voronerf.ops.grouped_mlp.case import layer_table
-from voronerf.ops.hash_encode.case import hash_grid
 
 DTYPES = (
     *(torch.float16, torch.float32, torch.float64, torch.bfloat16, torch.complex64),
@@ -66,7 +65,7 @@ def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tup
     if gradients:
 
         def leaf(value: Any) -> Any:
-            if not (isinstance(value, Tensor) and value.is_floating_point()):
+            if not (isinstance(value, Tensor) and value.is_floating_point()) or value.is_inference():
                 return value
             leaves.append(value.detach().requires_grad_())
             return leaves[-1]
@@ -82,76 +81,134 @@ def results(op: str, call: dict[str, Any], backend: str, gradients: bool) -> tup
 
 
 def invalid_call(rng: random.Random, folder: Path, given: Path) -> str:
-    """A call of which one argument is not what it must be; where it is one that the op takes, nothing may break."""
-    op = rng.choice(list(CASES))
-    call = CASES[op].make(Draw(rng.getrandbits(32), free=True), rng.choice(SIZES[1:]))
-    name = rng.choice([*call, "backend"])
-    call.setdefault("backend", "auto")
-    if name == "backend":
-        call["backend"] = rng.choice(("", "cuda", None, 3, "warp", "Native"))
-    else:
-        call[name] = other_argument(rng, op, name, call[name])
-    try:
-        called(op)(**call)
-    except (ValueError, TypeError, backends.BackendUnavailable) as error:
-        check_message(op, call, name, error)
-        return REFUSED
-    except (RuntimeError, MemoryError) as error:
-        if any(sign in str(error) for sign in NO_MEMORY) or isinstance(error, MemoryError):
+    """A call of which an argument, or a part of one, is not what it must be, on each backend that has the op.
+
+    All of them refuse it by name, or none does; then nothing may break, and no gradient either.
+    """
+    op, seed, gradients = rng.choice(list(CASES)), rng.getrandbits(32), rng.random() < 0.3
+    said: dict[str, str] = {}
+    for backend in (*backends.implemented(op), "auto"):
+        generator = random.Random(seed)  # the same call again, since an op may write into its arguments
+        torch.manual_seed(seed)
+        try:
+            call, names = harmed_call(generator, op)
+        except (ValueError, TypeError) as error:  # of a struct, which its constructor refuses
+            if "\n" in str(error) or len(str(error)) > 500:
+                raise Failed(f"{op}: a struct is not refused clearly: {error}") from None
             return REFUSED
-        raise Failed(f"{op}: {name} is no argument for it: {type(error).__name__}: {error}; {describe(call)}") from None
-    return RIGHT
+        call.setdefault("backend", backend)
+        try:
+            results(op, call, call.pop("backend"), gradients and CASES[op].differentiable)
+            said[backend] = ""
+        except backends.BackendUnavailable:
+            continue
+        except (ValueError, TypeError) as error:
+            check_message(op, call, names, error)
+            said[backend] = str(error)
+        except Exception as error:
+            text = f"{type(error).__name__}: {error}"
+            if huge(call) and any(sign in text for sign in NO_MEMORY):
+                return REFUSED
+            raise Failed(f"{op} on {backend}: {names} end in {text:.300}; {describe(call)}") from None
+    if "" in said.values() and any(said.values()):
+        raise Failed(f"{op}: {names} are refused by some backends: {said}; {describe(call)}")
+    return REFUSED if any(said.values()) else RIGHT
 
 
-def check_message(op: str, call: dict[str, Any], name: str, error: Exception) -> None:
+def huge(call: dict[str, Any]) -> bool:
+    """Whether an argument speaks of gigabytes."""
+    leaves = tree_leaves(call)
+    return any(
+        leaf.numel() > 2**24 if isinstance(leaf, Tensor) else isinstance(leaf, int) and leaf > 2**24 for leaf in leaves
+    )
+
+
+def harmed_call(rng: random.Random, op: str) -> tuple[dict[str, Any], list[str]]:
+    """The arguments of an op, and those of them that were harmed."""
+    case = CASES[op]
+    made, other = (case.make(Draw(rng.getrandbits(32), free=True), rng.choice(SIZES)) for _ in range(2))
+    parameters = inspect.signature(called(op)).parameters.values()
+    call = {each.name: made.get(each.name, each.default) for each in parameters if each.name != "backend"}
+    names = rng.sample([*call, "backend"], rng.choice((1, 1, 1, 2)))
+    for name in names:
+        if name == "backend":
+            call[name] = rng.choice(("", "cuda", None, 3, "Native", [], "a" * 10_000))
+        elif rng.random() < 0.15:  # of another call
+            call[name] = other.get(name, call[name])
+        elif call[name] is None:
+            tensors = [part for part in tree_leaves(call) if isinstance(part, Tensor)]
+            few = torch.tensor([rng.choice((0, 1, -1, 5, 1000, 2**31 - 1, -(2**31)))], dtype=torch.int32)
+            call[name] = rng.choice((3, "x", [1.0], harmed(rng, rng.choice(tensors)), rng.choice(tensors), few))
+        else:
+            call[name] = harmed(rng, call[name], counted=name == "steps")
+    return call, names
+
+
+def check_message(op: str, call: dict[str, Any], names: list[str], error: Exception) -> None:
     """The error names the op, or one that it is composed of, and an argument, in a line of some length."""
     text = str(error)
-    arguments = set(inspect.signature(called(op)).parameters)
+    arguments = {*inspect.signature(called(op)).parameters, *named(call)}
     arguments |= {argument.removesuffix("s") for argument in arguments}  # an entry of a list
-    arguments |= {field for value in call.values() for field in getattr(value, "_fields", ())}
-    named = re.match(rf"({'|'.join(backends.ops())})(: |\(\) ).*\b({'|'.join(arguments)})\b", text)
-    if not named or "\n" in text or len(text) > 500:
-        raise Failed(f"{op}: the error for {name} is not clear: {type(error).__name__}: {text:.300}; {describe(call)}")
+    clear = re.match(rf"({'|'.join(backends.ops())})(: |\(\) ).*\b({'|'.join(arguments)})\b", text)
+    if not clear or "\n" in text or len(text) > 500:
+        raise Failed(f"{op}: the error for {names} is not clear: {type(error).__name__}: {text:.300}; {describe(call)}")
 
 
-def other_argument(rng: random.Random, op: str, name: str, value: Any) -> Any:
-    """Something else in the place of an argument."""
+def named(value: Any) -> set[str]:
+    """The names of all parts of structs."""
+    found = {str(key) for key, _ in parts(value)} if not isinstance(value, (list, tuple)) else set()
+    found |= set(getattr(value, "_fields", ()))
+    return found.union(*(named(part) for _, part in parts(value)))
+
+
+def parts(value: Any) -> list[tuple[Any, Any]]:
+    """Keys and parts of a list or struct."""
+    if isinstance(value, (list, tuple)):
+        return list(enumerate(value))
+    if isinstance(value, dict):
+        return list(value.items())
+    if dataclasses.is_dataclass(value):
+        return [(each.name, getattr(value, each.name)) for each in dataclasses.fields(value) if each.init]
+    return []
+
+
+def with_part(value: Any, key: Any, part: Any) -> Any:
+    """A list or struct, of which one part is another."""
+    if dataclasses.is_dataclass(value):
+        return dataclasses.replace(value, **{key: part})
+    if isinstance(value, dict):
+        return {**value, key: part}
+    changed = [*value[:key], part, *value[key + 1 :]]
+    if hasattr(value, "_make"):
+        return value._make(changed)
+    return type(value)(changed)
+
+
+def harmed(rng: random.Random, value: Any, counted: bool = False) -> Any:
+    """Something else in the place of a value, or of a part of it; what is ``counted`` is worked off, however large."""
+    inside = parts(value)
+    if inside and rng.random() < 0.8:
+        key, part = rng.choice(inside)
+        return with_part(value, key, harmed(rng, part))
     if isinstance(value, Tensor):
         return other_tensor(rng, value)
-    if isinstance(value, list):
-        kind = rng.randrange(5)
-        if kind == 0:
-            return value[:-1]
-        if kind == 1:
-            return [*value, value[-1]]
-        if kind == 2:
-            return rng.choice((None, value[0], "x", 3))
-        at = rng.randrange(len(value))
-        there = value[at] if isinstance(value[at], Tensor) else torch.ones(2)
-        return [*value[:at], other_tensor(rng, there), *value[at + 1 :]]
-    if isinstance(value, (MLP, HashGrid)):
-        others = (
-            None,
-            "x",
-            3,
-            layer_table(Draw(rng.getrandbits(32), free=True)),
-            hash_grid(Draw()),
-            Layer((-1,), 3),
-            {},
-        )
-        return rng.choice(others)
+    if isinstance(value, (list, tuple, dict)) and value and rng.random() < 0.7:
+        if isinstance(value, dict):
+            less = {key: part for key, part in value.items() if key != rng.choice([*value, ""])}
+            return rng.choice((less, {**value, rng.choice(("more", "op", 3)): 1}))
+        fewer, more = value[:-1], [*value, value[-1]]
+        return rng.choice((fewer, more, (*value,), [*value], value[0], iter(value), dict(enumerate(value))))
     if isinstance(value, str):
         return rng.choice((*TEXTS, None, 3, torch.ones(2)))
-    if value is None:
-        return rng.choice((3, "x", other_tensor(rng, torch.ones(2, 3)), [1.0]))
-    # A count of steps is worked off, however large.
-    numbers = [one for one in NUMBERS if name != "steps" or not isinstance(one, int) or one < 3]
-    return rng.choice((*numbers, None, "x", True, torch.ones(2), [1], 1j, np.float32(2), float(2)))
+    if isinstance(value, int) and not counted and rng.random() < 0.3:
+        return value + rng.choice((-1, 1, 7))
+    numbers = [one for one in NUMBERS if not counted or not isinstance(one, int) or one < 3]
+    return rng.choice((*numbers, None, "x", True, torch.ones(2), [1], 1j, np.float32(2), float(2), {}, object()))
 
 
 def other_tensor(rng: random.Random, tensor: Tensor) -> Any:
     """A tensor of another kind, dtype, shape or place, or something that is none."""
-    kind = rng.randrange(12)
+    kind = rng.randrange(14)
     if kind == 0:
         return rng.choice((None, "x", 3, tensor.tolist(), tensor.float().numpy(), torch.float32, object()))
     if kind <= 3:
@@ -163,19 +220,20 @@ def other_tensor(rng: random.Random, tensor: Tensor) -> Any:
     if kind <= 7 and tensor.dim():
         dim = rng.randrange(tensor.dim())
         size = max(0, tensor.shape[dim] + rng.choice((-tensor.shape[dim], -1, 1, 5)))
-        shape = [*tensor.shape[:dim], size, *tensor.shape[dim + 1 :]]
-        return torch.zeros(shape, dtype=tensor.dtype)
+        return torch.zeros([*tensor.shape[:dim], size, *tensor.shape[dim + 1 :]], dtype=tensor.dtype)
     if kind == 8:
         return rng.choice(
             (lambda: tensor.to_sparse(), lambda: tensor.to("meta"), lambda: tensor.expand(2, *tensor.shape))
         )()
-    if kind == 9 and tensor.is_floating_point():
-        return tensor.masked_fill(
-            torch.rand(tensor.shape) < 0.3,
-            rng.choice((torch.nan, torch.inf, -torch.inf, 3e38 if tensor.dtype != torch.float16 else 6e4)),
-        )
-    if kind == 10 and not tensor.is_floating_point() and tensor.dtype not in (torch.bool, torch.uint8):
-        return tensor.masked_fill(torch.rand(tensor.shape) < 0.3, rng.choice((-1, -(2**31), 2**31 - 1, 100, 7)))
+    if kind == 9 and tensor.dim() and tensor.shape[0]:  # more rows than an index counts, in no memory; 2^31 - 1 of some
+        rows = 2**31 - (tensor.dim() == 1 and not tensor.is_floating_point() and rng.random() < 0.5)
+        return tensor[:1].expand(rows, *tensor.shape[1:])
+    if kind == 10 and tensor.is_floating_point():
+        extreme = rng.choice((torch.nan, torch.inf, -torch.inf, 3e38 if tensor.dtype != torch.float16 else 6e4))
+        return tensor.masked_fill(torch.rand(tensor.shape) < 0.3, extreme)
+    if kind <= 12 and not tensor.is_floating_point() and tensor.dtype not in (torch.bool, torch.uint8):
+        extreme = rng.choice((-1, -(2**31), 2**31 - 1, 100, 7, tensor.shape[0] if tensor.dim() else 1))
+        return tensor.masked_fill(torch.rand(tensor.shape) < rng.choice((0.3, 1.0)), extreme)
     with torch.inference_mode():
         return tensor.clone()
 

@@ -166,3 +166,23 @@ def test_native_bits_depend_neither_on_threads_nor_on_instructions():
         torch.set_num_threads(threads)
     for found in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(found, results[0], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("error", "message", "change"),
+    [
+        (TypeError, "found must be a tensor, got NoneType", {"guard": Guard(None, None, None)}),
+        (
+            ValueError,
+            "in_a_row must have shape [], got [0]",
+            {"guard": Guard.on("cpu")._replace(in_a_row=torch.ones(0))},
+        ),
+        (TypeError, "every must be True or False, got int", {"rules": [Rule(torch.ones(()), 0.1, every=1)]}),
+        (ValueError, "learning_rate must have shape [], got [0]", {"rules": [Rule(torch.ones(()), torch.ones(0))]}),
+        (ValueError, "step must have shape [], got [0]", {"rules": [Rule(torch.ones(0), 0.1)]}),
+    ],
+)
+def test_forged_rules_and_guards_are_refused(error, message, change, backend):
+    given = {"rules": [Rule(torch.ones(()), 0.1)], "guard": Guard.on("cpu"), "loss": torch.ones(()), **change}
+    with refused(error, f"adam: {message}"):
+        adam(given.pop("rules"), *([torch.ones(3)] for _ in range(4)), **given, backend=backend)

@@ -2,7 +2,9 @@
 
 import pytest
 import torch
+from helpers import refuses
 
+from voronerf.ops import draw_pixels as draw
 from voronerf.ops.draw_pixels.reference import Runs, draw_pixels
 
 SEED = torch.tensor([-7], dtype=torch.int32)
@@ -42,3 +44,30 @@ def test_native_draws_are_those_of_the_reference(name, count):
         for found, expected in zip(drawn(SEED, count, below, runs), draw_pixels(SEED, count, below, runs), strict=True):
             assert torch.equal(found, expected)
     torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("backend", ["reference", "native"])
+def test_tables_of_runs_that_do_not_fit_each_other_stay_in_bounds(backend):
+    runs = runs_of([2, 10, 50], [7, 100, 3])
+    for change in (
+        {"ends": runs.ends * 0},
+        {"ends": runs.ends + 2**40},
+        {"first": torch.tensor([2**31 - 1, -(2**31)], dtype=torch.int32)},
+        {"first": runs.first[:1], "bits": 0},
+        {"bits": 48},
+    ):
+        pixels, _ = draw(SEED, 1000, 110, runs=runs._replace(**change), backend=backend)
+        assert set((pixels - draw(SEED, 1000, 110, backend=backend)[0]).tolist()) <= set(runs.shift.tolist())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"shift": torch.zeros(2, dtype=torch.int64)}, "shift must have shape [n] with n = 1, got [2]"),
+        ({"first": torch.zeros(0, dtype=torch.int32)}, "runs must hold at least one run, got none"),
+        ({"bits": 64}, "bits must be at most 48, got 64"),
+        ({"total": 9}, "below must be the 9 pixels of the runs, got 5"),
+    ],
+)
+def test_forged_runs_are_refused(change, message):
+    refuses(f"draw_pixels: {message}", draw, SEED, 3, 5, runs=runs_of([2], [5])._replace(**change))

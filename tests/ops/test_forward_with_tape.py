@@ -170,3 +170,19 @@ def test_refuses_what_makes_no_sense(device, backend):
     with refused(TypeError, "forward_with_tape: defer must be True or False, got int"):
         tape.backward(loss, gradient, defer=1)
     assert all(parameter.grad is None for parameter in parameters_of(given))
+
+
+@pytest.mark.parametrize(
+    ("error", "message", "change"),
+    [
+        (ValueError, "network must hold positions, weights, biases and layers, got no layers", {"layers": ...}),
+        (TypeError, "positions must be a tensor, got str", {"positions": "x"}),
+        (TypeError, "weights must be a list, got Tensor", {"weights": torch.ones(3)}),
+        (TypeError, "unknown arguments op", {"op": 1}),
+        (TypeError, "network must hold arguments by name, got ...", {3: 1}),
+    ],
+)
+def test_a_network_of_other_entries_is_refused(error, message, change, backend):
+    given = {name: value for name, value in {**network("cpu"), **change}.items() if value is not ...}
+    with refused(error, f"forward_with_tape: {message}"):
+        forward_with_tape(given, backend=backend)

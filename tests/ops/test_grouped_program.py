@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import pytest
 import torch
+from helpers import refuses
 from torch import Tensor
 
 from voronerf.ops import grouped_program
@@ -271,3 +273,38 @@ def test_refuses_what_is_no_program() -> None:
             with pytest.raises(ValueError, match="grouped_program: offsets must rise from 0 or more to at most"):
                 given = torch.tensor(offsets, dtype=torch.int32)
                 grouped_program(rows, [p[:1] for p in parameters], given, program=every_step(), backend=backend)
+
+
+@pytest.mark.parametrize("backend", ["reference", "native"])
+@pytest.mark.parametrize("wrong", [4, -1, 2**31 - 1, -(2**31)])
+def test_an_order_that_leaves_the_rows_is_refused(backend, wrong):
+    b = Builder()
+    program = b.program([b.apply("exp", b.input(2))])
+    order = torch.tensor([3, 1, wrong, 0], dtype=torch.int32)
+    given = [torch.rand(4, 2)], [], torch.tensor([0, 1, 3], dtype=torch.int32)
+    message = f"grouped_program: order must lie in 0 to 3, got values from {min(0, wrong)} to {max(3, wrong)}"
+    refuses(message, grouped_program, *given, program=program, order=order, backend=backend)
+
+
+def test_a_program_of_what_is_not_there_is_refused():
+    """The compiled module trusts a program: each number of one, larger than it is, is refused where it is made."""
+    program = every_step()
+
+    def larger(value):
+        if isinstance(value, tuple):
+            for place, part in enumerate(value):
+                for other in larger(part):
+                    changed = (*value[:place], other, *value[place + 1 :])
+                    yield type(value)(*changed) if hasattr(value, "_fields") else changed
+        elif type(value) is int:
+            yield from (value + 100, -1, 2**31, 10**30)
+
+    for name in ("inputs", "parameters", "outputs", "steps"):
+        for other in larger(getattr(program, name)):
+            try:
+                made = replace(program, **{name: other})
+            except ValueError as error:
+                assert str(error).startswith("Program: ") and "\n" not in str(error)
+                continue
+            # What is left is valid: the number of a value that nothing else names, or of a parameter of other shape.
+            assert name == "parameters" or any(step.out > 99 for step in made.steps), other

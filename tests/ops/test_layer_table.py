@@ -93,15 +93,15 @@ def test_errors_of_directions():
 @pytest.mark.parametrize(
     ("layers", "outputs", "octaves", "message"),
     [
-        ((), (0,), None, "MLP: layers must hold at least one layer, got none"),
-        ((Layer((POSITIONS,), 4),), (), None, "MLP: outputs must name at least one layer, got none"),
+        ((), (0,), None, "MLP: layers must be a tuple of at least one layer, got ()"),
+        ((Layer((POSITIONS,), 4),), (), None, "MLP: outputs must be a tuple of at least one layer, got ()"),
         ((Layer((POSITIONS,), 4),), (1,), None, "MLP: outputs must be layer indices 0 to 0, got 1"),
         ((Layer((POSITIONS,), 4),), (-1,), None, "MLP: outputs must be layer indices 0 to 0, got -1"),
-        ((Layer((POSITIONS,), 4),), (0,), -1, "MLP: position_octaves must be None or at least 0, got -1"),
-        ((Layer((), 4),), (0,), None, "MLP: layer 0 must have at least one input, got none"),
+        ((Layer((POSITIONS,), 4),), (0,), -1, "MLP: position_octaves must be None or 0 to 127, got -1"),
+        ((Layer((), 4),), (0,), None, "MLP: layer 0 must have a tuple of at least one input, got ()"),
         ((Layer((0,), 4),), (0,), None, f"{SOURCES}, got 0"),
         ((Layer(("x",), 4),), (0,), None, f"{SOURCES}, got 'x'"),
-        ((Layer((POSITIONS,), 0),), (0,), None, "MLP: layer 0 must have a width of at least 1, got 0"),
+        ((Layer((POSITIONS,), 0),), (0,), None, "MLP: layer 0 must have a width of 1 to 1048576, got 0"),
         (
             (Layer((POSITIONS,), 1, "tanh"),),
             (0,),

@@ -73,6 +73,20 @@ def test_errors():
     refuses("depth must be an integer, got float", depth=1.0)
 
 
+@pytest.mark.parametrize("wrong", ["first", "falls", "child", "shallow"])
+def test_every_backend_refuses_what_is_no_tree(wrong, device, backend):
+    if device.type != "cpu":
+        pytest.skip("the values are not read")
+    offsets, child, depth = CHILD_OFFSETS.clone(), CHILD.clone(), DEPTH
+    if wrong == "shallow":
+        depth = 1
+    else:
+        target, place, value = {"first": (offsets, 0, 1), "falls": (offsets, 1, 9), "child": (child, 1, 4)}[wrong]
+        target[place] = value
+    with pytest.raises(ValueError, match="locate_cell: (child|depth).* must"):
+        locate_cell(torch.rand(40, 3), torch.rand(10, 3), offsets, child, depth=depth, backend=backend)
+
+
 @pytest.mark.native
 @pytest.mark.skipif(sys.platform == "win32", reason="stacks have other sizes")
 def test_threads_may_have_small_stacks():

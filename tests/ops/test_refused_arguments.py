@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers import refuses
+from torch.utils._pytree import tree_leaves, tree_map
 
 from voronerf import ops
+from voronerf.ops._core.cases import Draw, cases
 
 POINTS = torch.rand(4, 3)
 
@@ -44,3 +46,31 @@ def test_inference_tensors(backend):
     refuses(message, ops.grouped_linear, points, offsets, weight.clone(), backend=backend, error=TypeError)
     with torch.no_grad():
         ops.grouped_linear(points, offsets, weight, backend=backend)
+
+
+@pytest.mark.parametrize("op", ["render_loss_gradient", "run_gradients"])
+@pytest.mark.parametrize("inside", [True, False])
+def test_ops_that_differentiate_inside_take_inference_tensors(op, inside):
+    with torch.inference_mode():
+        call = cases()[op].make(Draw(3), 7)
+        call = tree_map(lambda value: value.clone() if isinstance(value, torch.Tensor) else value, call)
+    with torch.inference_mode(inside):
+        found = [tree_leaves(getattr(ops, op)(**call, backend=backend)) for backend in ("reference", "native")]
+    for part, other in zip(*found, strict=True):
+        assert torch.allclose(part, other, atol=1e-5)
+
+
+@pytest.mark.op("composite")
+def test_offsets_that_fall_are_refused_by_every_backend(backend):
+    given = [torch.rand(6), torch.rand(6, 3), torch.rand(6), torch.rand(6)]
+    for offsets in ([0, 4, 2], [0, 3, 7], [-1, 3, 6]):
+        message = "composite: ray_offsets must rise from 0 or more to at most the number of samples, 6"
+        refuses(message, ops.composite, *given, ray_offsets=torch.tensor(offsets).int(), backend=backend)
+
+
+@pytest.mark.op("hash_encode")
+def test_cells_without_a_table_are_refused_by_every_backend(backend):
+    call = {**cases()["hash_encode"].make(Draw(0), 7)}
+    table, cells = torch.rand(2, *call["grid"].table_shape), torch.tensor([0, 1, 2, 0, 0, 0, 0], dtype=torch.int32)
+    message = "hash_encode: cells must lie in 0 to 1, got values from 0 to 2"
+    refuses(message, ops.hash_encode, call["positions"], table, call["grid"], cells=cells, backend=backend)

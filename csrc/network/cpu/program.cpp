@@ -2,6 +2,8 @@
 #include "network/program.h"
 
 #include <algorithm>
+#include <stdexcept>
+#include <string>
 
 #include "common/common.h"
 #include "common/parallel.h"
@@ -42,6 +44,15 @@ void fetch(const ProgramCall& call, int64_t cell) {
 
 void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* const* sums, Isa isa, int threads) {
   check_offsets("grouped_program", in.offsets, in.k, in.n);
+  if (in.order != nullptr) {
+    bool beyond = false;  // what is below 0, too, as an unsigned number
+    for (int64_t i = 0; i < in.n; ++i) beyond |= static_cast<uint32_t>(in.order[i]) >= static_cast<uint32_t>(in.n);
+    if (beyond) {
+      const auto [low, high] = std::minmax_element(in.order, in.order + in.n);
+      throw std::invalid_argument("grouped_program: order must lie in 0 to " + std::to_string(in.n - 1) +
+                                  ", got values from " + std::to_string(*low) + " to " + std::to_string(*high));
+    }
+  }
   const auto& header = *reinterpret_cast<const ProgramHeader*>(in.code);
   const ProgramCall call{in.code, in.constants, in.inputs,     in.turned,  in.n,
                          outputs, sums,         in.parameters, in.strides, in.order};

@@ -272,6 +272,8 @@ def _describe(module: str) -> dict[str, Any]:
 # torch.compile runs this while tracing and keeps the answer; the function is then found by a look-up it can trace.
 @constant_result
 def _choose(op: str, backend: str, device: str, index: int | None, dtype: torch.dtype) -> str:
+    if not isinstance(backend, str):  # which a list would not let the cache look up
+        raise ValueError(f"{op}: backend must be one of {_choices(('auto', *BACKENDS))}, got {backend!r:.60}")
     return _choose_once(op, backend, device, index, dtype)
 
 

@@ -27,6 +27,8 @@ LIKE_FIRST: tuple[torch.dtype, ...] = ()
 """For `Checked`: the dtype of the first floating-point tensor."""
 MAX_COUNT = 2**31 - 1
 """Rows of one call: index tensors are int32."""
+MAX_GROUPS = 2**27
+"""Cells or rays that offsets speak of."""
 
 
 def check_tensor(op: str, name: str, value: object) -> None:
@@ -75,6 +77,8 @@ def check_shape(
                 fits = size == known[entry]
             elif entry[-2:] == "+1":
                 fits = size >= 1 and size - 1 == known.setdefault(entry[:-2], size - 1)
+                if size > MAX_GROUPS + 1:
+                    raise ValueError(f"{op}: {name} must have at most {MAX_GROUPS + 1} entries, got {size}")
             else:
                 known[entry] = size
             if not fits:

@@ -82,23 +82,30 @@ class HashGrid:
     def __post_init__(self) -> None:
         for name, least, most in (("levels", 1, 24), ("log2_entries", 10, 24)):
             value = getattr(self, name)
-            if not isinstance(value, int) or not least <= value <= most:
-                raise ValueError(f"HashGrid: {name} must be an integer from {least} to {most}, got {value!r}")
-        if self.features not in (1, 2, 4, 8):
-            raise ValueError(f"HashGrid: features must be 1, 2, 4 or 8, got {self.features!r}")
-        if not 1 <= self.base <= self.finest <= 2**20:
+            if type(value) is not int or not least <= value <= most:
+                raise ValueError(f"HashGrid: {name} must be an integer from {least} to {most}, got {value!r:.60}")
+        if type(self.features) is not int or self.features not in (1, 2, 4, 8):
+            raise ValueError(f"HashGrid: features must be 1, 2, 4 or 8, got {self.features!r:.60}")
+        numbers = [type(value) in (int, float) for value in (self.base, self.finest)]
+        if not all(numbers) or not 1 <= self.base <= self.finest <= 2**20:
             raise ValueError(
-                f"HashGrid: base and finest must be 1 <= base <= finest <= 2^20, got {self.base} and {self.finest}"
+                "HashGrid: base and finest must be 1 <= base <= finest <= 2^20, got "
+                f"{self.base!r:.60} and {self.finest!r:.60}"
             )
-        low, high = (tuple(map(float, corner)) for corner in self.box)
-        if len(low) != 3 or len(high) != 3 or not all(0 < b - a < math.inf for a, b in zip(low, high)):
+        try:
+            low, high = (tuple(map(float, corner)) for corner in self.box)
+            right = len(low) == len(high) == 3 and all(0 < b - a < math.inf for a, b in zip(low, high))
+        except (TypeError, ValueError, OverflowError):
+            right = False
+        if not right:
             raise ValueError(
-                f"HashGrid: box must be two corners of which the second is larger on each axis, got {self.box}"
+                f"HashGrid: box must be two corners of which the second is larger on each axis, got {self.box!r:.60}"
             )
         object.__setattr__(self, "box", (low, high))
         for name, words in (("interpolation", INTERPOLATIONS), ("convention", CONVENTIONS)):
-            if getattr(self, name) not in words:
-                raise ValueError(f"HashGrid: {name} must be one of {', '.join(words)}, got {getattr(self, name)!r}")
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in words:
+                raise ValueError(f"HashGrid: {name} must be one of {', '.join(words)}, got {value!r:.60}")
         said = {own.name: getattr(self, own.name) for own in dataclasses.fields(self) if own.init}
         # Not by a cached property, whose lock torch.compile does not enter.
         object.__setattr__(self, "text", json.dumps(said))

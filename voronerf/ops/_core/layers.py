@@ -21,6 +21,8 @@ POSITION_ENCODINGS = ("frequency", "integrated", "hash")
 DIRECTION_ENCODINGS = ("frequency", "spherical")
 POSITIONS = "positions"
 DIRECTIONS = "directions"
+MOST_FEATURES = 2**20
+"""Of a layer."""
 
 
 @dataclass(frozen=True)
@@ -88,31 +90,32 @@ class MLP:
     text: str = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if not self.layers:
-            raise ValueError("MLP: layers must hold at least one layer, got none")
+        for name, value in (("layers", self.layers), ("outputs", self.outputs)):
+            if not isinstance(value, tuple) or not value:
+                raise ValueError(f"MLP: {name} must be a tuple of at least one layer, got {value!r:.60}")
         for index, layer in enumerate(self.layers):
             _check_layer(index, layer)
-        if not self.outputs:
-            raise ValueError("MLP: outputs must name at least one layer, got none")
         for output in self.outputs:
-            if not isinstance(output, int) or not 0 <= output < len(self.layers):
-                raise ValueError(f"MLP: outputs must be layer indices 0 to {len(self.layers) - 1}, got {output!r}")
+            if type(output) is not int or not 0 <= output < len(self.layers):
+                raise ValueError(f"MLP: outputs must be layer indices 0 to {len(self.layers) - 1}, got {output!r:.60}")
         for name, octaves in (
             ("position_octaves", self.position_octaves),
             ("direction_octaves", self.direction_octaves),
         ):
-            if octaves is not None and octaves < 0:
-                raise ValueError(f"MLP: {name} must be None or at least 0, got {octaves}")
+            if octaves is not None and (type(octaves) is not int or not 0 <= octaves <= 127):
+                raise ValueError(f"MLP: {name} must be None or 0 to 127, got {octaves!r:.60}")
         for name, encoding, known in (
             ("position_encoding", self.position_encoding, POSITION_ENCODINGS),
             ("direction_encoding", self.direction_encoding, DIRECTION_ENCODINGS),
         ):
             if encoding not in known:
-                raise ValueError(f"MLP: {name} must be one of {', '.join(known)}, got {encoding!r}")
+                raise ValueError(f"MLP: {name} must be one of {', '.join(known)}, got {encoding!r:.60}")
         if self.integrated and not self.position_octaves:
             raise ValueError(
                 f"MLP: position_octaves must be at least 1 with the integrated encoding, got {self.position_octaves}"
             )
+        if self.grid is not None and not isinstance(self.grid, HashGrid):
+            raise ValueError(f"MLP: grid must be a HashGrid or None, got {type(self.grid).__name__}")
         hashed = self.position_encoding == "hash"
         if hashed != (self.grid is not None) or (hashed and self.position_octaves is not None):
             raise ValueError(
@@ -134,9 +137,9 @@ class MLP:
         degree, octaves = self.direction_degree, self.direction_octaves
         if self.direction_encoding != "spherical":
             if degree is not None:
-                raise ValueError(f"MLP: direction_degree must be None without spherical harmonics, got {degree}")
-        elif degree not in (1, 2, 3, 4):
-            raise ValueError(f"MLP: direction_degree must be 1 to 4 with spherical harmonics, got {degree}")
+                raise ValueError(f"MLP: direction_degree must be None without spherical harmonics, got {degree!r:.60}")
+        elif type(degree) is not int or not 1 <= degree <= 4:
+            raise ValueError(f"MLP: direction_degree must be 1 to 4 with spherical harmonics, got {degree!r:.60}")
         elif octaves is not None:
             raise ValueError(f"MLP: direction_octaves must be None with spherical harmonics, got {octaves}")
 
@@ -211,17 +214,19 @@ def encoded_width(features: int, octaves: int | None) -> int:
 
 
 def _check_layer(index: int, layer: Layer) -> None:
-    if not layer.inputs:
-        raise ValueError(f"MLP: layer {index} must have at least one input, got none")
+    if not isinstance(layer, Layer):
+        raise ValueError(f"MLP: layer {index} must be a Layer, got {layer!r:.60}")
+    if not isinstance(layer.inputs, tuple) or not layer.inputs:
+        raise ValueError(f"MLP: layer {index} must have a tuple of at least one input, got {layer.inputs!r:.60}")
     for source in layer.inputs:
-        earlier = isinstance(source, int) and not isinstance(source, bool) and 0 <= source < index
-        if not earlier and source not in (POSITIONS, DIRECTIONS):
+        earlier = type(source) is int and 0 <= source < index
+        if not earlier and not (isinstance(source, str) and source in (POSITIONS, DIRECTIONS)):
             raise ValueError(
-                f"MLP: layer {index} must read 'positions', 'directions' or an earlier layer, got {source!r}"
+                f"MLP: layer {index} must read 'positions', 'directions' or an earlier layer, got {source!r:.60}"
             )
-    if layer.width < 1:
-        raise ValueError(f"MLP: layer {index} must have a width of at least 1, got {layer.width}")
-    if layer.activation not in ACTIVATIONS:
+    if type(layer.width) is not int or not 1 <= layer.width <= MOST_FEATURES:
+        raise ValueError(f"MLP: layer {index} must have a width of 1 to {MOST_FEATURES}, got {layer.width!r:.60}")
+    if not isinstance(layer.activation, str) or layer.activation not in ACTIVATIONS:
         raise ValueError(
-            f"MLP: layer {index} must have an activation of {', '.join(ACTIVATIONS)}, got {layer.activation!r}"
+            f"MLP: layer {index} must have an activation of {', '.join(ACTIVATIONS)}, got {layer.activation!r:.60}"
         )

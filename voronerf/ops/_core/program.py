@@ -22,9 +22,10 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -130,7 +131,11 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Program:
-    """What is done with the rows of a cell."""
+    """What is done with the rows of a cell.
+
+    Raises:
+        ValueError: a step, an output or a sum of anything that is not there: what runs a program trusts it.
+    """
 
     inputs: tuple[int, ...]  # columns of each input
     parameters: tuple[tuple[int, ...], ...]  # shape for one cell of each parameter, (o, i) or (w,)
@@ -141,6 +146,7 @@ class Program:
     orders: int = field(init=False, compare=False)  # the highest derivative of a function in it
 
     def __post_init__(self) -> None:
+        check(self)
         parts = [self.inputs, self.parameters, self.steps, self.outputs, self.sums]
         object.__setattr__(self, "text", json.dumps(parts))
         orders = [int(step.numbers[0]) for step in self.steps if step.op == "function"]
@@ -157,6 +163,90 @@ class Program:
             for op, out, width, operands, numbers, name in steps
         ]
         return Program(tuple(inputs), shapes[0], tuple(known), tuple(Columns(*each) for each in outputs), shapes[1])
+
+
+_WIDEST = 1 << 20  # columns
+
+
+def check(program: Program) -> None:
+    """Raises ValueError unless a program reads and writes what is there alone."""
+    inputs, parameters, sums = program.inputs, program.parameters, program.sums
+    values: dict[int, int] = {}  # their columns
+    _rule("inputs", _sizes(inputs), inputs)
+    for name, shapes in (("parameters", parameters), ("sums", sums)):
+        known = isinstance(shapes, tuple) and all(_sizes(shape) and len(shape) in (1, 2) for shape in shapes)
+        _rule(name, known, shapes)
+
+    def fits(columns: Any, *widths: int, rows: bool = False) -> bool:
+        """Whether columns are there, of one of these widths if any are given; or even each a column of a value."""
+        if not isinstance(columns, Columns) or not _sizes(columns[1:4]) or not isinstance(columns.spread, bool):
+            return False
+        of, index, start, width, spread = columns
+        if of == VALUE:
+            there = values.get(index, -1)
+        else:
+            there = math.prod(parameters[index]) if of == PARAMETER and index < len(parameters) else -1
+        inside = start + (1 if spread else width) <= there
+        return inside and (not widths or width in widths) and not (rows and (spread or of != VALUE))
+
+    def right(step: Step) -> bool:
+        op, _, width, operands, numbers, name = step
+        count, whole = len(operands), _sizes(numbers)
+        if op == "input":
+            return whole and len(numbers) == 1 and numbers[0] < len(inputs) and width == inputs[int(numbers[0])]
+        if op == "function":
+            known = name in FUNCTIONS and len(numbers) == 3 and _sizes(numbers[:1])
+            return known and count in (1, 2) and all(fits(each, width) for each in operands)
+        if op == "binary":
+            return name in BINARY and count == 2 and all(fits(each, width) for each in operands)
+        if op == "total":
+            return whole and len(numbers) == count == 1 and fits(operands[0], width * int(numbers[0]), rows=True)
+        if op == "move":
+            places = whole and len(numbers) == count and all(map(fits, operands))
+            return places and all(at + each.width <= width for each, at in zip(operands, numbers))
+        if op == "linear":
+            if not (
+                whole and len(numbers) == 3 and numbers[0] < len(parameters) and numbers[2] < 2 and name in _FINISHES
+            ):
+                return False
+            (matrix, start, transposed), extra = map(int, numbers), name == "relu_slope"
+            o, i = (*parameters[matrix], -1)[:2]
+            if not (count in (1 + extra, 2 + extra) and fits(operands[0], rows=True)):
+                return False
+            depth = operands[0].width
+            inside = (depth, start + width) if transposed else (width, start + depth)
+            others = all(fits(each, width, rows=each.of == VALUE) for each in operands[1:])
+            return inside[0] == o and inside[1] <= i and others
+        if op not in ("outer", "columns") or step.out >= len(sums) or not (whole and len(numbers) == 1):
+            return False
+        shape, start = sums[step.out], int(numbers[0])
+        if op == "columns":
+            return count == 1 and fits(operands[0], width, rows=True) and start + width <= math.prod(shape)
+        last = count == len(shape) == 2 and fits(operands[1], width, rows=True) and start + width <= shape[1]
+        return last and fits(operands[0], shape[0], rows=True)
+
+    _rule("steps", isinstance(program.steps, tuple), program.steps)
+    for step in program.steps:
+        made = isinstance(step, Step) and _sizes(step[1:3]) and step.op in _STEPS
+        made = made and isinstance(step.operands, tuple) and isinstance(step.numbers, tuple)
+        _rule("steps", made and right(step) and (_sums(step) or step.out not in values), step)
+        if not _sums(step):
+            values[step.out] = step.width
+    _rule("outputs", isinstance(program.outputs, tuple) and all(map(fits, program.outputs)), program.outputs)
+
+
+_FINISHES = ("", "relu", "relu_slope")
+_STEPS = ("input", "linear", "function", "binary", "total", "move", "outer", "columns")
+
+
+def _sizes(values: Any) -> bool:
+    """Whether all values are columns that can be counted."""
+    return isinstance(values, tuple) and all(type(value) is int and 0 <= value <= _WIDEST for value in values)
+
+
+def _rule(name: str, kept: bool, given: object) -> None:
+    if not kept:
+        raise ValueError(f"Program: {name} must be of values, parameters and sums that are there, got {given!r:.100}")
 
 
 class Builder:
@@ -330,8 +420,7 @@ def gradient(
         parameters are its parameters, then the gradients of its sums; whose outputs are the gradients of inputs, and
         whose sums are those of parameters.
     """
-    b = Builder(replace(program, sums=()))
-    b.steps = [step for step in program.steps if not _sums(step)]
+    b = Builder(replace(program, steps=tuple(step for step in program.steps if not _sums(step)), sums=()))
     wanted = {p: i for i, p in enumerate(p for p, want in enumerate(parameters) if want)}
     b.sums = [program.parameters[p] for p in wanted]
     active: set[int] = set()

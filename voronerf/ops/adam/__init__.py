@@ -12,6 +12,7 @@ from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, Implementation
 from voronerf.ops._core.checks import (
     check_dtype,
+    check_flag,
     check_number,
     check_same_device,
     check_shape,
@@ -85,8 +86,8 @@ def adam(
     for rule in rules:
         if not isinstance(rule, Rule):
             raise TypeError(f"{_OP}: rules must hold a Rule for each parameter, got {type(rule).__name__}")
-        if before is None or rule[1:] != before[1:]:  # a training has the same rule many times
-            _check_rule(rule)
+        if before is None or any(part is not known for part, known in zip(rule[1:], before[1:])):
+            _check_rule(rule, parameters[0])  # a training has the same rule many times
         before = rule
     steps = [rule.step for rule in rules]
     if not _are_plain(parameters, gradients, means, squares) or not _are_scalars(steps, parameters[0].device):
@@ -100,7 +101,7 @@ def adam(
             raise TypeError(f"{_OP}: guard must be a Guard, got {type(guard).__name__}")
         check_number(_OP, "limit", guard.limit)
         for name, scalar in zip(guard._fields, guard[:4]):
-            if scalar is not None:
+            if scalar is not None or name != "scale":
                 _check_scalar(name, scalar, parameters[0])
     if loss is not None:
         if guard is None:
@@ -158,10 +159,13 @@ def _check_scalar(name: str, tensor: Tensor, parameter: Tensor) -> None:
     check_same_device(_OP, **{"parameters[0]": parameter, name: tensor})
 
 
-def _check_rule(rule: Rule) -> None:
-    if not isinstance(rule.learning_rate, Tensor):
+def _check_rule(rule: Rule, parameter: Tensor) -> None:
+    if isinstance(rule.learning_rate, Tensor):
+        _check_scalar("learning_rate", rule.learning_rate, parameter)
+    else:
         check_number(_OP, "learning_rate", rule.learning_rate)
     check_number(_OP, "epsilon", rule.epsilon)
+    check_flag(_OP, "every", rule.every)
     betas = rule.betas
     if not isinstance(betas, (tuple, list)) or len(betas) != 2:
         raise TypeError(f"{_OP}: betas must be a pair of numbers, got {betas!r:.60}")

@@ -82,7 +82,9 @@ def adam(
         first, second = rule.betas
         step = rule.step.double() + 1
         root = (1 - second**step).sqrt()
-        rate, epsilon = (rule.learning_rate * root / (1 - first**step)).float(), (rule.epsilon * root).float()
+        given = rule.learning_rate
+        given = given if isinstance(given, Tensor) else float(given)
+        rate, epsilon = (given * root / (1 - first**step)).float(), (float(rule.epsilon) * root).float()
         parameter, mean, square = tensors
         new_mean = first * mean + (1 - first) * gradient
         new_square = second * square + (1 - second) * gradient.square()

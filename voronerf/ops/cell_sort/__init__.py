@@ -13,7 +13,7 @@ from voronerf.ops._core.declare import declare
 
 @declare(native=Implementation(EVERYWHERE, INDEX), warp=Implementation(EVERYWHERE, INDEX))
 def cell_sort(
-    cells: Annotated[Tensor, "int32 [n]"], k: Annotated[int, "1.."], *, backend: str = "auto"
+    cells: Annotated[Tensor, "int32 [n]"], k: Annotated[int, "1..134217728"], *, backend: str = "auto"
 ) -> tuple[Annotated[Tensor, "int32 [n]"], Annotated[Tensor, "int32 [k + 1]"]]:
     """Stable order of samples by cell, and where each cell begins.
 
@@ -22,7 +22,7 @@ def cell_sort(
 
     Args:
         cells: int32 [n], values 0 to k - 1, n < 2**31.
-        k: number of cells, at least 1.
+        k: number of cells, 1 to 2**27.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

@@ -15,7 +15,7 @@ CASE = Case(
     refused={
         "k must be an integer, got str": {"k": "x"},
         "k must be at least 1, got 0": {"k": 0},
-        "k must be at most 2147483647, got 2147483648": {"k": 2**31},
+        "k must be at most 134217728, got 2147483647": {"k": 2**31 - 1},
     },
     device_rows=260,
     hostile="indices",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import EVERYWHERE, Implementation
-from voronerf.ops._core.checks import check_same_device
+from voronerf.ops._core.checks import INDEX, Checked, check_integer
 from voronerf.ops._core.declare import declare
 from voronerf.ops.draw_pixels.reference import Runs
 
@@ -16,7 +16,13 @@ from voronerf.ops.draw_pixels.reference import Runs
 def _prepare(given: Any) -> Any:
     runs, below = given.runs, given.below
     if runs is not None:
-        check_same_device("draw_pixels", seed=given.seed, ends=runs.ends, shift=runs.shift, first=runs.first)
+        checked = Checked("draw_pixels")
+        checked.tensor("seed", given.seed, INDEX, 1)
+        for name, dtype in (("ends", torch.int64), ("shift", torch.int64), ("first", torch.int32)):
+            checked.tensor(name, getattr(runs, name), (dtype,), "p" if name == "first" else "n")
+        if not (checked.sizes["n"] and checked.sizes["p"]):
+            raise ValueError("draw_pixels: runs must hold at least one run, got none")
+        check_integer("draw_pixels", "bits", runs.bits, 0, 48)
         if below != runs.total:
             raise ValueError(f"draw_pixels: below must be the {runs.total} pixels of the runs, got {below}")
     return given
@@ -25,7 +31,7 @@ def _prepare(given: Any) -> Any:
 @declare(native=Implementation(EVERYWHERE, (torch.int32,)), prepare=_prepare)
 def draw_pixels(
     seed: Annotated[Tensor, "int32 [1]"],
-    count: Annotated[int, "1.."],
+    count: Annotated[int, "1..134217728"],
     below: Annotated[int, "1..281474976710656"],
     *,
     runs: Runs | None = None,
@@ -37,7 +43,7 @@ def draw_pixels(
 
     Args:
         seed: int32 [1].
-        count: Of pixels, b, at least 1.
+        count: Of pixels, b, 1 to 2**27.
         below: Pixels to draw from, 1 to 2**48; with runs as many as they have.
         runs: The pixels to draw from; None for 0 to ``below`` - 1.
         backend: "auto", "reference" or "native".

@@ -49,5 +49,6 @@ def draw_pixels(seed: Tensor, count: int, below: int, runs: Runs | None) -> tupl
     numbers = hashed_uniforms(seed, count, 5)
     place = ((numbers[:, 0].double() + numbers[:, 1].double() / 2**24) * below).long()
     if runs is not None:
-        place = place + runs.shift[torch.searchsorted(runs.ends, place, right=True)]
+        run = torch.searchsorted(runs.ends, place, right=True).clamp(max=len(runs.ends) - 1)
+        place = place + runs.shift[run]
     return place, numbers[:, 2:].contiguous()

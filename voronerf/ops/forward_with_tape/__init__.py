@@ -47,6 +47,8 @@ def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> T
     if missing != []:
         came = f"no {', '.join(missing)}" if missing else f"{network!r:.60}"
         raise ValueError(f"{_OP}: network must hold positions, weights, biases and layers, got {came}")
+    if not all(isinstance(name, str) for name in network):
+        raise TypeError(f"{_OP}: network must hold arguments by name, got {list(network)!r:.100}")
     network = check_routed(_OP, **network)
     device, dtype = network["positions"].device, network["weights"][0].dtype
     tape: Tape = backends.resolve_composed(_OP, backend=backend, device=device, dtype=dtype)(network)

@@ -126,7 +126,7 @@ def _check_features(op: str, features: Tensor | None, layers: MLP, sizes: dict[s
 
 
 def check_routed(
-    op: str, positions: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor | None], **given: Any
+    op: str, /, positions: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor | None], **given: Any
 ) -> dict[str, Any]:
     """All arguments of `routed_mlp` but for the backend, checked; what is compared has one dtype."""
     network = {**_DEFAULTS, **given}

@@ -56,7 +56,7 @@ def grouped_program(
         [n, w] for each output of the program, then [k, ...] for each of its sums over the rows of a cell.
 
     Raises:
-        ValueError: on the CPU offsets that fall or exceed n.
+        ValueError: on the CPU offsets that fall or exceed n, and an order outside 0 to n - 1.
 
     Examples:
         >>> import torch

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from voronerf.ops._core.checks import check_range
 from voronerf.ops._core.program import BINARY, FUNCTIONS, VALUE, Columns, Program, Step
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
 from voronerf.ops.grouped_mlp.reference import cells_of
@@ -18,6 +19,7 @@ def grouped_program(
     """A program on the rows of each cell; see ``voronerf.ops.grouped_program``. ``text`` is that of a program."""
     check_offsets("grouped_program", offsets, inputs[0].shape[0])
     if order is not None:
+        check_range("grouped_program", "order", order, inputs[0].shape[0])
         inputs = [x.index_select(0, order) for x in inputs]
     program = Program.parse(text)
     run = _Run(program, inputs, parameters, offsets)

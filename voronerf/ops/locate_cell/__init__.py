@@ -40,7 +40,7 @@ def locate_cell(
     with ties to the lowest index, as ``nearest_centre``; a point that is not finite takes the first centre at every
     level. Trees may be uneven. Not differentiable.
 
-    On the CPU, "native" raises for tables that are not a tree of this depth: a diagram without centres, a child that is
+    On the CPU it raises for tables that are not a tree of this depth: a diagram without centres, a child that is
     not a diagram, a path longer than ``depth``. On CUDA that would need a host read. There nothing outside the tables
     is read, and a point whose path leaves the tables, or does not end at a leaf, gets a negative number.
 
@@ -57,7 +57,7 @@ def locate_cell(
         leaf int32 [n].
 
     Raises:
-        ValueError: with "native" on the CPU tables that are not a tree.
+        ValueError: on the CPU tables that are not a tree.
 
     Examples:
         >>> import torch

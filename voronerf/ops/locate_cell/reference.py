@@ -10,11 +10,30 @@ from voronerf.ops.nearest_centre.reference import distances, in_pieces
 _PIECE = 1 << 17
 
 
+def check_tree(child_offsets: Tensor, child: Tensor, caller: str) -> None:
+    """Raises ValueError on the CPU for tables that are not a tree; see ``voronerf.ops.locate_cell``."""
+    if child_offsets.device.type != "cpu" or torch.compiler.is_compiling():
+        return
+    if child_offsets[0] != 0 or child_offsets[-1] != len(child):
+        raise ValueError(f"{caller}: child_offsets must go from 0 to the number of centres")
+    if (child_offsets.diff() <= 0).any():
+        raise ValueError(f"{caller}: child_offsets must increase: every diagram has a centre")
+    if (child >= len(child_offsets) - 1).any():
+        raise ValueError(f"{caller}: child must name a diagram (below the number of diagrams) or a leaf (negative)")
+
+
+def check_leaves(leaves: Tensor, depth: int, caller: str) -> None:
+    """Raises ValueError on the CPU where a point is at no leaf after that many levels."""
+    if leaves.device.type == "cpu" and not torch.compiler.is_compiling() and (leaves < 0).any():
+        raise ValueError(f"{caller}: depth must be the number of levels of the tree, got {depth}, which is too few")
+
+
 def locate_cell(points: Tensor, centres: Tensor, child_offsets: Tensor, child: Tensor, depth: int) -> Tensor:
     """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``.
 
     Distances to all centres of the tree are taken once; at each level those of other diagrams are put out of reach.
     """
+    check_tree(child_offsets, child, "locate_cell")
     table = torch.arange(centres.shape[0], dtype=torch.int32, device=centres.device)
     owner = torch.searchsorted(child_offsets, table, right=True) - 1
 
@@ -27,4 +46,6 @@ def locate_cell(points: Tensor, centres: Tensor, child_offsets: Tensor, child: T
             state = torch.where(state < 0, state, child[nearest])
         return -state - 1
 
-    return in_pieces(run, _PIECE // centres.shape[0], points)
+    leaves = in_pieces(run, _PIECE // centres.shape[0], points)
+    check_leaves(leaves, depth, "locate_cell")
+    return leaves

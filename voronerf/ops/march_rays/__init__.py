@@ -42,7 +42,7 @@ def march_rays(
     spacing: Annotated[str, "linear|disparity"] = "linear",
     start: Annotated[Tensor | None, "int32 [r]"] = None,
     most: Annotated[int | None, "1.."] = None,
-    capacity: Annotated[int | None, "1.."] = None,
+    capacity: Annotated[int | None, "1..134217728"] = None,
     contraction: Annotated[Tensor | None, "same [4] or [5, 3]"] = None,
     backend: str = "auto",
 ) -> March:

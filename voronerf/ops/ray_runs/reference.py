@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from voronerf.ops.composite.reference import Composite, composite
+from voronerf.ops.render_loss.reference import kept
 
 #: Stands for infinite density, as in `composite`.
 _OPAQUE = 1e30
@@ -178,11 +179,12 @@ def compose_runs(
     sums: Tensor, target: Tensor, background: Tensor | None, first: int, rays: int
 ) -> tuple[Tensor, Tensor]:
     """Answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
-    ray = sums[:, 5].long() - first
-    wrong = sums[(ray < 0) | (ray >= len(target)), 5]
+    number = sums[:, 5].double()
+    wrong = number[~((number >= first) & (number < first + len(target)))]
     if len(wrong):
         allowed = f"{first} to {first + len(target) - 1}"
-        raise ValueError(f"compose_runs: rays must be {allowed}, got {int(wrong[0])}")
+        raise ValueError(f"compose_runs: rays must be {allowed}, got {float(wrong[0]):g}")
+    ray = number.long() - first
     order = along_rays(ray, sums[:, 4])
     part, optical, ray = sums[order, :3], sums[order, 3], ray[order]
     whole = compose(part, optical, ray, len(target))
@@ -200,12 +202,14 @@ def answer(order: Tensor, whole: Composed, behind: Tensor, slopes: Tensor, error
     return torch.empty_like(told).index_copy(0, order, told)
 
 
+@torch.inference_mode(False)
 @torch.enable_grad()
 def run_gradients(
     raw: Tensor, samples: OwnSamples, answers: Tensor, density_scale: float, hidden: float
 ) -> tuple[Tensor, Tensor]:
     """Gradient of the loss to the outputs [m, 4], and weights [m]; see ``voronerf.ops.run_gradients``."""
-    raw = raw.detach().requires_grad_()
+    samples, answers = OwnSamples._make(map(kept, samples)), kept(answers)
+    raw = kept(raw.detach()).requires_grad_()
     colour, density = _activated(raw, density_scale)
     runs, front = sum_runs(samples, colour, density), torch.exp(-answers[:, 4])
     run = torch.repeat_interleave(samples.run_offsets.diff())

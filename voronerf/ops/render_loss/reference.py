@@ -60,9 +60,15 @@ def render_loss(
     return RenderLoss(error.mean() / 3, *(part.detach() for part in rest))
 
 
+def kept(value: Any) -> Any:
+    """The same, or a copy of an inference tensor, which autograd can keep."""
+    return value.clone() if isinstance(value, Tensor) and value.is_inference() else value
+
+
+@torch.inference_mode(False)
 @torch.enable_grad()
 def render_loss_gradient(raw: Tensor, *others: Any) -> tuple[Tensor, ...]:
     """The result of `render_loss`, and the gradient of its loss to ``raw``."""
-    raw = raw.detach().requires_grad_()
-    found = render_loss(raw, *others)
+    raw = kept(raw.detach()).requires_grad_()
+    found = render_loss(raw, *(kept(value) for value in others))
     return found.loss.detach(), *found[1:], torch.autograd.grad(found.loss, raw)[0]
