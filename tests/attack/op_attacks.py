@@ -117,10 +117,8 @@ def invalid_call(rng: random.Random, folder: Path, given: Path) -> str:
 
 def huge(call: dict[str, Any]) -> bool:
     """Whether an argument speaks of gigabytes."""
-    leaves = tree_leaves(call)
-    return any(
-        leaf.numel() > 2**24 if isinstance(leaf, Tensor) else isinstance(leaf, int) and leaf > 2**24 for leaf in leaves
-    )
+    sizes = [leaf.numel() if isinstance(leaf, Tensor) else leaf for leaf in tree_leaves(call)]
+    return any(isinstance(size, int) and size > 2**24 for size in sizes)
 
 
 def harmed_call(rng: random.Random, op: str) -> tuple[dict[str, Any], list[str]]:

@@ -172,11 +172,7 @@ def test_native_bits_depend_neither_on_threads_nor_on_instructions():
     ("error", "message", "change"),
     [
         (TypeError, "found must be a tensor, got NoneType", {"guard": Guard(None, None, None)}),
-        (
-            ValueError,
-            "in_a_row must have shape [], got [0]",
-            {"guard": Guard.on("cpu")._replace(in_a_row=torch.ones(0))},
-        ),
+        (ValueError, "skipped must have shape [], got [0]", {"guard": Guard(torch.ones(()), *[torch.ones(0)] * 2)}),
         (TypeError, "every must be True or False, got int", {"rules": [Rule(torch.ones(()), 0.1, every=1)]}),
         (ValueError, "learning_rate must have shape [], got [0]", {"rules": [Rule(torch.ones(()), torch.ones(0))]}),
         (ValueError, "step must have shape [], got [0]", {"rules": [Rule(torch.ones(0), 0.1)]}),

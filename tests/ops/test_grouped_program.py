@@ -299,12 +299,12 @@ def test_a_program_of_what_is_not_there_is_refused():
         elif type(value) is int:
             yield from (value + 100, -1, 2**31, 10**30)
 
+    taken = 0
     for name in ("inputs", "parameters", "outputs", "steps"):
         for other in larger(getattr(program, name)):
             try:
-                made = replace(program, **{name: other})
+                replace(program, **{name: other})
+                taken += 1
             except ValueError as error:
                 assert str(error).startswith("Program: ") and "\n" not in str(error)
-                continue
-            # What is left is valid: the number of a value that nothing else names, or of a parameter of other shape.
-            assert name == "parameters" or any(step.out > 99 for step in made.steps), other
+    assert taken == 4  # parameters with more entries than are read, and two steps with more columns, which are 0

@@ -83,7 +83,7 @@ def test_every_backend_refuses_what_is_no_tree(wrong, device, backend):
     else:
         target, place, value = {"first": (offsets, 0, 1), "falls": (offsets, 1, 9), "child": (child, 1, 4)}[wrong]
         target[place] = value
-    with pytest.raises(ValueError, match="locate_cell: (child|depth).* must"):
+    with pytest.raises(ValueError, match=r"locate_cell: (child|depth).* must"):
         locate_cell(torch.rand(40, 3), torch.rand(10, 3), offsets, child, depth=depth, backend=backend)
 
 

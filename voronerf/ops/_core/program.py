@@ -166,6 +166,7 @@ class Program:
 
 
 _WIDEST = 1 << 20  # columns
+_ORDERS = 20  # of derivatives
 
 
 def check(program: Program) -> None:
@@ -195,7 +196,7 @@ def check(program: Program) -> None:
         if op == "input":
             return whole and len(numbers) == 1 and numbers[0] < len(inputs) and width == inputs[int(numbers[0])]
         if op == "function":
-            known = name in FUNCTIONS and len(numbers) == 3 and _sizes(numbers[:1])
+            known = name in FUNCTIONS and len(numbers) == 3 and _sizes(numbers[:1]) and numbers[0] < _ORDERS
             return known and count in (1, 2) and all(fits(each, width) for each in operands)
         if op == "binary":
             return name in BINARY and count == 2 and all(fits(each, width) for each in operands)
@@ -205,9 +206,8 @@ def check(program: Program) -> None:
             places = whole and len(numbers) == count and all(map(fits, operands))
             return places and all(at + each.width <= width for each, at in zip(operands, numbers))
         if op == "linear":
-            if not (
-                whole and len(numbers) == 3 and numbers[0] < len(parameters) and numbers[2] < 2 and name in _FINISHES
-            ):
+            known = whole and len(numbers) == 3 and name in _FINISHES
+            if not (known and numbers[0] < len(parameters) and numbers[2] < 2):
                 return False
             (matrix, start, transposed), extra = map(int, numbers), name == "relu_slope"
             o, i = (*parameters[matrix], -1)[:2]

@@ -153,7 +153,7 @@ def _are_scalars(steps: Sequence[Any], device: torch.device) -> bool:
     )
 
 
-def _check_scalar(name: str, tensor: Tensor, parameter: Tensor) -> None:
+def _check_scalar(name: str, tensor: Any, parameter: Tensor) -> None:
     check_shape(_OP, name, tensor, ())
     check_dtype(_OP, name, tensor, (torch.float32,))
     check_same_device(_OP, **{"parameters[0]": parameter, name: tensor})

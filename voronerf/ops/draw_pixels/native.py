@@ -15,6 +15,6 @@ def draw_pixels(given: Any, found: tuple[Tensor, Tensor]) -> None:
     """Pixels, and three uniform numbers for each; see ``voronerf.ops.draw_pixels.reference``."""
     seed, count, below, runs = given
     ends, shift, first, bits, _ = runs or (None, None, None, 0, below)
-    n, places = (0, 0) if runs is None else (len(ends), len(first))
+    n, places = (0, 0) if ends is None or first is None else (len(ends), len(first))
     inputs = native.compiled.DrawPixelsInputs(seed, ends, shift, first, n, places, bits, below, count)
     native.compiled.draw_pixels(inputs, *found, native.machine(seed))
