@@ -32,7 +32,7 @@ def table(layers, d=None):
     seen = torch.zeros(1, 3) if layers.uses_directions else None
     weights = [torch.zeros(1, o, i) for o, i in layers.weight_shapes(d, 3 if layers.uses_directions else 0)]
     call = grouped_mlp.Given(torch.zeros(1, d), weights, [None] * len(weights), layers, seen)
-    given, _ = grouped_mlp.network(call, None, hashed_before=False)
+    given, _ = grouped_mlp.as_network(call, None, hashed_before=False)
     key = grouped_mlp.table_key(given.table, given.positions, given.weights, given.directions)
     return grouped_mlp.table_of(*key)
 
