@@ -234,7 +234,10 @@ def onednn(batch: Batch, encoded: Encoded, *, piece: int | None = None) -> Conte
         raise NotApplicable(f"this torch has no such op: {error}") from error
     net, dtype = batch.net, encoded.positions[0].dtype
     rows = piece or max(max(b - a for a, b in itertools.pairwise(batch.bounds)), 1)
-    packed = [[pack(own.to(dtype), rows) for own in weight.detach()] for weight in batch.weights]
+    try:
+        packed = [[pack(own.to(dtype), rows) for own in weight.detach()] for weight in batch.weights]
+    except RuntimeError as error:  # bfloat16 on a processor with AVX2 alone
+        raise NotApplicable(str(error)) from error
     cells = list(zip(*packed)), list(zip(*[bias.detach().to(dtype).unbind() for bias in batch.biases]))
     pieces = list(row_pieces(batch.bounds, piece))
 

@@ -25,6 +25,7 @@ from ops import (
     networks,
     route,
 )
+from ops.case import NotApplicable
 
 import voronerf
 from voronerf.ops._core import cases as of_ops
@@ -154,7 +155,12 @@ def test_alternatives_compute_the_same(name, direction):
                 contender = alternatives.ours(batch, backend)
                 assert error(contender.adapt(contender.run(0))) < tolerance, backend
         for label, set_up in alternatives.alternatives(batch).items():
-            contender = set_up()
+            try:
+                contender = set_up()
+            except NotApplicable as reason:
+                assert "oneDNN" in label and dtype is torch.bfloat16 and "cpu support" in str(reason)
+                done.append(label)
+                continue
             assert error(contender.adapt(contender.run(0))) < tolerance, f"{label}, {dtype}"
             # A later call sees other samples and a dense gradient.
             assert error(contender.adapt(contender.run(1))) > 0
