@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import inspect
 import re
@@ -11,6 +10,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from voronerf.app.cli.main import COMMANDS
 from voronerf.app.cli.opening import Opening
+from voronerf.app.cli.parsing import field_docs, group_name
 from voronerf.app.train.config import TrainConfig
 
 HEADER = ["| option | values | default | |", "|---|---|---|---|"]
@@ -34,7 +34,7 @@ def train_tables() -> list[str]:
     """The settings of a training, a table for each group of them."""
     lines = []
     for group in reversed(TrainConfig.__bases__):
-        lines += [f"### {group.__name__.removesuffix('Settings')}", "", *HEADER, *settings(group), ""]
+        lines += [f"### {group_name(group).capitalize()}", "", *HEADER, *settings(group), ""]
     return lines
 
 
@@ -88,18 +88,6 @@ def values(kind: Any) -> str:
 def words(default: Any) -> str:
     """A default as one types it."""
     return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
-
-
-def field_docs(kind: type) -> dict[str, str]:
-    """The strings that stand below the fields of a dataclass."""
-    (tree,) = ast.parse(inspect.getsource(kind)).body
-    assert isinstance(tree, ast.ClassDef)
-    found = {}
-    for before, after in zip(tree.body, tree.body[1:]):
-        if isinstance(before, ast.AnnAssign) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-            assert isinstance(before.target, ast.Name)
-            found[before.target.id] = str(after.value.value)
-    return found
 
 
 def argument_docs(arguments: str) -> Iterator[tuple[str, str]]:

@@ -197,8 +197,8 @@ def open_run(
     Args:
         path: The run directory.
         scene: The scene, if it is loaded already.
-        data: Scene folder; None for that of the training, if it lies in the run directory, the working directory or
-            ``VORONERF_DATA``, since a run may be another person's.
+        data: Scene folder; None for that of the training, if the user named it there, or it lies in the run directory,
+            the working directory or ``VORONERF_DATA``, since a run may be another person's.
         downscale: Factor on the images; None for that of the training.
         allow_outside: Also read images that lie outside of the scene folder.
         samples: Samples per ray of each pass; None for those of the training.

@@ -1,5 +1,10 @@
 """Commands as lists of words, and options of a run of a few steps."""
 
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1] / "scenes"))  # for scene_files
+
 TINY = (
     "--downscale 6 --steps 16 --cells 3 --split-at 0.5 --width 8 --depth 2 --rays 64 --samples 8 --evaluations 2 "
     "--eval-views 2 --panels 1"

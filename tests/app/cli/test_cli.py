@@ -3,6 +3,8 @@
 import itertools
 import json
 import os
+import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -16,6 +18,7 @@ import pytest
 from cli_commands import TINY, words
 from helpers import read_json
 from PIL import Image
+from scene_files import write_blender
 
 from voronerf.app.cli import main
 from voronerf.app.cli.display import TrainingDisplay
@@ -140,6 +143,28 @@ def test_resume_needs_no_setting_again(run, tmp_path):
         assert steps is None or read_json(copy / "summary.json")["steps"] == steps
 
 
+def test_a_stopped_run_goes_on_with_the_command_that_it_prints(tmp_path, monkeypatch, capsys, fails):
+    """Its scene lies neither in the run nor in the working directory, and the command does not name it."""
+    data, out, elsewhere = tmp_path / "a scene", tmp_path / "a run", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    monkeypatch.delenv("VORONERF_DATA", raising=False)
+    write_blender(data, builtin_scene(16, train_views=4, test_views=2), 0.7)
+    stop = lambda display, state: state.step == 3 and state.stop()  # noqa: E731
+    with monkeypatch.context() as patched:
+        patched.setattr(TrainingDisplay, "after_step", stop)
+        assert main([*words("train --data"), str(data), "--out", str(out), *words(TINY), "--downscale", "1"]) == 130
+    (said,) = re.findall("continue with: voronerf (.*)", capsys.readouterr().out)
+    assert main(shlex.split(said)) == 0 and "--data" not in said
+    assert read_json(out / "summary.json")["steps"] == 16
+    assert main(["eval", str(out), "--panels", "0"]) == 0
+    shutil.copytree(data, tmp_path / "never named")
+    config = json.loads((out / "config.json").read_text()) | {"data": str(tmp_path / "never named")}
+    (out / "config.json").write_text(json.dumps(config))
+    assert main(["train", "--resume", "--out", str(out)]) == 1
+    assert "--data must be given once" in capsys.readouterr().err
+
+
 def test_folders_with_brackets_and_spaces_are_told_as_they_are(run, tmp_path, capsys):
     copy = tmp_path / "toys[old] :dog: 2"
     shutil.copytree(run, copy)
@@ -192,10 +217,10 @@ def test_bad_input_is_one_line(run, tmp_path, fails):
     fails("--cells must lie in 2..10000 on every level", "train --cells 0", *small)
     fails("--device must name a device", "train --device gpu", *small)
     fails("must not hold a run already", "train --downscale 20 --out", run)
-    fails("--resume needs a checkpoint in --out: there is nothing to resume in", "train --resume", *small)
+    fails(f"no run at {out}: there is nothing to resume", "train --resume", *small)
     fails("--resume needs --out", "train --resume")
-    fails("there is no checkpoint", "eval", tmp_path)
-    fails("there is no checkpoint", "render", out)
+    fails(f"no run at {tmp_path}: there is no checkpoint in it", "eval", tmp_path)
+    fails(f"no run at {out}: there is no such folder", "render", out)
     fails("--frames must be at least 1, got 0", "render", run, "--frames 0")
     fails("a video must end in", "render", run, "--out", tmp_path / "turn")
     fails("--views must be at least 1, got 0", "eval", run, "--views 0")

@@ -39,7 +39,7 @@ def test_runs_are_compared(tmp_path, capsys):
 def test_what_is_not_compared(tmp_path, fails):
     run, broken = make_run(tmp_path / "run", 30.0, [16]), make_run(tmp_path / "broken", 30.0, [16])
     fails("compare needs at least two runs, got 1", "compare", run)
-    fails(f"{tmp_path}: there is no run, it has no config.json", "compare", run, tmp_path)
+    fails(f"no run at {tmp_path}: there is no config.json in it", "compare", run, tmp_path)
     (broken / "summary.json").write_text("[1]")
     fails("summary.json: must be an object, got [1]", "compare", run, broken)
 

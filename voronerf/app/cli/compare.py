@@ -55,7 +55,7 @@ def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     check_folders(run)
     if not (run / "config.json").is_file():
-        raise ConfigError(f"{run}: there is no run, it has no config.json")
+        raise ConfigError(f"no run at {run}: there is no {'config.json in it' if run.is_dir() else 'such folder'}")
     metrics = read_metrics(run)
     ended = (run / "summary.json").is_file()
     figures = read_json(run / "summary.json") if ended else metrics[-1] if metrics else {}

@@ -14,21 +14,24 @@ import warnings
 from collections.abc import Callable, Iterator
 
 import torch
-import tyro
 from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
+from voronerf import __version__
 from voronerf.app.cli.compare import compare
 from voronerf.app.cli.demo import demo
 from voronerf.app.cli.display import one_line, say
 from voronerf.app.cli.eval import evaluate_run
 from voronerf.app.cli.export import export
 from voronerf.app.cli.info import info
+from voronerf.app.cli.parsing import parse
 from voronerf.app.cli.process import process
 from voronerf.app.cli.render import render
 from voronerf.app.cli.town import cut, join, place, train_territories
 from voronerf.app.cli.train import WHAT_TO_TRY, train, with_stored_settings
 from voronerf.app.cli.view import view
-from voronerf.app.train.config import ConfigError
+from voronerf.app.train.config import ConfigError, did_you_mean
 from voronerf.app.train.loop import TrainingError
 from voronerf.ops._core.backends import BackendUnavailable
 
@@ -110,14 +113,7 @@ def _run(args: list[str]) -> int:
         for word in args:  # the parser prints a word that it does not know as it is
             if any(unicodedata.category(char) == "Cc" for char in word):
                 raise ConfigError(f"arguments must have no control characters, got {word}")
-        stored = {name: with_stored_settings(COMMANDS[name], args) for name in TRAININGS if name in args[:1]}
-        return tyro.extras.subcommand_cli_from_dict(
-            COMMANDS | stored,
-            prog="voronerf",
-            description="Adaptive Voronoi NeRFs: one small network per Voronoi cell, trained and run as one.",
-            args=args,
-            config=(tyro.conf.OmitArgPrefixes,),
-        )
+        return chosen(*args)()
     except KeyboardInterrupt:
         print("voronerf: interrupted", file=sys.stderr)
         return 130
@@ -134,6 +130,36 @@ def _run(args: list[str]) -> int:
         size = f" for {int(wanted[1]) / 2**30:.1f} GiB" if wanted else ""
         print(f"voronerf: error: not enough memory{size}; try a smaller --width, --rays or --samples", file=sys.stderr)
         return 1
+
+
+def chosen(name: str = "--help", *words: str) -> Callable[[], int]:
+    """The command that a command line names, with its arguments.
+
+    Raises:
+        ConfigError: There is no such command, or no such argument.
+    """
+    if name in ("-h", "--help"):
+        return _show_commands
+    if name == "--version":
+        print(f"voronerf {__version__}")
+        return lambda: 0
+    if name not in COMMANDS:
+        raise ConfigError(f"there is no command {name}{did_you_mean(name, COMMANDS) or '; see voronerf --help'}")
+    command = COMMANDS[name]
+    return parse(name, with_stored_settings(command, list(words)) if name in TRAININGS else command, words)
+
+
+def _show_commands() -> int:
+    """Prints the commands, with the first paragraph of what each says of itself."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, command in COMMANDS.items():
+        table.add_row(f"  {name}", escape(" ".join((command.__doc__ or "").partition("\n\n")[0].split())))
+    print(
+        "usage: voronerf COMMAND ...\n\nMany small networks, one per Voronoi cell of space, trained and run as one.\n"
+    )
+    Console().print(table)
+    print("\nvoronerf COMMAND --help shows the options of one, voronerf --version the version.")
+    return 0
 
 
 def _show_thread_error(args: threading.ExceptHookArgs) -> None:

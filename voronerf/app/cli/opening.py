@@ -28,8 +28,8 @@ class Opening:
     """How a run is opened; what is None is as in training."""
 
     data: str | None = None
-    """Scene folder; default as in training, if that lies in the run directory, the working directory or VORONERF_DATA,
-    since a run may be another person's."""
+    """Scene folder; default as in training, if you named it there, or it lies in the run directory, the working
+    directory or VORONERF_DATA, since a run may be another person's."""
     downscale: int | None = None
     """Factor on the images, and on the frames of a camera path; default as in training, and 1 for a path."""
     allow_outside: bool = False

@@ -13,7 +13,7 @@ import torch
 import tyro
 
 from voronerf.app.cli.display import TrainingDisplay, say
-from voronerf.app.cli.train import stopped_by_signals
+from voronerf.app.cli.train import continuation, stopped_by_signals
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.files import json_text, write_text
 from voronerf.app.scenes import BUILTIN, load_scene
@@ -228,5 +228,7 @@ def _train_territories(
                 if panels:
                     write_panels(opened.renderer, opened.diagram, opened.scene, out / "images", views=panels)
             write_text(out / "summary.json", json_text(summary, indent=2) + "\n")
-            say(f"wrote {out}" if summary["complete"] else f"stopped; continue with --resume --out {out}")
+            start = f"torchrun --nproc-per-node {group.size} -m " * (group.size > 1)
+            again = continuation(f"{start}voronerf train-territories", config)
+            say(f"wrote {out}" if summary["complete"] else f"stopped; continue with: {again}")
     return 0 if summary["complete"] else 130

@@ -38,6 +38,7 @@ from voronerf.app.train.run_directory import (
     is_outside,
     read_config,
     read_curve,
+    remember_choice,
     stored_config,
     write_curve,
 )
@@ -99,6 +100,9 @@ def train(
         return 0
     chosen = choose_directory(config, scene, resume=resume)
     assert chosen.out is not None
+    for path in (config.data, config.lpips):
+        if path is not None and is_outside(chosen.out, path):
+            remember_choice(path)
     with contextlib.ExitStack() as stack:
         if config.out is None:
             stack.callback(_remove_empty, chosen.out)
@@ -121,6 +125,16 @@ def train(
                 with contextlib.suppress(KeyboardInterrupt):
                     viewer.serve()
     return 0 if summary["complete"] else 130
+
+
+def continuation(command: str, config: TrainConfig) -> str:
+    """The command that goes on with a stopped run."""
+    assert config.out is not None
+    words = [*command.split(), "--resume", "--out", str(config.out)]
+    for option, path in (("--data", config.data), ("--lpips", config.lpips)):
+        if path is not None and is_outside(config.out, path):
+            words += [option, str(path)]
+    return shlex.join(words + ["--allow-outside"] * config.allow_outside)
 
 
 def _remove_empty(folder: Path) -> None:
@@ -178,8 +192,7 @@ def run_training(
                     checkpoints.on_end(state)
                     raise
         if not scores.summary["complete"]:
-            again = f" --data {shlex.quote(config.data)}" if is_outside(out, config.data) else ""
-            say(f"stopped; continue with: voronerf train --resume --out {shlex.quote(str(out))}{again}")
+            say(f"stopped; continue with: {continuation('voronerf train', config)}")
             return scores.summary
         if panels:
             with state.averaged():
@@ -225,7 +238,10 @@ def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callab
     stored = read_config(file) if file is not None else None if out is None else stored_config(out)
     folder = out if file is None else file.parent
     if folder is None or stored is None:
-        return command
+        if {"-h", "--help"}.intersection(args):
+            return command
+        nothing = "--resume needs --out, the run directory to continue"
+        raise ConfigError(nothing if out is None else f"no run at {out}: there is nothing to resume")
 
     def given(name: str) -> bool:
         return any(word == f"--{name}" or word.startswith(f"--{name}=") for word in args)

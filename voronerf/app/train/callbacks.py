@@ -66,10 +66,8 @@ class Checkpoints(Callback):
         write_bytes(self.out / "samples" / f"level-{state.strategy.splits}.npz", kept.getvalue())
         when = f"at {state.seconds:.0f} s, step {state.step}"
         if stage.split_cells:
-            state.report(
-                f"{stage.cells} cells {when}, imbalance of their importance {stage.balance_before:.3f} -> "
-                f"{stage.balance_after:.4f}"
-            )
+            balance = f", imbalance of their importance {stage.balance_before:.3f} -> {stage.balance_after:.4f}"
+            state.report(f"{stage.cells} cells {when}{balance if state.config.centres == 'balanced' else ''}")
         else:
             state.report(f"no cell split {when}: none holds {MIN_SAMPLES} of the {len(done.points)} samples kept")
 

@@ -130,7 +130,9 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
     Raises:
         CheckpointError: When there is none.
     """
-    paths = checkpoint_paths(run) or [checkpoint_path(run)]
+    paths = checkpoint_paths(run)
+    if not paths:
+        raise CheckpointError(f"no run at {run}: there is no {'checkpoint in it' if run.is_dir() else 'such folder'}")
     errors = []
     for path in paths:
         try:

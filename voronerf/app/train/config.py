@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import difflib
 import itertools
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -290,20 +291,28 @@ def either(names: Sequence[str]) -> str:
     return " or ".join((", ".join(names[:-1]), names[-1])) if len(names) > 1 else names[0]
 
 
+def did_you_mean(word: object, words: Iterable[str]) -> str:
+    """``; did you mean nerf?`` for the most similar of some words; empty if none is similar."""
+    near = difflib.get_close_matches(str(word), list(words), 1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
 def check_config(config: TrainConfig) -> None:
     """Raises ConfigError for the first setting that is out of range, or that the field or the sampler does not have."""
 
-    def need(ok: bool, name: str, rule: str) -> None:
+    def need(ok: bool, name: str, rule: str, words: Iterable[str] = ()) -> None:
         if not ok:
-            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {getattr(config, name)!r}")
+            value = getattr(config, name)
+            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {value!r}{did_you_mean(value, words)}")
 
-    need(config.sampling in SAMPLERS, "sampling", f"be {either(list(SAMPLERS))}")
-    need(config.field in FIELDS, "field", f"be {either(list(FIELDS))}; voronerf.nerf.fields.register_field adds others")
+    need(config.sampling in SAMPLERS, "sampling", f"be {either(list(SAMPLERS))}", SAMPLERS)
+    more = "voronerf.nerf.fields.register_field adds others"
+    need(config.field in FIELDS, "field", f"be {either(list(FIELDS))}; {more}", FIELDS)
     if config.budget is not None and config.steps is not None:
         raise ConfigError("give --budget SECONDS or --steps N, not both")
     for name, words in CHOICES.items():
-        need(getattr(config, name) in words, name, f"be {either(words)}")
-    need(config.backend in ("auto", *BACKENDS), "backend", f"be auto, {', '.join(BACKENDS)}")
+        need(getattr(config, name) in words, name, f"be {either(words)}", words)
+    need(config.backend in ("auto", *BACKENDS), "backend", f"be {either(['auto', *BACKENDS])}", ("auto", *BACKENDS))
     need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
     need(config.steps is None or 1 <= config.steps < 2**53, "steps", "lie in 1..2^53 - 1")
     for name in ("rays", "evaluations", "eval_views", "downscale", "parameters"):
@@ -311,7 +320,7 @@ def check_config(config: TrainConfig) -> None:
         need(value is None or value >= 1, name, "be at least 1")
     need(config.width is None or config.width >= 2, "width", "be at least 2")
     need(config.depth is None or 1 <= config.depth <= 1000, "depth", "be at least 1 and at most 1000")
-    need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be positive")
+    need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be a positive number")
     need(0 <= config.average < 1, "average", "lie in [0, 1)")
     need(0 <= config.seed < 2**63, "seed", "lie in 0..2^63 - 1")
     factor = config.sparse_depth

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import shlex
@@ -13,7 +14,15 @@ from typing import Any
 
 from voronerf.app.evaluate.lpips import OFF
 from voronerf.app.evaluate.plots import plot_curves
-from voronerf.app.files import leads_outside, locked, read_json, read_json_lines, remove_partial
+from voronerf.app.files import (
+    cache_folder,
+    leads_outside,
+    locked,
+    private_folder,
+    read_json,
+    read_json_lines,
+    remove_partial,
+)
 from voronerf.app.scenes import Scene, is_builtin
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
@@ -30,9 +39,25 @@ def check_folders(run: Path) -> None:
 
 
 def is_outside(run: Path, path: str | Path) -> bool:
-    """Whether a path is in no folder of the user's choice: the run's, the working directory, ``VORONERF_DATA``."""
+    """Whether the user has chosen neither a path nor a folder that it is in: the run's, the working directory,
+    ``VORONERF_DATA``."""
     data = os.environ.get("VORONERF_DATA")
-    return all(leads_outside(Path(path), folder) for folder in (run, Path.cwd(), *([Path(data)] if data else [])))
+    folders = (run, Path.cwd(), *([Path(data)] if data else []))
+    with contextlib.suppress(OSError):
+        if _note_of(path).exists():
+            return False
+    return all(leads_outside(Path(path), folder) for folder in folders)
+
+
+def remember_choice(path: str | Path) -> None:
+    """Notes that the user of this machine has named a path, so that a run may name it from now on."""
+    with contextlib.suppress(OSError):  # it must then be named again
+        _note_of(path).touch()
+
+
+def _note_of(path: str | Path) -> Path:
+    name = hashlib.sha256(os.path.realpath(path).encode(errors="surrogateescape")).hexdigest()
+    return private_folder(cache_folder() / "chosen") / name
 
 
 def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None = None) -> None:
@@ -47,8 +72,8 @@ def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None
     for option, path in paths.items():
         if path is not None and is_outside(run, path):
             raise ConfigError(
-                f"{run}: --{option} must be given, since the settings of the run name what is outside of it, of the "
-                f"working directory and of VORONERF_DATA: --{option} {shlex.quote(str(path))}"
+                f"{run}: --{option} must be given once, since a run may be another person's and this one names what is "
+                f"outside of it, of the working directory and of VORONERF_DATA: --{option} {shlex.quote(str(path))}"
             )
 
 
@@ -63,7 +88,7 @@ def choose_directory(config: TrainConfig, scene: Scene, *, resume: bool = False)
     elif not resume and checkpoint_paths(out):
         raise ConfigError(f"--out must not hold a run already, got {out}: continue it with --resume or choose another")
     elif resume and not checkpoint_paths(out):
-        raise ConfigError(f"--resume needs a checkpoint in --out: there is nothing to resume in {out} yet")
+        raise ConfigError(f"--resume needs a run in --out, and there is no checkpoint in {out}")
     return replace(config, out=out)
 
 

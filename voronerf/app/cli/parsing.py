@@ -1,0 +1,178 @@
+"""From the words of a command line to a command with its arguments: tyro's parser, told to be brief."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import functools
+import inspect
+import io
+import itertools
+import operator
+import re
+import types
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
+
+from voronerf.app.train.config import ConfigError, TrainConfig, did_you_mean, either
+
+RULES = ConstructorRegistry()
+#: What a number must be.
+NUMBERS = {int: "a whole number", float: "a number"}
+#: Defaults that are none.
+NOTHING = (None, (), inspect.Parameter.empty)
+#: What sets the colours of a terminal.
+COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def parse(name: str, command: Callable[..., int], words: Sequence[str]) -> Callable[[], int]:
+    """The command with the arguments that words give it; prints its help and exits for ``--help``.
+
+    Raises:
+        ConfigError: For words that are none of its arguments. The message is one line.
+    """
+
+    @functools.wraps(command)
+    def later(*given: Any, **options: Any) -> Callable[[], int]:
+        return functools.partial(command, *given, **options)
+
+    hints, signature = get_type_hints(command, include_extras=True), inspect.signature(command)
+    later.__annotations__ = {k: _argument(hints[k], given.default) for k, given in signature.parameters.items()}
+    later.__doc__ = re.sub(r"\n {12}", " ", command.__doc__ or "")  # tyro would keep these breaks
+    later.__signature__ = signature  # type: ignore[attr-defined]
+    del later.__wrapped__  # tyro would read its annotations
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            markers = (tyro.conf.OmitArgPrefixes, tyro.conf.PositionalMetavarFromFieldName)
+            return tyro.cli(later, prog=f"voronerf {name}", args=words, config=markers, registry=RULES)
+    except SystemExit as stop:
+        if stop.code == 0:
+            raise
+        line = in_a_line(said.getvalue())
+        raise ConfigError(line if line.endswith("?") else f"{line}; see voronerf {name} --help") from None
+
+
+def in_a_line(box: str) -> str:
+    """What a box of tyro's says, and which options are similar to those that it does not know."""
+    _, *rows = (line[2:].rstrip(" │") for line in COLOURS.sub("", box).splitlines())
+    parts = [[*part] for is_rule, part in itertools.groupby(rows, lambda row: row[:1] in ("─", "-")) if not is_rule]
+    message = re.sub("^Error parsing ([^:]+):", r"\1", " ".join(" ".join(parts[0]).split())).rstrip(".")
+    found = (row.split()[0].strip(",") for part in parts[1:] for row in part if row.startswith("    --"))
+    near = list(dict.fromkeys(found)) if message.startswith("Unrecognized") else []
+    return message + (f"; did you mean {either(near)}?" if near else "")
+
+
+def _argument(hint: Any, default: Any) -> Any:
+    """A type as tyro takes it: the settings go into groups of their own, and a default that is nothing is not shown."""
+    if hint is TrainConfig:
+        return Annotated[hint, tyro.conf.arg(name="")]
+    return Annotated[hint, tyro.conf.arg(help_behavior_hint="")] if default in NOTHING else hint
+
+
+@RULES.struct_rule
+def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Dataclasses: those of a training in a box for each group, and texts without the breaks of their source."""
+    if info.type is TrainConfig:
+        given = vars(info.default) if isinstance(info.default, TrainConfig) else {}
+        groups = {
+            base: base(**{field.name: given[field.name] for field in fields(base) if given})
+            for base in reversed(TrainConfig.__bases__)
+        }
+        return StructConstructorSpec(
+            lambda **parts: TrainConfig(**{k: v for part in parts.values() for k, v in vars(part).items()}),
+            tuple(StructFieldSpec(group_name(base), base, default) for base, default in groups.items()),
+        )
+    if not is_dataclass(info.type):
+        return None
+    texts, hints, found = field_docs(info.type), get_type_hints(info.type), []
+    for field in fields(info.type):
+        default = getattr(info.default, field.name, field.default)
+        found.append(StructFieldSpec(field.name, _argument(hints[field.name], default), default, texts[field.name]))
+    return StructConstructorSpec(info.type, tuple(found))
+
+
+@RULES.primitive_rule
+def values(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Numbers, lists of them, words of a choice, and what may be None: errors say the rule and what came."""
+    kind, origin, parts = info.type, get_origin(info.type), get_args(info.type)
+    if kind in NUMBERS:
+        return _spec(1, kind.__name__.upper(), NUMBERS[kind], lambda words: kind(words[0]))
+    if origin is tuple and parts[0] in NUMBERS:
+        name = parts[0].__name__.upper()
+        if parts[-1] is Ellipsis:
+            rule = f"{NUMBERS[parts[0]].split(' ', 1)[1]}s"
+            return _spec("*", f"[{name} ...]", rule, lambda words: tuple(map(parts[0], words)))
+        metavar = " ".join([name] * len(parts))
+        return _spec(len(parts), metavar, f"{len(parts)} numbers", lambda words: tuple(map(parts[0], words)))
+    if origin is Literal:
+        return _spec(1, f"{{{','.join(parts)}}}", either(parts), lambda words: dict(zip(parts, parts))[words[0]], parts)
+    if origin in (Union, types.UnionType) and type(None) in parts:
+        inner = functools.reduce(operator.or_, (part for part in parts if part is not type(None)))
+        found = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(inner, info.markers))
+        if not isinstance(found, PrimitiveConstructorSpec):
+            return None
+        read = found.instance_from_str
+        if len(parts) > 2:
+            read = _spec(
+                found.nargs,
+                found.metavar,
+                found.metavar.translate({ord(c): None for c in "{}"}).replace("|", " or "),
+                read,
+            ).instance_from_str
+        return replace(
+            found,
+            instance_from_str=lambda words: None if words == ["None"] else read(words),
+            str_from_instance=lambda value: [] if value is None else found.str_from_instance(value),
+        )
+    return None
+
+
+def _spec(
+    count: int | tuple[int, ...] | Literal["*"],
+    metavar: str,
+    rule: str,
+    read: Callable[[list[str]], Any],
+    choices: Sequence[str] = (),
+) -> PrimitiveConstructorSpec:
+    """How words become a value; ``rule`` says what they must be."""
+
+    def value(words: list[str]) -> Any:
+        try:
+            return read(words)
+        except (KeyError, ValueError):
+            came = " ".join(words)
+            raise ValueError(f"must be {rule}, got {came!r}{did_you_mean(came, choices)}") from None
+
+    def shown(instance: Any) -> list[str]:
+        return [str(part) for part in (instance if isinstance(instance, tuple) else (instance,))]
+
+    return PrimitiveConstructorSpec(count, metavar, value, lambda instance: True, shown)
+
+
+def group_name(kind: type) -> str:
+    """The name of a group of settings in the help, "scene" for `SceneSettings`."""
+    return kind.__name__.removesuffix("Settings").lower()
+
+
+def field_docs(kind: type) -> dict[str, str]:
+    """The strings that stand below the fields of a dataclass, each as one line."""
+    (tree,) = ast.parse(inspect.getsource(kind)).body
+    assert isinstance(tree, ast.ClassDef)
+    return {
+        before.target.id: " ".join(str(after.value.value).split())
+        for before, after in itertools.pairwise(tree.body)
+        if isinstance(before, ast.AnnAssign) and isinstance(before.target, ast.Name)
+        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+    }
