@@ -71,7 +71,7 @@ def test_help_is_whole(capsys, monkeypatch, command):
     boxes = set(re.findall(r" (\w+) options ", shown))
     if command.startswith("train"):
         assert boxes >= {"scene", "run", "field", "cell", "sampling", "optimiser", "output"}
-        assert "--data STR" in shown and "hundreds of solids" in shown
+        assert "--data STR" in shown and "farthest camera at distance 1" in shown
 
 
 def test_none_stands_for_the_default(tmp_path):
