@@ -10,8 +10,6 @@ VN_STRUCT(SeeCells, centres, child_offsets, child, m, depth);
 VN_STRUCT(SeeRule, density_scale, opaque, wave);
 VN_STRUCT(SeeOutputs, colour, opacity, depth, light, heaviest);
 
-VN_BINDINGS(module) {
-  module.cpu("render_opaque", VN_CPU(render_opaque_cpu));
-}
+VN_BINDINGS(module) { module.cpu("render_opaque", VN_CPU(render_opaque_cpu)); }
 
 }  // namespace voronerf

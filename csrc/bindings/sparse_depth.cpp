@@ -6,8 +6,6 @@ namespace voronerf {
 
 VN_STRUCT(SparseDepth, density, depths, deltas, weights, offsets, distances, nearby, s, m);
 
-VN_BINDINGS(module) {
-  module.cpu("sparse_depth_gradient", VN_CPU(sparse_depth_gradient_cpu));
-}
+VN_BINDINGS(module) { module.cpu("sparse_depth_gradient", VN_CPU(sparse_depth_gradient_cpu)); }
 
 }  // namespace voronerf

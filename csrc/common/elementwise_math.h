@@ -100,14 +100,10 @@ VN_INLINE F32 softplus(F32 x) {
   return fma(s + s, p, x < splat(0.0f) ? splat(0.0f) : x);
 }
 
-VN_INLINE F32 sigmoid(F32 x) {
-  return splat(1.0f) / (splat(1.0f) + exponential(splat(0.0f) - x));
-}
+VN_INLINE F32 sigmoid(F32 x) { return splat(1.0f) / (splat(1.0f) + exponential(splat(0.0f) - x)); }
 
 // Whether a lane is too large for `sine`, or not finite.
-VN_INLINE bool beyond_sine(F32 angle) {
-  return bits(less(abs(angle), splat(kLargestAngle))) != (1u << kLanes) - 1u;
-}
+VN_INLINE bool beyond_sine(F32 angle) { return bits(less(abs(angle), splat(kLargestAngle))) != (1u << kLanes) - 1u; }
 
 }  // namespace
 }  // namespace VN_ISA_NAMESPACE

@@ -18,13 +18,9 @@ constexpr double kBurst = 1.5e-3, kSeconds = 0.1;
 constexpr int64_t kCopied = int64_t{1} << 24;  // floats: 64 MiB to 64 MiB
 constexpr int64_t kLine = 64;
 
-double now() {
-  return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
-}
+double now() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
 
-int64_t run_float32(Isa isa, int64_t turns, float* sink) {
-  VN_FOR_ISA(isa, peak_float32(turns, sink))
-}
+int64_t run_float32(Isa isa, int64_t turns, float* sink) { VN_FOR_ISA(isa, peak_float32(turns, sink)) }
 
 void stream(Isa isa, const float* from, float* to, int64_t floats){VN_FOR_ISA(isa, peak_copy(from, to, floats))}
 

@@ -13,9 +13,7 @@ VN_INLINE F32 load(const float* from) {
   return a;
 }
 
-VN_INLINE void store(float* to, F32 a) {
-  __builtin_memcpy(to, &a, sizeof a);
-}
+VN_INLINE void store(float* to, F32 a) { __builtin_memcpy(to, &a, sizeof a); }
 
 }  // namespace
 }  // namespace VN_ISA_NAMESPACE

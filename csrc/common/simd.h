@@ -39,50 +39,22 @@ using F32 = __m512;
 using I32 = __m512i;
 using Mask = __mmask16;
 
-VN_INLINE F32 splat(float a) {
-  return _mm512_set1_ps(a);
-}
-VN_INLINE I32 splat(int32_t a) {
-  return _mm512_set1_epi32(a);
-}
-VN_INLINE F32 sub(F32 a, F32 b) {
-  return _mm512_sub_ps(a, b);
-}
-VN_INLINE F32 mul(F32 a, F32 b) {
-  return _mm512_mul_ps(a, b);
-}
-VN_INLINE F32 add(F32 a, F32 b) {
-  return _mm512_add_ps(a, b);
-}
-VN_INLINE F32 fma(F32 a, F32 b, F32 c) {
-  return _mm512_fmadd_ps(a, b, c);
-}
+VN_INLINE F32 splat(float a) { return _mm512_set1_ps(a); }
+VN_INLINE I32 splat(int32_t a) { return _mm512_set1_epi32(a); }
+VN_INLINE F32 sub(F32 a, F32 b) { return _mm512_sub_ps(a, b); }
+VN_INLINE F32 mul(F32 a, F32 b) { return _mm512_mul_ps(a, b); }
+VN_INLINE F32 add(F32 a, F32 b) { return _mm512_add_ps(a, b); }
+VN_INLINE F32 fma(F32 a, F32 b, F32 c) { return _mm512_fmadd_ps(a, b, c); }
 // With a full mask these are the plain instructions; gcc 12 warns of an uninitialised operand in its unmasked ones (its
 // bug 105593).
-VN_INLINE F32 min(F32 a, F32 b) {
-  return _mm512_maskz_min_ps(0xffff, a, b);
-}
-VN_INLINE F32 max(F32 a, F32 b) {
-  return _mm512_maskz_max_ps(0xffff, a, b);
-}
-VN_INLINE F32 abs(F32 a) {
-  return _mm512_abs_ps(a);
-}
-VN_INLINE F32 square_root(F32 a) {
-  return _mm512_maskz_sqrt_ps(0xffff, a);
-}
-VN_INLINE Mask less(F32 a, F32 b) {
-  return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ);
-}
-VN_INLINE I32 select(Mask m, I32 a, I32 b) {
-  return _mm512_mask_mov_epi32(b, m, a);
-}
-VN_INLINE unsigned bits(Mask m) {
-  return m;
-}
-VN_INLINE void store(int32_t* to, I32 a) {
-  _mm512_storeu_si512(to, a);
-}
+VN_INLINE F32 min(F32 a, F32 b) { return _mm512_maskz_min_ps(0xffff, a, b); }
+VN_INLINE F32 max(F32 a, F32 b) { return _mm512_maskz_max_ps(0xffff, a, b); }
+VN_INLINE F32 abs(F32 a) { return _mm512_abs_ps(a); }
+VN_INLINE F32 square_root(F32 a) { return _mm512_maskz_sqrt_ps(0xffff, a); }
+VN_INLINE Mask less(F32 a, F32 b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
+VN_INLINE I32 select(Mask m, I32 a, I32 b) { return _mm512_mask_mov_epi32(b, m, a); }
+VN_INLINE unsigned bits(Mask m) { return m; }
+VN_INLINE void store(int32_t* to, I32 a) { _mm512_storeu_si512(to, a); }
 
 // Sixteen points [16,3] to their three coordinates.
 VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
@@ -132,48 +104,20 @@ using F32 = __m256;
 using I32 = __m256i;
 using Mask = __m256;
 
-VN_INLINE F32 splat(float a) {
-  return _mm256_set1_ps(a);
-}
-VN_INLINE I32 splat(int32_t a) {
-  return _mm256_set1_epi32(a);
-}
-VN_INLINE F32 sub(F32 a, F32 b) {
-  return _mm256_sub_ps(a, b);
-}
-VN_INLINE F32 mul(F32 a, F32 b) {
-  return _mm256_mul_ps(a, b);
-}
-VN_INLINE F32 add(F32 a, F32 b) {
-  return _mm256_add_ps(a, b);
-}
-VN_INLINE F32 fma(F32 a, F32 b, F32 c) {
-  return _mm256_fmadd_ps(a, b, c);
-}
-VN_INLINE F32 min(F32 a, F32 b) {
-  return _mm256_min_ps(a, b);
-}
-VN_INLINE F32 max(F32 a, F32 b) {
-  return _mm256_max_ps(a, b);
-}
-VN_INLINE F32 abs(F32 a) {
-  return _mm256_andnot_ps(_mm256_set1_ps(-0.0f), a);
-}
-VN_INLINE F32 square_root(F32 a) {
-  return _mm256_sqrt_ps(a);
-}
-VN_INLINE Mask less(F32 a, F32 b) {
-  return _mm256_cmp_ps(a, b, _CMP_LT_OQ);
-}
-VN_INLINE I32 select(Mask m, I32 a, I32 b) {
-  return _mm256_blendv_epi8(b, a, _mm256_castps_si256(m));
-}
-VN_INLINE unsigned bits(Mask m) {
-  return static_cast<unsigned>(_mm256_movemask_ps(m));
-}
-VN_INLINE void store(int32_t* to, I32 a) {
-  _mm256_storeu_si256(reinterpret_cast<__m256i*>(to), a);
-}
+VN_INLINE F32 splat(float a) { return _mm256_set1_ps(a); }
+VN_INLINE I32 splat(int32_t a) { return _mm256_set1_epi32(a); }
+VN_INLINE F32 sub(F32 a, F32 b) { return _mm256_sub_ps(a, b); }
+VN_INLINE F32 mul(F32 a, F32 b) { return _mm256_mul_ps(a, b); }
+VN_INLINE F32 add(F32 a, F32 b) { return _mm256_add_ps(a, b); }
+VN_INLINE F32 fma(F32 a, F32 b, F32 c) { return _mm256_fmadd_ps(a, b, c); }
+VN_INLINE F32 min(F32 a, F32 b) { return _mm256_min_ps(a, b); }
+VN_INLINE F32 max(F32 a, F32 b) { return _mm256_max_ps(a, b); }
+VN_INLINE F32 abs(F32 a) { return _mm256_andnot_ps(_mm256_set1_ps(-0.0f), a); }
+VN_INLINE F32 square_root(F32 a) { return _mm256_sqrt_ps(a); }
+VN_INLINE Mask less(F32 a, F32 b) { return _mm256_cmp_ps(a, b, _CMP_LT_OQ); }
+VN_INLINE I32 select(Mask m, I32 a, I32 b) { return _mm256_blendv_epi8(b, a, _mm256_castps_si256(m)); }
+VN_INLINE unsigned bits(Mask m) { return static_cast<unsigned>(_mm256_movemask_ps(m)); }
+VN_INLINE void store(int32_t* to, I32 a) { _mm256_storeu_si256(reinterpret_cast<__m256i*>(to), a); }
 
 VN_INLINE void zip(F32 a, F32 b, F32& low, F32& high) {
   const F32 even = _mm256_unpacklo_ps(a, b), odd = _mm256_unpackhi_ps(a, b);
@@ -219,58 +163,28 @@ typedef float F32 __attribute__((vector_size(16)));
 typedef int32_t I32 __attribute__((vector_size(16)));
 typedef I32 Mask;
 
-VN_INLINE F32 splat(float a) {
-  return F32{a, a, a, a};
-}
-VN_INLINE I32 splat(int32_t a) {
-  return I32{a, a, a, a};
-}
-VN_INLINE F32 sub(F32 a, F32 b) {
-  return a - b;
-}
-VN_INLINE F32 mul(F32 a, F32 b) {
-  return a * b;
-}
-VN_INLINE F32 add(F32 a, F32 b) {
-  return a + b;
-}
-VN_INLINE F32 min(F32 a, F32 b) {
-  return a < b ? a : b;
-}
-VN_INLINE F32 max(F32 a, F32 b) {
-  return a > b ? a : b;
-}
-VN_INLINE F32 abs(F32 a) {
-  return reinterpret_cast<F32>(reinterpret_cast<I32>(a) & splat(0x7fffffff));
-}
-VN_INLINE Mask less(F32 a, F32 b) {
-  return a < b;
-}
-VN_INLINE I32 select(Mask m, I32 a, I32 b) {
-  return (m & a) | (~m & b);
-}
-VN_INLINE void store(int32_t* to, I32 a) {
-  __builtin_memcpy(to, &a, sizeof a);
-}
+VN_INLINE F32 splat(float a) { return F32{a, a, a, a}; }
+VN_INLINE I32 splat(int32_t a) { return I32{a, a, a, a}; }
+VN_INLINE F32 sub(F32 a, F32 b) { return a - b; }
+VN_INLINE F32 mul(F32 a, F32 b) { return a * b; }
+VN_INLINE F32 add(F32 a, F32 b) { return a + b; }
+VN_INLINE F32 min(F32 a, F32 b) { return a < b ? a : b; }
+VN_INLINE F32 max(F32 a, F32 b) { return a > b ? a : b; }
+VN_INLINE F32 abs(F32 a) { return reinterpret_cast<F32>(reinterpret_cast<I32>(a) & splat(0x7fffffff)); }
+VN_INLINE Mask less(F32 a, F32 b) { return a < b; }
+VN_INLINE I32 select(Mask m, I32 a, I32 b) { return (m & a) | (~m & b); }
+VN_INLINE void store(int32_t* to, I32 a) { __builtin_memcpy(to, &a, sizeof a); }
 
 #if VN_ISA == 3
 
-VN_INLINE F32 fma(F32 a, F32 b, F32 c) {
-  return vfmaq_f32(c, a, b);
-}
-VN_INLINE F32 square_root(F32 a) {
-  return vsqrtq_f32(a);
-}
-VN_INLINE unsigned bits(Mask m) {
-  return static_cast<unsigned>(vaddvq_s32(m & I32{1, 2, 4, 8}));
-}
+VN_INLINE F32 fma(F32 a, F32 b, F32 c) { return vfmaq_f32(c, a, b); }
+VN_INLINE F32 square_root(F32 a) { return vsqrtq_f32(a); }
+VN_INLINE unsigned bits(Mask m) { return static_cast<unsigned>(vaddvq_s32(m & I32{1, 2, 4, 8})); }
 VN_INLINE void zip(F32 a, F32 b, F32& low, F32& high) {
   low = vzip1q_f32(a, b);
   high = vzip2q_f32(a, b);
 }
-VN_INLINE F32 lane_sums(const F32* v) {
-  return vpaddq_f32(vpaddq_f32(v[0], v[1]), vpaddq_f32(v[2], v[3]));
-}
+VN_INLINE F32 lane_sums(const F32* v) { return vpaddq_f32(vpaddq_f32(v[0], v[1]), vpaddq_f32(v[2], v[3])); }
 VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
   const float32x4x3_t points = vld3q_f32(p);
   x = points.val[0];
@@ -280,16 +194,12 @@ VN_INLINE void load_points(const float* p, F32& x, F32& y, F32& z) {
 
 #else
 
-VN_INLINE F32 fma(F32 a, F32 b, F32 c) {
-  return a * b + c;
-}
+VN_INLINE F32 fma(F32 a, F32 b, F32 c) { return a * b + c; }
 VN_INLINE F32 square_root(F32 a) {
   for (int i = 0; i < kLanes; ++i) a[i] = __builtin_sqrtf(a[i]);
   return a;
 }
-VN_INLINE unsigned bits(Mask m) {
-  return (m[0] & 1u) | (m[1] & 2u) | (m[2] & 4u) | (m[3] & 8u);
-}
+VN_INLINE unsigned bits(Mask m) { return (m[0] & 1u) | (m[1] & 2u) | (m[2] & 4u) | (m[3] & 8u); }
 VN_INLINE void zip(F32 a, F32 b, F32& low, F32& high) {
   low = F32{a[0], b[0], a[1], b[1]};
   high = F32{a[2], b[2], a[3], b[3]};

@@ -11,9 +11,7 @@ namespace voronerf {
 
 namespace {
 
-int64_t stride_of(int64_t d, int64_t octaves) {
-  return ceil_div(d * (1 + 2 * octaves), kEncodeLanes) * kEncodeLanes;
-}
+int64_t stride_of(int64_t d, int64_t octaves) { return ceil_div(d * (1 + 2 * octaves), kEncodeLanes) * kEncodeLanes; }
 
 // Table, encoded rows, staged rows with a vector to spare, staged variances.
 int64_t workspace_of_thread(int64_t d, int64_t octaves) {

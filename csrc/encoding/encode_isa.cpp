@@ -15,9 +15,7 @@ struct Workspace {
   float *table, *staged, *variances, *value;
 };
 
-VN_INLINE Columns columns_of(const Encoding& in) {
-  return {in.d, in.octaves, in.include_input};
-}
+VN_INLINE Columns columns_of(const Encoding& in) { return {in.d, in.octaves, in.include_input}; }
 
 VN_INLINE Workspace carve(const Encoding& in, float* workspace, int64_t stride) {
   const int64_t staged = kEncodeRows * in.d + kEncodeLanes;

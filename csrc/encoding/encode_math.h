@@ -60,13 +60,9 @@ VN_HD float turns_of_large(float x) {
 }
 
 // 2^octave; products with it are exact.
-VN_HD float octave_scale(int octave) {
-  return ldexpf(1.0f, octave);
-}
+VN_HD float octave_scale(int octave) { return ldexpf(1.0f, octave); }
 
 // The factor on an octave for a Gaussian of this variance.
-VN_HD float octave_blur(float scale, float variance) {
-  return expf(-0.5f * scale * scale * variance);
-}
+VN_HD float octave_blur(float scale, float variance) { return expf(-0.5f * scale * scale * variance); }
 
 }  // namespace voronerf

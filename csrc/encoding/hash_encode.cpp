@@ -17,9 +17,7 @@ namespace {
 
 constexpr int64_t kRun = 16 * kHashBlock;  // points of a task
 
-int64_t width_of(const HashEncoding& in) {
-  return int64_t{in.count} * in.features;
-}
+int64_t width_of(const HashEncoding& in) { return int64_t{in.count} * in.features; }
 
 void encode_rows(Isa isa, const HashEncoding& in, float* out, int64_t begin, int64_t end) {
   VN_FOR_ISA(isa, hash_encode_rows(in, out, width_of(in), begin, end))

@@ -178,9 +178,7 @@ void for_table(const HashEncoding& in, const Run& run) {
   });
 }
 
-unsigned blocks_of(int64_t n) {
-  return static_cast<unsigned>(ceil_div<int64_t>(n, kThreads));
-}
+unsigned blocks_of(int64_t n) { return static_cast<unsigned>(ceil_div<int64_t>(n, kThreads)); }
 
 dim3 blocks_of(const HashEncoding& in) {
   return dim3(blocks_of(in.in.n), static_cast<unsigned>(ceil_div(in.count * in.features, kSector)));

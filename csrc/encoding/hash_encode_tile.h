@@ -153,9 +153,7 @@ struct Float16 {
   uint16_t bits;
 };
 
-VN_INLINE Four widen(FourWords bits, Bfloat16) {
-  return reinterpret_cast<Four>(bits << 16);
-}
+VN_INLINE Four widen(FourWords bits, Bfloat16) { return reinterpret_cast<Four>(bits << 16); }
 VN_INLINE Four widen(FourWords bits, Float16) {
 #if VN_ISA == 2
   return _mm_maskz_cvtph_ps(0xf, _mm_cvtepi32_epi16(reinterpret_cast<__m128i>(bits)));

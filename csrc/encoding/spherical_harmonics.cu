@@ -51,9 +51,7 @@ __global__ void __launch_bounds__(kThreads)
   for (int axis = 0; axis < 3; ++axis) grad_directions[3 * row + axis] = found[axis];
 }
 
-unsigned blocks_of(int64_t n) {
-  return static_cast<unsigned>(ceil_div<int64_t>(n, kThreads));
-}
+unsigned blocks_of(int64_t n) { return static_cast<unsigned>(ceil_div<int64_t>(n, kThreads)); }
 
 }  // namespace
 

@@ -49,9 +49,7 @@ void find_neighbours(const BalanceInputs& in, const float* centres, int64_t i, d
 
 }  // namespace
 
-int64_t balance_centres_workspace(int64_t k) {
-  return 5 * k;
-}
+int64_t balance_centres_workspace(int64_t k) { return 5 * k; }
 
 void balance_centres_cpu(const BalanceInputs& in, float* centres, double* weights, int32_t* cells, double* workspace,
                          Isa isa, int threads) {

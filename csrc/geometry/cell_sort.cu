@@ -187,9 +187,7 @@ __global__ void __launch_bounds__(kThreads)
   offsets[cell] = static_cast<int32_t>(first_above(sorted, n, cell));  // the bucket of cell c is c + 1
 }
 
-unsigned blocks_of(int64_t threads) {
-  return static_cast<unsigned>(ceil_div<int64_t>(threads, kThreads));
-}
+unsigned blocks_of(int64_t threads) { return static_cast<unsigned>(ceil_div<int64_t>(threads, kThreads)); }
 
 // The plan for the current device.
 CellSortPlan plan_of(int64_t n, int64_t k, CellSortWay way) {
@@ -227,9 +225,7 @@ void sort_by_radix(const CellSortPlan& plan, const int32_t* cells, int32_t* orde
 
 }  // namespace
 
-int64_t cell_sort_workspace_cuda(int64_t n, int64_t k, CellSortWay way) {
-  return plan_of(n, k, way).bytes;
-}
+int64_t cell_sort_workspace_cuda(int64_t n, int64_t k, CellSortWay way) { return plan_of(n, k, way).bytes; }
 
 void cell_sort_cuda(const int32_t* cells, int32_t* order, int32_t* offsets, unsigned char* workspace, int64_t n,
                     int64_t k, CellSortWay way, void* stream) {

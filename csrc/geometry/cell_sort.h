@@ -10,17 +10,11 @@
 
 namespace voronerf {
 
-inline int64_t cell_sort_chunk_rows(int64_t k) {
-  return 4 * k < 2048 ? 2048 : 4 * k;
-}
-inline int64_t cell_sort_chunks(int64_t n, int64_t k) {
-  return ceil_div(n, cell_sort_chunk_rows(k));
-}
+inline int64_t cell_sort_chunk_rows(int64_t k) { return 4 * k < 2048 ? 2048 : 4 * k; }
+inline int64_t cell_sort_chunks(int64_t n, int64_t k) { return ceil_div(n, cell_sort_chunk_rows(k)); }
 
 // int32 elements of the CPU's workspace: the histograms.
-inline int64_t cell_sort_workspace(int64_t n, int64_t k) {
-  return cell_sort_chunks(n, k) * k;
-}
+inline int64_t cell_sort_workspace(int64_t n, int64_t k) { return cell_sort_chunks(n, k) * k; }
 
 // False if a cell lies outside 0..k-1; `order` and `offsets` are then undefined.
 bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,

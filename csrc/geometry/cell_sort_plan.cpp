@@ -5,9 +5,7 @@ namespace voronerf {
 namespace {
 
 // Parts of a workspace begin at multiples of this, which the toolkit's sort wants of its own.
-int64_t aligned(int64_t bytes) {
-  return ceil_div<int64_t>(bytes, 256) * 256;
-}
+int64_t aligned(int64_t bytes) { return ceil_div<int64_t>(bytes, 256) * 256; }
 
 }  // namespace
 

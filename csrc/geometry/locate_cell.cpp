@@ -18,9 +18,7 @@ const char* locate_cell_fault(const int32_t* child_offsets, const int32_t* child
   return nullptr;
 }
 
-int64_t locate_cell_workspace(int64_t m, int threads) {
-  return threads * descent_stride(m);
-}
+int64_t locate_cell_workspace(int64_t m, int threads) { return threads * descent_stride(m); }
 
 template <typename T>
 bool locate_cell_cpu(const T* points, const T* centres, const int32_t* child_offsets, const int32_t* child,

@@ -69,9 +69,7 @@ __global__ void __launch_bounds__(kThreads)
   if (i < n) cells[i] = rows == nullptr || i < *rows ? nearest_by_definition(points + 3 * i, centres, k) : -1;
 }
 
-unsigned blocks_of(int64_t n, int64_t points) {
-  return static_cast<unsigned>(ceil_div<int64_t>(n, points * kThreads));
-}
+unsigned blocks_of(int64_t n, int64_t points) { return static_cast<unsigned>(ceil_div<int64_t>(n, points * kThreads)); }
 
 }  // namespace
 

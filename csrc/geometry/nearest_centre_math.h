@@ -25,14 +25,10 @@ constexpr float kMargin = 2e-6f;
 constexpr float kFloor = 1e-36f;
 
 // kMargin for values whose lowest bits are an index.
-VN_HD float nearest_margin(int index_bits) {
-  return kMargin + 2.5f * static_cast<float>(1 << index_bits) / 8388608.0f;
-}
+VN_HD float nearest_margin(int index_bits) { return kMargin + 2.5f * static_cast<float>(1 << index_bits) / 8388608.0f; }
 
 // Whether float32 decides: `second` is the smallest computed value except that of the best index.
-VN_HD bool nearest_is_certain(float best, float second) {
-  return best + (kMargin * best + kFloor) < second;
-}
+VN_HD bool nearest_is_certain(float best, float second) { return best + (kMargin * best + kFloor) < second; }
 
 // The defining value for one centre (c points to its three coordinates). On the host -ffp-contract=off keeps the
 // roundings.

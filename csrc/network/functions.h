@@ -10,14 +10,10 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-VN_INLINE F32 constant(float a) {
-  return splat(a);
-}
+VN_INLINE F32 constant(float a) { return splat(a); }
 
 // Where x > 0, and where it is not.
-VN_INLINE F32 positive(F32 x, F32 yes, F32 no) {
-  return x > splat(0.0f) ? yes : no;
-}
+VN_INLINE F32 positive(F32 x, F32 yes, F32 no) { return x > splat(0.0f) ? yes : no; }
 
 // x^p, times the factors of `order` derivatives of x^(p + order); by products where p is a multiple of 0.5.
 VN_INLINE F32 raised(F32 x, float p, int order) {
@@ -47,14 +43,10 @@ VN_INLINE F32 tangent_slope(F32 x) {
 }
 
 // As far as any density is more than 0, so that 0 times a power of x is not 0 times infinity.
-VN_INLINE F32 nearby(F32 x) {
-  return x > splat(30.0f) ? splat(30.0f) : x < splat(-30.0f) ? splat(-30.0f) : x;
-}
+VN_INLINE F32 nearby(F32 x) { return x > splat(30.0f) ? splat(30.0f) : x < splat(-30.0f) ? splat(-30.0f) : x; }
 
 // The density of the normal distribution.
-VN_INLINE F32 density(F32 x) {
-  return splat(0.39894228f) * any_exponential(splat(-0.5f) * x * x);
-}
+VN_INLINE F32 density(F32 x) { return splat(0.39894228f) * any_exponential(splat(-0.5f) * x * x); }
 
 // Its distribution function, erfc(-x / sqrt 2) / 2; erfc by Numerical Recipes' erfcc, relative error 1.2e-7.
 VN_INLINE F32 distribution(F32 x) {
@@ -92,9 +84,7 @@ VN_INLINE F32 arctangent(F32 x) {
 }
 
 // Its slope.
-VN_INLINE F32 arctangent_slope(F32 x) {
-  return splat(1.0f) / fma(x, x, splat(1.0f));
-}
+VN_INLINE F32 arctangent_slope(F32 x) { return splat(1.0f) / fma(x, x, splat(1.0f)); }
 
 // The logistic function and its derivatives.
 template <int Order>

@@ -167,9 +167,7 @@ void zero_strays(const CompositeInputs& in, int64_t width, float* values, void* 
             in.r, in.m, width, values);
 }
 
-unsigned blocks_of_rays(int64_t r) {
-  return static_cast<unsigned>(ceil_div<int64_t>(r, kWarps));
-}
+unsigned blocks_of_rays(int64_t r) { return static_cast<unsigned>(ceil_div<int64_t>(r, kWarps)); }
 
 }  // namespace
 

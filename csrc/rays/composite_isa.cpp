@@ -24,9 +24,7 @@ constexpr int64_t kChunk = 128;
 constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
 
 // A NaN stays one.
-VN_INLINE float finite_density(float sigma) {
-  return sigma > kOpaque ? kOpaque : sigma;
-}
+VN_INLINE float finite_density(float sigma) { return sigma > kOpaque ? kOpaque : sigma; }
 
 // What a vector of samples lets through, of the light in front of it and of its own, and what it takes away.
 struct Passage {

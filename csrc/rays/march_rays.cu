@@ -18,9 +18,7 @@ constexpr int kWarps = kThreads / 32;
 constexpr int kScanThreads = 1024;
 static_assert(kMarchWord == 32, "a word of the mask is the votes of a warp");
 
-__device__ __forceinline__ uint32_t lanes_below(int lane) {
-  return (1u << lane) - 1u;
-}
+__device__ __forceinline__ uint32_t lanes_below(int lane) { return (1u << lane) - 1u; }
 
 __device__ __forceinline__ float sample_of(const MarchInputs& in, const MarchRay& ray, uint32_t key, int64_t i,
                                            int64_t stratum, float* point, float& length) {

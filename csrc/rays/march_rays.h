@@ -36,9 +36,7 @@ struct MarchInputs {
 // Strata of a word of the mask.
 constexpr int64_t kMarchWord = 32;
 
-VN_HD int64_t march_words(int64_t s) {
-  return (s + kMarchWord - 1) / kMarchWord;
-}
+VN_HD int64_t march_words(int64_t s) { return (s + kMarchWord - 1) / kMarchWord; }
 
 // mask: [r, march_words(s)], bit i of word w for stratum 32 w + i. offsets: [r+1], none above capacity.
 void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, Isa isa,

@@ -34,9 +34,7 @@ VN_INLINE void cells_of(const MarchInputs& in, const MarchRay& ray, const float*
   }
 }
 
-VN_INLINE int bits_of(uint32_t word) {
-  return __builtin_popcount(word);
-}
+VN_INLINE int bits_of(uint32_t word) { return __builtin_popcount(word); }
 
 template <MarchWhere W, bool Disparity>
 void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {

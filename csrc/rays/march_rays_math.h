@@ -55,9 +55,7 @@ VN_HD float march_sample(const MarchRay& ray, int64_t i, float inside, float fir
   return above > last ? last : above;
 }
 
-VN_HD uint32_t march_key(const MarchInputs& in, int64_t i) {
-  return in.seed == nullptr ? 0 : hash_key(*in.seed, i);
-}
+VN_HD uint32_t march_key(const MarchInputs& in, int64_t i) { return in.seed == nullptr ? 0 : hash_key(*in.seed, i); }
 
 // The place of a sample in its stratum.
 VN_HD float march_inside(const MarchInputs& in, uint32_t key, int64_t i, int64_t stratum) {

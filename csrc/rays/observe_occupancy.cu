@@ -12,9 +12,7 @@ namespace {
 constexpr int kThreads = 128;
 constexpr unsigned kSign = 0x80000000u;
 
-__device__ __forceinline__ int64_t this_sample() {
-  return static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-}
+__device__ __forceinline__ int64_t this_sample() { return static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; }
 
 // before: the density of the cell that a sample speaks for, -1 for the others.
 __global__ void __launch_bounds__(kThreads)

@@ -10,9 +10,7 @@
 namespace voronerf {
 
 // Whether a sample says anything: not if it stands for no part of its ray.
-VN_HD bool observes(const ObservedSamples& in, int64_t i) {
-  return in.deltas[i] != 0.0f;
-}
+VN_HD bool observes(const ObservedSamples& in, int64_t i) { return in.deltas[i] != 0.0f; }
 
 // The cell of a sample; NaN is in the first of its axis.
 VN_HD int64_t observed_cell(const ObservedSamples& in, int64_t i) {

@@ -37,12 +37,8 @@ VN_HD void pixel_direction(const PixelRaysInputs& in, int64_t camera, int64_t x,
 }
 
 // The first where they do not compare, as with std::min and std::max, which CUDA has not.
-VN_HD float smaller(float a, float b) {
-  return b < a ? b : a;
-}
-VN_HD float larger(float a, float b) {
-  return a < b ? b : a;
-}
+VN_HD float smaller(float a, float b) { return b < a ? b : a; }
+VN_HD float larger(float a, float b) { return a < b ? b : a; }
 
 // The slab method; a ray that misses has no extent.
 VN_HD void meet_box(const PixelRaysInputs& in, const float* origin, const float* direction, float& near, float& far) {

@@ -8,9 +8,7 @@ namespace voronerf {
 constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over any length but 0
 
 // A NaN stays one.
-__device__ inline float finite_density(float sigma) {
-  return sigma > kOpaque ? kOpaque : sigma;
-}
+__device__ inline float finite_density(float sigma) { return sigma > kOpaque ? kOpaque : sigma; }
 
 // A sum in two floats.
 struct Carry {

@@ -14,13 +14,9 @@ namespace {
 constexpr int kThreads = 128;
 constexpr int kWarps = kThreads / 32;
 
-__device__ float sigmoid(float x) {
-  return 1.0f / (1.0f + expf(-x));
-}
+__device__ float sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
 
-__device__ float density_of(float x, float scale) {
-  return ((x < 0.0f ? 0.0f : x) + log1pf(expf(-fabsf(x)))) * scale;
-}
+__device__ float density_of(float x, float scale) { return ((x < 0.0f ? 0.0f : x) + log1pf(expf(-fabsf(x)))) * scale; }
 
 __device__ float4 load_row(const float* raw, int64_t i, bool aligned) {
   const float* row = raw + 4 * i;

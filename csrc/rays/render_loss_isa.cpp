@@ -22,13 +22,9 @@ struct Sums {
   float slopes[3][kRenderLossRays];
 };
 
-VN_INLINE void put(float* to, const float* from, int64_t count) {
-  __builtin_memcpy(to, from, sizeof(float) * count);
-}
+VN_INLINE void put(float* to, const float* from, int64_t count) { __builtin_memcpy(to, from, sizeof(float) * count); }
 
-VN_INLINE F32 only(Bits lanes, F32 value) {
-  return reinterpret_cast<F32>(lanes & reinterpret_cast<Bits>(value));
-}
+VN_INLINE F32 only(Bits lanes, F32 value) { return reinterpret_cast<F32>(lanes & reinterpret_cast<Bits>(value)); }
 
 VN_INLINE void forward(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to,
                        int64_t first, int64_t count, bool together, Chunk& chunk, Sums& sums) {

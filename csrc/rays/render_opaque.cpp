@@ -37,9 +37,7 @@ void fill_samples(Isa isa, const MarchInputs& in, const uint32_t* mask, const in
                   float* depths, float* deltas, float* positions, int32_t* stop) {
   VN_FOR_ISA(isa, march_fill(in, mask, offsets, ray_index, depths, deltas, positions, stop, 0, in.r))
 }
-void add_wave(Isa isa, const SeenWave& in, int64_t r) {
-  VN_FOR_ISA(isa, see_wave(in, r))
-}
+void add_wave(Isa isa, const SeenWave& in, int64_t r) { VN_FOR_ISA(isa, see_wave(in, r)) }
 
 // One call, as its threads read it.
 struct Call {

@@ -18,9 +18,7 @@ __device__ double mass_of(float weight) {
 }
 
 // Before another in the order of depths: by value, NaN last.
-__device__ bool is_before(float a, float b) {
-  return a < b || (b != b && a == a);
-}
+__device__ bool is_before(float a, float b) { return a < b || (b != b && a == a); }
 
 __global__ void __launch_bounds__(kThreads)
     resample_kernel(const float* __restrict__ weights, const float* __restrict__ edges,

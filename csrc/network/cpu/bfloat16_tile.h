@@ -17,9 +17,7 @@ VN_INLINE F32 load_some(const float* from, int64_t count) {
   return _mm512_maskz_loadu_ps(static_cast<__mmask16>(mask), from);
 }
 
-VN_INLINE F32 joined(F32 low, F32 high) {
-  return (F32)_mm512_cvtne2ps_pbh(high, low);
-}
+VN_INLINE F32 joined(F32 low, F32 high) { return (F32)_mm512_cvtne2ps_pbh(high, low); }
 
 // Pairs (even[i], odd[i]).
 VN_INLINE F32 interleave(F32 even, F32 odd) {

@@ -20,9 +20,7 @@ void check(const LinearInputs& in) {
   check_offsets("grouped_linear", in.offsets, in.k, in.n);
 }
 
-int64_t pad(int64_t width, int64_t to) {
-  return ceil_div(width, to) * to;
-}
+int64_t pad(int64_t width, int64_t to) { return ceil_div(width, to) * to; }
 
 LinearCall describe(const LinearInputs& in, const LinearGradients* gradients, Isa isa) {
   LinearCall call{};

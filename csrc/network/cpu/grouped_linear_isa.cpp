@@ -12,9 +12,7 @@
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 
-void linear_pack(const LinearCall& call, int64_t cell, float* workspace) {
-  pack_linear(call, cell, workspace);
-}
+void linear_pack(const LinearCall& call, int64_t cell, float* workspace) { pack_linear(call, cell, workspace); }
 
 void linear_forward(const LinearCall& call, int64_t begin, int64_t end, float* workspace) {
   run_linear_forward(call, begin, end, workspace);

@@ -50,13 +50,9 @@ void zero_strays(const MlpInputs& in, int64_t width, float* out) {
   clear(in.offsets[in.k], in.n);
 }
 
-bool use_half(const MlpTable& table, Isa isa) {
-  return table.half && isa == Isa::avx512_bf16;
-}
+bool use_half(const MlpTable& table, Isa isa) { return table.half && isa == Isa::avx512_bf16; }
 
-void prepare(Isa isa, const MlpPlan& plan, float* own) {
-  VN_FOR_ISA(isa, mlp_prepare(plan, own))
-}
+void prepare(Isa isa, const MlpPlan& plan, float* own) { VN_FOR_ISA(isa, mlp_prepare(plan, own)) }
 void pack(Isa isa, const MlpPlan& plan, const MlpData& data, int64_t cell, float* own) {
 #if VN_HAS_HALF
   if (plan.half) return avx512::mlp_half_pack(plan, data, cell, own);
@@ -95,9 +91,7 @@ void fetch(const MlpPlan& plan, const MlpData& data, int64_t cell) {
 }
 
 // Floats of a thread's workspace.
-int64_t stride(const MlpPlan& plan) {
-  return ceil_div(plan.workspace, kGranule) * kGranule;
-}
+int64_t stride(const MlpPlan& plan) { return ceil_div(plan.workspace, kGranule) * kGranule; }
 
 template <typename Run>
 void run_tasks(const RowTasks& tasks, const MlpPlan& plan, const MlpData& data, float* memory, Isa isa, int threads,
@@ -243,9 +237,7 @@ MlpRows::MlpRows(const MlpTable& table, const MlpInputs& in, const MlpGathered& 
       hash_(hash_of(table, in)),
       isa_(isa) {}
 
-int64_t MlpRows::workspace() const {
-  return stride(planner_.plan());
-}
+int64_t MlpRows::workspace() const { return stride(planner_.plan()); }
 
 void MlpRows::forward(const MlpInputs& in, float* out, Own& own) const {
   const MlpPlan& plan = planner_.plan();

@@ -10,9 +10,7 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-VN_INLINE int64_t smaller(int64_t a, int64_t b) {
-  return a < b ? a : b;
-}
+VN_INLINE int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
 
 VN_INLINE int64_t padded_width(const MlpPlanSource& source) {
   return (source.width + kGranule - 1) / kGranule * kGranule;

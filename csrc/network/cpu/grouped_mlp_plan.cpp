@@ -27,9 +27,7 @@ constexpr int64_t kFewOutputs = 6;
 // A layer of few outputs as dot products (few_outputs_tile.h): where each source is a tile's buffer of whole vectors.
 constexpr int64_t kMostDots = 4, kMostDotSources = 8;
 
-int64_t pad(int64_t width) {
-  return ceil_div(width, kGranule) * kGranule;
-}
+int64_t pad(int64_t width) { return ceil_div(width, kGranule) * kGranule; }
 
 }  // namespace
 

@@ -40,9 +40,7 @@ Workspace::~Workspace() {
   if (kept.size > kKeptFloats) kept = Block{};
 }
 
-float* Workspace::data() const {
-  return kept.memory.get();
-}
+float* Workspace::data() const { return kept.memory.get(); }
 
 void check_offsets(const std::string& op, const int32_t* offsets, int64_t k, int64_t n) {
   int64_t before = 0;

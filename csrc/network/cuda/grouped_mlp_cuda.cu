@@ -70,9 +70,7 @@ std::unique_ptr<MlpCudaCall> grouped_mlp_call_cuda(const MlpTable& table, int64_
   return call;
 }
 
-int64_t grouped_mlp_workspace_cuda(const MlpCudaCall& call) {
-  return call.workspace;
-}
+int64_t grouped_mlp_workspace_cuda(const MlpCudaCall& call) { return call.workspace; }
 
 bool grouped_mlp_hashes_cuda(const MlpTable& table, MlpPrecision precision, MlpCudaWay way) {
   return mlp_cuda_hashes(table, precision, way, mlp_cuda_device());

@@ -88,9 +88,7 @@ __device__ inline void chain_next_piece(const MlpChainPlan& plan, int l, int chu
 }
 
 // Threads of a block at most, by the registers that they need.
-constexpr int chain_threads(int width) {
-  return width == 32 ? 512 : width == 64 ? 384 : 256;
-}
+constexpr int chain_threads(int width) { return width == 32 ? 512 : width == 64 ? 384 : 256; }
 
 // Results of a chunk of `kTiles` tiles of a layer's outputs, for the rows of a warp: into the output, into `held`, and
 // where they are stored. Those of the first of two chunks are stored in any case, since the second reads what is held.

@@ -92,9 +92,7 @@ MlpCudaWorkspace mlp_chain_workspace(const MlpChainPlan& plan, int64_t k);
 void mlp_chain_cuda(const MlpChainPlan& plan, MlpCudaData data, const MlpCudaParameters& parameters,
                     unsigned char* workspace, void* stream);
 
-VN_HD constexpr int chain_chunks(int width) {
-  return (width + kChainChunk - 1) / kChainChunk;
-}
+VN_HD constexpr int chain_chunks(int width) { return (width + kChainChunk - 1) / kChainChunk; }
 
 // 8-column tiles that are multiplied for the outputs of a chunk: 1, 2, 4 or 8; for what reads an encoding 4 or 8, so
 // that there is code for encoding in two places alone.
@@ -104,14 +102,10 @@ VN_HD constexpr int chain_tiles(int width, int chunk, bool fresh) {
 }
 
 // Pairs of tiles that are packed for them.
-VN_HD constexpr int chain_pairs(int tiles) {
-  return (tiles + 1) / 2;
-}
+VN_HD constexpr int chain_pairs(int tiles) { return (tiles + 1) / 2; }
 
 // Bytes of a piece: its weights, then a float of bias for each packed output.
-VN_HD constexpr int chain_piece_weights(int steps, int pairs) {
-  return steps * pairs * kChainQuad;
-}
+VN_HD constexpr int chain_piece_weights(int steps, int pairs) { return steps * pairs * kChainQuad; }
 VN_HD constexpr int chain_piece_bytes(int steps, int pairs) {
   return chain_piece_weights(steps, pairs) + pairs * 16 * 4;
 }

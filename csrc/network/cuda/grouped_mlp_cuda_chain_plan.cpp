@@ -16,14 +16,10 @@ constexpr int kTasks = 32;
 constexpr int kEnough = 8;
 constexpr int kBlockReserve = 1024;  // bytes of shared memory that a block costs besides its own
 
-int steps_of(int width) {
-  return ceil_div(width, kChainStep);
-}
+int steps_of(int width) { return ceil_div(width, kChainStep); }
 
 // Warps of which the registers fit a multiprocessor; what __launch_bounds__ of the kernels says.
-int warps_of(int width) {
-  return width == 32 ? 16 : width == 64 ? 12 : 8;
-}
+int warps_of(int width) { return width == 32 ? 16 : width == 64 ? 12 : 8; }
 
 MlpChainInput input_of(const MlpCudaInput& given) {
   MlpChainInput input{};

@@ -14,9 +14,7 @@ constexpr int kBlocksPerMultiprocessor = 8;
 constexpr int kMostSplits = 64;
 constexpr int64_t kMostPartialBytes = int64_t{512} << 20;  // unless one split has more
 
-int64_t pad(int64_t width) {
-  return ceil_div<int64_t>(width, kMlpDepth) * kMlpDepth;
-}
+int64_t pad(int64_t width) { return ceil_div<int64_t>(width, kMlpDepth) * kMlpDepth; }
 
 MlpLayersInput input_of(int64_t raw, const MlpEncoding& encoding) {
   MlpLayersInput input{};

@@ -19,9 +19,7 @@ constexpr int kBackwardTasks = 8;
 constexpr int kEnoughWarps = 8;
 constexpr int kBlockReserve = 1024;  // bytes of shared memory that the system takes of each block
 
-int pad(int64_t width) {
-  return static_cast<int>(ceil_div<int64_t>(width, kMlpDepth) * kMlpDepth);
-}
+int pad(int64_t width) { return static_cast<int>(ceil_div<int64_t>(width, kMlpDepth) * kMlpDepth); }
 
 bool is_half(MlpPrecision precision) {
   return precision == MlpPrecision::bfloat16 || precision == MlpPrecision::float16;

@@ -82,9 +82,7 @@ __device__ inline float mlp_activate(int activation, float x) {
 }
 
 // Activations that are an instruction or two, which the kernels repeat for every register.
-__device__ inline bool mlp_is_simple(int activation) {
-  return activation <= static_cast<int>(Activation::relu);
-}
+__device__ inline bool mlp_is_simple(int activation) { return activation <= static_cast<int>(Activation::relu); }
 __device__ inline float mlp_activate_simply(int activation, float x) {
   return activation == static_cast<int>(Activation::relu) && x < 0.0f ? 0.0f : x;
 }
