@@ -132,7 +132,7 @@ NAN = float("nan")
         (POINTS, ONES * NAN, 2, {}, ValueError, "importance must be finite"),
         (POINTS * NAN, ONES, 2, {}, ValueError, "points must be finite"),
         (POINTS, -ONES, 2, {}, ValueError, "must not be negative, got -1"),
-        (POINTS[:, :2], ONES, 2, {}, ValueError, "shape [m, 3], got [9, 2]"),
+        (POINTS[0], ONES, 2, {}, ValueError, "shape [m, d], d = 1 to 4, got [3]"),
         (POINTS, ONES[:4], 2, {}, ValueError, "importance must have shape [9], got [4]"),
         (POINTS.long(), ONES, 2, {}, TypeError, "points must be floating-point"),
         (POINTS, ONES.int(), 2, {}, TypeError, "importance must be floating-point"),

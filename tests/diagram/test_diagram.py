@@ -133,8 +133,8 @@ def test_refine_leaves_the_diagram_it_is_called_on_alone():
     ("centres", "error", "message"),
     [
         (torch.zeros(0, 3), ValueError, "at least one centre"),
-        (torch.zeros(4, 2), ValueError, "shape [k, 3], got [4, 2]"),
-        (torch.zeros(3), ValueError, "shape [k, 3], got [3]"),
+        (torch.zeros(4, 5), ValueError, "shape [k, d], d = 1 to 4, got [4, 5]"),
+        (torch.zeros(3), ValueError, "shape [k, d], d = 1 to 4, got [3]"),
         (torch.tensor([[0.0, float("nan"), 0.0]]), ValueError, "must be finite"),
         (torch.zeros(4, 3, dtype=torch.int32), TypeError, "floating-point"),
         ([[0.0, 0.0, 0.0]], TypeError, "floating-point tensor, got list"),
@@ -267,5 +267,5 @@ def test_uniform_centres_of_a_flat_box_and_of_no_box():
     flat = uniform_centres(torch.tensor([[0.0, 0, 1], [2, 2, 1]]), 4)
     assert bool((flat[:, 2] == 1).all())
     refuses("k must be at least 1, got 0", uniform_centres, torch.zeros(2, 3), 0)
-    refuses("shape [2, 3], got [3, 2]", uniform_centres, torch.zeros(3, 2), 4)
+    refuses("shape [2, d], d = 1 to 4, got [3, 2]", uniform_centres, torch.zeros(3, 2), 4)
     refuses("box[0] <= box[1]", uniform_centres, torch.tensor([[1.0, 0, 0], [0, 1, 1]]), 4)

@@ -133,12 +133,12 @@ MODULES: Errors = [
     (lambda: single(listed()), TypeError, "keeps parameters in the plain list `extra`"),
 ]
 OPTIONS: Errors = [
-    (lambda: VoronoiRouter(Field(), torch.randn(8, 2)), ValueError, "centres must"),
+    (lambda: VoronoiRouter(Field(), torch.randn(8, 5)), ValueError, "centres must"),
     (lambda: routed(assignment="near"), ValueError, "assignment must be 'nearest' or 'stochastic', got 'near'"),
     (lambda: routed(temperature=0), ValueError, "temperature must be positive, got 0"),
     (lambda: routed(layout="row"), ValueError, "layout must be 'rays' or 'flat', got 'row'"),
     (lambda: routed(backend="nativ"), ValueError, "backend must be auto, reference, native, warp, got 'nativ'"),
-    (lambda: routed("last3"), ValueError, "coords must be 'first3', a slice or a function, got 'last3'"),
+    (lambda: routed("last3"), ValueError, "coords must be 'first1' to 'first4', a slice or a function, got 'last3'"),
     (lambda: routed(methods=["colour_of"]), ValueError, "methods must name methods of Field, got 'colour_of'"),
     (lambda: VoronoiRouter(Heads(), X[:, :3], methods=["cell"]), ValueError, "methods must name methods of Heads"),
     (lambda: routed(methods=["train"]), ValueError, "methods must not name what a router has itself, got 'train'"),

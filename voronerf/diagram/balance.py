@@ -1,6 +1,6 @@
 """Balances a Voronoi diagram: moves the centres until every cell holds the same importance.
 
-Letters: m samples, k centres, W [k] the total importance of the samples in each cell.
+Letters: m samples, k centres, d coordinates (1 to 4), W [k] the total importance of the samples in each cell.
 
 Source: Elsner et al. 2023, "Adaptive Voronoi NeRFs", section 3.2. The figure of merit is the paper's: the standard
 deviation (of the population: divided by k, not k - 1) of `W / max W`; 0 is perfect balance.
@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from voronerf import ops
-from voronerf.diagram.voronoi import VoronoiDiagram
+from voronerf.diagram.voronoi import VoronoiDiagram, in_space, nearest_cell
+from voronerf.ops.balance_centres.reference import balance_centres as balance_in_torch
 
 _STEPS = 200  # of Lloyd's iteration at most
 _TOLERANCE = 1e-5  # it ends when a step lowers the energy by less than this part of it
@@ -28,7 +29,7 @@ class Balance:
     """The result of `balance`.
 
     Attributes:
-        centres: float32 [k, 3], on the device of the samples.
+        centres: float32 [k, d], on the device of the samples.
         before: float64 [k], importance of each cell with the first centres.
         after: float64 [k], importance of each cell with the returned centres.
         imbalance_before: std(W / max W) of `before`.
@@ -105,7 +106,7 @@ def balance(
     Light cells move towards heavy neighbours, and heavy cells away from light ones.
 
     Args:
-        points: floating [m, 3], finite.
+        points: floating [m, d], finite.
         importance: floating [m], finite, >= 0, not all 0.
         k: number of cells, 1 <= k <= number of distinct points.
         centres: "balanced", as published; "centroidal": the centroids of their cells, weighted by importance, which
@@ -144,7 +145,7 @@ def balance(
     masses = importance.detach().to("cpu", torch.float64)
 
     def weigh(centres: Tensor) -> Tensor:
-        return cell_weights(ops.nearest_centre(samples, centres, backend=backend), masses, k)
+        return cell_weights(nearest_cell(samples, centres, backend=backend), masses, k)
 
     found = first_centres(samples, masses, k, centres, generator)
     before = after = weigh(found)
@@ -152,7 +153,12 @@ def balance(
         found = lloyd(samples, masses, found, backend=backend)
         after = weigh(found)
     elif centres == "balanced" and k > 1:
-        found, after = ops.balance_centres(samples, masses, found, steps=steps, backend=backend)
+        if (d := samples.shape[1]) > 3:
+            found, after = balance_in_torch(samples, masses, found, steps, 0.05, 8)
+        else:
+            given = in_space(samples), masses, in_space(found)
+            found, after = ops.balance_centres(*given, steps=steps, backend=backend)
+        found = found[:, :d]
     device = points.device
     return Balance(
         centres=found.to(device),
@@ -164,7 +170,7 @@ def balance(
 
 
 def first_centres(samples: Tensor, masses: Tensor, k: int, centres: str, generator: torch.Generator | None) -> Tensor:
-    """float32 [k, 3] first centres from CPU samples float32 [m, 3] of masses [m], which centroidal ones follow."""
+    """float32 [k, d] first centres from CPU samples float32 [m, d] of masses [m], which centroidal ones follow."""
     distinct, member = torch.unique(samples, dim=0, return_inverse=True)
     if k > distinct.shape[0]:
         raise ValueError(f"balance: k must be at most the number of distinct samples, {distinct.shape[0]}, got {k}")
@@ -189,11 +195,11 @@ def uniform_centres(box: Tensor, k: int) -> Tensor:
     and 16 gives 4 x 2 x 2.
 
     Args:
-        box: floating [2, 3], lowest and highest corner; flat boxes are allowed.
+        box: floating [2, d], lowest and highest corner; flat boxes are allowed.
         k: number of centres, >= 1.
 
     Returns:
-        [k, 3] in the dtype and on the device of `box`.
+        [k, d] in the dtype and on the device of `box`.
 
     Raises:
         ValueError: k < 1, a wrong shape, a value that is not finite, or a highest corner below the lowest.
@@ -208,8 +214,8 @@ def uniform_centres(box: Tensor, k: int) -> Tensor:
     """
     if k < 1:
         raise ValueError(f"uniform_centres: k must be at least 1, got {k}")
-    if tuple(box.shape) != (2, 3):
-        raise ValueError(f"uniform_centres: box must have shape [2, 3], got {list(box.shape)}")
+    if box.dim() != 2 or box.shape[0] != 2 or not 1 <= box.shape[1] <= 4:
+        raise ValueError(f"uniform_centres: box must have shape [2, d], d = 1 to 4, got {list(box.shape)}")
     low, high = box.tolist()
     if not bool(torch.isfinite(box).all()) or any(a > b for a, b in zip(low, high, strict=True)):
         raise ValueError(f"uniform_centres: box must be finite with box[0] <= box[1], got {box.tolist()}")
@@ -250,7 +256,7 @@ def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "a
     precise, energy = samples.double(), float("inf")
     weighted = [masses * axis for axis in precise.unbind(1)]
     for _ in range(_STEPS):
-        cells = ops.nearest_centre(samples, centres, backend=backend)
+        cells = nearest_cell(samples, centres, backend=backend)
         costs = masses * (precise - centres.double()[cells]).square().sum(1)
         before, energy = energy, float(costs.sum())
         mass = torch.bincount(cells, weights=masses, minlength=k)
@@ -268,10 +274,10 @@ def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "a
 
 
 def check_samples(op: str, points: Tensor, importance: Tensor) -> None:
-    """Raises ValueError or TypeError unless points [m, 3] and importance [m] are finite, floating-point, and the latter
+    """Raises ValueError or TypeError unless points [m, d] and importance [m] are finite, floating-point, and the latter
     >= 0."""
-    if points.dim() != 2 or points.shape[1] != 3:
-        raise ValueError(f"{op}: points must have shape [m, 3], got {list(points.shape)}")
+    if points.dim() != 2 or not 1 <= points.shape[1] <= 4:
+        raise ValueError(f"{op}: points must have shape [m, d], d = 1 to 4, got {list(points.shape)}")
     if tuple(importance.shape) != (points.shape[0],):
         raise ValueError(f"{op}: importance must have shape [{points.shape[0]}], got {list(importance.shape)}")
     for name, table in (("points", points), ("importance", importance)):

@@ -57,7 +57,7 @@ def split_diagram(
 
     Args:
         diagram: a diagram of any depth.
-        points: floating [m, 3], the kept samples, finite.
+        points: floating [m, d], the kept samples, finite; d coordinates as the diagram has.
         importance: floating [m], finite, >= 0; samples of importance 0 do not count.
         k: children of each cell that is split, >= 1.
         cells: "all"; "worst", the one cell with the largest accumulated importance among those that hold enough
@@ -143,7 +143,7 @@ def finer_diagram(
 ) -> tuple[VoronoiDiagram, Tensor]:
     """The diagram that ``VoronoiRouter.subdivide`` was asked for, and the parents of its cells.
 
-    With a number of children for ``finer`` come points [m, 3], their weights [m] and options of :func:`split_diagram`;
+    With a number of children for ``finer`` come points [m, d], their weights [m] and options of :func:`split_diagram`;
     a diagram has parents int64 [new cells], or None for those that hold the new centres.
 
     Raises:

@@ -1,6 +1,7 @@
 """Nested Voronoi diagrams: which cell of space a point belongs to.
 
-Letters: n points, k centres of one diagram, m centres of all diagrams of a tree, g diagrams (internal nodes) of a tree.
+Letters: n points, k centres of one diagram, m centres of all diagrams of a tree, g diagrams (internal nodes) of a tree,
+d coordinates, 1 to 4.
 
 A diagram gives each point of space to its nearest centre, `v(x) = argmin_i |x - v_i|` (Elsner et al. 2023, "Adaptive
 Voronoi NeRFs", section 3). A centre may be refined by a diagram of its own, and so on: a query goes down level by level
@@ -20,6 +21,10 @@ from torch import Tensor, nn
 
 from voronerf import ops
 from voronerf.diagram.drawing import draw_cell
+from voronerf.ops.locate_cell.reference import locate_cell as locate_in_torch
+from voronerf.ops.nearest_centre.reference import nearest_centre as nearest_in_torch
+
+_DECIDE = 20_000  # samples that place the centres of `from_points`
 
 
 class VoronoiDiagram(nn.Module):
@@ -29,7 +34,7 @@ class VoronoiDiagram(nn.Module):
     is converted to another dtype, because rounded centres would move samples to networks that never saw them.
 
     Attributes:
-        centres: float32 [m, 3], the centres of all diagrams, diagram after diagram; diagram 0 is the root.
+        centres: float32 [m, d], the centres of all diagrams, diagram after diagram; diagram 0 is the root.
         child_offsets: int32 [g + 1]; diagram j owns rows `child_offsets[j] : child_offsets[j + 1]` of `centres`.
         child: int32 [m]; a value c >= 0 says that diagram c refines this centre, c < 0 that it is leaf number `-c - 1`.
         depth: number of levels; 1 for a flat diagram.
@@ -61,8 +66,10 @@ class VoronoiDiagram(nn.Module):
     def __init__(self, centres: Tensor) -> None:
         """Makes a flat diagram. A single centre is allowed: one cell, all of space.
 
+        Cells of 1 and 2 coordinates are found as fast as those of 3. Those of 4 are found in PyTorch, in float64.
+
         Args:
-            centres: floating [k, 3], k >= 1, finite; copied to float32.
+            centres: floating [k, d], k >= 1, d = 1 to 4, finite; copied to float32.
 
         Raises:
             ValueError: wrong shape, no centre, or a value that is not finite.
@@ -72,7 +79,7 @@ class VoronoiDiagram(nn.Module):
         _check_centres(centres)
         k = centres.shape[0]
         if k == 0:
-            raise ValueError("VoronoiDiagram: centres must hold at least one centre, got shape [0, 3]")
+            raise ValueError(f"VoronoiDiagram: centres must hold at least one centre, got {list(centres.shape)}")
         device = centres.device
         self._set_tables(
             centres.detach().to(torch.float32, copy=True).contiguous(),
@@ -92,6 +99,48 @@ class VoronoiDiagram(nn.Module):
         nn.Module.__init__(diagram)
         diagram._set_tables(centres, child_offsets, child)
         return diagram
+
+    @classmethod
+    def from_points(
+        cls,
+        points: Tensor,
+        k: int,
+        importance: Tensor | None = None,
+        *,
+        centres: str = "centroidal",
+        generator: torch.Generator | None = None,
+    ) -> "VoronoiDiagram":
+        """A flat diagram of k cells whose centres are placed by samples.
+
+        Args:
+            points: floating [..., d], finite, in the coordinates in which samples will be located: what the field is
+                given in a few batches of training. 20,000 of them, drawn at random, decide.
+            k: cells.
+            importance: floating [...], >= 0, how much each of them counts; None for 1 each.
+            centres: how they are placed, see `balance`.
+            generator: CPU generator of the draws; None for torch's global one.
+
+        Raises:
+            ValueError: more cells than distinct points, or what else `balance` refuses.
+            TypeError: points or importance that are not floating-point.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiDiagram
+            >>> diagram = VoronoiDiagram.from_points(torch.rand(64, 32, 3), 8)  # rays of 32 samples
+            >>> diagram
+            VoronoiDiagram(cells=8, depth=1)
+            >>> VoronoiDiagram.from_points(torch.rand(5000, 2), 16).locate(torch.rand(10, 2)).shape  # of an image
+            torch.Size([10])
+        """
+        from voronerf.diagram.balance import balance
+
+        flat = points.detach().reshape(-1, points.shape[-1])
+        weights = torch.ones_like(flat[:, 0]) if importance is None else importance.detach().reshape(-1)
+        if len(flat) > _DECIDE and len(weights) == len(flat):
+            drawn = torch.randperm(len(flat), generator=generator)[:_DECIDE].to(flat.device)
+            flat, weights = flat[drawn], weights[drawn]
+        return balance(flat, weights, k, centres=centres, generator=generator).diagram()
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], prefix: str = "") -> "VoronoiDiagram":
@@ -118,7 +167,7 @@ class VoronoiDiagram(nn.Module):
 
     @property
     def leaf_centres(self) -> Tensor:
-        """float32 [num_cells, 3]: the centre of each leaf among its siblings."""
+        """float32 [num_cells, d]: the centre of each leaf among its siblings."""
         return self.centres[self.leaf_rows]
 
     def paths(self) -> Tensor:
@@ -144,24 +193,26 @@ class VoronoiDiagram(nn.Module):
         """The leaf that each point lies in.
 
         Args:
-            points: floating [..., 3]; half types are compared in float32, float64 points in float64.
+            points: floating [..., d]; half types are compared in float32, float64 points in float64.
             backend: see `voronerf.ops._core.backends`.
 
         Returns:
             int32 [...]. On each level, ties go to the lowest index, and points that are not finite to the first cell.
 
         Raises:
-            ValueError: the last dimension of points is not 3.
+            ValueError: the last dimension of points is not d.
             TypeError: points are not floating.
         """
         flat = self._flatten("locate", points)
         dtype = torch.float64 if flat.dtype == torch.float64 else torch.float32
         flat, centres = flat.to(dtype), self.centres.to(dtype)
         if self.depth == 1:
-            cells = ops.nearest_centre(flat, centres, backend=backend)
+            cells = nearest_cell(flat, centres, backend=backend)
+        elif centres.shape[1] > 3:
+            cells = locate_in_torch(flat, centres, self.child_offsets, self.child, self.depth)
         else:
-            tree = self.child_offsets, self.child
-            cells = ops.locate_cell(flat, centres, *tree, depth=self.depth, backend=backend)
+            tree = in_space(centres), self.child_offsets, self.child
+            cells = ops.locate_cell(in_space(flat), *tree, depth=self.depth, backend=backend)
         return cells.reshape(points.shape[:-1])
 
     def sample_cell(
@@ -179,7 +230,7 @@ class VoronoiDiagram(nn.Module):
         gives `locate`. One uniform number in 0 to 1 is drawn for each point and level (`diagram.drawing`).
 
         Args:
-            points: floating [..., 3]; compared in float32.
+            points: floating [..., d]; compared in float32.
             temperature: >= 0, in scene units.
             generator: on any device; its numbers are moved to the device of `points`. None for torch's global one.
             backend: see `voronerf.ops._core.backends`.
@@ -188,7 +239,7 @@ class VoronoiDiagram(nn.Module):
             int32 [...] leaf numbers.
 
         Raises:
-            ValueError: the last dimension of points is not 3, or the temperature is negative or not finite.
+            ValueError: the last dimension of points is not d, or the temperature is negative or not finite.
             TypeError: points are not floating.
         """
         if not 0.0 <= temperature < float("inf"):
@@ -209,7 +260,7 @@ class VoronoiDiagram(nn.Module):
         itself, without an additional level.
 
         Args:
-            children: leaf number -> centres [k, 3] of the diagram inside it, or a `VoronoiDiagram` of any depth.
+            children: leaf number -> centres [k, d] of the diagram inside it, or a `VoronoiDiagram` of any depth.
 
         Returns:
             The refined diagram, and `parents`, int64 [new num_cells]: for each new leaf the old leaf that it lies in.
@@ -227,6 +278,8 @@ class VoronoiDiagram(nn.Module):
             if leaf in grafts:
                 raise ValueError(f"refine: children must name each leaf once, got {leaf} twice")
             graft = value if isinstance(value, VoronoiDiagram) else VoronoiDiagram(value)
+            if (d := graft.centres.shape[1]) != self.centres.shape[1]:
+                raise ValueError(f"refine: children must have centres [k, {self.centres.shape[1]}], got [k, {d}]")
             grafts[leaf] = graft
 
         counts = torch.ones(self.num_cells, dtype=torch.int64)
@@ -293,11 +346,12 @@ class VoronoiDiagram(nn.Module):
         return f"cells={self.num_cells}, depth={self.depth}"
 
     def _flatten(self, op: str, points: Tensor) -> Tensor:
-        if points.dim() == 0 or points.shape[-1] != 3:
-            raise ValueError(f"{op}: points must have shape [..., 3], got {list(points.shape)}")
+        d = self.centres.shape[1]
+        if points.dim() == 0 or points.shape[-1] != d:
+            raise ValueError(f"{op}: points must have shape [..., {d}], got {list(points.shape)}")
         if not points.is_floating_point():
             raise TypeError(f"{op}: points must be floating-point, got {points.dtype}")
-        return points.detach().reshape(-1, 3)
+        return points.detach().reshape(-1, d)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "VoronoiDiagram":
         kept = self.centres
@@ -315,13 +369,26 @@ class VoronoiDiagram(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
+def in_space(points: Tensor) -> Tensor:
+    """Points [n, d] of 1 to 3 coordinates as the operations take them, [n, 3]: zeros change no distance."""
+    d = points.shape[1]
+    return points if d == 3 else torch.nn.functional.pad(points, (0, 3 - d))
+
+
+def nearest_cell(points: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
+    """int32 [n], the nearest of centres [k, d] for points [n, d]."""
+    if points.shape[1] > 3:
+        return nearest_in_torch(points, centres)
+    return ops.nearest_centre(in_space(points), in_space(centres), backend=backend)
+
+
 def _check_centres(centres: Tensor) -> None:
-    """Raises ValueError or TypeError unless centres are floating and finite, [any number, 3]."""
+    """Raises ValueError or TypeError unless centres are floating and finite, [any number, 1 to 4]."""
     if not isinstance(centres, Tensor) or not centres.is_floating_point():
         got = centres.dtype if isinstance(centres, Tensor) else type(centres).__name__
         raise TypeError(f"VoronoiDiagram: centres must be a floating-point tensor, got {got}")
-    if centres.dim() != 2 or centres.shape[1] != 3:
-        raise ValueError(f"VoronoiDiagram: centres must have shape [k, 3], got {list(centres.shape)}")
+    if centres.dim() != 2 or not 1 <= centres.shape[1] <= 4:
+        raise ValueError(f"VoronoiDiagram: centres must have shape [k, d], d = 1 to 4, got {list(centres.shape)}")
     if not bool(torch.isfinite(centres).all()):
         raise ValueError("VoronoiDiagram: centres must be finite, got NaN or infinity")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import fnmatch
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -143,6 +143,24 @@ def plain_cell(routed: nn.Module, index: int) -> nn.Module:
     for part in plain.modules():
         vars(part).pop(SHARED, None)
     return plain
+
+
+def apply_to_cells(routed: nn.Module, k: int, function: Callable[[nn.Module], Any]) -> None:
+    """Applies a function to the modules of each of k cells, and keeps what it makes of parameters and buffers.
+
+    What cells share is as the function leaves it in the first cell.
+    """
+    stacked = {id(parameter) for parameter in cell_parameters(routed)}
+    for index in range(k):
+        given = plain_cell(routed, index).apply(function).state_dict()
+        with torch.no_grad():
+            for name, own in routed.state_dict(keep_vars=True).items():
+                if given.get(name) is None or given[name].shape != own.shape[id(own) in stacked :]:
+                    raise ValueError(f"{_OP}.apply: fn must keep names and shapes of parameters, got another {name!r}")
+                if id(own) in stacked:
+                    own[index] = given[name].to(own)
+                elif index == 0:
+                    own.copy_(given[name])
 
 
 def renew_cells(

@@ -120,7 +120,7 @@ class Dispatch:
                 return plan
             if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
                 check_rays(call)
-            ways, is_open = probe.find_ways(options, self._warn_once)
+            ways, is_open = probe.find_ways(options, self.warn_once)
         if len(self.plans) >= _PLANS:
             self.plans.clear()
         plan = self.plans[key] = CallPlan(ways, options.way == "fastest", is_open)
@@ -176,7 +176,7 @@ class Dispatch:
             return results
         latest[way.name] = why
         if why and warns and grouping.k > 1 and layout.n >= _FEWEST:
-            self._warn_once(f"cells {call.method}", f"{call.name} runs cell by cell: {why}")
+            self.warn_once(f"cells {call.method}", f"{call.name} runs cell by cell: {why}")
         return results
 
     def _run_apart(self, plan: CallPlan, call: Call, grouping: Grouping, frozen: Tensor) -> Results:
@@ -202,7 +202,7 @@ class Dispatch:
             tensors.append(joined)
         return Results(found[0].value, tensors)
 
-    def _warn_once(self, topic: str, message: str) -> None:
+    def warn_once(self, topic: str, message: str) -> None:
         """Warns, the first time that a topic comes up, at the line that called the router."""
         if topic not in self._warned:
             files = [frame.f_code.co_filename for frame, _ in traceback.walk_stack(sys._getframe())]

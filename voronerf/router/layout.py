@@ -317,35 +317,66 @@ class Results:
         return rebuild(self.value, [layout.restore(rows if layout.n else rows[:0]) for rows in self.unsorted])
 
 
-def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor:
-    """The positions of a call's samples, [..., 3], by a rule or as a tensor."""
+def first_tensor(args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor | None:
+    """The first tensor among the arguments of a call."""
+    return next((value for value in (*args, *kwargs.values()) if isinstance(value, Tensor) and value.dim()), None)
+
+
+def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: int = 3) -> Tensor:
+    """The positions of a call's samples, [..., d], by a rule or as a tensor."""
     if rule is None:
         raise ValueError(
             f"{_OP}: coords must say where the positions are, since a module's arguments do not: pass "
-            "coords='first3', a slice of the features or a function of the arguments to the router, or "
-            "coords=positions [..., 3] to this call"
+            f"coords='first{d}', a slice of the features or a function of the arguments to the router, or "
+            f"coords=positions [..., {d}] to this call"
         )
     if isinstance(rule, Tensor):
         positions, what = rule, "coords"
     elif callable(rule):
         positions, what = rule(*args, **kwargs), "what coords returns"
     else:
-        given = [*args, *kwargs.values()]
-        source = next((value for value in given if isinstance(value, Tensor) and value.dim()), None)
+        source = first_tensor(args, kwargs)
         if source is None:
-            got = ", ".join(type(value).__name__ for value in given) or "nothing"
+            got = ", ".join(type(value).__name__ for value in (*args, *kwargs.values())) or "nothing"
             raise ValueError(
                 f"{_OP}: coords={rule!r} must find a tensor among the arguments, got {got}; pass a function"
             )
-        positions = source[..., :3] if rule == "first3" else source[..., rule]
+        positions = source[..., : int(rule[5:])] if isinstance(rule, str) else source[..., rule]
         what = f"what coords={rule!r} takes from the first tensor, {list(source.shape)},"
     if not isinstance(positions, Tensor):
         raise TypeError(f"{_OP}: {what} must be a tensor, got {type(positions).__name__}")
-    if positions.shape[-1:] != (3,):
-        raise ValueError(f"{_OP}: {what} must have shape [..., 3], got {list(positions.shape)}")
+    if positions.shape[-1:] != (d,):
+        raise ValueError(f"{_OP}: {what} must have shape [..., {d}], got {list(positions.shape)}")
     if not positions.is_floating_point():
         raise TypeError(f"{_OP}: {what} must be floating-point, got {positions.dtype}")
     return positions
+
+
+_MANY = 4  # cells, of which one that has nearly all samples is suspicious
+
+
+@torch.no_grad()
+def doubt_of(rule: Any, source: Tensor | None, positions: Tensor, offsets: Tensor, centres: Tensor) -> str:
+    """Why what a rule has taken from the first tensor, positions [n, d], may be something else; or an empty text."""
+    flat, k, d = positions.detach().flatten(0, -2), len(offsets) - 1, positions.shape[-1]
+    if isinstance(rule, str) and source is not None:
+        x = source.detach().flatten(0, -2)[:256].float()
+        circle = (x[:, :1].square() + x.square() - 1).abs().amax(0) < 1e-3
+        if x.shape[1] > d and float(x[:, 0].std()) > 1e-3 and bool(circle.any()):
+            return (
+                f"coords={rule!r} takes sines and cosines of an encoding for positions; let the encoding begin with "
+                "the position, or pass coords=positions to each call"
+            )
+        if d == 3 and float((x[:, :3].norm(dim=1) - 1).abs().max()) < 1e-3:
+            return f"coords={rule!r} takes unit vectors, such as directions, for positions; pass coords=positions"
+    most = int(offsets.diff().max())
+    if k < _MANY or most <= 0.9 * len(flat):
+        return ""
+    spans = (f"{float(x.min()):.3g} to {float(x.max()):.3g}" for x in (centres, flat))
+    return (
+        f"{most:,} of {len(flat):,} samples are in one of {k} cells; centres (coordinates {next(spans)}) must be in "
+        f"the units of positions ({next(spans)}): VoronoiDiagram.from_points(positions, {k}) places them"
+    )
 
 
 def argument_names(function: Callable[..., Any]) -> list[str]:

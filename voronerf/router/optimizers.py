@@ -96,6 +96,32 @@ def watch_optimizers(module: nn.Module, line: str) -> Any:
     return handle
 
 
+def watch_former(module: nn.Module, former: Sequence[nn.Parameter]) -> None:
+    """Warns at the first step of an optimiser of the parameters that a module had before it was routed.
+
+    They get no gradients, so such an optimiser would train nothing.
+    """
+    watched, routed = {id(parameter): weakref.ref(parameter) for parameter in former}, weakref.ref(module)
+
+    def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        now = routed()
+        if not watched or now is None:
+            return
+        held = [p for group in optimizer.param_groups for p in group["params"]]
+        old = [p for p in held if id(p) in watched and watched[id(p)]() is p]
+        right = not {id(p) for p in now.parameters()}.isdisjoint(map(id, held))
+        if old and not right and all(p.grad is None for p in old):
+            warnings.warn(
+                f"{_OP}: optimizer ({type(optimizer).__name__}) trains nothing: it holds the parameters that the "
+                "module had before it was wrapped; make it of router.parameters()",
+                stacklevel=3,
+            )
+        if old or right:
+            watched.clear()  # torch does not let a hook remove itself
+
+    weakref.finalize(module, register_optimizer_step_pre_hook(check).remove)
+
+
 # Frozen cells ---------------------------------------------------------------------------------------------------------
 
 #: The frozen cells, bool [k], of every routed module that has some.

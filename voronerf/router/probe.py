@@ -185,8 +185,14 @@ class Probe:
         halves = [half for cell, a, b, c in bounds for half in ((cell, a, b), (cell, b, c))]
         with NoRandomness():
             apart = loop.on(self._call, self._entries, halves)
-        if not all(map(agree, apart.tensors, self._run(loop).tensors)):
-            name = type(self._call.module).__name__
+        once, again = self._run(loop).tensors, self._run(loop).tensors
+        name = type(self._call.module).__name__
+        if not all(map(agree, once, again)):
+            raise TypeError(
+                f"{_OP}: module must give the same results for the same samples, but {name} makes layers or draws "
+                "numbers inside of its forward; make layers in __init__, and pass numbers as an argument"
+            )
+        if not all(map(agree, apart.tensors, once)):
             raise TypeError(
                 f"{_OP}: module must treat samples one by one, but {name} gives other results for a sample when other "
                 "samples are left out: it mixes samples (attention or statistics over a batch)"

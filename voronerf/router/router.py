@@ -1,12 +1,14 @@
 """VoronoiRouter: one network per Voronoi cell, evaluated for all cells in one pass.
 
-Letters: n samples, k cells, r rays. Positions are in scene units; cells and rows are int32, parents int64.
+Letters: n samples, k cells, r rays, d coordinates (1 to 4). Positions are in scene units; cells and rows are int32,
+parents int64.
 """
 
 from __future__ import annotations
 
 import copy
 import functools
+import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, cast
@@ -22,6 +24,7 @@ from voronerf.ops._core.compiler import not_compiled
 from voronerf.ops._core.layers import for_last_output
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.router.cells import (
+    apply_to_cells,
     check_module,
     clone_module,
     detach_results,
@@ -33,15 +36,23 @@ from voronerf.router.cells import (
 )
 from voronerf.router.dispatch import Dispatch
 from voronerf.router.grouping import Assigned, Grouping
-from voronerf.router.layout import Call, Layout, accepted_names, argument_names, find_positions
-from voronerf.router.optimizers import check_optimizer, drop_state, freeze_cells, move_state, watch_optimizers
+from voronerf.router.layout import Call, Layout, accepted_names, argument_names, doubt_of, find_positions, first_tensor
+from voronerf.router.optimizers import (
+    check_optimizer,
+    drop_state,
+    freeze_cells,
+    move_state,
+    watch_former,
+    watch_optimizers,
+)
 from voronerf.router.probe import Options
 from voronerf.router.table import LayeredField, described_by_table, each_direction, parameters_of_table
 from voronerf.router.transforms import outside, refuse_transforms, transformed, unwrapped
 
 _NO_GRAPH = "VoronoiRouter: a routed module runs as it is, between two graphs of torch.compile; omit fullgraph=True"
+_LARGE = 512  # samples of a batch that shows whether centres and positions fit
 Assignment = Literal["nearest", "stochastic"]
-Coordinates = Literal["first3"] | slice | Callable[..., Tensor]
+Coordinates = Literal["first1", "first2", "first3", "first4"] | slice | Callable[..., Tensor]
 
 
 class VoronoiRouter(nn.Module):
@@ -70,11 +81,12 @@ class VoronoiRouter(nn.Module):
 
     Args:
         module: Any ``nn.Module`` that treats samples one by one; it is copied and never changed.
-        diagram: A VoronoiDiagram, or centres [k, 3].
-        coords: Where the positions are: ``"first3"``, the first three features of the first tensor; a slice of its
-            features; or a function of the call's arguments that returns positions [..., 3]. They can be given at the
-            call instead, ``router(x, coords=positions)``, unless the module itself has an argument ``coords``. For a
-            field with a layer table they are its first argument.
+        diagram: A VoronoiDiagram (:meth:`VoronoiDiagram.from_points` places its centres), or centres [k, d], in the
+            coordinates of the positions.
+        coords: Where the positions are: ``"first3"``, the first three features of the first tensor (``"first2"`` for
+            d = 2 and so on); a slice of its features; or a function of the call's arguments that returns positions
+            [..., d]. They can be given at the call instead, ``router(x, coords=positions)``, unless the module itself
+            has an argument ``coords``. For a field with a layer table they are its first argument.
         per_ray: Names or numbers of the arguments that have one row for each ray. None decides by shapes, and refuses
             shapes that fit both readings.
         shared: Names or numbers of tensor arguments that are the same for all samples.
@@ -144,6 +156,7 @@ class VoronoiRouter(nn.Module):
         self.diagram = own if first is None or first.is_meta else own.to(first.device)
         self.module: nn.Module = clone_module(module)
         stack_parameters(self.module, own.num_cells, share)
+        watch_former(self.module, list(module.parameters()))
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
         self._watch: Any = None  # of optimisers that hold the state of other cells
         self.assignment, self.temperature = assignment, temperature
@@ -153,6 +166,7 @@ class VoronoiRouter(nn.Module):
         self._layered = isinstance(module, LayeredField)
         self._dispatch = Dispatch()
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
+        self._unseen = True  # no large batch has shown whether the centres fit the positions
         self.register_buffer("frozen_cells", None, persistent=False)
         self._by_table = self._layered and described_by_table(self.module)
 
@@ -164,7 +178,7 @@ class VoronoiRouter(nn.Module):
 
         Args:
             modules: k modules of one architecture.
-            diagram: A VoronoiDiagram of k cells, or centres [k, 3].
+            diagram: A VoronoiDiagram of k cells, or centres [k, d].
             **options: Those of the constructor.
 
         Raises:
@@ -227,6 +241,27 @@ class VoronoiRouter(nn.Module):
             ValueError: For parameters of other names or shapes, or buffers that differ from the shared ones.
         """
         fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
+
+    def apply(self, fn: Callable[[nn.Module], Any]) -> VoronoiRouter:
+        """Applies a function to the modules of each cell in turn, such as one that initialises layers.
+
+        It sees weights of one cell, [o, i], where ``router.module.apply`` shows it stacked ones, [k, o, i], whose fans
+        an initialisation takes for those of a convolution. What it changes beside parameters and buffers is not kept.
+
+        Raises:
+            ValueError: Where it changes names or shapes of parameters.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiRouter
+            >>> router = VoronoiRouter(torch.nn.Linear(3, 2), torch.rand(4, 3), coords="first3")
+            >>> _ = router.apply(lambda m: torch.nn.init.orthogonal_(m.weight))
+            >>> weight = router.cell(1).weight
+            >>> torch.allclose(weight @ weight.T, torch.eye(2), atol=1e-6)
+            True
+        """
+        apply_to_cells(self.module, self.num_cells, fn)
+        return self
 
     def _check_index(self, method: str, index: int) -> int:
         if not -self.num_cells <= index < self.num_cells:
@@ -323,7 +358,7 @@ class VoronoiRouter(nn.Module):
             optimizer: The optimiser that holds this router's parameters.
             inherit: False draws new parameters for the children of every cell that is split, with moments of zero: the
                 ablation that shows ghosting.
-            points: [m, 3], samples in scene units, if ``diagram`` is a number of children.
+            points: [m, d], samples in scene units, if ``diagram`` is a number of children.
             weights: [m], the importance of the samples, by which the new cells are balanced.
             **split: Further options of ``split_diagram``, such as cells, centres, min_samples.
 
@@ -353,7 +388,7 @@ class VoronoiRouter(nn.Module):
         new = torch.bincount(parents, minlength=k)[parents] > 1
         fresh = None if inherit else draw_parameters(plain_cell(self.module, 0), len(new), self.generator)
         renew_cells(self.module, parents, fresh, new)
-        self.diagram = copy.deepcopy(finer).to(self.diagram.centres.device)
+        self.diagram, self._unseen = copy.deepcopy(finer).to(self.diagram.centres.device), True
         if self.frozen_cells is not None:
             self._set_frozen(self.frozen_cells[parents.to(self.frozen_cells.device)])
         if optimizer is not None:
@@ -405,7 +440,15 @@ class VoronoiRouter(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Takes over the stored diagram first, so that parameters of any number of cells fit."""
-        if f"{prefix}diagram.centres" in state_dict:
+        if f"{prefix}diagram.centres" not in state_dict:
+            names = self.module.state_dict().keys()
+            if names and any(all(f"{prefix}{part}{name}" in state_dict for name in names) for part in ("", "module.")):
+                raise ValueError(
+                    f"VoronoiRouter.load_state_dict: state_dict is of a plain {type(self.module).__name__}, without "
+                    "cells; load it into the module before that is wrapped, or, loaded, give the module to cells by "
+                    "router.load_cell(i, module)"
+                )
+        else:
             diagram, k = VoronoiDiagram.from_state(state_dict, f"{prefix}diagram."), self.num_cells
             self.diagram = diagram.to(self.diagram.centres.device)
             if diagram.num_cells != k:
@@ -422,7 +465,7 @@ class VoronoiRouter(nn.Module):
         return cast(LayeredField, self.module)
 
     def assign(self, positions: Tensor) -> Tensor:
-        """The cell that evaluates each position: positions [n, 3] -> int32 [n]."""
+        """The cell that evaluates each position: positions [n, d] -> int32 [n]."""
         if self.assignment == "stochastic" and self.training and self.num_cells > 1:
             return self.diagram.sample_cell(
                 positions, temperature=self.temperature, generator=self.generator, backend=self.backend
@@ -436,7 +479,7 @@ class VoronoiRouter(nn.Module):
             *args: Those of the module's ``forward``. For a field with a layer table: positions [n, 3] in scene units,
                 directions, unit vectors [n, 3] or [r, 3] together with ray_index, int32 [n], the row of ``directions``
                 that belongs to each sample.
-            coords: Positions [..., 3] in scene units that decide the cells, instead of the router's own rule.
+            coords: Positions [..., d] in scene units that decide the cells, instead of the router's own rule.
             **kwargs: Those of the module's ``forward``.
 
         Returns:
@@ -464,7 +507,11 @@ class VoronoiRouter(nn.Module):
     def _coords_of_table(self, coords: Tensor | None, args: Any, kwargs: Any) -> Tensor | None:
         """The positions that decide the cells; None for those of the samples."""
         rule = self.coords if coords is None else coords
-        return None if rule is None or isinstance(rule, str) else find_positions(rule, args, kwargs)
+        return None if rule is None or isinstance(rule, str) else find_positions(rule, args, kwargs, self._d)
+
+    @property
+    def _d(self) -> int:
+        return self.diagram.centres.shape[1]
 
     def _evaluate_table(
         self,
@@ -489,6 +536,8 @@ class VoronoiRouter(nn.Module):
         diagram = self.diagram
         if self.num_cells > 1 and self.assignment == "stochastic" and self.training:
             given["cells"] = self.assign((positions[:, :3] if coords is None else coords).detach())
+        elif self.num_cells > 1 and self._d != 3:
+            given["cells"] = self.assign(positions if coords is None else coords)
         elif self.num_cells > 1:
             given.update(centres=diagram.centres, coords=coords)
             if diagram.depth > 1:
@@ -545,11 +594,14 @@ class VoronoiRouter(nn.Module):
             return super().__getattr__(name)
         except AttributeError:
             module = self.__dict__.get("_modules", {}).get("module")
-            if not callable(getattr(module, name, None)):
+            if module is None or name not in dir(module):
                 raise
+            has, there = f"VoronoiRouter: {name} of {type(module).__name__}", f"router.module.{name}"
+            if not callable(inspect.getattr_static(module, name, None)):
+                raise AttributeError(f"{has} is {there}, where parameters are of all cells, [k, ...]") from None
             raise AttributeError(
-                f"VoronoiRouter: {name} of {type(module).__name__} is not routed; pass "
-                f"methods={[*methods, name]!r} to the router"
+                f"{has} is not routed; pass methods={[*methods, name]!r} to the router if it evaluates samples, else "
+                f"call {there}"
             ) from None
 
     def _route(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
@@ -565,7 +617,7 @@ class VoronoiRouter(nn.Module):
         if coords is not None and "coords" in (accepted_names([called]) or ()):  # the method's own argument
             kwargs, coords = {**kwargs, "coords": coords}, None
         rule = coords if coords is not None else self.coords
-        positions = find_positions("first3" if rule is None and self._layered else rule, args, kwargs)
+        positions = find_positions("first3" if rule is None and self._layered else rule, args, kwargs, self._d)
         known = argument_names(called)
         names = [*known[: len(args)], *map(str, range(len(known), len(args)))]
 
@@ -580,6 +632,14 @@ class VoronoiRouter(nn.Module):
         )
         call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
         grouping = self._group(method, positions)
+        if self._unseen and layout.n >= _LARGE:
+            self._unseen = False
+            with outside():
+                given = first_tensor(args, kwargs), positions
+                given = (None if x is None else unwrapped(x) for x in given)
+                doubt = doubt_of(rule, *given, grouping.offsets, self.diagram.centres)
+            if doubt:
+                self._dispatch.warn_once("positions", doubt)
         options = Options(self.fuse, self.way, bool(self.methods))
         return self._dispatch.evaluate(call, grouping, options, self.frozen_cells).restored(layout)
 
@@ -595,7 +655,7 @@ class VoronoiRouter(nn.Module):
         if known is not None and known.serves(method, positions, key, drawn):
             return known.grouping
         with outside():
-            flat, k = unwrapped(positions).detach().reshape(-1, 3), self.num_cells
+            flat, k = unwrapped(positions).detach().reshape(-1, self._d), self.num_cells
             if flat.shape[0]:
                 cells = None if k == 1 else self.assign(flat)
             else:  # the module runs on placeholders, since it may not take an empty batch
@@ -641,8 +701,8 @@ def _check_options(module: nn.Module, lists: dict[str, Any], **options: Any) -> 
         "way": (options["way"] in ("fastest", "fused", "grouped", "loop"), "'fastest', 'fused', 'grouped' or 'loop'"),
         "backend": (options["backend"] in ("auto", *BACKENDS), f"auto, {', '.join(BACKENDS)}"),
         "coords": (
-            coords is None or coords == "first3" or isinstance(coords, slice) or callable(coords),
-            "'first3', a slice or a function",
+            coords in (None, "first1", "first2", "first3", "first4") or isinstance(coords, slice) or callable(coords),
+            "'first1' to 'first4', a slice or a function",
         ),
     }
     for name, (fits, rule) in rules.items():

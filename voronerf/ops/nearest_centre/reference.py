@@ -33,6 +33,6 @@ def distances(points: Tensor, centres: Tensor) -> Tensor:
     """
     points, centres = points.detach().double(), centres.detach().double()
     total = (points[:, None, 0] - centres[None, :, 0]).square()
-    for axis in (1, 2):
+    for axis in range(1, points.shape[1]):
         total = total + (points[:, None, axis] - centres[None, :, axis]).square()
     return total.nan_to_num(nan=torch.finfo(torch.float64).max)

@@ -1,0 +1,121 @@
+"""Diagrams and routers of 1 to 4 coordinates."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from voronerf import VoronoiDiagram, balance, split_diagram, uniform_centres
+from voronerf.router import VoronoiRouter
+
+DIMENSIONS = [1, 2, 3, 4]
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(8)
+
+
+def nearest(points: Tensor, centres: Tensor) -> Tensor:
+    return (points[:, None].double() - centres.double()).square().sum(-1).argmin(1)
+
+
+@pytest.mark.parametrize("d", DIMENSIONS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16])
+@pytest.mark.parametrize("k", [1, 2, 17])
+def test_locate(d: int, dtype: torch.dtype, k: int, generator: torch.Generator) -> None:
+    diagram = VoronoiDiagram(torch.randint(-4, 5, (k, d), generator=generator).float())
+    points = torch.randint(-4, 5, (11, 23, d), generator=generator).to(dtype)  # with ties
+    found = diagram.locate(points)
+    assert found.shape == (11, 23)
+    assert torch.equal(found.flatten().long(), nearest(points.reshape(-1, d), diagram.centres))
+    assert diagram.locate(points[:0]).shape == (0, 23)
+    points[0, 0] = float("nan")
+    assert diagram.locate(points)[0, 0] == 0
+
+
+@pytest.mark.parametrize("d", DIMENSIONS)
+def test_refine_split_draw_save_and_part(d: int, generator: torch.Generator) -> None:
+    points, importance = torch.rand(3000, d, generator=generator), torch.rand(3000, generator=generator)
+    for centres in ("balanced", "centroidal", "random", "uniform"):
+        result = balance(points, importance, 6, centres=centres, generator=generator)
+        assert result.centres.shape == (6, d)
+        weights = torch.zeros(6).double().index_add(0, nearest(points, result.centres), importance.double())
+        torch.testing.assert_close(result.after, weights)
+        assert centres != "balanced" or result.imbalance_after < result.imbalance_before
+    flat = VoronoiDiagram.from_points(points, 6, importance, generator=generator)
+    nested = split_diagram(flat, points, importance, 4, generator=generator).diagram
+    assert (nested.num_cells, nested.depth) == (24, 2)
+    cells = nested.locate(points).long()
+    assert torch.equal(nested.paths()[cells, 0], flat.locate(points).long())
+    for outer in range(6):
+        inside = (nested.paths()[:, 0] == outer).nonzero()[:, 0]
+        own = flat.locate(points) == outer
+        assert torch.equal(cells[own], inside[nearest(points[own], nested.leaf_centres[inside])])
+    assert torch.equal(nested.sample_cell(points, temperature=1e-9, generator=generator).long(), cells)
+    assert torch.equal(VoronoiDiagram.from_state(nested.state_dict()).locate(points).long(), cells)
+    part = nested.part(torch.tensor([3, 20]))
+    assert bool((part.locate(points[cells == 20]) == 1).all())
+
+
+def test_uniform_centres() -> None:
+    assert uniform_centres(torch.tensor([[0.0], [4.0]]), 4).flatten().tolist() == [0.5, 1.5, 2.5, 3.5]
+    assert uniform_centres(torch.tensor([[0.0, 0], [1, 1]]), 16).unique(dim=0).shape == (16, 2)
+    assert uniform_centres(torch.tensor([[0.0] * 4, [1.0] * 4]), 16).unique(dim=0).shape == (16, 4)
+
+
+def test_from_points_draws_of_many_and_takes_any_shape(generator: torch.Generator) -> None:
+    points = torch.rand(100, 400, 2, generator=generator)
+    diagram = VoronoiDiagram.from_points(points, 16, generator=generator)
+    shares = torch.bincount(diagram.locate(points).flatten(), minlength=16) / 40_000
+    assert 0.3 / 16 < shares.min() < shares.max() < 3 / 16
+    left = (points[..., 0] < 0.1).float()
+    assert VoronoiDiagram.from_points(points, 4, left, generator=generator).centres[:, 0].max() < 0.1
+
+
+def test_what_does_not_fit_is_refused(generator: torch.Generator) -> None:
+    plane = VoronoiDiagram(torch.rand(4, 2, generator=generator))
+    with pytest.raises(ValueError, match=r"centres must have shape \[k, d\], d = 1 to 4, got \[4, 5\]"):
+        VoronoiDiagram(torch.rand(4, 5))
+    with pytest.raises(ValueError, match=r"locate: points must have shape \[..., 2\], got \[7, 3\]"):
+        plane.locate(torch.rand(7, 3))
+    with pytest.raises(ValueError, match=r"children must have centres \[k, 2\], got \[k, 3\]"):
+        plane.refine({0: torch.rand(2, 3)})
+    with pytest.raises(ValueError, match=r"points must have shape \[m, d\], d = 1 to 4, got \[9, 6\]"):
+        balance(torch.rand(9, 6), torch.ones(9), 2)
+    with pytest.raises(ValueError, match=r"points must have shape \[..., 2\], got \[50, 3\]"):
+        split_diagram(plane, torch.rand(50, 3), torch.ones(50), 2)
+
+
+@pytest.mark.parametrize("d", DIMENSIONS)
+@pytest.mark.parametrize("options", [{"way": "loop"}, {"way": "grouped"}, {"fuse": True, "way": "fused"}])
+def test_a_router_of_so_many_coordinates(d: int, options: dict[str, object], generator: torch.Generator) -> None:
+    net = nn.Sequential(nn.Linear(d, 16), nn.ReLU(), nn.Linear(16, 3))
+    points = torch.rand(30, 20, d, generator=generator)
+    router = VoronoiRouter(net, VoronoiDiagram.from_points(points, 5), coords=f"first{d}", **options)  # type: ignore[arg-type]
+    with torch.no_grad():
+        for parameter in router.parameters():
+            parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
+    cells = nearest(points.reshape(-1, d), router.diagram.centres)
+    expected = torch.stack([router.cell(int(c))(x) for c, x in zip(cells, points.reshape(-1, d))])
+    torch.testing.assert_close(router(points), expected.reshape(30, 20, 3))
+    torch.testing.assert_close(router(points, coords=points.clone()), router(points))
+    optimizer = torch.optim.Adam(router.parameters())
+    router(points).square().mean().backward()
+    optimizer.step()
+    router.subdivide(2, optimizer=optimizer, points=points.reshape(-1, d), weights=torch.ones(600))
+    assert router.num_cells == 10
+    router(points).square().mean().backward()
+    again = VoronoiRouter(net, torch.zeros(1, d), coords=f"first{d}", **options)  # type: ignore[arg-type]
+    again.load_state_dict(router.state_dict())
+    torch.testing.assert_close(again(points), router(points))
+
+
+def test_coords_must_be_as_many_as_the_centres_have(generator: torch.Generator) -> None:
+    router = VoronoiRouter(nn.Linear(2, 1), torch.rand(4, 2, generator=generator), coords="first2")
+    with pytest.raises(ValueError, match=r"coords must have shape \[..., 2\], got \[9, 3\]"):
+        router(torch.rand(9, 2), coords=torch.rand(9, 3))
+    router.coords = "first3"
+    with pytest.raises(ValueError, match=r"what coords='first3' takes .* must have shape \[..., 2\]"):
+        router(torch.rand(9, 4))

@@ -1,0 +1,260 @@
+"""What is easily done wrong around a VoronoiRouter, and what it then says."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from voronerf import VoronoiDiagram
+from voronerf.router import VoronoiRouter
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(3)
+
+
+def net(features: int = 3) -> nn.Module:
+    return nn.Sequential(nn.Linear(features, 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU(), nn.Linear(64, 4))
+
+
+def router_of(module: nn.Module, generator: torch.Generator, k: int = 8, **options: Any) -> VoronoiRouter:
+    return VoronoiRouter(
+        module, torch.rand(k, 3, generator=generator), **{"coords": "first3", "way": "loop", **options}
+    )
+
+
+# Initialisation -------------------------------------------------------------------------------------------------------
+
+
+class Field(nn.Module):
+    """A shared encoder, a table, a normalised layer and a buffer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder, self.table = nn.Linear(3, 16), nn.Embedding(10, 16)
+        self.head = nn.utils.parametrizations.weight_norm(nn.Linear(16, 2))
+        self.register_buffer("scale", torch.ones(1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.head(self.encoder(x) + self.table((x[:, 0] * 9).long())) * self.scale
+
+
+def test_apply_initialises_cell_by_cell(generator: torch.Generator) -> None:
+    router = router_of(net(), generator, k=16)
+
+    def init(module: nn.Module) -> None:
+        if isinstance(module, nn.Linear):
+            nn.init.xavier_uniform_(module.weight)
+            nn.init.constant_(module.bias, 0.25)
+
+    parameters = list(router.parameters())
+    whole = nn.ModuleDict({"field": router})  # as a model that holds the router does it
+    assert whole.apply(init) is whole
+    assert all(a is b for a, b in zip(parameters, router.parameters(), strict=True))
+    weight = router.module[2].weight
+    assert weight.requires_grad
+    bound = math.sqrt(6 / 128)
+    assert weight.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.03)
+    assert bound > weight.abs().max() > 0.99 * bound
+    assert not torch.equal(weight[0], weight[1])
+    assert bool((router.module[4].bias == 0.25).all())
+
+
+def test_apply_with_shared_parameters_buffers_and_parametrizations(generator: torch.Generator) -> None:
+    router = router_of(Field(), generator, share=["encoder.*"])
+
+    def init(module: nn.Module) -> None:
+        for parameter in module.parameters(recurse=False):
+            nn.init.normal_(parameter)
+        if isinstance(module, Field):
+            module.scale.fill_(2.0)
+
+    router.apply(init)
+    assert router.module.encoder.weight.shape == (16, 3)
+    assert router.module.scale.item() == 2.0
+    assert not torch.equal(router.cell(0).table.weight, router.cell(1).table.weight)
+    assert torch.equal(router.cell(0).encoder.weight, router.cell(1).encoder.weight)
+    x = torch.rand(50, 3, generator=generator)
+    cells = router.diagram.locate(x)
+    expected = torch.stack([router.cell(int(c))(row[None])[0] for c, row in zip(cells, x)])
+    torch.testing.assert_close(router(x), expected)
+
+    def replace(module: nn.Module) -> None:
+        if isinstance(module, nn.Embedding):
+            module.weight = nn.Parameter(torch.zeros(3, 3))
+
+    with pytest.raises(ValueError, match="apply: fn must keep names and shapes of parameters, got another 'table"):
+        router.apply(replace)
+
+
+# Optimisers and checkpoints -------------------------------------------------------------------------------------------
+
+
+def test_an_optimiser_that_was_made_before_wrapping_is_told(generator: torch.Generator) -> None:
+    field, x = net(), torch.rand(20, 3, generator=generator)
+    optimizer = torch.optim.Adam(field.parameters())
+    router = router_of(field, generator)
+    router(x).sum().backward()
+    with pytest.warns(
+        UserWarning, match=r"optimizer \(Adam\) trains nothing.*make it of router.parameters\(\)"
+    ) as told:
+        optimizer.step()
+    assert told[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        optimizer.step()  # once
+        torch.optim.SGD(router.parameters(), 0.1).step()
+
+
+def test_optimisers_that_train_something_are_not_told(generator: torch.Generator) -> None:
+    fields, other, x = [net() for _ in range(3)], net(), torch.rand(20, 3, generator=generator)
+    routers = [router_of(field, generator) for field in fields]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        torch.optim.Adam(other.parameters()).step()
+        right = torch.optim.Adam(routers[0].parameters())
+        routers[0](x).sum().backward()
+        right.step()
+        both = torch.optim.Adam([*fields[1].parameters(), *routers[1].parameters()])
+        routers[1](x).sum().backward()
+        both.step()
+        fields[2](x).sum().backward()  # the plain module is trained beside
+        torch.optim.SGD(fields[2].parameters(), 0.1).step()
+
+
+@pytest.mark.parametrize("prefix", ["", "module."])
+@pytest.mark.parametrize("strict", [True, False])
+def test_a_plain_checkpoint_is_told_apart(prefix: str, strict: bool, generator: torch.Generator) -> None:
+    router, plain = router_of(net(), generator), net()
+    state = {prefix + name: value for name, value in plain.state_dict().items()}
+    with pytest.raises(ValueError, match=r"of a plain Sequential, without cells.*router.load_cell\(i, module\)"):
+        router.load_state_dict(state, strict=strict)
+    whole = nn.ModuleDict({"field": router})
+    with pytest.raises(ValueError, match="of a plain Sequential"):
+        whole.load_state_dict({"field." + name: value for name, value in state.items()}, strict=strict)
+    router.load_cell(3, plain)
+    own = router.state_dict()
+    router.load_state_dict(own)
+    with pytest.raises(RuntimeError, match="Missing key"):
+        router.load_state_dict({"other": torch.zeros(1)})
+
+
+# Names ----------------------------------------------------------------------------------------------------------------
+
+
+class Model(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer, self.bound, self.step = nn.Linear(3, 4), 2.0, 0
+        self.register_buffer("box", torch.zeros(2, 3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layer(x)
+
+    def update_step(self, step: int) -> None:
+        self.step = step
+
+    @property
+    def width(self) -> int:
+        raise RuntimeError("is not to be run by a message")
+
+
+def test_attributes_and_methods_of_the_module_are_pointed_to(generator: torch.Generator) -> None:
+    router = router_of(Model(), generator)
+    with pytest.raises(
+        AttributeError, match=r"methods=\['update_step'\].* if it evaluates samples, else call router.mod"
+    ):
+        router.update_step(3)
+    router.module.update_step(3)
+    for name in ("bound", "layer", "box", "width"):
+        with pytest.raises(AttributeError, match=f"{name} of Model is router.module.{name}, where"):
+            getattr(router, name)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        router.nothing  # noqa: B018
+    assert not hasattr(router, "bound")
+
+
+class MadeInside(nn.Module):
+    """Makes a layer in every call, as one of its own or for once."""
+
+    def __init__(self, kept: bool) -> None:
+        super().__init__()
+        self.layer, self.kept = nn.Linear(3, 8), kept
+
+    def forward(self, x: Tensor) -> Tensor:
+        last = nn.Linear(8, 4)
+        if self.kept:
+            self.last = last
+        return last(self.layer(x))
+
+
+@pytest.mark.parametrize("kept", [True, False])
+@pytest.mark.parametrize("fuse", [True, False])
+def test_layers_that_are_made_inside_of_forward(kept: bool, fuse: bool, generator: torch.Generator) -> None:
+    router = router_of(MadeInside(kept), generator, fuse=fuse, way="fastest")
+    with pytest.raises(TypeError, match="MadeInside makes layers or draws numbers inside of its forward"):
+        router(torch.rand(100, 3, generator=generator))
+
+
+# Positions ------------------------------------------------------------------------------------------------------------
+
+
+def encoding(x: Tensor, raw: bool, together: bool) -> Tensor:
+    waves = [torch.stack([torch.sin(2.0**i * x), torch.cos(2.0**i * x)], -1 if together else -2) for i in range(4)]
+    return torch.cat([x] * raw + [wave.flatten(-2) for wave in waves], -1)
+
+
+@pytest.mark.parametrize("k", [1, 8])
+@pytest.mark.parametrize("together", [True, False])
+def test_an_encoding_without_position_is_told_once(k: int, together: bool, generator: torch.Generator) -> None:
+    x = torch.rand(64, 16, 3, generator=generator)
+    router = router_of(net(24), generator, k=k)
+    with pytest.warns(UserWarning, match=r"'first3' takes sines and cosines.*coords=positions") as told:
+        router(encoding(x, raw=False, together=together))
+    assert told[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        router(encoding(x, raw=False, together=together))
+        router_of(net(24), generator, k=k)(encoding(x, raw=False, together=together), coords=x)
+        router_of(net(27), generator, k=k)(encoding(x, raw=True, together=together))
+        router_of(net(4), generator)(F.pad(x * torch.tensor([0.0, 1, 1]), (0, 1), value=1.0))
+
+
+def test_directions_are_told(generator: torch.Generator) -> None:
+    x = torch.rand(600, 3, generator=generator)
+    d = F.normalize(x - 0.5, dim=1)
+    for given in (d, torch.cat([d, x], 1)):
+        with pytest.warns(UserWarning, match="'first3' takes unit vectors, such as directions"):
+            router_of(net(given.shape[1]), generator)(given)
+
+
+def test_centres_in_other_units_are_told_once(generator: torch.Generator) -> None:
+    x = torch.rand(2000, 3, generator=generator)
+    for options in ({}, {"way": "grouped"}, {"fuse": True, "way": "fused"}):
+        router = VoronoiRouter(net(), 100 * torch.rand(8, 3, generator=generator), coords="first3", **options)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            router(x[:100])  # too few to tell
+        with pytest.warns(UserWarning, match=r"2,000 of 2,000 samples are in one of 8.*from_points\(positions, 8\)"):
+            router(x)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            router(x)
+
+
+def test_centres_that_fit_are_not_told(generator: torch.Generator) -> None:
+    x = torch.rand(2000, 3, generator=generator)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        VoronoiRouter(net(), VoronoiDiagram.from_points(x, 8, generator=generator), coords="first3", way="loop")(x)
+        router_of(net(), generator, k=1)(x)
+        spread = router_of(net(), generator)
+        spread(x)
+        spread(x * 0 + 0.5)  # the first large batch has shown that they fit
