@@ -73,7 +73,7 @@ def draw_balance(points: Tensor, importance: Tensor) -> None:
     for column, steps in enumerate((0, 500)):
         result = balance(points, importance, k, steps=steps, generator=torch.Generator().manual_seed(18))
         above, below = axes[:, column]
-        show_cells(above, palette(k), result.diagram().locate(plane()))
+        show_cells(above, palette(k), VoronoiDiagram(result.centres).locate(plane()))
         above.scatter(*points[::3, :2].T, s=2, c="#333333", linewidths=0)
         above.scatter(*result.centres[:, :2].T, s=60, c=palette(k), edgecolors="black", zorder=3)
         above.set_title("centres drawn from the samples" if steps == 0 else "after 500 steps of balancing")

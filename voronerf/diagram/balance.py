@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from voronerf import ops
-from voronerf.diagram.voronoi import VoronoiDiagram, in_space, nearest_cell
 from voronerf.ops.balance_centres.reference import balance_centres as balance_in_torch
+from voronerf.ops.nearest_centre.reference import nearest_centre as nearest_in_torch
 
 _STEPS = 200  # of Lloyd's iteration at most
 _TOLERANCE = 1e-5  # it ends when a step lowers the energy by less than this part of it
@@ -41,8 +41,8 @@ class Balance:
         >>> result = balance(torch.rand(500, 3), torch.ones(500), 4)
         >>> int(result.after.sum())  # the importance of all cells together
         500
-        >>> result.diagram()
-        VoronoiDiagram(cells=4, depth=1)
+        >>> result.centres.shape  # VoronoiDiagram(result.centres) is the diagram
+        torch.Size([4, 3])
     """
 
     centres: Tensor
@@ -50,10 +50,6 @@ class Balance:
     after: Tensor
     imbalance_before: float
     imbalance_after: float
-
-    def diagram(self) -> VoronoiDiagram:
-        """The balanced centres as a flat diagram."""
-        return VoronoiDiagram(self.centres)
 
 
 def imbalance(weights: Tensor) -> float:
@@ -287,3 +283,16 @@ def check_samples(op: str, points: Tensor, importance: Tensor) -> None:
             raise ValueError(f"{op}: {name} must be finite, got NaN or infinity")
     if bool((importance < 0).any()):
         raise ValueError(f"{op}: importance must not be negative, got {float(importance.min())}")
+
+
+def in_space(points: Tensor) -> Tensor:
+    """Points [n, d] of 1 to 3 coordinates as the operations take them, [n, 3]: zeros change no distance."""
+    d = points.shape[1]
+    return points if d == 3 else torch.nn.functional.pad(points, (0, 3 - d))
+
+
+def nearest_cell(points: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
+    """int32 [n], the nearest of centres [k, d] for points [n, d]."""
+    if points.shape[1] > 3:
+        return nearest_in_torch(points, centres)
+    return ops.nearest_centre(in_space(points), in_space(centres), backend=backend)

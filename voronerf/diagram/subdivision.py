@@ -118,7 +118,7 @@ def split_diagram(
         inside = leaves == cell
         given = points[inside], importance[inside], k
         balances[cell] = balance(*given, centres=centres, steps=steps, generator=generator, backend=backend)
-    refined, parents = diagram.refine({cell: result.diagram() for cell, result in balances.items()})
+    refined, parents = diagram.refine({cell: result.centres for cell, result in balances.items()})
     return Split(refined if balances else diagram, parents, balances)
 
 

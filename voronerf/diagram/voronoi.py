@@ -20,9 +20,9 @@ import torch
 from torch import Tensor, nn
 
 from voronerf import ops
+from voronerf.diagram.balance import balance, in_space, nearest_cell
 from voronerf.diagram.drawing import draw_cell
 from voronerf.ops.locate_cell.reference import locate_cell as locate_in_torch
-from voronerf.ops.nearest_centre.reference import nearest_centre as nearest_in_torch
 
 _DECIDE = 20_000  # samples that place the centres of `from_points`
 
@@ -66,7 +66,7 @@ class VoronoiDiagram(nn.Module):
     def __init__(self, centres: Tensor) -> None:
         """Makes a flat diagram. A single centre is allowed: one cell, all of space.
 
-        Cells of 1 and 2 coordinates are found as fast as those of 3. Those of 4 are found in PyTorch, in float64.
+        Cells of 1 to 3 coordinates are found by the operations, those of 4 in PyTorch, in float64, much slower.
 
         Args:
             centres: floating [k, d], k >= 1, d = 1 to 4, finite; copied to float32.
@@ -133,14 +133,12 @@ class VoronoiDiagram(nn.Module):
             >>> VoronoiDiagram.from_points(torch.rand(5000, 2), 16).locate(torch.rand(10, 2)).shape  # of an image
             torch.Size([10])
         """
-        from voronerf.diagram.balance import balance
-
         flat = points.detach().reshape(-1, points.shape[-1])
         weights = torch.ones_like(flat[:, 0]) if importance is None else importance.detach().reshape(-1)
         if len(flat) > _DECIDE and len(weights) == len(flat):
             drawn = torch.randperm(len(flat), generator=generator)[:_DECIDE].to(flat.device)
             flat, weights = flat[drawn], weights[drawn]
-        return balance(flat, weights, k, centres=centres, generator=generator).diagram()
+        return cls(balance(flat, weights, k, centres=centres, generator=generator).centres)
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], prefix: str = "") -> "VoronoiDiagram":
@@ -367,19 +365,6 @@ class VoronoiDiagram(nn.Module):
             loaded = VoronoiDiagram.from_state(state_dict, prefix)
             self._set_tables(loaded.centres.to(device), loaded.child_offsets.to(device), loaded.child.to(device))
         super()._load_from_state_dict(state_dict, prefix, *args)
-
-
-def in_space(points: Tensor) -> Tensor:
-    """Points [n, d] of 1 to 3 coordinates as the operations take them, [n, 3]: zeros change no distance."""
-    d = points.shape[1]
-    return points if d == 3 else torch.nn.functional.pad(points, (0, 3 - d))
-
-
-def nearest_cell(points: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
-    """int32 [n], the nearest of centres [k, d] for points [n, d]."""
-    if points.shape[1] > 3:
-        return nearest_in_torch(points, centres)
-    return ops.nearest_centre(in_space(points), in_space(centres), backend=backend)
 
 
 def _check_centres(centres: Tensor) -> None:
