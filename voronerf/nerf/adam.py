@@ -223,12 +223,7 @@ class Adam(torch.optim.Adam):
 def parameter_groups(
     routers: Mapping[str, VoronoiRouter], sparse: Sequence[str] = ()
 ) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
-    """The parameters in the order that an optimiser numbers them: those of the networks, then the tables.
-
-    Args:
-        routers: The networks by name.
-        sparse: Names of tables, as patterns.
-    """
+    """The parameters in the order that an optimiser numbers them: those of the networks, then the tables."""
     dense, tables = list[nn.Parameter](), list[nn.Parameter]()
     for router in routers.values():
         for name, parameter in router.module.named_parameters():

@@ -38,15 +38,7 @@ MOST_VOXELS = 1 << 22
 
 @dataclass(frozen=True)
 class Source:
-    """What is taken of a run.
-
-    Attributes:
-        name: For the names of its views.
-        config: Its settings.
-        scene: Its cameras and its bounds.
-        parts: Its networks.
-        grid: What is empty, in its scene; None for a run that reaches to infinity.
-    """
+    """What is taken of a run."""
 
     name: str
     config: TrainConfig
@@ -468,11 +460,6 @@ def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, in
     """The similarity that moves cameras of a scene to where another has the images of the same names.
 
     Source: Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns".
-
-    Args:
-        fixed: The scene that stays.
-        moving: The scene that moves.
-        name: Of its run, for errors.
 
     Returns:
         The similarity, the root of the mean squared distance of camera centres after it, and how many these are.

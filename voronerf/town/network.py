@@ -18,16 +18,7 @@ from voronerf.router import VoronoiRouter
 
 
 class Network:
-    """The networks of cells: settings and tensors.
-
-    Attributes:
-        diagram: The cells.
-
-    Args:
-        checkpoint: Of a training: the group "router" has the cells, "optimizer" may have averages of the weights.
-        device: Of the router.
-        backend: Of its operations.
-    """
+    """The networks of cells: settings and tensors."""
 
     def __init__(self, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> None:
         self.checkpoint, self.device, self.backend = checkpoint, device, backend

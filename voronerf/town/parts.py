@@ -229,13 +229,7 @@ class Parts(nn.Module):
         return self[claim.part].number[claim.leaf] + sum(part.num_cells for part in [*self][: claim.part])
 
     def forward(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours [n, 3] and densities [n] of positions [n, 3]; see :class:`voronerf.nerf.Field`.
-
-        Args:
-            positions: [n, 3], in the scene.
-            directions: [r, 3], unit vectors.
-            ray_index: int32 [n], the row of ``directions`` that belongs to each position.
-        """
+        """Colours [n, 3] and densities [n] of positions [n, 3]; see :class:`voronerf.nerf.Field`."""
         under, below = positions.new_zeros(len(positions), 3), positions.new_zeros(len(positions))
         for layer in range(len(self.layers)):
             colour, density = torch.zeros_like(under), torch.zeros_like(below)

@@ -37,13 +37,7 @@ RAY, SUM = 8, 6
 
 @dataclass(frozen=True)
 class Territory:
-    """A territory of this rank.
-
-    Attributes:
-        place: Where it is.
-        renderer: Its networks and its grid.
-        generator: Of its samples.
-    """
+    """A territory of this rank."""
 
     place: Place
     renderer: Renderer

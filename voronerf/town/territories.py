@@ -116,11 +116,6 @@ def cut_space(scene: Scene, count: int, contraction: Contraction | Perspective |
     A view lies where its rays are when they have gone half of their way through the scene, but for no longer than a
     territory is wide. Views are halved by their places along the longest side of these, again and again; the centre of
     a territory is the mean of its views' places.
-
-    Args:
-        scene: Of which the cameras alone are read.
-        count: T.
-        contraction: Of the space of the fields, or None for that of the world.
     """
     views = len(scene.train)
     if count > views:
@@ -140,10 +135,6 @@ def cut_space(scene: Scene, count: int, contraction: Contraction | Perspective |
 
 def halve(places: Tensor, count: int) -> Tensor:
     """Divides places into parts that lie together and have as many each, within one.
-
-    Args:
-        places: [n, 3].
-        count: Parts, at most n.
 
     Returns:
         int64 [n], the part of each place; parts with neighbouring numbers lie together.

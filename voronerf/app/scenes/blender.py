@@ -31,10 +31,6 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     such as `fl_x`, `cx` or `k1`, which Blender's files do not have, mark a capture that was split before. It is loaded
     like `load_transforms` does, with that split.
 
-    Args:
-        folder: holds `transforms_train.json`.
-        reading: how it is read; images are reduced by averaging areas of the composited image.
-
     Returns:
         The scene, between distances 2 and 6 (or the file's `near` and `far`), in a box carved from the alpha masks of
         the training views; without alpha the box is None. For a capture see `load_transforms`.

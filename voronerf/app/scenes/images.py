@@ -69,12 +69,7 @@ def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
 
 
 def read_header(path: Path, factor: int) -> Header:
-    """Reads the header of an image file, without its pixels.
-
-    Args:
-        path: image file, PNG or JPEG.
-        factor: of the reduction, >= 1.
-    """
+    """Reads the header of an image file, without its pixels."""
     with _opened(path) as file:
         size, alpha = file.size, _has_alpha(file)
         if factor > min(size):
@@ -89,10 +84,6 @@ def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
 
     Orientation tags are ignored: poses and intrinsics belong to the pixels as stored. JPEG files are reduced by up to 8
     while they are decoded, from the low frequencies of each block of 8 x 8 pixels, which saves time and memory.
-
-    Args:
-        path: image file, PNG or JPEG.
-        factor: of the reduction, from 1 to the number of pixels of the shorter side.
 
     Returns:
         [h, w, 3], or [h, w, 4] with an alpha channel.

@@ -58,10 +58,6 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
 
     Images that are listed but missing are left out, with a warning that says how many.
 
-    Args:
-        path: the JSON file.
-        allow_outside: also take images that lie outside of its folder.
-
     Returns:
         (the file's entries, the frames whose image exists, in the file's order).
     """
@@ -200,10 +196,6 @@ def load_transforms(folder: Path, reading: Reading) -> Scene:
 
     Where the file has nerfstudio's `train_filenames`, `test_filenames` or `val_filenames`, they decide instead.
     Validation images are for testing if there are no others, and are else left out.
-
-    Args:
-        folder: holds `transforms.json`.
-        reading: how it is read.
     """
     path = folder / "transforms.json"
     entries, frames = read_transforms(path, reading.allow_outside)
@@ -261,15 +253,7 @@ def has_lens(frames: Sequence[Frame]) -> bool:
 def capture_scene(
     folder: Path, entries: dict[str, Any], frames: Sequence[Frame], held_out: Tensor, reading: Reading
 ) -> Scene:
-    """Makes the scene of a capture from its frames, see `load_transforms`.
-
-    Args:
-        folder: of the scene.
-        entries: of the file, or of the first.
-        frames: its c images.
-        held_out: bool [c], the test views.
-        reading: how it is read.
-    """
+    """Makes the scene of a capture from its frames, see `load_transforms`."""
     path = frames[0].source
     notes = [f"{path.name} of {len(frames)} images"]
     if any(frame.values.get("depth_file_path") is not None for frame in frames):

@@ -72,12 +72,7 @@ def keep_checkpoint(run: Path, checkpoint: Checkpoint, keep: int) -> None:
 
 
 class CheckpointWriter:
-    """Writes the checkpoints of a run one after the other, beside what the caller does.
-
-    Args:
-        run: The run directory.
-        keep: How many checkpoints stay.
-    """
+    """Writes the checkpoints of a run one after the other, beside what the caller does."""
 
     def __init__(self, run: Path, keep: int) -> None:
         self.run, self.keep = run, keep

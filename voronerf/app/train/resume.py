@@ -155,13 +155,7 @@ def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
 
 
 def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint, *, assign: bool = False) -> None:
-    """Loads the cells of a checkpoint into routers; their number may differ.
-
-    Args:
-        routers: By name.
-        checkpoint: Of networks of the same architecture.
-        assign: Takes the checkpoint's tensors in place of copies of them, for routers on the CPU.
-    """
+    """Loads the cells of a checkpoint, whose number may differ; ``assign`` takes its tensors in place of copies."""
     for name, router in routers.items():
         try:
             router.load_state_dict(checkpoint.group(group(name)), assign=assign)

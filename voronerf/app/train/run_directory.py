@@ -61,13 +61,7 @@ def _note_of(path: str | Path) -> Path:
 
 
 def check_stored_paths(run: Path, *, data: str | None = None, lpips: Path | None = None) -> None:
-    """Refuses paths of a run's settings outside of what the user chose, since the run may be another person's.
-
-    Args:
-        run: The run directory.
-        data: The scene of the settings.
-        lpips: The weights of the settings.
-    """
+    """Refuses paths of a run's settings outside of what the user chose, since the run may be another person's."""
     paths = {"data": None if is_builtin(data) else data, "lpips": None if str(lpips) == OFF else lpips}
     for option, path in paths.items():
         if path is not None and is_outside(run, path):

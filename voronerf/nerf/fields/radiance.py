@@ -68,16 +68,7 @@ def run_network(
     ray_index: Tensor | None = None,
     features: Tensor | None = None,
 ) -> Tensor:
-    """The raw outputs [n, layers.out_features] of one network that a layer table describes.
-
-    Args:
-        layers: the table.
-        linears: the layers, in the table's order.
-        positions: [n, 3], or Gaussians [n, 6] for the integrated encoding.
-        directions: [n, 3], or [r, 3] together with `ray_index`; None if no layer reads them.
-        ray_index: int32 [n], the row of `directions` of each sample.
-        features: the table of the hash encoding, if `layers` have a grid.
-    """
+    """The raw outputs [n, layers.out_features] of one network that a layer table describes."""
     offsets = torch.tensor([0, positions.shape[0]], dtype=torch.int32, device=positions.device)
     return grouped_mlp(
         positions,
