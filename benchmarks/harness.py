@@ -55,14 +55,10 @@ FAMILIES = {
 """Names by vendor, family and models; the first that fits. Virtual machines leave them out of the processor's name."""
 
 
-def processor(text: str | None = None) -> str:
-    """The processor's name, and that of its family where it is known.
-
-    Args:
-        text: of /proc/cpuinfo; by default that of this machine.
-    """
+def processor() -> str:
+    """The processor's name, and that of its family where it is known."""
     path = Path("/proc/cpuinfo")
-    known = text if text is not None else path.read_text() if path.is_file() else ""
+    known = path.read_text() if path.is_file() else ""
     found = {name: re.search(rf"^{name}\s*: (.*)$", known, re.MULTILINE) for name in ("model name", *_NUMBERS)}
     name = found["model name"][1] if found["model name"] else platform.processor() or platform.machine()
     if not all(found[number] for number in _NUMBERS):

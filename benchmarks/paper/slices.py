@@ -14,11 +14,11 @@ from voronerf.app.scenes import Scene
 DENSEST = 100.0
 
 
-def slice_points(scene: Scene, *, at: float = 1 / 3, size: int = 96) -> Tensor:
-    """Points [size, size, 3] of a horizontal plane across the scene's box, at a fraction of its height."""
+def slice_points(scene: Scene, *, size: int) -> Tensor:
+    """Points [size, size, 3] of a horizontal plane across the scene's box, at a third of its height."""
     assert scene.box is not None
     steps = (torch.arange(size) + 0.5) / size
-    points = torch.lerp(scene.box[0], scene.box[1], at).repeat(size, size, 1)
+    points = torch.lerp(scene.box[0], scene.box[1], 1 / 3).repeat(size, size, 1)
     points[..., 0] = torch.lerp(scene.box[0, 0], scene.box[1, 0], steps)[None, :]
     points[..., 1] = torch.lerp(scene.box[1, 1], scene.box[0, 1], steps)[:, None]
     return points

@@ -80,12 +80,3 @@ def test_second_derivatives(form: str, parts: tuple[str, ...]) -> None:
         results[backend] = torch.autograd.grad(penalty, leaves, allow_unused=True, materialize_grads=True)
     for want, got in zip(results["reference"], results["native"]):
         torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-5 * (1 + float(want.abs().max())))
-
-
-def test_offsets_that_do_not_rise() -> None:
-    given, _ = leaves_of(scene([5, 8]), torch.float32)
-    for bad in ([0, 9, 5], [0, 5, 14], [-1, 5, 13]):
-        for backend in ("native", "reference"):
-            message = r"^composite: ray_offsets must rise from 0 or more to at most .* 13, got"
-            with pytest.raises(ValueError, match=message):
-                composite(**{**given, "ray_offsets": torch.tensor(bad, dtype=torch.int32)}, backend=backend)

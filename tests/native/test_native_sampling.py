@@ -1,4 +1,4 @@
-"""The encodings and resample of the compiled module: what the tests of the operations leave open."""
+"""The encodings of the compiled module: what the tests of the operations leave open."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from helpers import all_pairs
 from tolerances import assert_as_exact
 from torch import Tensor
 
-from voronerf.ops import frequency_encode, integrated_encode, resample, spherical_harmonics
+from voronerf.ops import frequency_encode, integrated_encode, spherical_harmonics
 
 pytestmark = pytest.mark.native
 
-HALVES = (torch.float16, torch.bfloat16)
 # Around the rows of a tile.
 ROWS = (0, 1, 2, 31, 32, 33, 100)
 
@@ -105,31 +104,3 @@ def test_large_variances(isa: str) -> None:
     for got, want in zip(results[0], expected):
         assert got.isfinite().all()
         torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("dtype", HALVES)
-def test_half_gradients(dtype: torch.dtype) -> None:
-    for run, inputs in all_encodings(20, 3):
-        wide = [tensor.to(dtype).float() for tensor in inputs]
-        found, want = evaluate(run, wide, dtype, "native"), evaluate(run, wide, torch.float32, "native")
-        assert all(tensor.dtype == dtype for tensor in found)
-        for got, right in zip(found, want):
-            scale = float(right.abs().max())
-            torch.testing.assert_close(got.float(), right, rtol=0, atol=2 * torch.finfo(dtype).eps * scale)
-
-
-@pytest.mark.parametrize(("r", "s", "count"), [(1, 1, 1), (7, 1, 5), (9, 33, 2), (40, 64, 65)])
-@pytest.mark.parametrize("given", [False, True])
-def test_depths_of_the_reference(r: int, s: int, count: int, given: bool) -> None:
-    weights = (torch.rand(r, s) * (torch.rand(r, s) > 0.4)).float()
-    edges = (0.1 + torch.rand(r, s + 1)).cumsum(1)
-    uniforms = torch.rand(r, count) if given else None
-    found = resample(weights, edges, count, uniforms=uniforms, backend="native")
-    wide = None if uniforms is None else uniforms.double()
-    exact = resample(weights.double(), edges.double(), count, uniforms=wide, backend="reference")
-    torch.testing.assert_close(found.double(), exact, rtol=1e-6, atol=0)
-
-
-def test_masses_whose_sum_overflows_float32() -> None:
-    weights, edges = torch.full((1, 4), 3e38), torch.arange(5.0)[None]
-    assert resample(weights, edges, 4, backend="native").tolist() == [[0.5, 1.5, 2.5, 3.5]]

@@ -31,17 +31,6 @@ def test_matches_a_slow_loop(device, backend, n, d, octaves, include_input):
     torch.testing.assert_close(encoded.double().cpu(), slow(x, octaves, include_input), rtol=0, atol=3e-7)
 
 
-def test_gradient_matches_the_formula(device, backend):
-    x = torch.rand(31, 3, device=device, requires_grad=True)
-    g = torch.randn(31, 3 + 6 * 6, device=device)
-    frequency_encode(x, 6, backend=backend).backward(g)
-    expected = g[:, :3].double()
-    for octave, part in enumerate(g[:, 3:].double().split(6, dim=1)):
-        angle = 2**octave * x.detach().double()
-        expected = expected + 2**octave * (part[:, :3] * angle.cos() - part[:, 3:] * angle.sin())
-    torch.testing.assert_close(x.grad.double(), expected, rtol=1e-6, atol=1e-4)
-
-
 def test_errors():
     x = torch.rand(4, 3)
     refuses = refusals(frequency_encode, x=x, octaves=2)

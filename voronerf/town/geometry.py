@@ -143,7 +143,7 @@ class Solid:
             raise ValueError(f"Solid: the radius of a ball must be positive, got {self.ball[3]}")
 
     @classmethod
-    def box(cls, low: Sequence[float], high: Sequence[float], *, outside: bool = False) -> Solid:
+    def box(cls, low: Sequence[float], high: Sequence[float]) -> Solid:
         """The box between two corners.
 
         Raises:
@@ -154,7 +154,7 @@ class Solid:
         unit = _eye().tolist()
         above = [(*unit[i], float(high[i])) for i in range(3)]
         below = [(*(-x for x in unit[i]), -float(low[i])) for i in range(3)]
-        return cls(tuple(above + below), outside=outside)
+        return cls(tuple(above + below))
 
     def holds(self, points: Tensor) -> Tensor:
         """Which of the points [n, 3] it has: bool [n]."""

@@ -104,17 +104,6 @@ def write_camera_path(file: Path | str, path: CameraPath) -> None:
     """Writes a path that nerfstudio and :func:`read_camera_path` read.
 
     The file keeps poses, size and the vertical angle of view; the principal point becomes the middle of the frame.
-
-    Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from voronerf.nerf import orbit_cameras
-        >>> from voronerf.app.render.paths import CameraPath, read_camera_path, write_camera_path
-        >>> frames = orbit_cameras(24, radius=3.0, elevation=20.0, width=64, height=48, focal=70.0)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_camera_path(Path(folder) / "path.json", CameraPath(frames, fps=24))
-        ...     len(read_camera_path(Path(folder) / "path.json").frames)
-        24
     """
     size = {"render_height": path.frames.height, "render_width": path.frames.width}
     keyframes = [] if path.keyframes is None else _entries(path.keyframes, "matrix")

@@ -250,10 +250,10 @@ class Scores(Callback):
             state.report(poor)
 
 
-def one_colour_psnr(scene: Scene, views: int = 5) -> float:
+def one_colour_psnr(scene: Scene) -> float:
     """PSNR in dB of test views that are painted in their mean colour."""
     background = scene.background_colour()
-    pixels = torch.cat([scene.test.truth(i, background).reshape(-1, 3) for i in view_numbers(len(scene.test), views)])
+    pixels = torch.cat([scene.test.truth(i, background).reshape(-1, 3) for i in view_numbers(len(scene.test), 5)])
     return -10 * math.log10(max(float(pixels.var(0, correction=0).mean()), 1e-10))
 
 
