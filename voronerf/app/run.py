@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from voronerf.app.evaluate.lpips import Lpips, find_lpips
-from voronerf.app.evaluate.scores import evaluate, mean_scores
+from voronerf.app.evaluate.scores import Track, evaluate, in_silence, mean_scores
 from voronerf.app.files import json_text, read_json, write_text
 from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene, load_scene
@@ -112,12 +112,15 @@ class Run:
         weights = self.config.lpips if weights is None else Path(weights)
         return find_lpips(weights, self.config.data, self.scene.test.cameras.smallest[::-1])
 
-    def evaluate(self, *, views: int | None = None, lpips: Lpips | Path | str | None = None) -> dict[str, Any]:
+    def evaluate(
+        self, *, views: int | None = None, lpips: Lpips | Path | str | None = None, track: Track = in_silence
+    ) -> dict[str, Any]:
         """Scores of the test views, and their means.
 
         Args:
             views: Number of test views, evenly spread; None for all.
             lpips: The network, or the weights for :meth:`find_lpips`.
+            track: Shows progress: yields the items of a sequence, and is given its name.
 
         Returns:
             "psnr" in dB, "ssim", "lpips" (None without its weights) and "psnr_of_mean_error" over all views, and
@@ -125,7 +128,7 @@ class Run:
         """
         if not isinstance(lpips, Lpips):
             lpips, _ = self.find_lpips(lpips)
-        scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips)
+        scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips, track=track)
         return {**mean_scores(scores), "views": [asdict(score) for score in scores]}
 
 

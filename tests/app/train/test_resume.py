@@ -51,7 +51,7 @@ def test_resume_drops_evaluations_made_after_the_checkpoint(tmp_path, scene):
 def test_an_evaluation_that_was_stopped_is_made_again(tmp_path, scene, monkeypatch):
     whole, part = (small(tmp_path / name) for name in ("whole", "part"))
     trained(whole, scene)
-    rendered = scores_module.render_view
+    rendered = scores_module.render_camera
 
     for stop_at, steps, evaluated in ((12, 12, []), (24, 24, [12]), (None, 24, [12, 24])):
         states = []
@@ -65,7 +65,7 @@ def test_an_evaluation_that_was_stopped_is_made_again(tmp_path, scene, monkeypat
             def on_start(self, state, states=states):
                 states.append(state)
 
-        monkeypatch.setattr(scores_module, "render_view", stopping_view)
+        monkeypatch.setattr(scores_module, "render_camera", stopping_view)
         keep = Keep(lambda state: None)
         summary = trained(part, scene, resume=stop_at != 12, callbacks=[keep])
         assert (summary["steps"], summary["complete"]) == (steps, stop_at is None)

@@ -1,6 +1,5 @@
 """Evaluations of a training: within their share of the budget, and with what makes them poor; steps that go wrong."""
 
-import itertools
 import json
 import math
 import re
@@ -11,6 +10,8 @@ import torch
 from helpers import refuses, same, trained
 from tiny_runs import Each, small, started, steps_of
 
+from voronerf.app.render.camera import render_camera
+from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Checkpoints, Divergence, Scores, TrainConfig, TrainingError, build, run
 from voronerf.app.train.callbacks import why_scores_are_poor
 from voronerf.app.train.defaults import resolve
@@ -21,20 +22,67 @@ def weights(state):
     return [parameter.detach().clone() for parameter in state.router.parameters()]
 
 
-@pytest.mark.parametrize("views", [None, 2])
-def test_evaluations_are_part_of_the_budget(tmp_path, scene, views):
-    """A second for each step and for each evaluation, whatever its views: a tenth of 40 is four evaluations."""
-    seconds = itertools.count()
-    config = small(tmp_path, steps=None, budget=40.0, eval_views=views, evaluations=4)
-    clock = lambda: float(next(seconds))  # noqa: E731
-    state, scores = build(config, scene), Scores(None, clock=clock)
+class Clock:
+    """A second for each step, at whose beginning and end it is read, and for each view what its pixels take."""
+
+    def __init__(self, monkeypatch, view_seconds):
+        self.now, self.read, self.views, pixels = 0.0, 0, [], SIDE**2
+        render = render_camera
+
+        def slow(renderer, scene, cameras, index, **options):
+            self.views.append(cameras.width)
+            self.now += view_seconds(self.now) * cameras.width * cameras.height / pixels
+            return render(renderer, scene, cameras, index, **options)
+
+        monkeypatch.setattr("voronerf.app.evaluate.scores.render_camera", slow)
+
+    def __call__(self):
+        self.read += 1
+        self.now += self.read % 2 == 0
+        return self.now
+
+
+SIDE = 96
+
+
+def scored(monkeypatch, view_seconds, **settings):
+    """A training at a budget of 40 s that takes a second a step: state, scores and clock."""
+    clock = Clock(monkeypatch, view_seconds)
+    settings = {"steps": None, "budget": 40.0, "eval_views": None, "evaluations": 4, **settings}
+    state = build(small(**settings), builtin_scene(SIDE, train_views=2, test_views=8))
+    scores = Scores(None, clock=lambda: clock.now)
     run(state, [scores], clock=clock)
-    if views is None:
-        assert state.evaluation_seconds <= 2 and 36 <= state.seconds + state.evaluation_seconds <= 42
-        assert scores.summary["complete"] and scores.summary["views"] >= 1
-    else:
-        assert state.evaluation_seconds == 0 and 40 <= state.seconds <= 44
-        assert [line["views"] for line in scores.metrics] == [2, 2, 2, 2]
+    return state, scores, clock
+
+
+@pytest.mark.parametrize("seconds", [0.001, 0.1, 0.3, 1.0, 3.0, 20.0])
+def test_evaluations_take_a_tenth_of_the_budget(monkeypatch, seconds):
+    """However long a view takes: fewer of them, none on the way, or the middle of one at the end."""
+    state, scores, clock = scored(monkeypatch, lambda now: seconds)
+    spent = clock.now - state.seconds
+    found = [line["views"] for line in scores.metrics]
+    assert spent <= 4 + seconds / 9 and 38 <= clock.now <= 42.5  # the first view tells what they take
+    assert scores.summary["complete"] and scores.summary["views"] >= 1 and scores.summary["psnr"] > 0
+    assert (scores.summary["part"] == 1) == (seconds <= 3)
+    assert len(found) == (4 if seconds < 1 else 2 if seconds < 3 else 1)
+
+
+def test_views_that_become_cheaper_are_scored_later(monkeypatch):
+    """Empty space is found in the first seconds, so that a later view takes less."""
+    _, scores, clock = scored(monkeypatch, lambda now: 2.0 if now < 25 else 0.1)
+    assert [line["views"] for line in scores.metrics] == [8, 8] and min(clock.views) < SIDE
+    assert scores.metrics[0]["seconds"] > 25 and {line["part"] for line in scores.metrics} == {1}
+
+
+def test_views_that_are_asked_for_are_scored_beside_the_budget(monkeypatch):
+    state, scores, _ = scored(monkeypatch, lambda now: 20.0, eval_views=2)
+    assert state.evaluation_seconds == 0 and 39 <= state.seconds <= 41
+    assert [line["views"] for line in scores.metrics] == [2, 2, 2, 2]
+
+
+def test_evaluations_of_a_number_of_steps_do_not_depend_on_time(monkeypatch):
+    _, scores, _ = scored(monkeypatch, lambda now: 20.0, steps=40, budget=None)
+    assert [(line["step"], line["views"]) for line in scores.metrics] == [(10, 8), (20, 8), (30, 8), (40, 8)]
 
 
 def test_a_stop_in_the_last_step_leaves_nothing_out(tmp_path, scene):

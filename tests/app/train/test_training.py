@@ -60,6 +60,24 @@ def test_training_learns_and_the_reference_learns_the_same(scene):
     assert psnr["auto"] > float(white) + 1 and psnr["auto"] == pytest.approx(psnr["reference"], abs=0.5)
 
 
+def test_the_middle_of_a_view_is_that_of_the_whole_view(scene):
+    """Of views of several sizes and bent lenses, to the bit; with the same rows of the truth and of the mask."""
+    state = started(scene, 4)
+    count, cameras = len(scene.test), scene.test.cameras
+    distortion = torch.zeros(count, 8)
+    distortion[:, 0] = 0.05
+    sizes = torch.tensor([[15, 16]] + [[16, 13]] * (count - 1))
+    masks = torch.rand(count, 16, 16, generator=torch.Generator().manual_seed(0)) > 0.3
+    test = replace(scene.test, cameras=replace(cameras, distortion=distortion, sizes=sizes), masks=masks)
+    scene = replace(scene, test=test)
+    for view, rows, columns in ((0, slice(5, 10), slice(5, 10)), (1, slice(4, 8), slice(5, 10))):
+        whole = render_view(state.renderer, scene, view).colour.clamp(0, 1)[rows, columns]
+        kept = test.mask(view)[rows, columns]
+        error = (whole - test.truth(view, torch.ones(3))[rows, columns])[kept].double().square().mean()
+        (score,) = evaluate(state.renderer, scene, views=[view], middle=3)
+        assert score.psnr == pytest.approx(float(-10 * error.log10()), abs=1e-5)
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_no_collapse_to_white(scene, seed):
     """A NeRF that gives up paints every ray white; its opacity is then 0 and no gradient brings it back."""

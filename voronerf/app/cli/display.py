@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from rich.console import Console
+import rich
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
     Progress,
     TextColumn,
+    TimeElapsedColumn,
     TimeRemainingColumn,
     track,
 )
@@ -22,7 +24,9 @@ from voronerf.app.train.state import State
 
 LONGEST_LINE = 900
 
-console = Console(soft_wrap=True)
+#: The one of rich, so that a bar of another module can show below one of these.
+console = rich.get_console()
+console.soft_wrap = True
 
 
 def say(line: str) -> None:
@@ -33,6 +37,15 @@ def say(line: str) -> None:
 def tracked(parts: Sequence[Any], name: str) -> Iterable[Any]:
     """Yields the parts of a task, with a progress bar on a terminal."""
     return track(parts, description=name, console=console, disable=not console.is_terminal)
+
+
+@contextlib.contextmanager
+def busy(name: str) -> Iterator[None]:
+    """A context that shows a name and its seconds on a terminal, for what takes long and tells nothing on the way."""
+    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        bar.add_task(escape(printable(name)), total=None)
+        yield
 
 
 def printable(text: str) -> str:
@@ -61,19 +74,13 @@ class TrainingDisplay(Callback):
             TextColumn("[bold]{task.description}"),
             BarColumn(bar_width=24),
             TextColumn("{task.percentage:3.0f} %"),
-            TextColumn("step {task.fields[step]}"),
-            TextColumn("{task.fields[stage]}"),
-            TextColumn("{task.fields[speed]} k rays/s"),
-            TextColumn("loss {task.fields[loss]:.5f}"),
-            TextColumn("{task.fields[psnr]}"),
+            TextColumn("{task.fields[text]}"),
             TimeRemainingColumn(),
             console=console,
             disable=not console.is_terminal,
             refresh_per_second=4,
         )
-        self.task = self.progress.add_task(
-            escape(printable(label)), total=1.0, step=0, stage="", speed="", loss=0.0, psnr=""
-        )
+        self.task = self.progress.add_task(escape(printable(label)), total=1.0, text="")
         self.loss = math.nan  # until the first is read
         self.scores: Scores | None = None
 
@@ -87,15 +94,22 @@ class TrainingDisplay(Callback):
         self.loss = state.loss if math.isnan(self.loss) else 0.95 * self.loss + 0.05 * state.loss
         cells = state.router.num_cells
         psnr = self.scores.metrics[-1].get("psnr") if self.scores is not None and self.scores.metrics else None
-        self.progress.update(
-            self.task,
-            completed=state.fraction,
-            step=state.step,
-            stage="coarse" if cells == 1 else f"{cells} cells",
-            speed=f"{state.rays_done / max(state.seconds, 1e-9) / 1000:6.1f}",
-            loss=self.loss,
-            psnr="" if psnr is None else f"psnr {psnr:.2f} dB",
-        )
+        shown = [
+            *(f"step {state.step}", "coarse" if cells == 1 else f"{cells} cells"),
+            *(f"{state.rays_done / max(state.seconds, 1e-9) / 1000:.1f} k rays/s", f"loss {self.loss:.5f}"),
+            *([] if psnr is None else [f"psnr {psnr:.2f} dB"]),
+        ]
+        self.progress.update(self.task, completed=state.fraction, text="  ".join(shown))
+
+    def track(self, parts: Sequence[Any], name: str) -> Iterable[Any]:
+        """Yields the parts of a task beside the training, with a bar below its live line."""
+        task = self.progress.add_task(name, total=len(parts), text="")
+        try:
+            for number, part in enumerate(parts):
+                self.progress.update(task, completed=number, text=f"{number} of {len(parts)}")
+                yield part
+        finally:
+            self.progress.remove_task(task)
 
     def on_event(self, line: str) -> None:
         """Prints a line that stays, above the live one."""

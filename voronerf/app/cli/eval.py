@@ -8,7 +8,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from voronerf.app.cli.display import console, printable, say
+from voronerf.app.cli.display import console, printable, say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Opening, check_counts
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.files import json_text, write_text
@@ -40,7 +40,7 @@ def evaluate_run(
     perceived, source = opened.find_lpips(lpips)
     if perceived is None:
         say(source)
-    result = opened.evaluate(views=views, lpips=perceived or "off")
+    result = opened.evaluate(views=views, lpips=perceived or "off", track=tracked)
     table = Table("view", "PSNR, dB", "SSIM", "LPIPS")
     for view in result["views"]:
         table.add_row(escape(printable(view["name"])), *_figures(view))
@@ -50,7 +50,7 @@ def evaluate_run(
     say(f"PSNR of the mean squared error: {result['psnr_of_mean_error']:.2f} dB")
     write_text(run / "eval.json", json_text(result, indent=2) + "\n")
     if panels:
-        write_panels(opened.renderer, opened.diagram, opened.scene, run / "images", views=panels)
+        write_panels(opened.renderer, opened.diagram, opened.scene, run / "images", views=panels, track=tracked)
     say(f"wrote {run / 'eval.json'}" + (f" and {run / 'images'}" if panels else ""))
     return 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from voronerf.app.cli.display import say, tracked
+from voronerf.app.cli.display import busy, say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
 from voronerf.app.export import cells as cell_files
 from voronerf.app.export import mesh as mesh_files
@@ -70,7 +70,8 @@ def export(
         gain = f"PSNR {scores['after']:.2f} dB against the run's own test views, {scores['before']:.2f} before fitting"
         say(f"wrote {splat}: {len(splats):,} Gaussians, {gain}")
     if points is not None:
-        cloud = point_files.export_points(opened, points, count=count or 200_000, box=box, to_files=to_files)
+        with busy("points"):
+            cloud = point_files.export_points(opened, points, count=count or 200_000, box=box, to_files=to_files)
         say(f"wrote {points}: {len(cloud.vertices):,} points")
     if mesh is not None:
         surface = mesh_files.export_mesh(
@@ -80,6 +81,7 @@ def export(
         extent = " x ".join(f"{side:.3g}" for side in surface.extents)
         say(f"wrote {mesh}: {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {closed}, {extent}")
     if cells is not None:
-        scene = cell_files.export_cells(opened, cells, box=box, to_files=to_files)
+        with busy("cells"):
+            scene = cell_files.export_cells(opened, cells, box=box, to_files=to_files)
         say(f"wrote {cells}: {len(scene.geometry)} of {opened.diagram.num_cells} cells")
     return 0

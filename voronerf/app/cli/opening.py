@@ -10,6 +10,7 @@ from typing import Literal
 
 from torch import Tensor, tensor
 
+from voronerf.app.cli.display import busy
 from voronerf.app.run import Run, open_run, read_crop
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import read_scene
@@ -54,7 +55,8 @@ class Opening:
         check_counts(samples=None if self.samples is None else min(self.samples), downscale=self.downscale)
         opener = next((opener for file, opener in OPENERS.items() if (run / file).is_file()), open_run)
         kept = inspect.signature(opener).parameters
-        return opener(run, scene=scene, **{name: value for name, value in vars(self).items() if name in kept})
+        with busy(f"opening {run}"):
+            return opener(run, scene=scene, **{name: value for name, value in vars(self).items() if name in kept})
 
 
 AS_IN_TRAINING = Opening()

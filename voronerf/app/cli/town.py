@@ -12,7 +12,7 @@ from typing import Annotated
 import torch
 import tyro
 
-from voronerf.app.cli.display import TrainingDisplay, say
+from voronerf.app.cli.display import TrainingDisplay, busy, say, tracked
 from voronerf.app.cli.train import continuation, stopped_by_signals
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.files import json_text, write_text
@@ -74,7 +74,9 @@ def join(
             )
             frames[number] = frame
     every = [frames.get(number, Similarity()) for number in range(len(runs))]
-    return tell(out, editing.join(runs, out, frames=every))
+    with busy("joining"):
+        made = editing.join(runs, out, frames=every)
+    return tell(out, made)
 
 
 def given_frames(runs: int, move: Sequence[tuple[str, str]]) -> dict[int, Similarity]:
@@ -124,7 +126,9 @@ def cut(
     except ValueError as error:
         raise ConfigError(f"--{given[0]}: {error}") from None
     kept = list(cells or ()) if solid is None else solid
-    return tell(out, editing.cut(run, kept, out, outside=outside))
+    with busy("cutting"):
+        made = editing.cut(run, kept, out, outside=outside)
+    return tell(out, made)
 
 
 def place(
@@ -151,7 +155,9 @@ def place(
         Similarity.of(at, turn, scale)
     except ValueError as error:
         raise ConfigError(f"--scale, --turn, --at: {error}") from None
-    return tell(out, editing.place(run, thing, at, out, degrees=turn, scale=scale))
+    with busy("placing"):
+        made = editing.place(run, thing, at, out, degrees=turn, scale=scale)
+    return tell(out, made)
 
 
 def train_territories(
@@ -204,7 +210,8 @@ def _train_territories(
     assert out is not None
     if group.size > 1 and config.data != BUILTIN:  # each rank reads its own of one copy
         reading["images"] = "disk"
-    scene = load_scene(config.data, **reading)
+    with busy(f"reading {config.data}"):
+        scene = load_scene(config.data, **reading)
     group.check_same_scene(scene)
     if group.rank == 0:  # alone, for what it writes is there already when others look
         resume = resume or (restarts() > 0 and bool(checkpoint_paths(out)))
@@ -223,10 +230,12 @@ def _train_territories(
         if group.rank == 0:
             if summary["complete"]:
                 opened = open_run(out, scene=scene, backend=config.backend)
-                summary |= opened.evaluate(views=config.eval_views, lpips=config.lpips)
+                summary |= opened.evaluate(views=config.eval_views, lpips=config.lpips, track=tracked)
                 say(f"{count} territories, {summary['cells']} cells: psnr {summary['psnr']:.2f} dB")
                 if panels:
-                    write_panels(opened.renderer, opened.diagram, opened.scene, out / "images", views=panels)
+                    write_panels(
+                        opened.renderer, opened.diagram, opened.scene, out / "images", views=panels, track=tracked
+                    )
             write_text(out / "summary.json", json_text(summary, indent=2) + "\n")
             start = f"torchrun --nproc-per-node {group.size} -m " * (group.size > 1)
             again = continuation(f"{start}voronerf train-territories", config)

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from voronerf.app.cli.display import TrainingDisplay, say
+from voronerf.app.cli.display import TrainingDisplay, busy, say, tracked
 from voronerf.app.cli.view import import_viewer
 from voronerf.app.evaluate.lpips import find_lpips
 from voronerf.app.evaluate.panels import write_panels
@@ -93,7 +93,8 @@ def train(
         raise ConfigError(f"--{name} must be {'0 or more' if panels < 0 else 'positive'}, got {value}")
     if view:
         import_viewer().check_address(host, port)
-    scene = load_scene(config.data, **config.reading)
+    with busy(f"reading {config.data}"):
+        scene = load_scene(config.data, **config.reading)
     if explain:
         for line in build(config, scene).ray_loss.explain().splitlines():
             say(line)
@@ -179,7 +180,7 @@ def run_training(
             if config.occupancy and not state.config.occupancy:
                 obstacle = why_no_occupancy(state.config) or "a scene without a box"
                 display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")
-            checkpoints, scores = Checkpoints(out, checkpoint_every), Scores(out, lpips)
+            checkpoints, scores = Checkpoints(out, checkpoint_every), Scores(out, lpips, display.track)
             callbacks: list[Callback] = [Divergence(out), checkpoints, scores, display.following(scores)]
             if tensorboard:
                 callbacks.append(TensorBoard(out / "tensorboard", scores))
@@ -196,7 +197,7 @@ def run_training(
             return scores.summary
         if panels:
             with state.averaged():
-                write_panels(state.renderer, state.router.diagram, scene, out / "images", views=panels)
+                write_panels(state.renderer, state.router.diagram, scene, out / "images", views=panels, track=tracked)
         write_curve(out)
         if not quiet:
             say(f"wrote {out}: summary.json, metrics.jsonl, images/, plots/, checkpoints/")

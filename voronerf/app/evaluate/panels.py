@@ -15,7 +15,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from voronerf.app.evaluate.scores import render_view, view_numbers
+from voronerf.app.evaluate.scores import Track, in_silence, render_view, view_numbers
 from voronerf.app.files import write_bytes
 from voronerf.app.scenes import Scene
 from voronerf.diagram import VoronoiDiagram
@@ -148,10 +148,12 @@ def _on_white(picture: Tensor, opacity: Tensor) -> Tensor:
     return (picture * share + 255 * (1 - share)).round().to(torch.uint8)
 
 
-def write_panels(renderer: Renderer, diagram: VoronoiDiagram, scene: Scene, folder: Path, *, views: int) -> list[Path]:
+def write_panels(
+    renderer: Renderer, diagram: VoronoiDiagram, scene: Scene, folder: Path, *, views: int, track: Track = in_silence
+) -> list[Path]:
     """Draws truth, render, error, depth and cells of evenly spread test views, a PNG each; returns the paths."""
     paths = []
-    for view in view_numbers(len(scene.test), views):
+    for view in track(view_numbers(len(scene.test), views), "panels"):
         image = render_view(renderer, scene, view)
         # Each pixel in the colour of the cell of its heaviest sample, as in figure 1 of the paper.
         cells = diagram.locate(image.heaviest.reshape(-1, 3), backend=renderer.backend)

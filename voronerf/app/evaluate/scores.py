@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -12,7 +13,16 @@ from voronerf.app.evaluate.lpips import Lpips
 from voronerf.app.evaluate.metrics import psnr, ssim
 from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene
+from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.renderer import RenderedImage, Renderer
+
+#: Shows progress: yields the items of a sequence, and is given its name.
+Track = Callable[[Sequence[Any], str], Iterable[Any]]
+
+
+def in_silence(items: Sequence[Any], name: str) -> Iterable[Any]:
+    """The items of a sequence, whose progress nobody is shown."""
+    return items
 
 
 @dataclass(frozen=True)
@@ -49,13 +59,22 @@ def evaluate(
     *,
     views: int | Sequence[int] | None = None,
     lpips: Lpips | None = None,
+    middle: int = 1,
     stop: Callable[[], bool] | None = None,
+    track: Track = in_silence,
 ) -> list[ViewScore]:
-    """PSNR, SSIM and, where given, LPIPS of test views, until ``stop`` is true.
-
-    ``views`` are so many, evenly spread, or these, by their numbers; None is all.
+    """PSNR, SSIM and, where given, LPIPS of test views.
 
     PSNR leaves out the pixels that a mask leaves out. For SSIM and LPIPS these pixels have the colour of the truth.
+
+    Args:
+        renderer: Of the field.
+        scene: With the test views.
+        views: So many, evenly spread, or these, by their numbers; None is all.
+        lpips: None for no LPIPS.
+        middle: Of each view, only the middle this many times narrower and lower is rendered and scored.
+        stop: Asked before each view but the first whether it and those behind it shall be left out.
+        track: Shows progress.
 
     Examples:
         >>> from voronerf import NeRF
@@ -67,25 +86,37 @@ def evaluate(
         >>> [score.name for score in evaluate(renderer, scene, views=2)]
         ['test_000', 'test_012']
     """
-    scores = []
+    scores: list[ViewScore] = []
     chosen = views if isinstance(views, Sequence) else view_numbers(len(scene.test.names), views)
-    for view in chosen:
-        if stop is not None and stop():
+    for view in track(chosen, "scores"):
+        if scores and stop is not None and stop():
             break
-        image = render_view(renderer, scene, view, heaviest=False)
-        target = scene.test.truth(view, scene.background_colour()).to(renderer.device)
+        camera, rows, columns = _middle_of(scene.test.cameras, view, middle)
+        image = render_camera(renderer, scene, camera, 0, heaviest=False)
+        target = scene.test.truth(view, scene.background_colour())[rows, columns].to(renderer.device)
         colour = image.colour.clamp(0, 1)
         kept = scene.test.mask(view)
         if kept is None:
             noise = psnr(colour, target)
         else:
-            kept = kept.to(renderer.device)
+            kept = kept[rows, columns].to(renderer.device)
             colour = torch.where(kept[..., None], colour, target)
             noise = psnr(colour[kept][None], target[kept][None])
         perceived = None if lpips is None else float(lpips(colour, target))
         name = scene.test.names[view]
         scores.append(ViewScore(name, float(noise), float(ssim(colour, target)), perceived))
     return scores
+
+
+def _middle_of(cameras: Cameras, view: int, factor: int) -> tuple[Cameras, slice, slice]:
+    """The camera of the middle of a view, `factor` times narrower and lower, and the rows and columns of that."""
+    (width, height), camera = cameras.size(view), cameras[[view]]
+    part = max(width // factor, 1), max(height // factor, 1)
+    left, top = (width - part[0]) // 2, (height - part[1]) // 2
+    if factor > 1:
+        moved = camera.intrinsics - camera.intrinsics.new_tensor((0, 0, left, top))
+        camera = replace(camera, intrinsics=moved, width=part[0], height=part[1], sizes=None)
+    return camera, slice(top, top + part[1]), slice(left, left + part[0])
 
 
 def mean_scores(scores: list[ViewScore]) -> dict[str, float | None]:

@@ -6,7 +6,6 @@ n points, c cameras. Positions and densities are in scene units.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf.app.evaluate.scores import Track, in_silence
 from voronerf.app.files import write_bytes
 from voronerf.app.run import Run
 from voronerf.app.train.config import ConfigError
@@ -21,7 +21,6 @@ from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction
 
 #: What shows progress: it is given the parts of a work and its name, and yields the parts, as `rich.progress.track`.
-Track = Callable[[Sequence[Any], str], Iterable[Any]]
 #: Packages of the extra `export`: the name that is imported, and the name that is installed.
 PACKAGES = {"trimesh": "trimesh", "skimage": "scikit-image", "scipy": "scipy"}
 #: Points that a field is asked for at a time.
@@ -141,11 +140,6 @@ class Nodes:
         """Ranges of first indices with about `CHUNK` nodes each."""
         step = max(CHUNK // (self.shape[1] * self.shape[2]), 1)
         return [(first, min(first + step, self.shape[0])) for first in range(0, self.shape[0], step)]
-
-
-def in_silence(parts: Sequence[Any], name: str) -> Iterable[Any]:
-    """The `Track` that shows nothing."""
-    return parts
 
 
 def density_at(run: Run, nodes: Nodes, track: Track) -> Tensor:

@@ -143,11 +143,11 @@ def _undamaged(folder: Path, mapped: mmap.mmap, sums: list[int], each: int, thre
 def _build(
     folder: Path, file: int, wanted: dict[str, Any], sums: list[int], shape: Sequence[int], make: Make, threads: int
 ) -> None:
-    from rich.console import Console  # here, since importing it takes long
+    from rich import get_console  # here, since importing it takes long
     from rich.progress import Progress
 
     each = int(np.prod(shape[1:]))
-    console = Console(stderr=True)
+    console = get_console()
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)
     recorded = time.monotonic()
     with bar, ThreadPoolExecutor(threads) as pool:

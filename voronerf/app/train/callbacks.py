@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.utils import get_total_norm
 
 from voronerf.app.evaluate.lpips import Lpips
-from voronerf.app.evaluate.scores import ViewScore, evaluate, mean_scores, view_numbers
+from voronerf.app.evaluate.scores import Track, ViewScore, evaluate, in_silence, mean_scores, view_numbers
 from voronerf.app.files import json_text, write_bytes, write_text
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import write_scene
@@ -32,8 +32,10 @@ from voronerf.nerf.split import MIN_SAMPLES, SplitDone
 CHECKPOINT_EVERY, KEPT = 30.0, 3
 #: Share of the budget for evaluations, half of it for the final one; and the most views of one on the way.
 SHARE, VIEWS = 0.1, 20
+#: About the pixels that are rendered to learn what a view takes, and the least side of a part of one, for LPIPS.
+PROBE, PROBE_SIDE = 1024, 31
 #: Entries of the last evaluation that summary.json repeats.
-FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views")
+FIGURES = ("psnr", "ssim", "lpips", "psnr_of_mean_error", "views", "part")
 #: Skipped steps in a row after which waiting is of no use.
 PATIENCE = 10
 #: Decibels below the best evaluation so far that are a collapse.
@@ -130,12 +132,14 @@ def all_finite(optimizer: torch.optim.Optimizer) -> bool:
 class Scores(Callback):
     """Scores test views at even times and at the end, into ``metrics.jsonl``, and writes ``summary.json``.
 
-    Without ``config.eval_views``, evaluations count towards ``config.budget``: they take a tenth of it, and where that
-    is too short, fewer views are scored or an evaluation on the way is left out.
+    With ``config.budget`` and without ``config.eval_views``, evaluations on the way take at most a twentieth of the
+    time so far: fewer views are scored where that is too short, or none. All evaluations take at most a tenth of the
+    budget. Where that is too short for one view at the end, the middle of it is scored.
 
     Args:
         out: The run directory; None to write nothing.
         lpips: For the final evaluation; None for none.
+        track: Shows progress: yields the items of a sequence, and is given its name.
         clock: Counts seconds.
 
     Attributes:
@@ -144,12 +148,17 @@ class Scores(Callback):
     """
 
     def __init__(
-        self, out: Path | None, lpips: Lpips | None = None, *, clock: Callable[[], float] = time.perf_counter
+        self,
+        out: Path | None,
+        lpips: Lpips | None = None,
+        track: Track = in_silence,
+        *,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self.out, self.lpips, self.clock = out, lpips, clock
+        self.out, self.lpips, self.track, self.clock = out, lpips, track, clock
         self.metrics: list[dict[str, Any]] = []
         self.summary: dict[str, Any] = {}
-        self.done, self.view_seconds, self.one_colour = 0, 0.0, math.nan
+        self.done, self.view_seconds, self.probe_seconds, self.one_colour = 0, 0.0, 0.0, math.nan
 
     def on_start(self, state: State) -> None:
         """Goes on after the evaluations that a resumed run has made."""
@@ -194,38 +203,50 @@ class Scores(Callback):
 
     def _evaluate(self, state: State, *, last: bool) -> None:
         """Scores test views; where a stop is asked for meanwhile, not all of them, and without a trace."""
-        config, lpips = state.config, self.lpips if last else None
-        every = len(state.scene.test)
-        wanted = min(every, config.eval_views or (every if last else VIEWS))
-        counted = config.eval_views is None and config.budget is not None
-        if counted:
-            budget, probed = float(config.budget or 0), 0.0
-            if self.view_seconds == 0 or lpips is not None:
-                probed = self._score(state, 1, lpips, counted=not last)[1]
-            left = (
-                SHARE * budget - state.evaluation_seconds - probed
-                if last
-                else SHARE / 2 * state.seconds - state.evaluation_seconds
-            )
-            wanted = min(wanted, max(int(left / max(self.view_seconds, 1e-9)), int(last)))
-        scores = self._score(state, wanted, lpips, counted=counted and not last)[0] if wanted else []
-        if scores and not state.stopped:
-            self._record(state, scores)
+        config, lpips, every = state.config, self.lpips if last else None, len(state.scene.test)
+        views, middle = min(every, config.eval_views or (every if last else VIEWS)), 1
+        left, started, budget = math.inf, self.clock(), None if config.eval_views else config.budget
+        if budget is not None:
+            left = (SHARE * budget if last else SHARE / 2 * state.seconds) - state.evaluation_seconds
+            most = max(1, min(state.scene.test.cameras.smallest) // PROBE_SIDE)
+            if not 0 < self.view_seconds <= left and 4 * self.probe_seconds <= left:
+                self._probe(state, most)
+            each = self.view_seconds + (0.0 if lpips is None else self._seconds_of(lpips, state))
+            left -= self.clock() - started
+            views = min(views, int(max(left, 0) / max(each, 1e-9)))
+            if last and views < 1:
+                views, middle = 1, min(most, math.ceil(math.sqrt(each / max(left, 1e-9))))
+        if views:
+            begun = self.clock()
+            stop = lambda: state.stopped or self.clock() - begun > left  # noqa: E731
+            scores = self._score(state, views, lpips, middle, stop=stop, track=self.track)
+            if middle == 1:
+                self.view_seconds = (self.clock() - begun) / len(scores)
+            if not state.stopped:
+                self._record(state, scores, middle)
+        if budget is not None and not last:
+            state.count_evaluation(self.clock() - started, min(self.view_seconds * every, SHARE / 2 * budget))
 
-    def _score(self, state: State, views: int, lpips: Lpips | None, *, counted: bool) -> tuple[list[ViewScore], float]:
-        """Scores of test views, and the seconds that they took; counted, they and the last ones are of the budget."""
+    def _seconds_of(self, lpips: Lpips, state: State) -> float:
+        """What LPIPS takes of a view."""
+        truth = state.scene.test.truth(0, state.scene.background_colour()).to(state.device)
         started = self.clock()
-        with state.averaged():
-            scores = evaluate(state.renderer, state.scene, views=views, lpips=lpips, stop=lambda: state.stopped)
-        passed = self.clock() - started
-        self.view_seconds = passed / max(len(scores), 1)
-        if counted:
-            budget = float(state.config.budget or 0)
-            last = min(self.view_seconds * len(state.scene.test), SHARE / 2 * budget)
-            state.count_evaluation(passed, last)
-        return scores, passed
+        float(lpips(truth, truth))
+        return self.clock() - started
 
-    def _record(self, state: State, scores: list[ViewScore]) -> None:
+    def _probe(self, state: State, most: int) -> None:
+        """Learns what a view takes from its middle, which is at most so many times narrower."""
+        width, height = state.scene.test.cameras.size(0)
+        factor, started = min(most, max(1, round(math.sqrt(width * height / PROBE)))), self.clock()
+        self._score(state, 1, None, factor)
+        self.probe_seconds = self.clock() - started
+        self.view_seconds = self.probe_seconds * factor**2
+
+    def _score(self, state: State, views: int, lpips: Lpips | None, middle: int, **options: Any) -> list[ViewScore]:
+        with state.averaged():
+            return evaluate(state.renderer, state.scene, views=views, lpips=lpips, middle=middle, **options)
+
+    def _record(self, state: State, scores: list[ViewScore], middle: int) -> None:
         """Adds an evaluation to ``metrics.jsonl`` and says it, with what makes it poor."""
         now = {
             "step": state.step,
@@ -233,14 +254,16 @@ class Scores(Callback):
             "cells": state.router.num_cells,
             "learning_rate": state.learning_rate(),
             "views": len(scores),
+            "part": 1 / middle**2,
             **mean_scores(scores),
         }
         self.metrics = [line for line in self.metrics if line["step"] < state.step] + [now]
         if self.out is not None:
             write_text(self.out / "metrics.jsonl", "".join(json_text(line) + "\n" for line in self.metrics))
+        part = f"the middle {1 / middle**2:.0%} of " if middle > 1 else ""
         state.report(
             f"{state.seconds:7.1f} s  step {state.step:6d}  {now['cells']:4d} cells  "
-            f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({len(scores)} view{'s' * (len(scores) != 1)})"
+            f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({part}{len(scores)} view{'s' * (len(scores) != 1)})"
         )
         if math.isnan(self.one_colour):
             self.one_colour = one_colour_psnr(state.scene)

@@ -166,7 +166,7 @@ class OutputSettings:
     """Evaluations during the run, evenly spaced; the last one is at the end."""
     eval_views: int | None = None
     """Test views of every evaluation, evenly spread, in time of their own beside --budget; default: at most 20 on the
-    way and all at the end, as many as a tenth of the budget allows."""
+    way and all at the end, as many as a twentieth of the time so far and a tenth of the budget allow."""
     lpips: Path | None = None
     """LPIPS weights for the final evaluation, a file or folder, or "off"; default: VORONERF_LPIPS, the folder lpips of
     VORONERF_DATA or beside the scene, the installed lpips package."""
