@@ -153,9 +153,18 @@ class Frame {
     if (number == nullptr) return PyErr_Clear(), false;
     void* const found = PyLong_AsVoidPtr(number);
     Py_DECREF(number);
+    if (found == nullptr && holds_entries(kept_.back())) return false;  // memory that was freed, as by storage.resize_
     alignas(64) static char nothing[64];
     address = found == nullptr ? nothing : found;
     return true;
+  }
+
+  static bool holds_entries(PyObject* tensor) {
+    PyObject* const count = PyObject_CallMethod(tensor, "numel", nullptr);
+    const bool holds = count == nullptr || PyLong_AsLongLong(count) != 0;
+    PyErr_Clear();
+    Py_XDECREF(count);
+    return holds;
   }
 
   template <typename Resize>

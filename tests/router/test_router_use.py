@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from voronerf import VoronoiDiagram
+from voronerf.ops._core.tolerances import FLOOR
 from voronerf.router import VoronoiRouter
 
 
@@ -195,6 +196,82 @@ def test_autocast(generator: torch.Generator, make: type[nn.Module]) -> None:
             assert found.dtype == router.cell(0)(x).dtype
         torch.testing.assert_close(found.float(), exact, rtol=0.1, atol=0.05)
         assert router(x).dtype == torch.float32
+
+
+class Fast(nn.Module):
+    """SIREN: sines of thirty times a layer, which amplify rounding."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers, self.out = nn.ModuleList([nn.Linear(3 if i == 0 else 32, 32) for i in range(5)]), nn.Linear(32, 2)
+        for i, layer in enumerate(self.layers):
+            bound = 1 / 3 if i == 0 else (6 / 32) ** 0.5 / 30
+            nn.init.uniform_(layer.weight, -bound, bound)
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in self.layers:
+            x = torch.sin(30 * layer(x))
+        return self.out(x)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("make", [SkipNet, Sine, Fast, Heads])
+def test_fused_under_autocast_is_as_near_to_float64_as_the_loop(make: type[nn.Module], dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(5)
+    router = VoronoiRouter(make(), uniform(generator, 5, 3), coords="first3", fuse=True, way="fused")
+    perturb(router, generator, 0.01 if make is Fast else 0.2)
+    x = uniform(generator, 120, 15 if make is SkipNet else 3)
+    router(x)  # and autocast comes later
+    cells = router.diagram.locate(x[:, :3])
+    exact_router = copy.deepcopy(router).double()
+    (exact, *_), exact_modules = masked_loop(exact_router, cells, [x.double()])
+    with torch.autocast("cpu", dtype):
+        found = router(x)
+        found = found[0] if isinstance(found, tuple) else found
+        (loop, *_), modules = masked_loop(router, cells, [x])
+    assert router.explain() == "forward: fused" and found.dtype == loop.dtype
+    weights = torch.randn(exact.shape, generator=generator)
+    for y in (found, loop, exact):
+        (y * weights.to(y)).sum().backward()
+    pairs = [(found, loop, exact)]
+    for name, p in router.module.named_parameters():
+        if p.grad is not None:
+            own = [torch.stack([m.get_parameter(name).grad for m in cells]) for cells in (modules, exact_modules)]
+            pairs.append((p.grad, *own))
+    for ours, theirs, right in pairs:
+        error, other = ((y.double() - right).norm() for y in (ours, theirs))
+        assert error <= 2 * other + FLOOR[dtype] * right.norm()
+
+
+def test_inference_mode(generator: torch.Generator) -> None:
+    """Made, called and fed in inference mode, a router trains after it."""
+    for options in ({"fuse": True, "way": "fused"}, {"way": "grouped"}, {"way": "loop"}):
+        with torch.inference_mode():
+            router, x = router_of(Heads(), generator, **options), uniform(generator, 50, 3)
+            before = router(x)
+        found = router(x)
+        torch.testing.assert_close(found, before.clone())
+        found.sum().backward()
+        assert all(p.grad is not None for name, p in router.named_parameters() if ".net." in name)
+
+
+class Bent(nn.Module):
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.sin(x) * 2
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit", "ignore:.*cell by cell")
+def test_compiled_parts_have_no_parameters(generator: torch.Generator) -> None:
+    net = nn.Sequential(nn.Linear(3, 4), nn.Linear(4, 2))
+    for module in (torch.jit.script(net), nn.Sequential(torch.jit.trace(net, torch.rand(5, 3)), nn.Linear(2, 2))):
+        with pytest.raises(TypeError, match=r"is compiled by torch\.jit, and .* \(wrap the Python module\)"):
+            VoronoiRouter(module, torch.rand(4, 3), coords="first3")
+    module = nn.Sequential(nn.Linear(3, 4), torch.jit.script(Bent()), nn.Linear(4, 2))
+    router, x = router_of(module, generator), uniform(generator, 60, 3)
+    torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
+    router = router_of(module, generator, fuse=True)
+    with pytest.raises(ValueError, match="a tensor comes from what is no PyTorch function"):
+        router(x)
 
 
 def test_compile_checkpoint_and_functional_call(generator: torch.Generator) -> None:

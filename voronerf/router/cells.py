@@ -52,6 +52,8 @@ def _refusal(part: nn.Module) -> str:
         return "mixes the samples of a batch (use LayerNorm)"
     if isinstance(part, nn.RNNBase):
         return "is recurrent, with weights that cannot be one set for each cell"
+    if isinstance(part, torch.jit.ScriptModule) and next(part.parameters(), None) is not None:
+        return "is compiled by torch.jit, and cannot take the parameters of a cell (wrap the Python module)"
     if any(type(one).__name__.endswith("SpectralNorm") for one in (part, *part._forward_pre_hooks.values())):
         return "keeps a state for each weight (spectral norm) that cells cannot share"
     for name, value in vars(part).items():

@@ -8,12 +8,14 @@ size, or with ``way=`` the one that was named.
 from __future__ import annotations
 
 import contextlib
+import operator
 import os
 import sys
 import threading
 import time
 import traceback
 import warnings
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,16 +26,20 @@ from torch import Tensor
 from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.double import Double
+from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
-from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters
+from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters, parts_of
 from voronerf.router.layout import Call, Results, map_tensors
 from voronerf.router.probe import Options, Probe, check_rays
 from voronerf.router.transforms import aside, recorded
+from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup, same
 
 _OP = "VoronoiRouter"
 _FEWEST = 8  # samples; a first call of fewer is not probed and runs cell by cell
 _PLANS = 256  # kinds of calls that are remembered
+_TRACES = 8  # of one kind of call; a module that changes more often runs grouped
 _TURNS, _SECONDS = 8, 0.08  # a way is measured at most so often, and no more than twice after so many seconds
+_SLICE, _BEHIND = 8192, 1.5  # samples of a batch that are measured; times behind the fastest, so not measured again
 _EQUAL = 1.02  # of the least time: an earlier way of a plan is taken unless it is slower by more
 _OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
 
@@ -47,6 +53,8 @@ class CallPlan:
         measured: Whether the first batch of each size decides between the ways; else the first one runs.
         open: Whether another batch may run grouped, though the first did not.
         chosen: The fastest way and why, by the size of a batch and the number of cells.
+        constants: What is no tensor among the arguments of the call that it was made for, if it is fused.
+        watch: What its trace read of the module, as it was.
         skip: The next calls that run cell by cell before another way is tried again.
         wait: ``skip`` after the next batch that cannot be grouped.
     """
@@ -54,9 +62,25 @@ class CallPlan:
     ways: list[Way]
     measured: bool = False
     open: bool = False
-    chosen: dict[tuple[int, int], tuple[Way, str]] = field(default_factory=dict)
+    chosen: dict[tuple[int, int], tuple[int, str]] = field(default_factory=dict)
+    constants: dict[str, Any] = field(default_factory=dict)
+    watch: Watch = field(default_factory=Watch)
     skip: int = 0
     wait: int = 0
+
+    @property
+    def fused(self) -> Fused | None:
+        """The way that a call takes as it was traced."""
+        return self.ways[0] if isinstance(self.ways[0], Fused) else None
+
+    def changed(self, constants: dict[str, Any]) -> list[Source]:
+        """What is not as it was when the module was traced: arguments, attributes and buffers."""
+        fused = self.fused
+        if fused is None:
+            return []
+        now = constants.keys() | self.constants.keys() if constants.keys() != self.constants.keys() else constants
+        names = [n for n in now if not same(constants.get(n), self.constants.get(n)) and n not in fused.inputs.sources]
+        return [*names, *self.watch.changed()]
 
     def postpone(self) -> None:
         """Runs the next calls cell by cell, twice as many each time."""
@@ -75,7 +99,10 @@ class Dispatch:
 
     def forget(self) -> None:
         """Drops all plans, after a change of dtype, device or parameters' names."""
-        self.plans: dict[Any, CallPlan] = {}
+        self.plans: dict[Any, list[CallPlan]] = {}  # the latest first; several where they are traced with other values
+        self._fixed: dict[Any, tuple[set[Source], str]] = {}  # what cannot be an input of a trace, and why
+        self._known, self._trees = list[Any](), list[Any]()  # parameters, and parts of the module, at the last call
+        self._inner: list[Any] = []  # shapes of one cell's parameters
         self._warned: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
 
@@ -96,35 +123,113 @@ class Dispatch:
         """
         if grouping.device.type == "cpu":
             keep_freed_memory()
+        self._check_parameters(call, grouping.k, options.names)
         plan = self._plan(call, grouping, options)
         if frozen is None or not torch.is_grad_enabled() or not call.layout.n:
             return self._run(plan, call, grouping)
         return self._run_apart(plan, call, grouping, frozen)
 
+    def _check_parameters(self, call: Call, k: int, names: Collection[str]) -> None:
+        """Raises TypeError or ValueError where the module has not the parameters of k cells that it was wrapped with.
+
+        A parametrisation, or memory of another shape, would send kernels to memory that is not theirs.
+        """
+        if (
+            self._known
+            and all(
+                (p := own.get(name)) is not None and p.shape == shape and p.dtype is dtype
+                for own, name, shape, dtype in self._known
+            )
+            and all(len(own) == len(was) and all(map(operator.is_, own.values(), was)) for own, was in self._trees)
+        ):
+            return
+        now = dict(call.module.named_parameters())
+        if gone := [name for name in names if name not in now]:
+            raise TypeError(
+                f"{_OP}: module must keep the parameters that it was wrapped with, but {gone[0]!r} is gone; change a "
+                "module (weight_norm, parametrizations, pruning) before it is wrapped"
+            )
+        cells = set(map(id, cell_parameters(call.module)))
+        for name, p in now.items():
+            if id(p) in cells and p.shape[:1] != (k,):
+                raise ValueError(
+                    f"{_OP}: parameters of module must be [{k}, ...], one for each cell, but {name!r} is "
+                    f"{list(p.shape)}"
+                )
+        inner = [(name, p.shape[id(p) in cells :], p.dtype) for name, p in now.items()]
+        if inner != self._inner:
+            self.forget()
+        self._inner = inner
+        self._known = [(own._parameters, name, p.shape, p.dtype) for own, name, p in owned_parameters(call.module)]
+        trees = [own._modules for own in parts_of(call.module).values()]
+        self._trees = [(own, tuple(own.values())) for own in trees if own]
+
     def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
-        """The plan for calls of this kind, which the first of them makes."""
-        layout, key = call.layout, _kind_of(call, grouping.device, options.fuse)
-        plan = self.plans.get(key)
+        """The plan for calls of this kind, which the first of them makes, and one that finds other values."""
+        layout, key = call.layout, _kind_of(call, grouping.device)
+        constants = call.constants() if options.fuse else {}
+        plans = self.plans.get(key, [])
+        plan = next((plan for plan in plans if not plan.changed(constants)), None)
         if plan is not None and (not (plan.open and plan.skip == 0 and layout.n >= _FEWEST) or recorded()):
             return plan
         call.changed(lambda tensor, kind: tensor)  # arguments that are refused are so before anything is probed
         generators = [grouping.device] if grouping.device.type == "cuda" else []
-        with self._lock, torch.random.fork_rng(generators), aside(call) as call:
+        with self._lock, torch.random.fork_rng(generators), aside(call) as beside:
             if layout.n < _FEWEST:
                 if layout.n:
-                    Probe(call, grouping).check_parameters()
+                    Probe(beside, grouping).check_parameters()
                 return CallPlan([Loop(f"first calls of fewer than {_FEWEST} samples")])
-            probe = Probe(call, grouping)
+            probe = Probe(beside, grouping)
             if plan is not None and not probe.is_groupable():
                 plan.postpone()
                 return plan
             if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
-                check_rays(call)
-            ways, is_open = probe.find_ways(options, self.warn_once)
+                check_rays(beside)
+            inputs, over = self._inputs(call, constants, plans, key) if plan is None and plans else ([Inputs()], "")
+            # What was fused once goes on grouped where it cannot be fused again.
+            options = replace(options, several=options.several or bool(plans))
+            ways, is_open = probe.find_ways(options, self.warn_once, inputs, over)
         if len(self.plans) >= _PLANS:
             self.plans.clear()
-        plan = self.plans[key] = CallPlan(ways, options.way == "fastest", is_open)
-        return plan
+        made = CallPlan(ways, options.way == "fastest", is_open, constants=constants)
+        if made.fused is not None:
+            made.watch = Watch.of(call.module, made.fused.reads, made.fused.inputs)
+        if probe.refused and made.fused is not None:
+            fixed = self._fixed.setdefault(key, (set(), probe.refused))[0]
+            fixed.update(*(own.sources - made.fused.inputs.sources for own in inputs))
+        if plans and [way.name for way in plans[0].ways] == [way.name for way in ways]:
+            made.chosen = plans[0].chosen
+        self.plans[key] = [made] if made.fused is None else [made, *(own for own in plans if own is not plan)]
+        return made
+
+    def _inputs(
+        self, call: Call, constants: dict[str, Any], plans: list[CallPlan], key: Any
+    ) -> tuple[list[Inputs], str]:
+        """What a trace may take as inputs, after something has changed; or none, and that it changed too often."""
+        fused = plans[0].fused
+        assert fused is not None
+        changed, parts = plans[0].changed(constants), list(parts_of(call.module).values())
+        fixed, why = self._fixed.get(key, (set(), ""))
+
+        def named(source: Source) -> str:
+            if isinstance(source, str):
+                return f"argument {source}"
+            return f"{type(parts[source[0]]).__name__}.{source[1]}"
+
+        if len(plans) >= _TRACES:
+            names = " and ".join(dict.fromkeys(map(named, changed)))
+            rule = "changes from call to call, and a trace takes it as fixed"
+            self._latest.pop(call.method, None)
+            return [], f"not fused any more, since {names} {rule}{f': as an input of the trace {why}' if why else ''}"
+
+        def value(source: Source) -> Any:
+            return constants.get(source) if isinstance(source, str) else lookup(parts[source[0]], source[1])
+
+        new = {source for source in changed if source not in fixed and is_number(value(source))}
+        sources = frozenset(new | fused.inputs.sources)
+        kept = [fused.inputs] if fused.inputs.sources else []
+        tried = [Inputs(sources, dtype) for dtype in NUMBERS] if new else []
+        return [*tried, *kept, Inputs()], ""
 
     def _choose(self, plan: CallPlan, call: Call, grouping: Grouping) -> tuple[Way, str]:
         """The way of a call, and why."""
@@ -135,16 +240,19 @@ class Dispatch:
             ways = ways[-1:]
         if not plan.measured or len(ways) == 1 or n < _FEWEST:
             return ways[0], ways[0].why
-        size = n.bit_length() // 2, k  # batches of up to four times as many samples
+        size = min(n, _SLICE).bit_length() // 2, k  # batches of up to four times as many samples
         if size not in plan.chosen:
             with self._lock, aside(call) as beside:
                 times = measure(ways, beside, grouping)
             first = next(i for i, time in enumerate(times) if time <= _EQUAL * min(times))
             texts = [f"{way.name} {1e3 * time:.3g} ms" for way, time in zip(ways, times, strict=True)]
             others = ", ".join(texts[:first] + texts[first + 1 :])
-            way, own = ways[first], f"{1e3 * times[first]:.3g} ms for {n} samples, {others}" if min(times) else ""
-            plan.chosen[size] = way, "; ".join(filter(None, (way.why, own)))
-        return plan.chosen[size]
+            plan.chosen[size] = (
+                first,
+                f"{1e3 * times[first]:.3g} ms for {min(n, _SLICE)} samples, {others}" if min(times) else "",
+            )
+        first, own = plan.chosen[size]
+        return ways[first], "; ".join(filter(None, (ways[first].why, own)))
 
     def _run(self, plan: CallPlan, call: Call, grouping: Grouping) -> Results:
         """Runs a call as planned, or cell by cell where its batch cannot be grouped."""
@@ -211,11 +319,8 @@ class Dispatch:
         self._warned.add(topic)
 
 
-def _kind_of(call: Call, device: torch.device, fused: bool) -> Any:
-    """The key of a plan: modes, and types and sizes of the arguments but for the number of samples.
-
-    Numbers count by their value only where they would go into a fused network.
-    """
+def _kind_of(call: Call, device: torch.device) -> Any:
+    """The key of plans: modes, and types and sizes of the arguments but for the number of samples."""
     autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
     d = len(call.layout.lead)
     kind = [call.method, call.module.training, torch.is_grad_enabled(), autocast, tuple(call.kwargs), d]
@@ -224,8 +329,7 @@ def _kind_of(call: Call, device: torch.device, fused: bool) -> Any:
             ones = tuple(size == 1 for size in value.shape[:d])
             kind.append((tuple(value.shape[d:]), value.dim(), value.dtype, value.requires_grad, ones))
         else:
-            by_value = (type(None), bool, str, int, float) if fused else (type(None), bool, str)
-            kind.append(value if isinstance(value, by_value) else type(value))
+            kind.append(value if isinstance(value, (type(None), bool, str)) else type(value))
     return tuple(kind)
 
 
@@ -246,11 +350,16 @@ class _Constant(torch.autograd.Function):
 
 
 def measure(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
-    """Seconds that each way takes for the batch of a call, forward and, where there are gradients, backward.
+    """Seconds that each way takes for a part of a batch, forward and, where there are gradients, backward.
 
-    The ways take turns, and the least time of each counts. A double of the module takes what they write and the
-    gradients; random numbers go on as if nothing had run.
+    The ways take turns, and the least time of each counts; the loop has one turn where it is far behind. A double of
+    the module takes what they write and the gradients; random numbers go on as if nothing had run.
     """
+    k, device, picked = grouping.k, grouping.device, call.part(_SLICE) if grouping.rows is None else None
+    if picked is not None:
+        call, rows = picked
+        cells = None if grouping.cells is None else grouping.cells.index_select(0, rows)
+        grouping = Grouping(cells, len(rows), k, device, grouping.backend)
     double, leaves = Double(call.module), list[Tensor]()
 
     def leaf(value: Tensor) -> Tensor:
@@ -261,14 +370,14 @@ def measure(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
     double.fill({id(p): leaf(p) for _, _, p in owned_parameters(call.module)})
     double.own_buffers()
     args, kwargs = map_tensors((call.args, call.kwargs), leaf)
-    again, cuda = replace(call, module=double.module, args=args, kwargs=kwargs), grouping.device.type == "cuda"
+    again, cuda = replace(call, module=double.module, args=args, kwargs=kwargs), device.type == "cuda"
 
     # Beside other work the processor's time says more, but it leaves out what other threads do.
     clock = time.perf_counter if cuda or torch.get_num_threads() > 1 else time.thread_time
 
     def seconds(way: Way) -> float:
         if cuda:
-            torch.cuda.synchronize(grouping.device)
+            torch.cuda.synchronize(device)
         start = clock()
         outputs = [t for t in way.run(again, grouping.anew()).unsorted if t.requires_grad and t.is_floating_point()]
         if outputs and leaves:
@@ -276,11 +385,14 @@ def measure(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
             total = torch.stack([(t * torch.ones_like(t)).sum().float() for t in outputs]).sum()
             torch.autograd.grad(total, leaves, allow_unused=True)
         if cuda:
-            torch.cuda.synchronize(grouping.device)
+            torch.cuda.synchronize(device)
         return clock() - start
 
-    turns, began = list[list[float]](), clock()
-    with torch.random.fork_rng([grouping.device] if cuda else []):
-        while len(turns) < 2 or (len(turns) < _TURNS and clock() - began < _SECONDS):
-            turns.append([seconds(way) for way in ways])
-    return [min(times) for times in zip(*turns, strict=True)]
+    times, turns, began = [float("inf")] * len(ways), 0, clock()
+    with torch.random.fork_rng([device] if cuda else []):
+        while turns < 2 or (turns < _TURNS and clock() - began < _SECONDS):
+            for i, way in enumerate(ways):
+                if turns == 0 or not isinstance(way, Loop) or times[i] < _BEHIND * min(times):
+                    times[i] = min(times[i], seconds(way))
+            turns += 1
+    return times

@@ -21,10 +21,11 @@ from torch.fx.node import map_arg
 from voronerf.ops._core.program import VALUE, Builder, Columns, Program, Step
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable, name_of
-from voronerf.router.grouping import Grouping, owned_parameters
+from voronerf.router.grouping import Grouping, owned_parameters, parts_of
 from voronerf.router.layout import Call, Results, map_tensors, tensors_of
 from voronerf.router.lower import Entries, Lowering, NotAStep
 from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiable
+from voronerf.router.watch import Inputs, lookup
 
 
 class ParameterEntries:
@@ -41,7 +42,7 @@ class ParameterEntries:
     def of_values(self, values: Mapping[Any, Any]) -> Tensor:
         """Its entries, [k, ...], or [1, ...] where cells share it."""
         value = values.get(self._of, self._of)
-        flat = value.flatten(1) if self._of_cells else value.reshape(1, -1)
+        flat = value.reshape(value.shape[0] if self._of_cells else 1, -1)
         if self._whole:
             return flat.reshape(-1, *self._shape)
         if self._turned:
@@ -64,11 +65,17 @@ class Fused:
 
     It is traced on given rows of the arguments, for as many samples as ``rows_for`` gives. Raises :class:`Unfusable`
     where nothing can be fused, or a step cannot be done again for other samples.
+
+    Attributes:
+        inputs: Numbers and buffers that are looked up in each call.
+        reads: (place, name) of the attributes of parts that ``forward`` read.
     """
 
-    def __init__(self, call: Call, given: list[Tensor]) -> None:
-        self._module = call.module
-        trace = Trace(call, given)
+    def __init__(self, call: Call, given: list[Tensor], inputs: Inputs) -> None:
+        self._module, self.inputs = call.module, inputs
+        trace = Trace(self._with_inputs(call, given[0].device), given, inputs)
+        parts, self.reads = list(parts_of(call.module).values()), trace.reads
+        self._places = [(parts[i], i, name) for i, name in trace.places]
         self._n, self._inputs, self._shared, self._parameters = trace.n, trace.inputs, trace.shared, trace.parameters
         self._result, self._outputs = trace.result, trace.outputs
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
@@ -255,11 +262,15 @@ class Fused:
     def run(self, call: Call, grouping: Grouping) -> Results:
         """The method's results: in the order of the call, where nothing between runs needs rows by cell."""
         sort = self._sorted or grouping.rows is not None or not call.layout.n
-        rows = call.arranged(grouping if sort else None)
-        owned = self._owned
+        call = self._with_inputs(call, grouping.device)
+        rows, shared = call.arranged(grouping if sort else None), call.shared()
+        owned, places = self._owned, self._places
         if call.module is not self._module:  # a copy of the module, with parameters of its own
             owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
-        values: dict[Any, Any] = {self._n: rows[0].shape[0], **dict(zip(self._shared, call.shared(), strict=True))}
+            parts = list(parts_of(call.module).values())
+            places = [(parts[i], i, name) for _, i, name in places]
+        shared += [self.inputs.tensor(lookup(part, name), grouping.device) for part, _, name in places]
+        values: dict[Any, Any] = {self._n: rows[0].shape[0], **dict(zip(self._shared, shared, strict=True))}
         values.update(zip(self._inputs, [x.clone() for x in rows] if self._writes else rows))
         for node, place in self._parameters.items():
             owner, name = owned[place]
@@ -269,6 +280,11 @@ class Fused:
             self._compute(values, grouping, sort)
         found = [values[node] if recorded else values[node].detach() for node in self._outputs]
         return Results(self._result, found, grouping if sort else None)
+
+    def _with_inputs(self, call: Call, device: torch.device) -> Call:
+        """The call with tensors in the place of its numbers that are inputs."""
+        names = {source for source in self.inputs.sources if isinstance(source, str)}
+        return call.with_tensors(names, lambda value: self.inputs.tensor(value, device)) if names else call
 
     def _compute(self, values: dict[Any, Any], grouping: Grouping, sort: bool) -> None:
         order = None if sort else grouping.source
@@ -304,7 +320,7 @@ class Fused:
             if isinstance(of, fx.Node):
                 shape, at, m = of.meta["layout"]
                 tensor = tensor.reshape(n * m, *shape).movedim(0, at) if at else tensor.reshape(n * m, *shape)
-                half = of.meta["dtype"] in (torch.bfloat16, torch.float16)
+                half = of.meta["dtype"] in (torch.bfloat16, torch.float16) and dtype == torch.float32
                 tensor = tensor.to(of.meta["dtype"]) if half else tensor
             values[of] = tensor
 

@@ -174,11 +174,22 @@ class Assigned(NamedTuple):
 # Parameters -----------------------------------------------------------------------------------------------------------
 
 
+def parts_of(module: nn.Module, found: dict[int, nn.Module] | None = None) -> dict[int, nn.Module]:
+    """All parts of a module tree by their id, in the order of ``modules()``, which takes three times as long."""
+    found = {} if found is None else found
+    if id(module) not in found:
+        found[id(module)] = module
+        for child in module._modules.values():
+            if child is not None:
+                parts_of(child, found)
+    return found
+
+
 def owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Parameter]]:
     """(owner, name, parameter) of every parameter of a module tree; one that is used twice comes twice."""
     return [
         (owner, name, parameter)
-        for owner in module.modules()
+        for owner in parts_of(module).values()
         for name, parameter in list(owner._parameters.items())
         if parameter is not None
     ]

@@ -12,7 +12,7 @@ import functools
 import inspect
 import math
 import types
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -240,6 +240,50 @@ class Call:
         values = [map_tree(value, changed, name) for name, value in given]
         return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
 
+    def constants(self) -> dict[str, Any]:
+        """What is no tensor among the arguments and inside of them, by name."""
+        found: dict[str, Any] = {}
+
+        def note(name: str, value: Any, nested: bool) -> Any:
+            if not isinstance(value, Tensor):
+                found[name] = value
+            return value
+
+        for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True):
+            map_tree(value, note, name)
+        return found
+
+    def with_tensors(self, names: Container[str], make: Callable[[Any], Tensor]) -> Call:
+        """The same with tensors that all samples share in the place of numbers."""
+        given = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
+        values = [map_tree(v, lambda name, leaf, _: make(leaf) if name in names else leaf, n) for n, v in given]
+        args, kwargs = tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
+        own = dataclasses.replace(self, args=args, kwargs=kwargs, kinds=dict(self.kinds))
+        own.changed(lambda tensor, kind: tensor)
+        return own
+
+    def part(self, most: int) -> tuple[Call, Tensor] | None:
+        """A call with some of the samples, and int64 [m], which; None where all of them are few enough.
+
+        They are spread evenly along the longest leading dimension, so that rays stay whole where there are many.
+        """
+        lead = self.layout.lead
+        if self.layout.n <= most:
+            return None
+        dim = max(range(len(lead)), key=lead.__getitem__)
+        count = max(lead[dim] * most // self.layout.n, 1)
+        first = next(t for t in tensors_of((self.args, self.kwargs)))
+        index = torch.arange(count, device=first.device) * lead[dim] // count
+
+        def taken(tensor: Tensor, kind: str) -> Tensor:
+            whole = kind == RAY and dim == len(lead) - 1
+            return tensor if whole or tensor.shape[dim] == 1 else tensor.index_select(dim, index.to(tensor.device))
+
+        args, kwargs = self.changed(taken)
+        small = dataclasses.replace(self.layout, lead=(*lead[:dim], count, *lead[dim + 1 :]))
+        rows = torch.arange(self.layout.n, device=index.device).reshape(lead).index_select(dim, index)
+        return dataclasses.replace(self, layout=small, args=args, kwargs=kwargs), rows.flatten()
+
     def shared(self) -> list[Tensor]:
         """The tensors that are the same for all samples; known after :meth:`changed`."""
         found: list[Tensor] = []
@@ -266,6 +310,8 @@ class Call:
 
         def arrange(tensor: Tensor, kind: str) -> Tensor:
             rows = layout.flatten(tensor, kind)
+            if rows.is_inference() and not torch.is_inference_mode_enabled():
+                rows = rows.clone()  # which can be saved for a backward pass
             if not layout.n:  # no module is called without rows: placeholders give the shapes of its results
                 empty = rows.new_full((n, *rows.shape[1:]), 0.5 if rows.is_floating_point() else 0)
                 rows = torch.cat([rows[:0], empty])  # joined, so that results depend on the argument as ever

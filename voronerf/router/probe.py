@@ -7,7 +7,7 @@ results and gradients are compared.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,6 +22,7 @@ from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Wa
 from voronerf.router.grouping import Grouping, cell_parameters
 from voronerf.router.layout import RAY, Call, Results, map_tensors, tensors_of
 from voronerf.router.trace import Unfusable, rows_for
+from voronerf.router.watch import Inputs
 
 _OP = "VoronoiRouter"
 _SAMPLES, _CELLS = (41, 43, 47, 53), 3  # numbers of samples of a probe, of which one is taken, and their cells
@@ -37,6 +38,7 @@ class Options:
     fuse: bool  # ``forward`` does the same in every call
     way: str  # "fastest", or the way that is taken without measuring: "fused", "grouped" or "loop"
     several: bool  # methods besides ``forward`` are routed; one that cannot be fused leaves the others fused
+    names: tuple[str, ...]  # of the parameters that the module was wrapped with
 
 
 class Probe:
@@ -44,6 +46,7 @@ class Probe:
 
     def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
         self._made_of = call, grouping
+        self.refused = ""  # why what changed cannot be an input
         device = grouping.device
         self._n = n = rows_for(call.module, tensors_of((call.args, call.kwargs)), _SAMPLES)
         picked = torch.arange(n, device=device) * call.layout.n // n
@@ -65,8 +68,12 @@ class Probe:
         args, kwargs = map_tensors((call.args, call.kwargs), leaf)
         self._call = replace(call, module=module, args=args, kwargs=kwargs)
 
-    def find_ways(self, options: Options, warn_once: Callable[[str, str], None]) -> tuple[list[Way], bool]:
+    def find_ways(
+        self, options: Options, warn_once: Callable[[str, str], None], inputs: Sequence[Inputs], over: str = ""
+    ) -> tuple[list[Way], bool]:
         """The ways that give what the loop gives, the loop last; and whether another batch may have more of them.
+
+        The first of ``inputs`` is taken with which the module can be fused; ``over`` says why it is not to be any more.
 
         Raises:
             TypeError: Where the module changes its parameters or mixes samples.
@@ -83,10 +90,12 @@ class Probe:
                 why = f"its forward fails on a few samples ({type(error).__name__}: {error})"
         else:
             return [Loop(why)], False
-        ways, is_open, unfused = list[Way](), False, ""
-        if options.fuse and options.way in ("fastest", "fused"):
+        ways, is_open, unfused = list[Way](), False, over
+        if unfused:
+            warn_once(f"changes {call.method}", f"{call.name} is {unfused}")
+        elif options.fuse and options.way in ("fastest", "fused"):
             try:
-                ways.append(self._fused(loop, expected))
+                ways.append(self._fused(loop, expected, inputs))
             except Exception as error:
                 self._check_rows(loop)
                 why = str(error) if isinstance(error, Unfusable) else f"{type(error).__name__}: {error}"
@@ -159,25 +168,37 @@ class Probe:
     def _agrees(self, way: Way, loop: Way, expected: Outcome) -> bool:
         """Whether a way gives what the loop gives; where it does not, whether it does in float64.
 
-        A deep network of fast sines makes its own rounding as large as its results.
+        A deep network of fast sines makes its own rounding as large as its results, and so do layers under autocast,
+        which float64 leaves off.
         """
-        if _same(self._outcome(way), expected):
+        found = self._outcome(way)
+        if _same(found, expected):
             return True
+        if _kinds(found) != _kinds(expected):
+            return False
         try:
             exact = Probe(*self._made_of, dtype=torch.float64)
-            return _same(exact._outcome(way), exact._outcome(loop))
+            with torch.autocast(self._entries.device.type, enabled=False):
+                return _same(exact._outcome(way), exact._outcome(loop))
         except Exception:
             return False
 
-    def _fused(self, loop: Way, expected: Outcome) -> Way:
+    def _fused(self, loop: Way, expected: Outcome, inputs: Sequence[Inputs]) -> Way:
         """The network as one operation; raises where something stands in the way."""
-        with NoRandomness():
-            module, given = self._made_of[0].module, self._call.arranged(self._entries)
-            count = rows_for(module, given)
-            way = Fused(replace(self._call, module=module), [rows[:count] for rows in given])
-        if not self._agrees(way, loop, expected):
-            raise Unfusable("the traced network gives other results than its forward")
-        return way
+        for tried in inputs:
+            try:
+                with NoRandomness():
+                    module, given = self._made_of[0].module, self._call.arranged(self._entries)
+                    count = rows_for(module, given)
+                    way = Fused(replace(self._call, module=module), [rows[:count] for rows in given], tried)
+                if not self._agrees(way, loop, expected):
+                    raise Unfusable("the traced network gives other results than its forward")
+                return way
+            except Exception as error:
+                if tried is inputs[-1]:
+                    raise
+                self.refused = str(error)
+        raise AssertionError
 
     def _check_rows(self, loop: Loop) -> None:
         """Raises TypeError where results for samples change when others are left out."""
@@ -203,6 +224,10 @@ def _same(found: Outcome, expected: Outcome) -> bool:
     (a, ours), (b, theirs) = found, expected
     alike = len(a.tensors) == len(b.tensors) and len(ours) == len(theirs)
     return alike and all(map(agree, a.tensors, b.tensors)) and agree_gradients(ours, theirs)
+
+
+def _kinds(outcome: Outcome) -> list[tuple[torch.Size, torch.dtype]]:
+    return [(tensor.shape, tensor.dtype) for tensors in (outcome[0].tensors, outcome[1]) for tensor in tensors]
 
 
 @torch.no_grad()

@@ -95,9 +95,10 @@ class VoronoiRouter(nn.Module):
         share: Names of parameters that all cells have in common, with wildcards: ``["encoder.*"]``. There is one copy
             of them, with ordinary gradients; the others are per cell. Steps with shared parameters run once for all
             samples, also with ``fuse``.
-        fuse: Promises that ``forward`` does the same in every call. Its network is traced once and runs as one
-            operation, or is refused with the line that stands in the way.
-        way: "fastest" measures the ways of a call on the first batch of its kind and, within a factor of four, its
+        fuse: Promises that ``forward`` depends on its arguments and on what its parts hold alone. Its network is
+            traced and runs as one operation, or is refused with the line that stands in the way. Numbers, attributes
+            and buffers that change are followed.
+        way: "fastest" measures the ways of a call on some of the first batch of its kind and, within a factor of four,
             size. "fused", "grouped" and "loop" take that way, or the next in this order where it is not possible, and
             do not depend on timings.
         layout: How the module sees samples ``[rays, samples, f]``: "rays" as ``[n, 1, f]``, with what is per ray as
@@ -128,6 +129,7 @@ class VoronoiRouter(nn.Module):
         forward: fused
     """
 
+    @torch.inference_mode(False)  # in which parameters could never be trained
     def __init__(
         self,
         module: nn.Module,
@@ -164,6 +166,7 @@ class VoronoiRouter(nn.Module):
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._layered = isinstance(module, LayeredField)
+        self._names = tuple(name for name, _ in self.module.named_parameters())
         self._dispatch = Dispatch()
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
         self._unseen = True  # no large batch has shown whether the centres fit the positions
@@ -585,6 +588,16 @@ class VoronoiRouter(nn.Module):
             return "forward: fused, by the layer table of the field"
         return self._dispatch.explain(("forward", *self.methods))
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuses attributes of the module, which would have no effect here."""
+        own = self.__dict__
+        known = hasattr(type(self), name) or any(name in names for names in (own, self._modules, self._buffers))
+        if "_by_table" in own and not known and hasattr(self.module, name):
+            raise AttributeError(
+                f"VoronoiRouter: {name} belongs to {type(self.module).__name__}; set router.module.{name}"
+            )
+        super().__setattr__(name, value)
+
     def __getattr__(self, name: str) -> Any:
         """The routed methods, beside what a module has."""
         methods = self.__dict__.get("methods", ())
@@ -640,7 +653,7 @@ class VoronoiRouter(nn.Module):
                 doubt = doubt_of(rule, *given, grouping.offsets, self.diagram.centres)
             if doubt:
                 self._dispatch.warn_once("positions", doubt)
-        options = Options(self.fuse, self.way, bool(self.methods))
+        options = Options(self.fuse, self.way, bool(self.methods), self._names)
         return self._dispatch.evaluate(call, grouping, options, self.frozen_cells).restored(layout)
 
     _route_uncompiled = not_compiled(_route_as_it_is, _NO_GRAPH)

@@ -21,11 +21,11 @@ from torch.overrides import TorchFunctionMode
 
 from voronerf.router.double import Double
 from voronerf.router.grouped import METADATA, RANDOM, find, name_of, user_line, writes_in_place
-from voronerf.router.grouping import cell_parameters, owned_parameters
+from voronerf.router.grouping import cell_parameters, owned_parameters, parts_of
 from voronerf.router.layout import Call, rebuild, tensors_of
+from voronerf.router.watch import LOCK, Inputs, lookup, reads_of
 
 CONSTANTS, CELLS, SAMPLES = range(3)  # what a value depends on: the latter of these
-_PATCHES = threading.RLock()  # one thread at a time changes what torch calls for a custom function
 _PRIMES = (37, 31, 29, 23)  # numbers of samples of a trace, see `rows_for`
 _LIKE = find("new_zeros new_ones new_full new_empty new_tensor", torch.Tensor)
 _TOTALS = find("any all sum", torch, torch.Tensor)  # a number that may not be used, but for a gradient
@@ -53,11 +53,12 @@ class Trace(TorchFunctionMode):
     The ``meta`` of a node has its ``value``, what it depends on (``on``), its ``line`` in the module, whether gradients
     were on (``grad``), and whether it is its first argument, written to (``inplace``).
 
-    The rows of the arguments are given for ``self.rows`` samples. Raises :class:`Unfusable` for a step that cannot be
-    done again for other samples.
+    The rows of the arguments are given for ``self.rows`` samples, ``inputs`` are taken as values of each call, and
+    ``reads`` are the attributes that were read. Raises :class:`Unfusable` for a step that cannot be done again for
+    other samples.
     """
 
-    def __init__(self, call: Call, given: list[Tensor]) -> None:
+    def __init__(self, call: Call, given: list[Tensor], inputs: Inputs) -> None:
         super().__init__()
         module = call.module
         single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for p in cell_parameters(module)}
@@ -65,15 +66,23 @@ class Trace(TorchFunctionMode):
         self._places = {id(single.get(id(p), p)): i for i, (_, _, p) in enumerate(owned_parameters(module))}
         self.graph = fx.Graph()
         self.parameters: dict[fx.Node, int] = {}  # with their place among ``owned_parameters``
-        self._running = False
+        self._running, self._line = False, ""
         self._nodes: dict[int, fx.Node] = {}  # by the id of their tensor, which ``meta`` keeps
         self.rows = rows_for(module, given)
         self.n = self._new(self.rows)
         self.inputs = [self._new(tensor) for tensor in given]
         self.shared = [self._new(tensor, on=CONSTANTS) for tensor in call.shared()]
-        double = Double(module)
-        with _custom_functions(self), self:
+        double, parts = Double(module), list(parts_of(module).values())
+        self.places = [source for source in inputs.sources if not isinstance(source, str)]
+        for place, name in self.places:
+            value, part = inputs.tensor(lookup(parts[place], name), given[0].device), double.parts[place]
+            if part is parts[place] and vars(part).get(name) is not value:
+                raise Unfusable(f"{name} of {type(part).__name__} is a number of a layer without parameters")
+            (vars(part) if name in vars(part) else part._buffers)[name] = value
+            self.shared.append(self._new(value, on=CONSTANTS))
+        with reads_of(double.parts) as reads, _custom_functions(self), self:
             result = double.run(call, given, single)
+        self.reads = reads
         self._part_from_gradients()
         self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
         self.outputs = [self._argument(tensor) for tensor in tensors_of(result)]
@@ -108,7 +117,7 @@ class Trace(TorchFunctionMode):
             self.parameters[node] = self._places[id(value)]
             return node
         if value.requires_grad or value.shape[:1] == (self.rows,):
-            raise Unfusable(f"a tensor comes from what is no PyTorch function{user_line()}")
+            raise Unfusable(f"a tensor comes from what is no PyTorch function{self._line}")
         return value
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -118,7 +127,8 @@ class Trace(TorchFunctionMode):
         """Calls a function and records it."""
         if self._running or func in METADATA:
             return func(*args, **kwargs)
-        line, operands = user_line(), tensors_of((args, kwargs))
+        self._line = line = user_line()
+        operands = tensors_of((args, kwargs))
         if func is torch.Tensor.type_as:
             func, args = torch.Tensor.to, (args[0], args[1].device, args[1].dtype)
         if func is torch.autograd.grad:  # again of one run, where a loop over cells has a graph for each call
@@ -177,7 +187,7 @@ class Trace(TorchFunctionMode):
 def _custom_functions(trace: Trace) -> Iterator[None]:
     """Shows a trace the custom functions of this thread, which no mode sees."""
     here = threading.get_ident()
-    with _PATCHES:
+    with LOCK:
         # Below ``Function``, whose own ``apply`` a module may have bound when it was imported.
         base = torch.autograd.function._SingleLevelFunction
 

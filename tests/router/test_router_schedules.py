@@ -1,0 +1,227 @@
+"""Fused networks in loops whose numbers, attributes, buffers and parameters change between calls."""
+
+from __future__ import annotations
+
+import types
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from convention_harness import randomised
+from convention_listed import uniform
+from router_fields import masked_loop, perturb
+from torch import Tensor, nn
+from torch.nn.utils import parametrizations, parametrize, prune
+
+from voronerf import VoronoiRouter
+from voronerf.router import probe
+from voronerf.router.fused import Fused
+
+K = 4
+X = uniform((90,))
+
+
+class Scheduled(nn.Module):
+    """Reads numbers of many kinds beside its arguments; ``use`` says which."""
+
+    progress = 0.25  # of the class, until it is set
+
+    def __init__(self, use: Callable[..., Tensor]) -> None:
+        super().__init__()
+        self.a, self.b, self.use = nn.Linear(3, 8), nn.Linear(8, 2), [use]
+        self.codes = nn.Embedding(12, 8)
+        self.level, self.fine, self.bands, self.act = 1, False, [1.0, 2.0], nn.ReLU()
+        self.bent = nn.LeakyReLU()
+        self.options = types.SimpleNamespace(gain=1.0)
+        self.register_buffer("scalar", torch.tensor(1.0))
+        self.register_buffer("scale", torch.ones(8))
+        self.plain = torch.ones(8)
+
+    def forward(self, x: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        return self.b(self.use[0](self, torch.tanh(self.a(x)), *args, **kwargs))
+
+
+def routed(use: Callable[..., Tensor], **options: Any) -> VoronoiRouter:
+    torch.manual_seed(0)
+    router = VoronoiRouter(randomised(Scheduled(use)), uniform((K,)), coords="first3", fuse=True, **options)
+    return perturb(router, torch.Generator().manual_seed(1))
+
+
+def check(router: VoronoiRouter, *args: Any) -> None:
+    """Values and gradients of parameters are those of the loop over cells, as the module is now."""
+    found = router(X, *args)
+    (expected,), modules = masked_loop(router, router.assign(X), [X, *args])
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    found.square().sum().backward()
+    expected.square().sum().backward()
+    for name, p in router.module.named_parameters():
+        own = [m.get_parameter(name).grad for m in modules]
+        if p.grad is not None:
+            theirs = torch.stack([torch.zeros_like(p[0]) if g is None else g for g in own])
+            torch.testing.assert_close(p.grad, theirs, rtol=1e-3, atol=1e-4)
+        p.grad = None
+
+
+@pytest.fixture
+def traces(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What each trace so far has taken as inputs."""
+    found: list[Any] = []
+
+    class Counted(Fused):
+        def __init__(self, call: Any, given: Any, inputs: Any) -> None:
+            found.append(inputs.sources)
+            super().__init__(call, given, inputs)
+
+    monkeypatch.setattr(probe, "Fused", Counted)
+    return found
+
+
+NUMBERS: dict[str, tuple[Callable[..., Tensor], list[Any]]] = {
+    "a factor": (lambda net, h, it: h * (it / 10), [0, 3, 5, 9, 4]),
+    "a slope": (lambda net, h, it: torch.nn.functional.leaky_relu(h, it), [0.1, 0.2, 0.3, 0.7]),
+    "a limit": (lambda net, h, it: h.clamp(max=it) * torch.full_like(h, it), [0.1, 0.2, 0.3, 0.7]),
+    "a window": (lambda net, h, it: h * torch.clamp(it * 8 - torch.arange(8), 0.0, 1.0), [0.1, 0.2, 0.3, 0.7]),
+    "a frame": (lambda net, h, it: h + net.codes(torch.tensor([it])), [0, 3, 5, 11, 7]),
+    "a row of a parameter": (lambda net, h, it: h + net.codes.weight[it], [0, 3, 5, 11, 7]),
+    "in a dict": (lambda net, h, opts: h * opts["weights"][0], [{"weights": [w]} for w in (0.1, 0.2, 0.3, 0.5)]),
+}
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter.*not fused any more")
+@pytest.mark.parametrize("name", NUMBERS)
+def test_a_number_that_changes_becomes_an_input(name: str, traces: list[Any]) -> None:
+    """Two traces at most serve all values, or a few, and then the module runs grouped; each value is followed."""
+    use, values = NUMBERS[name]
+    router = routed(use)
+    for value in values:
+        check(router, value)
+    assert "fused" in router.explain()
+    if name not in ("a slope", "a limit"):  # Python numbers of functions, which are no tensors
+        assert len(traces) <= 4 and traces[-1]
+    count = len(traces)
+    for value in values:
+        check(router, value)
+    assert len(traces) == count  # what was traced once is not traced again
+
+
+def test_a_number_that_chooses_a_path_ends_grouped(traces: list[Any]) -> None:
+    router = routed(lambda net, h, it: h * min(1.0, it / 20))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for it in range(30):
+            check(router, it)
+    said = [str(w.message) for w in caught if "VoronoiRouter" in str(w.message)]
+    rule = "Scheduled.forward is not fused any more, since argument 1 changes from call to call, and a trace takes it"
+    assert len(said) == 1 and rule in said[0] and "test_router_schedules.py" in said[0]
+    assert router.explain().startswith("forward: grouped: not fused any more") and len(traces) == 11
+
+
+def written(net: Any, name: str, value: Any) -> None:
+    with torch.no_grad():
+        getattr(net, name).copy_(torch.as_tensor(value))
+
+
+SCHEDULES: dict[str, tuple[Callable[..., Tensor], Callable[[Any, float], None]]] = {
+    "an attribute": (lambda net, h: h * net.level, lambda net, v: setattr(net, "level", v)),
+    "an attribute of the class": (lambda net, h: h * net.progress, lambda net, v: setattr(net, "progress", v)),
+    "a scalar buffer, written": (lambda net, h: h * net.scalar, lambda net, v: written(net, "scalar", v)),
+    "a scalar buffer, replaced": (
+        lambda net, h: h * net.scalar,
+        lambda net, v: setattr(net, "scalar", torch.tensor(v)),
+    ),
+    "a buffer, written": (lambda net, h: h * net.scale, lambda net, v: written(net, "scale", v)),
+    "a function of a buffer": (lambda net, h: h * (net.scale * 2).sin(), lambda net, v: written(net, "scale", v)),
+    "a tensor, replaced": (lambda net, h: h * net.plain, lambda net, v: setattr(net, "plain", torch.full((8,), v))),
+    "a list": (lambda net, h: h * net.bands[1], lambda net, v: net.bands.__setitem__(1, v)),
+    "an object": (lambda net, h: h * net.options.gain, lambda net, v: setattr(net.options, "gain", v)),
+    "a part": (lambda net, h: net.act(h), lambda net, v: setattr(net, "act", nn.LeakyReLU(v))),
+    "an attribute of a part": (lambda net, h: net.bent(h), lambda net, v: setattr(net.bent, "negative_slope", v)),
+    "a hook": (lambda net, h: net.act(h), lambda net, v: net.act.register_forward_hook(lambda *a: a[2] * v) and None),
+}
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter.*not fused any more")
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_schedules_of_the_module_are_followed(name: str, traces: list[Any]) -> None:
+    use, change = SCHEDULES[name]
+    router = routed(use)
+    check(router)
+    for value in (0.5, 0.2, 0.8, 0.1):
+        change(router.module, value)
+        check(router)
+        check(router)
+    assert "fused" in router.explain()
+    if "buffer" in name or "tensor" in name or name == "an attribute of the class":
+        assert len(traces) == 2 and len(traces[1]) == 1
+    for step in range(12):
+        change(router.module, step / 13)
+        check(router)
+
+
+def test_a_flag_that_comes_back_is_not_traced_again(traces: list[Any]) -> None:
+    router = routed(lambda net, h: h.relu() if net.fine else h.sin())
+    for step in range(6):
+        router.module.fine = step % 2 == 1
+        check(router)
+    assert len(traces) == 2 and router.explain() == "forward: fused"
+
+
+def test_an_attribute_of_the_module_is_not_set_on_the_router() -> None:
+    router = routed(lambda net, h: h * net.level)
+    with pytest.raises(AttributeError, match=r"level belongs to Scheduled; set router\.module\.level"):
+        router.level = 2
+    router.note = "of my own"
+    assert router.note == "of my own"
+
+
+# Parameters -----------------------------------------------------------------------------------------------------------
+
+
+class Twice(nn.Module):
+    def forward(self, weight: Tensor) -> Tensor:
+        return 2 * weight
+
+
+GONE: dict[str, Callable[[nn.Module], Any]] = {
+    "weight_norm": parametrizations.weight_norm,
+    "the old weight_norm": nn.utils.weight_norm,
+    "a parametrization": lambda layer: parametrize.register_parametrization(layer, "weight", Twice()),
+    "pruning": lambda layer: prune.l1_unstructured(layer, "weight", 0.3),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*weight_norm")
+@pytest.mark.parametrize("way", ["fused", "grouped", "loop"])
+@pytest.mark.parametrize("name", GONE)
+def test_a_parametrization_after_wrapping_is_refused(name: str, way: Any) -> None:
+    router = routed(lambda net, h: h, way=way)
+    router(X)
+    GONE[name](router.module.a)
+    for x in (X, X[:30]):
+        with pytest.raises(TypeError, match=r"with, but 'a\.weight' is gone; change a module .* before it is wrapped"):
+            router(x)
+
+
+@pytest.mark.parametrize("way", ["fused", "grouped", "loop"])
+def test_parameters_of_other_shapes_are_refused_or_followed(way: Any) -> None:
+    router = routed(lambda net, h: h, way=way)
+    check(router)
+    weight, bias = router.module.b.weight.data, router.module.b.bias.data
+    router.module.b.weight.data, router.module.b.bias.data = weight[:, :1], bias[:, :1]
+    check(router)  # one output for each cell
+    router.module.b.weight.data = weight[:1, :1]
+    with pytest.raises(ValueError, match=r"must be \[4, \.\.\.\], one for each cell, but 'b.weight' is \[1, 1, 8\]"):
+        router(X)
+    router.module.b = nn.Linear(8, 2)
+    with pytest.raises(ValueError, match=r"one for each cell, but 'b.weight' is \[2, 8\]"):
+        router(X)
+
+
+def test_memory_that_was_freed_is_refused() -> None:
+    router = routed(lambda net, h: h, way="grouped")
+    router(X)
+    router.module.a.weight.untyped_storage().resize_(0)
+    with pytest.raises((TypeError, RuntimeError)):
+        router(X)

@@ -1,0 +1,157 @@
+"""What a traced ``forward`` took as fixed: attributes and buffers of its module, and arguments that are no tensors.
+
+A trace holds their values. Each call compares them with what they are then, so that a schedule that sets
+``module.progress`` is followed and not ignored.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import operator
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from numbers import Number
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.router.grouping import parts_of
+
+Source = str | tuple[int, str]
+"""An argument by its name, or an attribute by the place of its part in ``modules()`` and its name."""
+
+NUMBERS = (torch.float64, torch.float32, torch.int64)
+"""Dtypes of inputs: a number rounds nothing, decides no dtype beside integers, and may be an index."""
+
+LOCK = threading.RLock()  # one thread at a time changes classes of torch while it traces
+_OWN = frozenset(vars(nn.Module())) - {"training"}
+_HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+_MISSING: Any = object()
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a trace takes as numbers of each call, and not as fixed."""
+
+    sources: frozenset[Source] = frozenset()
+    dtype: torch.dtype = torch.float64  # of numbers, one of NUMBERS
+
+    def tensor(self, value: Any, device: torch.device) -> Tensor:
+        """A number as a tensor, and a tensor as it is."""
+        return value if isinstance(value, Tensor) else torch.tensor(value, dtype=self.dtype, device=device)
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value can be an input of a trace."""
+    return isinstance(value, (Tensor, Number)) and not isinstance(value, (bool, complex))
+
+
+def lookup(part: nn.Module, name: str) -> Any:
+    """An attribute or a buffer of a part of a module, without properties and the class."""
+    own = vars(part)
+    return own[name] if name in own else part._buffers.get(name, _MISSING)
+
+
+@contextlib.contextmanager
+def reads_of(parts: Sequence[nn.Module]) -> Iterator[set[tuple[int, str]]]:
+    """Collects (place, name) of all attributes that this thread reads of some modules."""
+    here, places, found = threading.get_ident(), {id(part): i for i, part in enumerate(parts)}, set[tuple[int, str]]()
+
+    def noted(self: nn.Module, name: str) -> Any:
+        if id(self) in places and threading.get_ident() == here:
+            found.add((places[id(self)], name))
+        return object.__getattribute__(self, name)
+
+    with LOCK:
+        kind: Any = nn.Module
+        kind.__getattribute__ = noted
+        try:
+            yield found
+        finally:
+            del kind.__getattribute__
+
+
+@dataclass
+class Watch:
+    """Values that a trace took as fixed, and where they are now."""
+
+    sources: list[Source] = field(default_factory=list)
+    _values: list[Any] = field(default_factory=list)
+    _dicts: list[tuple[dict[str, Any], str]] = field(default_factory=list)
+    _tensors: list[Tensor] = field(default_factory=list)
+    _versions: list[int] = field(default_factory=list)
+    _of_tensors: list[Source] = field(default_factory=list)
+    _holders: list[tuple[Source, Any, tuple[Any, ...]]] = field(default_factory=list)
+    _hooks: list[dict[int, Any]] = field(default_factory=list)
+    _counts: list[int] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, module: nn.Module, reads: set[tuple[int, str]], inputs: Inputs) -> Watch:
+        """Of what was read of the parts of a module, but for what is an input."""
+        watch, parts = cls(), list(parts_of(module).values())
+        for place, name in sorted(reads):
+            part, source = parts[place], (place, name)
+            if source in inputs.sources or name in part._parameters:
+                continue
+            if name in _HOOKS:
+                watch._hooks.append(vars(part)[name])
+                watch._counts.append(len(vars(part)[name]))
+            elif name == "_modules":
+                watch._holders.append((source, part._modules, (*part._modules, *part._modules.values())))
+            elif name not in _OWN:
+                watch._add(source, part)
+        return watch
+
+    def _add(self, source: tuple[int, str], part: nn.Module) -> None:
+        name = source[1]
+        registry = next((own for own in (vars(part), part._buffers, part._modules) if name in own), None)
+        if registry is None:
+            if not isinstance(getattr(type(part), name, None), (bool, int, float, str)):
+                return  # a method, a property or none
+            registry = vars(part)  # of which a value would come before that of the class
+        value = registry.get(name, _MISSING)
+        self.sources.append(source)
+        self._values.append(value)
+        self._dicts.append((registry, name))
+        if isinstance(value, Tensor):
+            if not value.is_inference():  # whose changes nobody counts
+                self._tensors.append(value)
+                self._versions.append(value._version)
+                self._of_tensors.append(source)
+        elif value is not _MISSING and (held := _held(value)) is not None:
+            self._holders.append((source, value, held))
+
+    def changed(self) -> list[Source]:
+        """What is not as it was."""
+        now = [registry.get(name, _MISSING) for registry, name in self._dicts]
+        found = list[Source]()
+        if not all(map(operator.is_, now, self._values)):
+            found += [s for s, a, b in zip(self.sources, now, self._values, strict=True) if not same(a, b)]
+        if [tensor._version for tensor in self._tensors] != self._versions:
+            pairs = zip(self._of_tensors, self._tensors, self._versions, strict=True)
+            found += [source for source, tensor, version in pairs if tensor._version != version]
+        for source, value, held in self._holders:
+            items = _held(value) or ()
+            if len(items) != len(held) or not all(map(same, items, held)):
+                found.append(source)
+        if [*map(len, self._hooks)] != self._counts:
+            found.append((0, "hooks"))
+        return found
+
+
+def _held(value: Any) -> tuple[Any, ...] | None:
+    """What a container or a plain object holds, one level deep."""
+    if isinstance(value, dict):
+        return (*value, *value.values())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return tuple(value)
+    if isinstance(value, (nn.Module, type)) or callable(value) or not hasattr(value, "__dict__"):
+        return None
+    return tuple(vars(value).values())
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two values are the same object, or equal numbers or texts."""
+    return a is b or (type(a) is type(b) and isinstance(a, (Number, str, torch.dtype, torch.device)) and bool(a == b))
