@@ -50,3 +50,12 @@ def launch(kernel: Any, threads: int | Sequence[int], inputs: Sequence[Any], ten
         return
     stream = wp.stream_from_torch(tensor.device) if tensor.is_cuda else None
     wp.launch(kernel, dim=threads, inputs=inputs, device=wp.device_from_torch(tensor.device), stream=stream)
+
+
+def launch_tiles(kernel: Any, tiles: int, threads: int, inputs: Sequence[Any], tensor: Tensor) -> None:
+    """Runs a kernel with a block of threads for each tile; otherwise as `launch`."""
+    if tiles == 0:
+        return
+    stream = wp.stream_from_torch(tensor.device) if tensor.is_cuda else None
+    device = wp.device_from_torch(tensor.device)
+    wp.launch_tiled(kernel, dim=[tiles], inputs=inputs, block_dim=threads, device=device, stream=stream)

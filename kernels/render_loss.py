@@ -1,8 +1,10 @@
 """The loss of rendered rays and its gradient as Warp kernels. r rays, m samples of all rays (packed).
 
-A thread takes a ray, as in ``composite``, whose formulas these are between the activations of the networks' outputs and
-the squared error of the colour: one sweep finds the colour of the ray and leaves the optical depth in front of each
-sample where the gradient of its density is to be, a second one comes back with the sum of what is behind.
+A thread takes a ray, whose samples lie side by side. With o_i = sigma_i delta_i the optical depth of sample i and F_i
+the sum of those in front of it, its weight is exp(-F_i) (1 - exp(-o_i)); the background is seen with exp(-F) over the
+whole ray. F is summed in float64, the rest is float32. With G_i the gradient to weight i, that to o_i is
+``G_i exp(-F_i - o_i) - sum over j > i of G_j w_j``: one sweep finds the colour of the ray and leaves F_i where the
+gradient of the density is to be, a second one comes back with the sum of what is behind.
 """
 
 from __future__ import annotations
@@ -14,21 +16,45 @@ import warp as wp
 from torch import Tensor
 
 from voronerf.kernels._launch import array, filled, launch
-from voronerf.kernels.composite import _OPAQUE, _absorbed, _density
 from voronerf.ops._core.declare import declared
 from voronerf.ops.composite.reference import check_ray_offsets
 from voronerf.ops.render_loss.autograd import register
 
 wp.set_module_options({"enable_backward": False})
 
+_OPAQUE = wp.constant(wp.float32(1.0e30))
+"""Stands for infinite density: as opaque over any length but 0, and 0 times it is 0."""
+
 
 @wp.func
-def _sigmoid(x: wp.float32) -> wp.float32:
+def _density(sigma: wp.float32) -> wp.float32:
+    # NaN stays NaN.
+    density = sigma
+    if sigma > _OPAQUE:
+        density = _OPAQUE
+    return density
+
+
+@wp.func
+def _absorbed(optical: wp.float32) -> wp.float32:
+    """1 - exp(-x) without the digits that the subtraction would cost (Kahan's way)."""
+    left = wp.exp(-optical)
+    absorbed = 1.0 - left
+    if left == 1.0:
+        absorbed = optical
+    elif left > 0.5:
+        absorbed = (left - 1.0) * optical / wp.log(left)
+    return absorbed
+
+
+@wp.func
+def sigmoid(x: wp.float32) -> wp.float32:
+    """1 / (1 + e^-x), which is 0 where e^-x is infinite."""
     return 1.0 / (1.0 + wp.exp(-x))
 
 
 @wp.func
-def _softplus(x: wp.float32) -> wp.float32:
+def softplus(x: wp.float32) -> wp.float32:
     """Without the digits that 1 + exp(-|x|) would cost (Kahan's way); NaN stays NaN."""
     small = wp.exp(-wp.abs(x))
     sum = 1.0 + small
@@ -71,14 +97,12 @@ def _render_loss_kernel(given: Inputs, found: Found) -> None:
     front = wp.float64(0.0)
     light = wp.vec3(0.0, 0.0, 0.0)
     for i in range(begin, end):
-        optical = _density(_softplus(given.raw[i, 3]) * given.scale) * given.deltas[i]
+        optical = _density(softplus(given.raw[i, 3]) * given.scale) * given.deltas[i]
         weight = wp.exp(-wp.float32(front)) * _absorbed(optical)
         found.gradient[i, 3] = wp.float32(front)
         front += wp.float64(optical)
         found.weights[i] = weight
-        light = light + weight * wp.vec3(
-            _sigmoid(given.raw[i, 0]), _sigmoid(given.raw[i, 1]), _sigmoid(given.raw[i, 2])
-        )
+        light = light + weight * wp.vec3(sigmoid(given.raw[i, 0]), sigmoid(given.raw[i, 1]), sigmoid(given.raw[i, 2]))
     left = wp.exp(-wp.float32(front))
     shown = wp.vec3(0.0, 0.0, 0.0)
     if given.background.shape[0] > 0:
@@ -92,16 +116,16 @@ def _render_loss_kernel(given: Inputs, found: Found) -> None:
     behind = left * wp.dot(slopes, shown)
     for reverse in range(end - begin):
         i = end - 1 - reverse
-        density = _softplus(given.raw[i, 3]) * given.scale
+        density = softplus(given.raw[i, 3]) * given.scale
         optical = _density(density) * given.deltas[i]
         ahead = found.gradient[i, 3]
-        value = wp.vec3(_sigmoid(given.raw[i, 0]), _sigmoid(given.raw[i, 1]), _sigmoid(given.raw[i, 2]))
+        value = wp.vec3(sigmoid(given.raw[i, 0]), sigmoid(given.raw[i, 1]), sigmoid(given.raw[i, 2]))
         to_weight = wp.dot(slopes, value)
         to_optical = to_weight * wp.exp(-(ahead + optical)) - behind
         behind += to_weight * found.weights[i]
         for k in range(3):
             found.gradient[i, k] = found.weights[i] * slopes[k] * (value[k] * (1.0 - value[k]))
-        slope = _sigmoid(given.raw[i, 3]) * given.scale
+        slope = sigmoid(given.raw[i, 3]) * given.scale
         if density > _OPAQUE:
             slope = wp.float32(0.0)
         found.gradient[i, 3] = to_optical * given.deltas[i] * slope
@@ -113,7 +137,7 @@ def _render_loss_kernel(given: Inputs, found: Found) -> None:
 @wp.kernel
 def _density_kernel(raw: wp.array2d(dtype=wp.float32), scale: wp.float32, density: wp.array(dtype=wp.float32)) -> None:
     i = wp.tid()
-    density[i] = _softplus(raw[i, 3]) * scale
+    density[i] = softplus(raw[i, 3]) * scale
 
 
 def render_loss(raw: Tensor, *others: Any) -> list[Tensor]:
@@ -138,3 +162,4 @@ def _render_loss(given: Any, found: Any) -> None:
 
 
 register(_render_loss)
+render_loss_gradient = _render_loss.inside

@@ -37,8 +37,8 @@ def test_unknown_names_list_the_choices() -> None:
 
 
 def test_named_backend_never_falls_back() -> None:
-    with pytest.raises(BackendUnavailable, match=r"there is no warp implementation of grouped_mlp; use backend="):
-        resolve("grouped_mlp", backend="warp", device=CPU, dtype=torch.float32)
+    with pytest.raises(BackendUnavailable, match=r"there is no warp implementation of grouped_program; use backend="):
+        resolve("grouped_program", backend="warp", device=CPU, dtype=torch.float32)
     with pytest.raises(BackendUnavailable, match="takes 'int32', not int64"):
         resolve("cell_sort", backend="native", device=CPU, dtype=torch.int64)
     with pytest.raises(BackendUnavailable, match=r"runs on 'cpu' \| 'cuda', not on meta"):
@@ -77,7 +77,7 @@ def test_table_agrees_with_resolve() -> None:
         assert "\n" not in row.reason
         for dtype in row.dtypes:
             for device in row.devices:
-                kind = torch.float32 if dtype == "any" else getattr(torch, dtype)
+                kind = getattr(torch, dtype, torch.float32)  # of "any" and "plain torch"
                 resolve(row.op, backend=row.backend, device=torch.device(device), dtype=kind)
 
 
@@ -200,6 +200,27 @@ def test_auto_runs_networks_natively_on_every_device(monkeypatch: pytest.MonkeyP
         for device in ("cpu", "cuda"):
             assert choose(op, "auto", device, None, torch.float32) == "native"
         assert choose(op, "auto", "cuda", None, torch.float64) == "reference"
+
+
+def test_auto_takes_warp_on_cuda_where_native_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    absent = lambda backend, device: "built without CUDA" if backend == "native" and device.type == "cuda" else None  # noqa: E731
+    monkeypatch.setattr(backends, "missing", absent)
+    choose = backends._choose_once.__wrapped__
+    for op in ("nearest_centre", "cell_sort", "grouped_mlp", "render_loss_gradient"):
+        kind = torch.int32 if op == "cell_sort" else torch.float32
+        assert choose(op, "auto", "cuda", None, kind) == "warp"
+        assert choose(op, "auto", "cpu", None, kind) == "native"
+    for op in ("routed_mlp", "adam", "composite"):  # plain torch, which calls what is of Warp
+        assert choose(op, "auto", "cuda", None, torch.float32) == "reference"
+        assert choose(op, "warp", "cuda", None, torch.float32) == "warp"
+
+
+@pytest.mark.warp
+def test_what_warp_has_no_kernel_of_runs_as_plain_torch_with_its_operations_on_warp() -> None:
+    run = backends.resolve_composed("routed_mlp", backend="warp", device=CPU, dtype=torch.float32)
+    assert run.func.__module__ == "voronerf.ops.routed_mlp.reference" and run.keywords == {"backend": "warp"}
+    assert resolve("adam", backend="warp", device=CPU, dtype=torch.float32).__module__ == "voronerf.ops.adam.reference"
+    assert "warp" not in backends.implemented("adam")
 
 
 @pytest.mark.slow

@@ -4,18 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from composite_cases import leaves_of, scene
-
-from voronerf.ops import composite
 
 pytestmark = pytest.mark.warp
-
-
-def test_composite_reads_nothing_outside_whatever_the_offsets_say() -> None:
-    given, _ = leaves_of(scene([5, 8]), torch.float32)
-    for bad in ([0, 9, 5], [0, 5, 2_000_000_000], [-2_000_000_000, 5, 13]):
-        result = composite(**{**given, "ray_offsets": torch.tensor(bad, dtype=torch.int32)}, backend="warp")
-        assert all(bool(part.isfinite().all()) for part in result)
 
 
 def test_locate_cell_stays_inside_unsound_tables() -> None:

@@ -5,12 +5,12 @@ An op has up to three implementations with one signature, that of its reference 
 
     reference   plain PyTorch, any device and dtype: the executable specification
     native      csrc/, C++ and CUDA
-    warp        kernels/, NVIDIA Warp, one source for CPU and CUDA
+    warp        kernels/, NVIDIA Warp, one source for CPU and CUDA; plain PyTorch where the row says so (``PLAIN``)
 
-``backend="auto"`` takes the first entry of the device's order that is available and supports the call. The choice never
-depends on timing. The reference is the last entry on CUDA too, so that every op runs on every device, although not
-every op has a CUDA kernel. A backend that is given by name never falls back to another: if it cannot run, it raises
-:class:`BackendUnavailable` with the reason and the remedy.
+``backend="auto"`` takes the first entry of the device's order that is available, supports the call and is not plain.
+The choice never depends on timing. The reference is the last entry on CUDA too, so that every op runs on every device,
+although not every op has a CUDA kernel. A backend that is given by name never falls back to another: if it cannot run,
+it raises :class:`BackendUnavailable` with the reason and the remedy.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ class Implementation:
     devices: tuple[str, ...] = ()  # device types it runs on; empty means any
     dtypes: tuple[torch.dtype, ...] = ()  # dtypes of the op's first tensor it takes; empty means any
     file: str | None = None  # the op whose module has the function; None for its own
+    plain: bool = False  # whether it is the reference, which serves where the backend needs no kernel of its own
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,8 @@ class Row:
         op: name of the op.
         backend: name of the backend.
         devices: device types on which this pair can run here and now.
-        dtypes: names of the dtypes it takes, ``("any",)`` for all, empty where there is no implementation.
+        dtypes: names of the dtypes it takes, ``("any",)`` for all, ``("plain torch",)`` where that serves, empty where
+            there is no implementation.
         reason: why it cannot run, or cannot run on some device, in one line; empty if it can.
     """
 
@@ -76,6 +78,7 @@ class Row:
 FLOATS = (torch.float32, torch.float16, torch.bfloat16)
 COORDINATES = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
 EVERYWHERE = ("cpu", "cuda")
+PLAIN = Implementation(EVERYWHERE, plain=True)
 
 _TABLE: dict[tuple[str, str], Implementation] = {}
 _FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {}
@@ -105,8 +108,8 @@ def ops(backend: str = "reference", device: str = "cpu") -> tuple[str, ...]:
 
 
 def implemented(op: str) -> tuple[str, ...]:
-    """Backends that have an implementation of an op, whether or not it can run here."""
-    return tuple(backend for backend in BACKENDS if (op, backend) in _TABLE)
+    """Backends that have an implementation of their own of an op, whether or not it can run here."""
+    return tuple(name for name in BACKENDS if (op, name) in _TABLE and not _TABLE[op, name].plain)
 
 
 def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) -> Callable[..., Any]:
@@ -130,11 +133,13 @@ def resolve(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) 
 def resolve_composed(op: str, *, backend: str, device: torch.device, dtype: torch.dtype) -> Callable[..., Any]:
     """`resolve` of an op whose reference calls other ops, and takes their ``backend``.
 
-    With "auto" it calls them where no other implementation runs, each on the backend that "auto" gives it.
+    With "auto" it calls them where no other implementation runs, each on the backend that "auto" gives it; and where
+    the implementation is plain, on the backend that was named.
     """
     name = _choose(op, backend, device.type, device.index, dtype)
     run = _FUNCTIONS[op, name]
-    return functools.partial(run, backend="auto") if name == "reference" and backend == "auto" else run
+    passed = _TABLE[op, name].plain or (name == "reference" and backend == "auto")
+    return functools.partial(run, backend=backend) if passed else run
 
 
 def folder(op: str) -> str:
@@ -239,6 +244,8 @@ def table() -> list[Row]:
             reasons = {device: why_not(op, backend, torch.device(device)) for device in ORDER}
             implementation = _TABLE.get((op, backend))
             dtypes = () if implementation is None else _names(implementation.dtypes) or ("any",)
+            if implementation is not None and implementation.plain:
+                dtypes = ("plain torch",)
             devices = tuple(device for device, reason in reasons.items() if reason is None)
             distinct = dict.fromkeys(reason for reason in reasons.values() if reason is not None)
             rows.append(Row(op, backend, devices, dtypes, "; ".join(distinct)))
@@ -286,14 +293,15 @@ def _choose_once(op: str, backend: str, device_type: str, index: int | None, dty
     device = torch.device(device_type) if index is None else torch.device(device_type, index)
     if backend == "auto":
         order = ORDER.get(device_type, ("reference",))
-        able = (name for name in order if why_not(op, name, device, dtype) is None)
-        backend = next(able)
+        own = implemented(op)
+        backend = next(name for name in order if name in own and why_not(op, name, device, dtype) is None)
     else:
         reason = why_not(op, backend, device, dtype)
         if reason is not None:
             raise BackendUnavailable(f"{op}: backend {backend!r} is not available: {reason}")
-    module = importlib.import_module(_MODULES[backend].format(_TABLE[op, backend].file or op))
-    _FUNCTIONS[op, backend] = getattr(module, op)
+    module = _MODULES["reference" if _TABLE[op, backend].plain else backend]
+    found = _TABLE[op, "reference" if _TABLE[op, backend].plain else backend]
+    _FUNCTIONS[op, backend] = getattr(importlib.import_module(module.format(found.file or op)), op)
     return backend
 
 

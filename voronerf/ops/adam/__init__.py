@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import backends
-from voronerf.ops._core.backends import EVERYWHERE, Implementation
+from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
 from voronerf.ops._core.checks import (
     check_dtype,
     check_flag,
@@ -21,7 +21,7 @@ from voronerf.ops._core.checks import (
 )
 from voronerf.ops.adam.reference import Guard, Rule
 
-_OP = backends.declare("adam", native=Implementation(EVERYWHERE, (torch.float32,)))
+_OP = backends.declare("adam", native=Implementation(EVERYWHERE, (torch.float32,)), warp=PLAIN)
 
 
 @torch.no_grad()
@@ -57,7 +57,7 @@ def adam(
         guard: Leaves the step out where it has ``found`` something; None for never.
         loss: float32 [], of the step. With it the guard judges first: the step is left out, and counted as such, unless
             the magnitudes of the loss, and of the gradients whose rule has ``every``, are all below the limit.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Raises:
         ValueError: a tensor that is not contiguous, lists of other lengths, a loss without a guard.

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.backends import Implementation
+from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.declare import declare
 
 
@@ -17,7 +17,7 @@ def _prepare(given: Any) -> Any:
     return given
 
 
-@declare(native=Implementation(("cpu",), (torch.float32,)), prepare=_prepare)
+@declare(native=Implementation(("cpu",), (torch.float32,)), warp=PLAIN, prepare=_prepare)
 def balance_centres(
     samples: Annotated[Tensor, "float32 [m, 3]"],
     masses: Annotated[Tensor, "float64 [m]"],
@@ -42,7 +42,7 @@ def balance_centres(
         steps: number of updates, >= 0.
         alpha: step size, no unit.
         neighbours: size of N(i), >= 1.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         (centres float32 [k, 3], weights float64 [k], the mass in each cell of the returned centres).

@@ -6,14 +6,14 @@ from typing import Annotated
 
 from torch import Tensor
 
-from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops._core.declare import declare
 from voronerf.ops.composite.reference import Composite
 
 
 @declare(
     native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS),
+    warp=PLAIN,
     smooth=["sigma", "rgb", "depths", "deltas", "background"],
     small=["sigma"],
 )

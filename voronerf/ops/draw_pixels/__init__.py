@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.backends import EVERYWHERE, Implementation
+from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
 from voronerf.ops._core.checks import INDEX, Checked, check_integer
 from voronerf.ops._core.declare import declare
 from voronerf.ops.draw_pixels.reference import Runs
@@ -28,7 +28,7 @@ def _prepare(given: Any) -> Any:
     return given
 
 
-@declare(native=Implementation(EVERYWHERE, (torch.int32,)), prepare=_prepare)
+@declare(native=Implementation(EVERYWHERE, (torch.int32,)), warp=PLAIN, prepare=_prepare)
 def draw_pixels(
     seed: Annotated[Tensor, "int32 [1]"],
     count: Annotated[int, "1..134217728"],
@@ -46,7 +46,7 @@ def draw_pixels(
         count: Of pixels, b, 1 to 2**27.
         below: Pixels to draw from, 1 to 2**48; with runs as many as they have.
         runs: The pixels to draw from; None for 0 to ``below`` - 1.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         int64 [b], and float32 [b, 3] in [0, 1).

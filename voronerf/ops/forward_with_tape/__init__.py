@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from voronerf.ops._core import backends
-from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops.forward_with_tape.reference import Tape
 from voronerf.ops.grouped_mlp.checks import check_routed
 
-_OP = backends.declare("forward_with_tape", native=Implementation(EVERYWHERE, FLOATS))
+_OP = backends.declare("forward_with_tape", native=Implementation(EVERYWHERE, FLOATS), warp=PLAIN)
 _NEEDED = ("positions", "weights", "biases", "layers")
 
 
@@ -25,7 +25,7 @@ def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> T
         network: The arguments of `routed_mlp` by name, but for ``backend``, as ``VoronoiRouter.table_arguments`` gives
             them. Gradients go to weights, biases and features, and to positions and directions that ask
             for them.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         :class:`Tape`, with an example.

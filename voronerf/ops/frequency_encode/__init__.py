@@ -10,7 +10,7 @@ from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops._core.declare import declare
 
 
-@declare(native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS, "encode"), smooth=["x"])
+@declare(native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS), smooth=["x"])
 def frequency_encode(
     x: Annotated[Tensor, "floating [n, d]"],
     octaves: Annotated[int, "0..127"],  # 2^128 is beyond float32

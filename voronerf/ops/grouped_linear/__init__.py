@@ -21,7 +21,12 @@ def _prepare(given: Any) -> Any:
     return given
 
 
-@declare(native=Implementation(EVERYWHERE, FLOATS), smooth=["x", "weight", "bias"], prepare=_prepare)
+@declare(
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS, "grouped_mlp"),
+    smooth=["x", "weight", "bias"],
+    prepare=_prepare,
+)
 def grouped_linear(
     x: Annotated[Tensor, "floating [n, i]"],
     offsets: Annotated[Tensor, "int32 [k+1]"],
@@ -43,7 +48,7 @@ def grouped_linear(
         weight: [k, o, i], o >= 1, the dtype of x.
         bias: [k, o] or None.
         activation: "none", "relu", "softplus", "sigmoid" or "sine".
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         [n, o] in the dtype of x (of autocast, where it is on).

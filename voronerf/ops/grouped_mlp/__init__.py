@@ -17,7 +17,9 @@ from voronerf.ops._core.checks import (
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.grouped_mlp.checks import check_network, check_together
 
-_OP = backends.declare("grouped_mlp", native=Implementation(EVERYWHERE, FLOATS))
+_OP = backends.declare(
+    "grouped_mlp", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
+)
 
 
 def grouped_mlp(
@@ -54,7 +56,7 @@ def grouped_mlp(
         direction_index: int32 [n], values 0 to r - 1: the row of ``directions`` of each sample.
         features: the table of the hash encoding, [e, f] for all cells (``layers.grid.table_shape``), or [k, e, f] with
             one for each cell; None without a grid.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         [n, layers.out_features] in the dtype of the weights (of autocast, where it is on).

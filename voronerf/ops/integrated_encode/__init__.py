@@ -6,13 +6,13 @@ from typing import Annotated
 
 from torch import Tensor
 
-from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops._core.declare import declare
 
 
 @declare(
     native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS, "encode"),
+    warp=PLAIN,
     smooth=["means", "variances"],
 )
 def integrated_encode(

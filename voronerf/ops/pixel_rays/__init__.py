@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.backends import EVERYWHERE, Implementation
+from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
 from voronerf.ops._core.declare import declare
 from voronerf.ops.pixel_rays.reference import PixelRays
 
@@ -25,7 +25,7 @@ def _prepare(given: Any) -> Any:
     return given
 
 
-@declare(native=Implementation(EVERYWHERE, (torch.float32,)), prepare=_prepare)
+@declare(native=Implementation(EVERYWHERE, (torch.float32,)), warp=PLAIN, prepare=_prepare)
 def pixel_rays(
     poses: Annotated[Tensor, "float32 [c, 4, 4]"],
     intrinsics: Annotated[Tensor, "same [c, 4]"],
@@ -59,7 +59,7 @@ def pixel_rays(
             stereographic projections (x, -y) / (1 - z), see `voronerf.nerf.lenses.LensTables`; None for no distortion.
         background: float32 [3] or [b, 3], the colour behind images with an alpha channel; None leaves their
             colours as they are.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         PixelRays(origins, directions, near, far, colour). A ray that misses the box has far == near.

@@ -72,6 +72,7 @@ def render_loss(
 
 @declare(
     native=Implementation(EVERYWHERE, (torch.float32,), file="render_loss"),
+    warp=Implementation(EVERYWHERE, (torch.float32,), file="render_loss"),
     reference=Implementation(file="render_loss"),
     smooth=["raw"],
     small=["raw"],
@@ -97,7 +98,7 @@ def render_loss_gradient(
         background: [3] or [r, 3], as in `render_loss`, or None.
         density_scale: factor on the density, > 0.
         hidden: share of the light, as in `render_loss`.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         (RenderLoss, gradient [m, 4]).

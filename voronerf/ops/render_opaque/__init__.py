@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.backends import Implementation
+from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
 from voronerf.ops.grouped_mlp.checks import check_routed
@@ -36,7 +36,9 @@ def _prepare(given: Any) -> Any:
     return *given[:7], table, *given[8:]
 
 
-@declare(native=Implementation(("cpu",), (torch.float32,)), small=["occupied"], prepare=_prepare, composed=True)
+@declare(
+    native=Implementation(("cpu",), (torch.float32,)), warp=PLAIN, small=["occupied"], prepare=_prepare, composed=True
+)
 def render_opaque(
     origins: Annotated[Tensor, "float32|float64 [r, 3]"],
     directions: Annotated[Tensor, "same [r, 3]"],
@@ -78,7 +80,7 @@ def render_opaque(
         spacing: of the strata, "linear" or "disparity".
         contraction: as in ``march_rays``, or None.
         heaviest: whether to find the heaviest sample of each ray; else ``heaviest`` is the far end.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         RaySums(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]), sums without a background.

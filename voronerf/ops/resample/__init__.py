@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from torch import Tensor
 
-from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
 
@@ -20,7 +20,7 @@ def _prepare(given: Any) -> Any:
 
 @declare(
     native=Implementation(EVERYWHERE, FLOATS),
-    warp=Implementation(EVERYWHERE, FLOATS),
+    warp=PLAIN,
     small=["weights"],
     prepare=_prepare,
 )

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import backends
-from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
+from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.grouped_mlp.checks import check_routed
 
-_OP = backends.declare("routed_mlp", native=Implementation(EVERYWHERE, FLOATS))
+_OP = backends.declare("routed_mlp", native=Implementation(EVERYWHERE, FLOATS), warp=PLAIN)
 
 
 def routed_mlp(
@@ -66,7 +66,7 @@ def routed_mlp(
             the backward pass, unless positions or directions have gradients.
         rows: int32 [1], how many of the samples count; None for all. Those behind them have outputs of 0, no gradient
             and no cell: -1. On CUDA the host does not wait for the number, which `march_rays` with a capacity gives.
-        backend: "auto", "reference" or "native". If there is no fused implementation, "auto" calls the separate
+        backend: "auto", "reference", "native" or "warp". If there is no fused implementation, "auto" calls the separate
             operations, each on the backend it chooses.
 
     Returns:

@@ -7,11 +7,11 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.backends import Implementation
+from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.declare import declare
 
 
-@declare(native=Implementation(("cpu",), (torch.float32,)))
+@declare(native=Implementation(("cpu",), (torch.float32,)), warp=PLAIN)
 def sparse_depth_gradient(
     density: Annotated[Tensor, "float32|float64 [m]"],
     depths: Annotated[Tensor, "same [m]"],
@@ -38,7 +38,7 @@ def sparse_depth_gradient(
         ray_offsets: int32 [s + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, counted from the
             first of all, which may be beyond 0; together all m.
         distances: [s], of the point that each ray ends at; NaN for none.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         (loss [], gradient [m]).

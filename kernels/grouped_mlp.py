@@ -1,0 +1,356 @@
+"""A whole network for each cell as Warp kernels, and ``grouped_linear``, a network of one layer.
+
+n samples, k cells, t tiles of rows, c columns.
+
+Everything is made of tiles. Samples come sorted by cell; the rows of each cell are padded to tiles of ``ROWS``, so that
+a tile is of one cell. Features are padded to columns of ``WIDTH``: those of the encoded positions, of the directions,
+and of what each layer puts out. A weight matrix falls into blocks [WIDTH, WIDTH], each of which takes one column to
+another, and a network with skips, branches and odd widths is a list of products::
+
+    column o of the layers = bias o + sum over the products p of o: activation(column source[p]) @ block p ^T
+
+One kernel runs any such list, so a new network compiles nothing. A block of threads takes a tile through all of it.
+The columns of a tile, as sums before the activation, which whoever reads them applies, lie in global memory: all of
+them do not fit into shared memory, and what a block has just written is in the cache. No other block touches them.
+
+Padding is harmless, since its weights are 0. Encodings are launches before this one. Sums and columns are float32; of
+float16 and bfloat16 weights the operands of products are rounded to these types, which tensor cores multiply.
+"""
+# mypy: disable-error-code="arg-type, operator"
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+import warp as wp
+from torch import Tensor
+
+from voronerf.kernels._launch import array, filled, launch_tiles
+from voronerf.kernels.frequency_encode import frequency_encode
+from voronerf.kernels.hash_encode import hash_encode
+from voronerf.kernels.render_loss import sigmoid, softplus
+from voronerf.kernels.spherical_harmonics import spherical_harmonics
+from voronerf.ops._core.compiler import constant_result
+from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.derivatives import register_derivatives
+from voronerf.ops._core.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops.grouped_linear.activation import activate
+from voronerf.ops.grouped_linear.reference import check_offsets
+from voronerf.ops.grouped_mlp.reference import cells_of, check_direction_index, encode_positions
+
+ROWS, WIDTH = 64, 16
+"""A thread a row; each then has 4 x 4 of the sums of a tile and a column. Wider columns would be emptier: heads have 1
+to 4 outputs."""
+
+_TYPES = {torch.float32: wp.float32, torch.float16: wp.float16, torch.bfloat16: wp.bfloat16}
+
+
+@wp.func
+def _activate(x: wp.float32, kind: wp.int32) -> wp.float32:
+    """One of ``ACTIVATIONS`` by its number."""
+    y = x
+    if kind == 1:
+        y = wp.where(x < 0.0, 0.0, x)  # NaN stays NaN
+    elif kind == 2:
+        y = softplus(x)
+    elif kind == 3:
+        y = sigmoid(x)
+    elif kind == 4:
+        y = wp.sin(x)
+    return y
+
+
+@wp.func
+def _slope(x: wp.float32, kind: wp.int32) -> wp.float32:
+    """Its derivative."""
+    y = wp.float32(1.0)
+    if kind == 1:
+        y = wp.where(x <= 0.0, 0.0, 1.0)
+    elif kind == 2:
+        y = sigmoid(x)
+    elif kind == 3:
+        y = sigmoid(x) * (1.0 - sigmoid(x))
+    elif kind == 4:
+        y = wp.cos(x)
+    return y
+
+
+@wp.struct
+class Products:
+    """Products ``first[o]`` to ``first[o + 1]`` add up to column o of the layers; each reads the column ``source[p]``,
+    and applies ``activation[column]`` to it."""
+
+    first: wp.array(dtype=wp.int32)
+    source: wp.array(dtype=wp.int32)
+    activation: wp.array(dtype=wp.int32)
+
+
+@functools.cache
+def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
+    """The kernels, forward and backward, for weights of a dtype; each is compiled when it is first used."""
+    scalar: Any = _TYPES[dtype]
+    # Tensor cores multiply 16 bits. In float32 Warp's own products compile in a second instead of twenty.
+    options = {"enable_backward": False, "enable_mathdx_gemm": dtype != torch.float32}
+    kernel = functools.partial(wp.kernel, module="unique", module_options=options)
+
+    @kernel
+    def forward(
+        cells: wp.array(dtype=wp.int32),  # of each tile, -1 for none
+        blocks: wp.array2d(dtype=scalar),
+        biases: wp.array(dtype=wp.float32),
+        products: Products,
+        columns: wp.array2d(dtype=wp.float32),
+    ) -> None:
+        """A block of threads takes a tile through all layers: a layer costs neither a launch nor a wait for others."""
+        tile = wp.tid()
+        cell = cells[tile]
+        if cell < 0:
+            return
+        row = tile * ROWS
+        outputs = products.first.shape[0] - 1
+        inputs = products.activation.shape[0] - outputs
+        for o in range(outputs):
+            # A shared tile that is filled again is a barrier: all threads read what all have stored before.
+            total = wp.tile_zeros(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+            for p in range(products.first[o], products.first[o + 1]):
+                source = products.source[p]
+                sums = wp.tile_load(columns, shape=(ROWS, WIDTH), offset=(row, source * WIDTH))
+                x = wp.tile_astype(wp.tile_map(_activate, sums, products.activation[source]), dtype=scalar)
+                at = (cell * products.source.shape[0] + p) * WIDTH
+                weight = wp.tile_load(blocks, shape=(WIDTH, WIDTH), offset=(at, 0), storage="shared")
+                wp.tile_matmul(x, wp.tile_transpose(weight), total)
+            bias = wp.tile_load(biases, shape=WIDTH, offset=(cell * outputs + o) * WIDTH)
+            found = total + wp.tile_broadcast(bias, shape=(ROWS, WIDTH))
+            wp.tile_store(columns, found, offset=(row, (inputs + o) * WIDTH))
+
+    @kernel
+    def backward(
+        cells: wp.array(dtype=wp.int32),
+        blocks: wp.array2d(dtype=scalar),
+        products: Products,
+        columns: wp.array2d(dtype=wp.float32),
+        lowest: wp.int32,
+        gradients: wp.array2d(dtype=wp.float32),
+        of_blocks: wp.array2d(dtype=wp.float32),
+        of_biases: wp.array(dtype=wp.float32),
+    ) -> None:
+        """The products in reverse, each once for the weights and once for the column that it read.
+
+        ``gradients`` are those of the sums, at first of the outputs alone; a column's is complete when its turn comes,
+        since whoever reads it stands behind it. Columns below ``lowest`` need none. The tiles of a cell add up the
+        gradients of its weights by atomics, so that none waits for another; on a GPU that is in any order.
+        """
+        tile = wp.tid()
+        cell = cells[tile]
+        if cell < 0:
+            return
+        row = tile * ROWS
+        outputs = products.first.shape[0] - 1
+        inputs = products.activation.shape[0] - outputs
+        for reverse in range(outputs):
+            o = outputs - 1 - reverse
+            # Shared, as it may be what other threads have just stored: that it is filled again is the barrier.
+            arrived = wp.tile_load(gradients, shape=(ROWS, WIDTH), offset=(row, (inputs + o) * WIDTH), storage="shared")
+            wp.tile_atomic_add(of_biases, wp.tile_sum(arrived, axis=0), offset=(cell * outputs + o) * WIDTH)
+            g = wp.tile_astype(arrived, dtype=scalar)
+            for p in range(products.first[o], products.first[o + 1]):
+                source = products.source[p]
+                at = (cell * products.source.shape[0] + p) * WIDTH
+                sums = wp.tile_load(columns, shape=(ROWS, WIDTH), offset=(row, source * WIDTH))
+                x = wp.tile_astype(wp.tile_map(_activate, sums, products.activation[source]), dtype=scalar)
+                of_weight = wp.tile_zeros(shape=(WIDTH, WIDTH), dtype=wp.float32, storage="shared")
+                wp.tile_matmul(wp.tile_transpose(g), x, of_weight)
+                wp.tile_atomic_add(of_blocks, of_weight, offset=(at, 0))
+                if source >= lowest:
+                    weight = wp.tile_load(blocks, shape=(WIDTH, WIDTH), offset=(at, 0), storage="shared")
+                    of_x = wp.tile_zeros(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+                    wp.tile_matmul(g, weight, of_x)
+                    slope = wp.tile_map(_slope, sums, products.activation[source])
+                    before = wp.tile_load(gradients, shape=(ROWS, WIDTH), offset=(row, source * WIDTH))
+                    wp.tile_store(gradients, before + of_x * slope, offset=(row, source * WIDTH))
+
+    return forward, backward
+
+
+@custom_op("grouped_mlp_warp")
+def _run(x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, plan: str) -> Iterator[Tensor]:
+    """Sums of the columns put out, [t * ROWS, outputs * WIDTH], from those of the inputs, float32 x [t * ROWS, inputs *
+    WIDTH], blocks [k, products, WIDTH, WIDTH], biases float32 [k, columns, WIDTH] and the cells of tiles, int32 [t]."""
+    outputs = json.loads(plan)[-1]
+    out = x.new_empty(x.shape[0], len(outputs) * WIDTH)
+    yield out
+    columns = _columns(x, blocks, biases, cells, _products(plan, x.device))
+    torch.cat([columns[:, o * WIDTH : (o + 1) * WIDTH] for o in outputs], dim=1, out=out)
+
+
+@custom_op("grouped_mlp_warp_backward")
+def _run_backward(
+    gradient: Tensor, x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, plan: str, wanted: Sequence[bool]
+) -> Iterator[list[Tensor]]:
+    """Gradients of x, blocks and biases. The columns are made again, so nothing is kept but the inputs."""
+    of_x, of_blocks, of_biases = results = [x.new_zeros(part.shape) for part in (x, blocks, biases)]
+    yield results
+    products = _products(plan, x.device)
+    columns = _columns(x, blocks, biases, cells, products)
+    gradients = torch.zeros_like(columns)
+    for o, part in zip(json.loads(plan)[-1], gradient.split(WIDTH, dim=1)):
+        gradients[:, o * WIDTH : (o + 1) * WIDTH] += part
+    lowest = 0 if wanted[0] else x.shape[1] // WIDTH
+    given = [array(cells, x), array(blocks.view(-1, WIDTH), x), products, array(columns, x), lowest]
+    given += [array(gradients, x), array(of_blocks.view(-1, WIDTH), x), array(of_biases.view(-1), x)]
+    launch_tiles(kernels(blocks.dtype)[1], len(cells), ROWS, given, x)
+    of_x.copy_(gradients[:, : x.shape[1]])
+
+
+def _columns(x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, products: Any) -> Tensor:
+    """All columns [t * ROWS, c * WIDTH]."""
+    columns = x.new_zeros(x.shape[0], products.activation.shape[0] * WIDTH)
+    columns[:, : x.shape[1]] = x
+    given = [array(cells, x), array(blocks.view(-1, WIDTH), x), array(biases.view(-1), x), products, array(columns, x)]
+    launch_tiles(kernels(blocks.dtype)[0], len(cells), ROWS, given, x)
+    return columns
+
+
+def _formula(x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, plan: str) -> Tensor:
+    """The same in plain PyTorch, for derivatives of the gradients."""
+    first, source, activation, outputs = json.loads(plan)
+    columns = list(x.view(len(cells), ROWS, -1).split(WIDTH, dim=2))
+    there, cell = (cells >= 0)[:, None, None], cells.clamp(min=0)
+    for o, (begin, end) in enumerate(itertools.pairwise(first)):
+        total = biases[:, o].index_select(0, cell)[:, None]
+        for p in range(begin, end):
+            read = activate(ACTIVATIONS[activation[source[p]]], columns[source[p]])
+            total = total + read.to(blocks.dtype).to(x.dtype) @ blocks[:, p].index_select(0, cell).to(x.dtype).mT
+        columns.append(total * there)
+    return torch.cat([columns[o] for o in outputs], dim=2).view(x.shape[0], -1)
+
+
+register_derivatives(_run, _run_backward, _formula, places=(0, 1, 2), width=5, count=1)
+
+
+@constant_result
+@functools.lru_cache(maxsize=256)
+def _plan(text: str, widths: tuple[int, ...]) -> str:
+    """The lists of `Products` and the columns put out, as JSON, of a layer table (``MLP.text``).
+
+    The widths are those of the encoded positions, the directions (0: none are read), and the layers.
+    """
+    layers, first, source, activation = MLP.parse(text), [0], list[int](), list[int]()
+    columns: dict[int | str, range] = {}
+    for name, width in zip((POSITIONS, DIRECTIONS, *range(len(layers.layers))), widths):
+        columns[name] = range(len(activation), len(activation) - (-width // WIDTH))
+        layer = layers.layers[name] if isinstance(name, int) else None
+        for _ in columns[name]:
+            activation.append(ACTIVATIONS.index(layer.activation) if layer else 0)
+            if layer:
+                source += [column for other in layer.inputs for column in columns[other]]
+                first.append(len(source))
+    return json.dumps([first, source, activation, [column for output in layers.outputs for column in columns[output]]])
+
+
+@functools.lru_cache(maxsize=256)
+def _products(plan: str, device: torch.device) -> Any:
+    numbers = zip(("first", "source", "activation"), json.loads(plan))
+    return filled(
+        Products(), **{name: torch.tensor(given, dtype=torch.int32, device=device) for name, given in numbers}
+    )
+
+
+def grouped_mlp(
+    positions: Tensor,
+    offsets: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    *,
+    layers: MLP,
+    directions: Tensor | None = None,
+    direction_index: Tensor | None = None,
+    features: Tensor | None = None,
+) -> Tensor:
+    """Every sample through the network of its cell; see ``voronerf.ops.grouped_mlp``."""
+    device = positions.device.type
+    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else weights[0].dtype
+    if device == "cpu" and not torch.compiler.is_compiling():
+        check_offsets("grouped_mlp", offsets, positions.shape[0])
+    check_direction_index("grouped_mlp", directions, direction_index)
+    with torch.autocast(device, enabled=False):
+        cell = cells_of(offsets, positions)
+        if features is not None and layers.grid is not None:
+            where = hash_encode(positions, features, layers.grid, cell if features.dim() == 3 else None)
+        elif layers.integrated:
+            where = encode_positions(positions, layers)
+        else:
+            where = _octaves(positions, layers.position_octaves)
+        read = {POSITIONS: where, DIRECTIONS: positions[:, :0]}
+        if directions is not None and layers.uses_directions:
+            if layers.direction_degree is None:
+                seen = _octaves(directions, layers.direction_octaves)
+            else:
+                seen = spherical_harmonics(directions.float(), layers.direction_degree)
+            read[DIRECTIONS] = seen if direction_index is None else seen.index_select(0, direction_index)
+        widths = {name: part.shape[1] for name, part in (*read.items(), *enumerate(weights))}
+        tiles, place, inside = _tiles(offsets, cell)
+        x = torch.cat([_padded(part.to(dtype).float()) for part in read.values()], dim=1)
+        x = x.new_zeros(len(tiles) * ROWS, x.shape[1]).index_copy(0, place, x)
+        blocks, rows = [], []
+        for layer, weight, bias in zip(layers.layers, weights, biases):
+            blocks.append(_blocks(weight.to(dtype), [widths[name] for name in layer.inputs]))
+            bias = weight.new_zeros(weight.shape[:2]) if bias is None else bias
+            rows.append(_padded(bias.to(dtype).float()).unflatten(1, (-1, WIDTH)))
+        plan = _plan(layers.text, tuple(widths.values()))
+        sums = _run(x, torch.cat(blocks, dim=1), torch.cat(rows, dim=1), tiles, plan).index_select(0, place)
+        found = []
+        for output in layers.outputs:
+            found.append(activate(layers.layers[output].activation, sums[:, : widths[output]]))
+            sums = sums[:, widths[output] + -widths[output] % WIDTH :]
+        return torch.where(inside[:, None], torch.cat(found, dim=1), 0).to(dtype)
+
+
+def grouped_linear(
+    x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
+) -> Tensor:
+    """A network of one layer; see ``voronerf.ops.grouped_linear``."""
+    return grouped_mlp(x, offsets, [weight], [bias], layers=_LINEAR[activation])
+
+
+# Of one layer, whose width is that of the weights.
+_LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)) for activation in ACTIVATIONS}
+
+
+def _tiles(offsets: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The cell of each tile, int32 [t], the row of each sample in them, [n], and whether it has a cell.
+
+    There are as many as there might be, so that the host reads nothing. The last is of no cell, for samples of none.
+    """
+    (n,), k = cell.shape, offsets.shape[0] - 1
+    tiles = (offsets.diff() + (ROWS - 1)) // ROWS
+    ends = tiles.cumsum(0)
+    count = min(n, n // ROWS + k) + 1
+    of_tiles = torch.searchsorted(ends, torch.arange(count, device=ends.device), right=True)
+    row = torch.arange(n, device=ends.device)
+    inside = (row >= offsets[0]) & (row < offsets[-1])
+    place = row - offsets.index_select(0, cell) + ROWS * (ends - tiles).index_select(0, cell)
+    return torch.where(of_tiles < k, of_tiles, -1).int(), torch.where(inside, place, count * ROWS - 1), inside
+
+
+def _blocks(weight: Tensor, widths: Sequence[int]) -> Tensor:
+    """[k, products, WIDTH, WIDTH] of a matrix [k, o, i] whose sources have these widths."""
+    wide = torch.cat([_padded(part) for part in weight.split(widths, dim=2)], dim=2)
+    high = _padded(wide.mT).mT.unflatten(2, (-1, WIDTH)).unflatten(1, (-1, WIDTH))
+    return high.transpose(2, 3).flatten(1, 2)
+
+
+def _padded(x: Tensor) -> Tensor:
+    """With zeros up to whole columns."""
+    return F.pad(x, (0, -x.shape[-1] % WIDTH))
+
+
+def _octaves(x: Tensor, octaves: int | None) -> Tensor:
+    """Encoded, or as it is without octaves."""
+    return x if octaves is None else frequency_encode(x.float(), octaves, True)
