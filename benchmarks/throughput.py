@@ -134,7 +134,9 @@ class Bench:
         names = [
             name
             for name in case.backends
-            if name in self.wanted and backends.why_not(case.needs or case.op, name, self.device, case.dtype) is None
+            if name in self.wanted
+            and name in backends.implemented(case.needs or case.op)
+            and backends.why_not(case.needs or case.op, name, self.device, case.dtype) is None
         ]
         if not names:
             return []

@@ -21,7 +21,7 @@ from voronerf.app.train.defaults import octaves_for, resolve
 from voronerf.app.train.run_directory import choose_directory, held
 from voronerf.nerf import OccupancyGrid
 from voronerf.nerf.cameras import Cameras
-from voronerf.ops._core import native
+from voronerf.ops._core import backends, native
 from voronerf.ops._core.backends import BackendUnavailable
 
 
@@ -297,10 +297,23 @@ def test_a_run_directory_has_one_run(tmp_path, scene, monkeypatch):
     assert other.is_dir() and not Path("runs/empty").exists()
 
 
-def test_refused_before_anything_is_written(tmp_path, scene):
-    with pytest.raises(BackendUnavailable):
+def test_refused_before_anything_is_written(tmp_path, scene, monkeypatch):
+    monkeypatch.setattr(backends, "missing", lambda backend, device: "it is not here")
+    backends._choose_once.cache_clear()
+    with pytest.raises(BackendUnavailable, match="'warp' is not available: it is not here"):
         build(small(tmp_path, backend="warp"), scene)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.warp
+@pytest.mark.parametrize("field", ["hashgrid", "nerf"])
+def test_warp_trains_as_the_reference_does(scene, field):
+    """Steps and a split by kernels of Warp and plain torch alone, with losses that are those of the reference."""
+    losses = {"reference": [], "warp": []}
+    for backend, found in losses.items():
+        config = small(backend=backend, field=field, width=17, occupancy=field == "hashgrid", split_at=(8,))
+        steps_of(build(config, scene), 16, Each(lambda state, found=found: found.append(state.loss)))
+    assert len(losses["warp"]) == 16 and losses["warp"] == pytest.approx(losses["reference"], rel=0.02)
 
 
 @pytest.mark.native
@@ -315,7 +328,9 @@ def test_the_reference_calls_nothing_compiled(scene, monkeypatch, occupancy):
             calls.append(name)
             return getattr(real, name)
 
-    for backend in ("reference", "native"):
+    for backend in ("reference", "warp", "native"):
+        if backends.missing(backend, torch.device("cpu")) is not None:
+            continue
         settings = {"cells": (2,), "split_at": (2,), "field": "hashgrid", "depth": 1}
         state = build(small(backend=backend, occupancy=occupancy, **settings), scene)
         with monkeypatch.context() as patch:
