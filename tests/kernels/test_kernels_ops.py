@@ -4,20 +4,38 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
+
+from voronerf import MLP, Layer, grouped_mlp
 
 pytestmark = pytest.mark.warp
+ROWS = 64  # of a tile
 
 
-def test_locate_cell_stays_inside_unsound_tables() -> None:
-    pytest.importorskip("voronerf.kernels.locate_cell")
-    points, centres = torch.rand(7, 3), torch.rand(3, 3)
-    for offsets, child, depth in (
-        ([0, 3], [5, 1_000_000_000, 9], 3),  # no such diagram
-        ([0, 2_000_000_000], [-1, -2, -3], 1),  # more centres than there are
-        ([0, 0, 3], [1, 1, 1], 2),  # a diagram without centres
-        ([0, 1, 3], [1, 1, 0], 4),  # a walk that ends at no leaf
-    ):
-        tables = (torch.tensor(table, dtype=torch.int32) for table in (offsets, child))
-        leaves = torch.ops.voronerf.locate_cell_warp(points, centres, *tables, depth)
-        assert bool((leaves < 3).all())
-        assert bool((leaves < 0).all()) == (offsets != [0, 2_000_000_000])
+def gradients(width: int, counts: list[int], backend: str) -> list[Tensor]:
+    """Output and gradients of three layers with a skip, of cells with so many rows."""
+    generator = torch.Generator().manual_seed(0)
+    layers = (Layer(("positions",), width, "relu"), Layer((0, "positions"), width, "softplus"), Layer((1,), 3, "sine"))
+    table = MLP(layers, outputs=(2, 0), position_octaves=2)
+    n, k = sum(counts), len(counts)
+    given = [torch.rand(n, 3, generator=generator)]
+    for o, i in table.weight_shapes(3):
+        given += [torch.randn(k, o, i, generator=generator) / i**0.5, torch.randn(k, o, generator=generator)]
+    positions, *parameters = [tensor.requires_grad_() for tensor in given]
+    offsets = torch.tensor([0, *counts], dtype=torch.int32).cumsum(0, dtype=torch.int32)
+    out = grouped_mlp(positions, offsets, parameters[::2], parameters[1::2], layers=table, backend=backend)
+    return [out, *torch.autograd.grad(out.square().sum(), (positions, *parameters))]
+
+
+@pytest.mark.parametrize("width", [1, 15, 16, 17, 256, 270])
+def test_a_network_of_any_width(width: int) -> None:
+    for found, right in zip(gradients(width, [70, 3], "warp"), gradients(width, [70, 3], "reference"), strict=True):
+        torch.testing.assert_close(found, right, rtol=1e-4, atol=1e-4 * float(right.abs().max()))
+
+
+@pytest.mark.parametrize(
+    "counts", [[0, 0], [ROWS], [ROWS + 1, 0, ROWS - 1], [0, 2 * ROWS, 0, 1, 0], [1] * 70, [300, *[0] * 40]], ids=str
+)
+def test_cells_of_any_size(counts: list[int]) -> None:
+    for found, right in zip(gradients(20, counts, "warp"), gradients(20, counts, "reference"), strict=True):
+        torch.testing.assert_close(found, right, rtol=1e-4, atol=1e-5)
