@@ -23,6 +23,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "grouped": {"way": "grouped"},
     "loop": {"way": "loop"},
     "fastest": {"fuse": True},
+    "reference": {"way": "grouped", "backend": "reference"},
 }
 
 

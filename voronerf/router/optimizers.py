@@ -107,7 +107,7 @@ def watch_former(module: nn.Module, former: Sequence[nn.Parameter]) -> None:
         now = routed()
         if not watched or now is None:
             return
-        held = [p for group in optimizer.param_groups for p in group["params"]]
+        held: list[Tensor] = [p for group in optimizer.param_groups for p in group["params"]]
         old = [p for p in held if id(p) in watched and watched[id(p)]() is p]
         right = not {id(p) for p in now.parameters()}.isdisjoint(map(id, held))
         if old and not right and all(p.grad is None for p in old):

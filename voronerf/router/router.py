@@ -648,9 +648,9 @@ class VoronoiRouter(nn.Module):
         if self._unseen and layout.n >= _LARGE:
             self._unseen = False
             with outside():
-                given = first_tensor(args, kwargs), positions
-                given = (None if x is None else unwrapped(x) for x in given)
-                doubt = doubt_of(rule, *given, grouping.offsets, self.diagram.centres)
+                source = first_tensor(args, kwargs)
+                source = None if source is None else unwrapped(source)
+                doubt = doubt_of(rule, source, unwrapped(positions), grouping.offsets, self.diagram.centres)
             if doubt:
                 self._dispatch.warn_once("positions", doubt)
         options = Options(self.fuse, self.way, bool(self.methods), self._names)

@@ -36,7 +36,9 @@ def grouped_linear(
         # The weight of an input that is 1.
         x = torch.nn.functional.pad(x, (0, 1), value=1.0)
         weight = torch.cat([weight, bias.to(dtype).to(wide)[:, :, None]], dim=2)
-    y = activate(activation, torch.ops.voronerf.grouped_product(x, offsets, weight))
+    # Custom ops have no gradient within torch.func.
+    product = _product_in_torch if torch._C._are_functorch_transforms_active() else torch.ops.voronerf.grouped_product
+    y = activate(activation, product(x, offsets, weight))
     row = torch.arange(x.shape[0], device=x.device)
     inside = (row >= offsets[0]) & (row < offsets[-1])
     return torch.where(inside[:, None], y, 0).to(dtype)
@@ -55,6 +57,13 @@ def _pieces(offsets: Tensor, n: int) -> Iterator[tuple[int, slice]]:
     for cell, (low, high) in enumerate(itertools.pairwise(check_offsets("grouped_linear", offsets, n))):
         for start in range(low, high, _PIECE):
             yield cell, slice(start, min(start + _PIECE, high))
+
+
+def _product_in_torch(x: Tensor, offsets: Tensor, weight: Tensor) -> Tensor:
+    n = x.shape[0]
+    bounds = check_offsets("grouped_linear", offsets, n)
+    parts = [x[low:high] @ weight[cell].t() for cell, (low, high) in enumerate(itertools.pairwise(bounds))]
+    return torch.nn.functional.pad(torch.cat(parts), (0, 0, bounds[0], n - bounds[-1]))
 
 
 @torch.library.custom_op("voronerf::grouped_product", mutates_args=())
