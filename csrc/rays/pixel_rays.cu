@@ -16,7 +16,7 @@ __global__ void __launch_bounds__(kThreads) pixel_rays_kernel(PixelRaysInputs in
 }  // namespace
 
 void pixel_rays_cuda(const PixelRaysInputs& in, const PixelRaysOutputs& out, void* stream) {
-  if (in.b == 0) return;
+  if (in.b == 0 || in.c * in.h * in.w == 0) return;
   VN_LAUNCH(pixel_rays_kernel, static_cast<unsigned>(ceil_div<int64_t>(in.b, kThreads)), kThreads, 0, stream, in, out);
 }
 

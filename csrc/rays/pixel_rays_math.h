@@ -67,9 +67,10 @@ VN_HD void pixel_colour(const PixelRaysInputs& in, const uint8_t* pixel, int64_t
   }
 }
 
-// Ray number `ray`, of a pixel that there is.
+// Ray number `ray`. A pixel that there is not, which the CPU has refused before, counts as the nearest.
 VN_HD void pixel_ray(const PixelRaysInputs& in, const PixelRaysOutputs& out, int64_t ray) {
-  const int64_t each = in.h * in.w, number = in.pixels[ray];
+  const int64_t each = in.h * in.w, last = in.c * each - 1, given = in.pixels[ray];
+  const int64_t number = given < 0 ? 0 : given < last ? given : last;
   const int64_t camera = number / each, pixel = number - camera * each, y = pixel / in.w;
   float *origin = out.origins + 3 * ray, *direction = out.directions + 3 * ray;
   for (int axis = 0; axis < 3; ++axis) origin[axis] = in.poses[16 * camera + 4 * axis + 3];

@@ -30,7 +30,7 @@ PARTS = {
         (Part("valid-calls", op_attacks.valid_call, 60, 200), 140_000, 150),
         (Part("invalid-calls", op_attacks.invalid_call, 20, 200, MEMORY // 2), 60_000, 150),
         (Part("kills", training_attacks.killed_training, 300, 1, prepare=given.prepare_scenes), 20, 1),
-        (Part("ranks", rank_attacks.harmed_ranks, 1200), 3, 0),
+        (Part("ranks", rank_attacks.harmed_ranks, 600), 16, 0),
         (Part("bits", run_attacks.flipped_bit, 60, 20, prepare=given.prepare_runs), 500, 15),
         (Part("scenes", scene_attacks.stranger_scene, 60, 1, prepare=given.prepare_photographs), 150, 4),
         (Part("runs", run_attacks.stranger_run, 60, 1, prepare=given.prepare_runs), 150, 4),

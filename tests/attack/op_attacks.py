@@ -134,7 +134,7 @@ def harmed_call(rng: random.Random, op: str) -> tuple[dict[str, Any], list[str]]
         elif rng.random() < 0.15:  # of another call
             call[name] = other.get(name, call[name])
         elif call[name] is None:
-            tensors = [part for part in tree_leaves(call) if isinstance(part, Tensor)]
+            tensors = [part for part in tree_leaves(made) if isinstance(part, Tensor)]
             few = torch.tensor([rng.choice((0, 1, -1, 5, 1000, 2**31 - 1, -(2**31)))], dtype=torch.int32)
             call[name] = rng.choice((3, "x", [1.0], harmed(rng, rng.choice(tensors)), rng.choice(tensors), few))
         else:
@@ -146,6 +146,7 @@ def check_message(op: str, call: dict[str, Any], names: list[str], error: Except
     """The error names the op, or one that it is composed of, and an argument, in a line of some length."""
     text = str(error)
     arguments = {*inspect.signature(called(op)).parameters, *named(call)}
+    arguments |= {*inspect.signature(ops.routed_mlp).parameters} if "network" in call else set()
     arguments |= {argument.removesuffix("s") for argument in arguments}  # an entry of a list
     clear = re.match(rf"({'|'.join(backends.ops())})(: |\(\) ).*\b({'|'.join(arguments)})\b", text)
     if not clear or "\n" in text or len(text) > 500:

@@ -29,8 +29,8 @@ VARIANTS = (
     [*FIELDS["hashgrid"], "--contraction", "sphere"],
     ["--field", "nerf", "--cells", "2", "2", "--split-at", "0.3", "0.6"],
 )
-#: Of a chain: ranks that are killed, stopped for good, and stopped for as many seconds.
-FAULTS = {"kill": 10, "stop": 10, "pause": 2}
+#: What happens to ranks, and how often: killed, stopped for good, stopped for some seconds; so many in an attempt.
+FAULTS, COUNT = {"kill": 10, "stop": 10, "pause": 2}, 4
 PAUSE = 1.5
 #: Share of the faults after which a bit of the last checkpoint is another.
 DAMAGED = 0.25
@@ -114,8 +114,7 @@ def harmed_ranks(rng: random.Random, folder: Path, _given: Path) -> Counter[str]
 
 def _ended_ranks(rng: random.Random, folder: Path, whole: Path, options: list[str]) -> int:
     """Ends ranks at random moments, and starts others; how many."""
-    faults = list(Counter(FAULTS).elements())
-    rng.shuffle(faults)
+    faults = rng.choices([*FAULTS], [*FAULTS.values()], k=COUNT)
     done, runs, length = 0, 0, 4.0
     while faults:  # a run may end before all of them
         part, ended = folder / f"part-{runs}", False

@@ -229,6 +229,19 @@ def test_a_command_that_is_ended_leaves_nothing(runs, tmp_path, monkeypatch) -> 
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
+@pytest.mark.skipif(os.name != "posix", reason="whether a process runs is not known")
+def test_what_a_killed_command_left_is_removed_by_the_next(opened, tmp_path) -> None:
+    child = os.fork()
+    if not child:
+        os._exit(0)
+    os.waitpid(child, 0)
+    for name in (f".other.{child}.partial", f".other.{os.getppid()}.partial"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "scene.json").touch()
+    joined_run(opened, tmp_path / "run")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f".other.{os.getppid()}.partial", "run"]
+
+
 def test_out_is_a_new_folder(opened, tmp_path) -> None:
     joined_run(opened, tmp_path / "run")
     before = contents(tmp_path / "run")
@@ -367,13 +380,17 @@ def test_the_commands(runs, tmp_path, capsys) -> None:
         f"cut {one} --out X": "cut needs one of --box, --sphere and --cells, got none",
         f"cut {one} --out X --box 1 1 1 0 0 0": "--box: Solid: a box must have its second corner above the first",
         f"cut {one} --out X --sphere 9 9 9 0.1": "nothing is left",
-        f"place {one} {two} --out X --at 0 0 0 --scale 0": "scale must be positive and finite, got 0",
+        f"place {one} {two} --out X --at 0 0 0 --scale 0": "scale must lie in 1e-9..1e9, got 0",
+        f"place {one} {two} --out X --at 0 0 0 --scale 1e30": "scale must lie in 1e-9..1e9, got 1e+30",
+        f"place {one} {two} --out X --at 0 0 0 --scale 1e-5": "second: must be at least 0.0001 times as large as",
+        f"place {one} {two} --out X --at 0 0 0 --scale 1e5": "first: must be at least 0.0001 times as large as",
+        f"place {one} {two} --out X --at 0 0 1e30": "first: must be at least 0.0001 times as large as",
     }.items():
         assert main(command.replace("X", str(tmp_path / "x")).split()) == 1
         told = capsys.readouterr().err
         assert said in told and told.count("\n") == 1, told
     for move, said in {
-        ("2", "1 0 0 0 0 0 0"): "--move 2: Similarity: scale must be positive and finite, got 0",
+        ("2", "1 0 0 0 0 0 0"): "--move 2: Similarity: scale must lie in 1e-9..1e9, got 0",
         ("2", "1 0 0"): "seven numbers, got 3",
         ("3", "1 0 0 0 0 0 1"): "--move 3: must be the number of a run, 1 to 2",
         ("2", "1 0 0 0 0 0 1", "--move", "2", "2 0 0 0 0 0 1"): "--move 2: must be given once",

@@ -110,8 +110,8 @@ def test_similarities(torch_seed) -> None:
     assert torch.allclose((frame @ other).points(points), frame.points(other.points(points)))
     assert torch.allclose(other.points(torch.tensor([[0.0, 0, 1]])), torch.tensor([[1.0, 1, 0]]), atol=1e-6)
     mirror = torch.diag(torch.tensor([1.0, 1, -1]))
-    refuses("scale must be positive and finite, got 0", lambda: Similarity(0.0))
-    refuses("scale must be positive and finite, got -1", lambda: Similarity(-1.0))
+    for scale in (0.0, -1.0, 1e30, float("nan")):
+        refuses(f"scale must lie in 1e-9..1e9, got {scale}", Similarity, scale)
     refuses("must not mirror", lambda: Similarity(1.0, mirror))
     refuses("must be orthonormal", lambda: Similarity(1.0, 2 * torch.eye(3)))
     refuses("translation must be [3] finite", lambda: Similarity(translation=torch.tensor([0, math.nan, 0])))

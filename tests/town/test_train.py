@@ -12,7 +12,7 @@ from ranks import complaints, network_files, new_store, on_ranks, town_tensors
 from voronerf.app.cli.main import main
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
-from voronerf.town import open_run, rays, train
+from voronerf.town import group, open_run, rays, train
 
 ARGUMENTS = """
 train-territories --data builtin --downscale 8 --width 8 --field-options levels=4 log2_entries=10 --rays 16 --cells 2
@@ -42,6 +42,14 @@ def in_step(number, harm):
 
 def dies(args, step):
     with in_step(step, lambda: os.kill(os.getpid(), signal.SIGKILL)):
+        return main(args)
+
+
+def dies_at_the_start(args):
+    """Rank 1, before it has met the others, who wait for it for some seconds."""
+    if group.own_rank() == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    with mock.patch.object(group, "PATIENCE", 3):
         return main(args)
 
 
@@ -105,6 +113,12 @@ def test_a_rank_that_is_killed(tmp_path, whole):
     assert "another rank has ended" in complaints(texts)[0]
     assert on_ranks(main, args, folder=tmp_path, restarts=1)[0] == [0, 0]
     assert same(whole, tmp_path / "run")
+
+
+def test_a_rank_that_is_killed_before_the_others_meet_it(tmp_path):
+    codes, texts = on_ranks(dies_at_the_start, command(tmp_path / "run"), folder=tmp_path, size=3)
+    assert codes == [1, -signal.SIGKILL, 1] and len(complaints(texts)) == 1
+    assert "another rank has ended" in complaints(texts)[0]
 
 
 @pytest.mark.parametrize("harm", ["changed", slow("cut short"), slow("missing")])

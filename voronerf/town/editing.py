@@ -34,6 +34,8 @@ from voronerf.town.run import TOWN, is_town, open_parts, write_parts
 
 #: The most voxels of the grid of a run that was made of others; it has larger ones where it would have more.
 MOST_VOXELS = 1 << 22
+#: The least size of a run beside all together: strata, of which a ray has so many at most, would jump over a smaller.
+SMALLEST = 1e-4
 
 
 @dataclass(frozen=True)
@@ -203,8 +205,8 @@ def join_sources(sources: Sequence[Source], frames: Sequence[Similarity], *, on_
         above = max((part.layer for part in parts), default=-1) + 1 if on_top and index else 0
         parts += [part.changed(frame=frame @ part.frame, layer=part.layer + above) for part in source.parts]
     every = Parts(parts, backend=first.parts.backend)
-    scene, grid = _join_scenes(sources, frames), _join_grids(sources, frames)
-    return Source(first.name, _settings(sources, frames, scene), scene, every, grid)
+    scene = _join_scenes(sources, frames)
+    return Source(first.name, _settings(sources, frames, scene), scene, every, _join_grids(sources, frames))
 
 
 def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Scene) -> TrainConfig:
@@ -216,6 +218,11 @@ def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Sc
         for source, frame in zip(sources, frames, strict=True):
             assert source.scene.box is not None
             own = float((source.scene.box[1] - source.scene.box[0]).norm()) * frame.scale
+            if not own >= SMALLEST * diagonal:
+                raise ConfigError(
+                    f"{source.name}: must be at least {SMALLEST:g} times as large as all together, got {own:.3g} "
+                    f"of {diagonal:.3g}"
+                )
             samples = max(samples, math.ceil((source.config.samples or (64,))[0] * diagonal / own - 1e-6))
     return replace(first, sampling="stratified", samples=(min(samples, 32_000),), out=None)
 
@@ -495,10 +502,24 @@ def check_out(out: Path) -> None:
         raise ConfigError(f"--out must be a new or an empty folder, got {out}")
 
 
+def _runs(number: int) -> bool:
+    """Whether there is a process of this number, or it cannot be known."""
+    try:
+        os.kill(number, 0) if os.name == "posix" else None  # elsewhere it would end the process
+    except ProcessLookupError:
+        return False
+    except OSError:
+        pass
+    return True
+
+
 def _write(source: Source, out: Path) -> Source:
     """Writes a run of parts into a new folder, whole or not at all."""
     check_out(out)
     out.parent.mkdir(parents=True, exist_ok=True)
+    for left in out.parent.glob(".*.[0-9]*.partial"):
+        if not _runs(int(left.suffixes[-2][1:])):  # it was killed
+            shutil.rmtree(left, ignore_errors=True)
     partial = out.parent / f".{out.name[:100]}.{os.getpid()}.partial"
     try:
         partial.mkdir()

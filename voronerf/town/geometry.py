@@ -29,7 +29,7 @@ class Similarity:
     """``x -> scale * rotation @ x + translation``, from the frame of a part to that of the scene.
 
     Args:
-        scale: Positive and finite.
+        scale: 1e-9 to 1e9.
         rotation: [3, 3], orthonormal, no mirror image.
         translation: [3].
 
@@ -56,8 +56,8 @@ class Similarity:
             object.__setattr__(self, name, value)
             if value.shape != shape or not bool(value.isfinite().all()):
                 raise ValueError(f"Similarity: {name} must be {list(shape)} finite numbers, got {value.tolist()}")
-        if not 0 < self.scale < math.inf:
-            raise ValueError(f"Similarity: scale must be positive and finite, got {self.scale}")
+        if not 1e-9 <= self.scale <= 1e9:
+            raise ValueError(f"Similarity: scale must lie in 1e-9..1e9, got {self.scale}")
         if float((self.rotation @ self.rotation.T - _eye()).abs().max()) > _ORTHONORMAL:
             raise ValueError(f"Similarity: rotation must be orthonormal, got {self.rotation.tolist()}")
         if float(torch.linalg.det(self.rotation)) < 0:

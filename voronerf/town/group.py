@@ -71,19 +71,24 @@ class Group:
 
     @classmethod
     def join(cls, device: torch.device) -> Group:
-        """Meets the other ranks that torchrun has started."""
+        """Finds the store of the ranks that torchrun has started, which `meet` each other."""
         if world_size() == 1:
             return cls(device)
-        if device.type == "cuda":
-            torch.cuda.set_device(device)  # where torch puts what it sends of Python objects
-        timeout = timedelta(seconds=PATIENCE)
         with waiting():
-            store, rank, size = next(iter(dist.rendezvous("env://", timeout=timeout)))
-            # torchrun keeps one store for all starts: a rank would find the addresses of those that were killed.
-            store = dist.PrefixStore(f"voronerf/{restarts()}", store)
-            backend = "nccl" if device.type == "cuda" else "gloo"
-            dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=timeout)
-        return cls(device, rank, size, store)
+            store, rank, size = next(iter(dist.rendezvous("env://", timeout=timedelta(seconds=PATIENCE))))
+        # torchrun keeps one store for all starts: a rank would find the addresses of those that were killed.
+        return cls(device, rank, size, dist.PrefixStore(f"voronerf/{restarts()}", store))
+
+    def meet(self) -> None:
+        """Meets the other ranks."""
+        if self.size == 1:
+            return
+        if self.device.type == "cuda":
+            torch.cuda.set_device(self.device)  # where torch puts what it sends of Python objects
+        options = {"store": self.store, "rank": self.rank, "world_size": self.size}
+        with waiting():
+            backend = "nccl" if self.device.type == "cuda" else "gloo"
+            dist.init_process_group(backend, timeout=timedelta(seconds=PATIENCE), **options)
 
     def leave(self) -> None:
         """Leaves together with the others."""

@@ -22,6 +22,7 @@ MlpCudaData data_of(const MlpInputs& in) {
   data.offsets = in.offsets;
   data.n = in.n;
   data.k = in.k;
+  data.r = in.r;
   data.encoded = in.encoded;
   return data;
 }

@@ -10,7 +10,7 @@ namespace voronerf {
 struct MlpCudaData {
   const float *positions, *directions;
   const int32_t *direction_index, *order, *offsets;
-  int64_t n, k;
+  int64_t n, k, r;         // r: rows of directions
   unsigned char* packed;   // in the workspace
   int32_t* first_task;     // in the workspace, [k+1]
   float* partials;         // in the workspace, null without gradients of parameters

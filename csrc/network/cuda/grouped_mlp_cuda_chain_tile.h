@@ -232,7 +232,7 @@ __device__ __forceinline__ void chain_source_rows(const MlpCudaData& data, MlpCh
     const bool there = row < rows.count;
     found[i] = -1;
     if (there) found[i] = static_cast<int>(mlp_source_row(data, rows.first + row));
-    if (there && index != nullptr) found[i] = index[found[i]];
+    if (there && index != nullptr) found[i] = mlp_within(index[found[i]], data.r);
   }
 }
 

@@ -60,13 +60,13 @@ __global__ void __launch_bounds__(kScanThreads)
 struct RawRows {
   const float* raw;
   const int32_t *order, *index;
-  int64_t first;
+  int64_t first, directions;  // rows that an index counts
   int features;
 
   __device__ int64_t sample(int64_t row) const { return order == nullptr ? first + row : order[first + row]; }
   __device__ const float* at(int64_t row) const {
     const int64_t source = sample(row);
-    return raw + (index == nullptr ? source : index[source]) * features;
+    return raw + (index == nullptr ? source : mlp_within(index[source], directions)) * features;
   }
 };
 
@@ -240,8 +240,8 @@ class Call {
     return given;
   }
   RawRows raw(int from) const {
-    if (from == kFromPositions) return {data_.positions, data_.order, nullptr, slab_.first, plan_.positions.raw};
-    return {data_.directions, data_.order, data_.direction_index, slab_.first, plan_.directions.raw};
+    if (from == kFromPositions) return {data_.positions, data_.order, nullptr, slab_.first, 0, plan_.positions.raw};
+    return {data_.directions, data_.order, data_.direction_index, slab_.first, data_.r, plan_.directions.raw};
   }
 
   template <typename Finish>

@@ -61,7 +61,7 @@ __global__ void __launch_bounds__(kThreads) mlp_strays_kernel(const MlpCudaData 
   const int64_t step = static_cast<int64_t>(gridDim.x) * kThreads;
   for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < data.n; i += step) {
     if (i >= first && i < last) continue;
-    const int64_t row = mlp_source_row(data, i);
+    const int64_t row = mlp_within(mlp_source_row(data, i), data.n);  // a program's order is its caller's
     for (int column = 0; column < width; ++column) rows[row * width + column] = 0.0f;
   }
 }

@@ -56,6 +56,12 @@ __device__ inline int64_t mlp_source_row(const MlpCudaData& data, int64_t row) {
   return data.order == nullptr ? row : data.order[row];
 }
 
+// An index that a caller has given, which no host has read: what leaves [0, n) counts as the nearest within.
+template <typename T>
+__device__ inline T mlp_within(T index, int64_t n) {
+  return index < 0 ? 0 : index < n ? index : static_cast<T>(n - 1);
+}
+
 // Raw features of a row.
 __device__ inline const float* mlp_positions(const MlpCudaPlan& plan, const MlpCudaData& data, int64_t row) {
   return data.positions + mlp_source_row(data, row) * plan.positions.raw;
@@ -63,7 +69,7 @@ __device__ inline const float* mlp_positions(const MlpCudaPlan& plan, const MlpC
 __device__ inline const float* mlp_directions(const MlpCudaPlan& plan, const MlpCudaData& data, int64_t row) {
   const int64_t source = mlp_source_row(data, row);
   return data.directions +
-         (data.direction_index == nullptr ? source : data.direction_index[source]) * plan.directions.raw;
+         (data.direction_index == nullptr ? source : mlp_within(data.direction_index[source], data.r)) * plan.directions.raw;
 }
 
 __device__ inline float mlp_activate(int activation, float x) {

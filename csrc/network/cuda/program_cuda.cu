@@ -119,6 +119,9 @@ struct Tile {
     return {slot(o.slot) + o.start, o.stride, o.spread != 0};
   }
 
+  // The order is a caller's.
+  __device__ int64_t source_row(int64_t row) const { return mlp_within(mlp_source_row(data, row), data.n); }
+
   __device__ void run() const {
     const auto& header = *reinterpret_cast<const ProgramHeader*>(tensors.code);
     const auto* code = reinterpret_cast<const int32_t*>(packs_of(tensors.code) + header.packs);
@@ -139,7 +142,7 @@ struct Tile {
         const float* from = tensors.inputs[step.number];
         const bool turned = tensors.turned[step.number];
         return each(to, step.stride, rows, step.width, [&](int row, int column) {
-          const int64_t source = mlp_source_row(data, begin + row);
+          const int64_t source = source_row(begin + row);
           return from[turned ? column * data.n + source : source * step.width + column];
         });
       }
@@ -147,7 +150,7 @@ struct Tile {
         float* out = tensors.outputs[step.number];
         for (int i = static_cast<int>(threadIdx.x); i < rows * step.width; i += kThreads) {
           const int row = i / step.width, column = i - row * step.width;
-          out[mlp_source_row(data, begin + row) * step.width + column] = x.at(row, column);
+          out[source_row(begin + row) * step.width + column] = x.at(row, column);
         }
         return;
       }

@@ -192,6 +192,7 @@ def train_territories(
                 null = stack.enter_context(open(os.devnull, "w"))
                 stack.enter_context(contextlib.redirect_stdout(null))
                 stack.enter_context(contextlib.redirect_stderr(null))
+            group.meet()
             count = territories or 1 << (group.size - 1).bit_length()
             return _train_territories(config, group, count, resume, checkpoint_every, panels)
     except Exception as error:

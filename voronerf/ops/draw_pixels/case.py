@@ -16,5 +16,9 @@ def _make(draw: Draw, n: int) -> Arguments:
 
 
 CASE = Case(
-    _make, refused={"below must be at least 1, got 0": {"below": 0, "runs": None}}, traced=False, device_rows=260
+    _make,
+    refused={"below must be at least 1, got 0": {"below": 0, "runs": None}},
+    traced=False,
+    device_rows=260,
+    hostile="indices",
 )

@@ -106,6 +106,8 @@ def _check_directions(
     check_dtype(op, "directions", directions)
     if direction_index is not None:
         check_shape(op, "direction_index", direction_index, ("n",), sizes)
+        if not sizes["r"] and sizes["n"]:
+            raise ValueError(f"{op}: directions must hold a row for the direction_index, got {list(directions.shape)}")
         check_dtype(op, "direction_index", direction_index, INDEX)
 
 

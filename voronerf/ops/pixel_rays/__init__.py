@@ -48,8 +48,8 @@ def pixel_rays(
         poses: float32 [c, 4, 4], camera to world, OpenGL axes.
         intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
         images: uint8 [c, h, w, 3], or [c, h, w, 4] with an alpha channel that the colours are not multiplied by.
-        index: int64 [b], the pixels: image * h * w + row * w + column. Others are an error on the CPU, and undefined on
-            CUDA, where they are not checked.
+        index: int64 [b], the pixels: image * h * w + row * w + column. Others are an error on the CPU; on CUDA, where
+            they are not read before, they count as the nearest.
         near: nearest distance of interest, >= 0.
         far: farthest.
         box: float32 [2, 3], lowest and highest corner, or None for all of space.

@@ -26,4 +26,5 @@ CASE = Case(
         "far must be at most 3.4e+38 or infinite, got 1e+39": {"far": 1e39},
     },
     on_devices=({"bent": False},),
+    hostile="indices",
 )

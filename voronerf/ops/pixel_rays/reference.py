@@ -48,7 +48,7 @@ def pixel_rays(*given: Any) -> PixelRays:
     camera = index // (h * w)
     fx, fy, cx, cy = intrinsics[camera].unbind(-1)
     u, v, ahead = (x - cx) / fx, (y - cy) / fy, torch.ones_like(x)
-    if lens is not None and tables is not None:
+    if lens is not None and tables is not None and len(tables):
         table = lens[camera].long()
         bent = (table >= 0) & (table < len(tables))
         right, down = tables.reshape(-1, 2)[torch.where(bent, table, 0) * (h * w) + pixel].unbind(-1)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import Implementation
-from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_range, check_shape
+from voronerf.ops._core.checks import INDEX, LIKE_FIRST, MAX_GROUPS, Checked, check_range, check_shape
 from voronerf.ops._core.declare import declare
 from voronerf.ops.composite.reference import check_ray_offsets
 from voronerf.ops.ray_runs.reference import OwnSamples
@@ -200,4 +200,6 @@ def _is_plain(tensor: Tensor, dtype: torch.dtype, rows: int | None) -> bool:
     """Whether it is a CPU tensor of this type and so many rows, or of one at least."""
     if type(tensor) is not Tensor or tensor.dtype is not dtype or not tensor.is_cpu or tensor.dim() != 1:
         return False
-    return tensor.layout is torch.strided and (len(tensor) >= 1 if rows is None else len(tensor) == rows)
+    return tensor.layout is torch.strided and (
+        1 <= len(tensor) <= MAX_GROUPS + 1 if rows is None else len(tensor) == rows
+    )

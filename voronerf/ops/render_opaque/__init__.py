@@ -26,7 +26,7 @@ def _prepare(given: Any) -> Any:
     if not isinstance(network, Mapping) or not {"weights", "biases", "layers"} <= network.keys():
         raise ValueError(f"{op}: network must hold weights, biases and layers, got {network!r:.60}")
     if unknown := [name for name in network if name not in NETWORK]:
-        raise TypeError(f"{op}: network must hold {', '.join(NETWORK)} alone, got {', '.join(unknown)}")
+        raise TypeError(f"{op}: network must hold {', '.join(NETWORK)} alone, got {', '.join(map(str, unknown))}")
     reads = getattr(network["layers"], "uses_directions", False)
     table = check_routed(op, given.origins, **network, directions=given.directions if reads else None)
     table.pop("frozen")

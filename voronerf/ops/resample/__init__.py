@@ -12,7 +12,7 @@ from voronerf.ops._core.declare import declare
 
 
 def _prepare(given: Any) -> Any:
-    check_count("resample", "depths", given.weights.shape[0] * given.count)
+    check_count("resample", "count times the rays", given.weights.shape[0] * given.count)
     if given.weights.shape[1] < 1:
         raise ValueError("resample: weights must have at least one bin, got none")
     return given
