@@ -16,8 +16,8 @@ from emulation_build import load
 RANDOM = np.random.default_rng(0)
 DTYPES = {name: name for name in ("float32", "float64", "int32", "int64", "uint8", "bool")}
 LEAST, MOST = -(2**31), 2**31 - 1
-SOUND = ("order", "direction_index", "code", "turned")
-"""Fields that are checked, or made by the library itself."""
+SOUND = ("code", "turned", "strides", "widths")
+"""Fields that are made by the library itself, like the order of a network."""
 
 
 class Memory:
@@ -57,7 +57,8 @@ def sound_arrays(value):
     if not isinstance(value, tuple) or value[0] == "array":
         return set()
     named = zip(value[2], value[3])
-    return {part[1] for name, part in named if name in SOUND and part is not None} | sound_arrays(list(value[3]))
+    sound = (*SOUND, "order") if value[1] == "MlpInputs" else SOUND
+    return {part[1] for name, part in named if name in sound and part is not None} | sound_arrays(list(value[3]))
 
 
 def harm(numbers, arguments, before, after):
@@ -66,9 +67,9 @@ def harm(numbers, arguments, before, after):
     for number, (array, changed) in enumerate(zip(before, after)):
         if number in kept or array.tobytes() != changed.tobytes():
             continue
-        if array.dtype == np.int32:
+        if array.dtype in (np.int32, np.int64):
             values = [LEAST, -5, -1, 0, 1, 4, 5, array.size, array.size + 1, 65_536, MOST]
-            before[number] = RANDOM.choice(values, array.shape).astype(np.int32)
+            before[number] = RANDOM.choice(values, array.shape).astype(array.dtype)
         elif numbers and array.dtype.kind == "f" and array.size > 1:
             before[number] = array.copy()
             before[number].ravel()[::5], before[number].ravel()[1::7] = np.nan, RANDOM.choice([np.inf, -1, 1e38])

@@ -16,7 +16,7 @@ from voronerf.ops.cell_sort.native import WAYS
 from voronerf.ops.cell_sort.native import sort as sort_cells
 from voronerf.ops.draw_pixels import native as draw_pixels
 from voronerf.ops.draw_pixels import reference as draw_pixels_reference
-from voronerf.ops.grouped_mlp.network import Given, backward, network
+from voronerf.ops.grouped_mlp.network import Given, as_network, backward
 
 
 @pytest.fixture(params=(0, 1, 2), autouse=True)
@@ -126,7 +126,7 @@ def test_a_backward_pass_needs_what_the_forward_pass_kept():
     grid = voronerf.HashGrid(levels=2, features=2, log2_entries=10, finest=20)
     layers = MLP((Layer((POSITIONS,), 3),), (0,), position_encoding="hash", grid=grid)
     given = Given(torch.rand(9, 3), [torch.rand(1, 3, 4)], [None], layers, features=torch.rand(grid.table_shape))
-    taken, _ = network(given, None, hashed_before=False)
+    taken, _ = as_network(given, None, hashed_before=False)
     offsets = torch.tensor([0, 9], dtype=torch.int32)
     with pytest.raises(ValueError, match=r"^grouped_mlp: encoded must be what the forward pass kept"):
         backward(torch.rand(9, 3), taken, offsets, None, torch.empty(0), [True, False, False, True])
