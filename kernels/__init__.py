@@ -1,26 +1,28 @@
 """NVIDIA Warp kernels, installed as ``voronerf.kernels``: one file per op, one source for CPU and CUDA.
 
-On the CPU Warp runs on one thread, so there it serves as a check. Importing this package raises
-``BackendUnavailable`` where Warp is missing or too old; ``import voronerf`` never imports it.
+They are for a GPU without a compiler. On the CPU Warp runs on one thread, so there it serves as a check. Importing this
+package raises ``BackendUnavailable`` where Warp is missing or too old; ``import voronerf`` never imports it.
 
-Kernels are compiled when they are first used, a file at a time. Compiled kernels stay in Warp's cache, in the folder
-WARP_CACHE_PATH or Warp's default.
+Kernels are compiled when they are first used, a file at a time, or by :func:`loads`. Compiled kernels stay in Warp's
+cache, in the folder WARP_CACHE_PATH or Warp's default.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import importlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 
 from voronerf.ops._core.backends import BackendUnavailable
 
-MINIMUM = (1, 10)
-_REMEDY = "install it with `pip install 'voronerf[warp]'` (warp-lang >= 1.10)"
+MINIMUM = (1, 19)
+_REMEDY = "install it with `pip install 'voronerf[warp]'` (warp-lang >= 1.19)"
 
 try:
     import warp as wp
@@ -77,3 +79,21 @@ def describe() -> dict[str, Any]:
         "devices": [str(device) for device in wp.get_devices()],
         "cache": str(wp.config.kernel_cache_dir),
     }
+
+
+_OF_A_STEP = (
+    *("nearest_centre", "locate_cell", "cell_sort", "hash_encode", "frequency_encode"),
+    *("march_rays", "observe_occupancy", "render_loss"),
+)
+
+
+def loads(device: torch.device, dtype: torch.dtype) -> list[Callable[[], None]]:
+    """Functions that together load the kernels of a training step with weights of a dtype; only new ones compile."""
+    from voronerf.kernels.grouped_mlp import ROWS, kernels
+
+    where = wp.device_from_torch(device)
+    names = [f"voronerf.kernels.{name}" for name in _OF_A_STEP]
+    for name in names:
+        importlib.import_module(name)
+    files = [functools.partial(wp.load_module, name, where) for name in names]
+    return files + [functools.partial(wp.force_load, where, [part.module], ROWS) for part in kernels(dtype)]

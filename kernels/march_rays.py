@@ -19,6 +19,7 @@ from voronerf.ops.march_rays.reference import March
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 _OP = declared("march_rays")
+_FIRST, _SECOND, _GOLDEN = (wp.constant(wp.uint32(number)) for number in (0x7FEB352D, 0x846CA68B, 0x9E3779B9))
 
 
 @wp.func
@@ -95,15 +96,15 @@ def _point(origin: wp.vec3, direction: wp.vec3, at: wp.float32, space: wp.array2
 
 @wp.func
 def _mixed(bits: wp.uint32) -> wp.uint32:
-    x = (bits ^ (bits >> wp.uint32(16))) * wp.uint32(0x7FEB352D)
-    x = (x ^ (x >> wp.uint32(15))) * wp.uint32(0x846CA68B)
+    x = (bits ^ (bits >> wp.uint32(16))) * _FIRST
+    x = (x ^ (x >> wp.uint32(15))) * _SECOND
     return x ^ (x >> wp.uint32(16))
 
 
 @wp.func
 def _hashed(key: wp.uint32, stratum: wp.int32) -> wp.float32:
     # A number in [0, 1) for each stratum of a ray.
-    h = _mixed(key ^ (wp.uint32(stratum) * wp.uint32(0x9E3779B9)))
+    h = _mixed(key ^ (wp.uint32(stratum) * _GOLDEN))
     return wp.float32(h >> wp.uint32(8)) / 16777216.0
 
 

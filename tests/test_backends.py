@@ -215,6 +215,19 @@ def test_auto_takes_warp_on_cuda_where_native_is_missing(monkeypatch: pytest.Mon
         assert choose(op, "warp", "cuda", None, torch.float32) == "warp"
 
 
+def test_what_auto_takes_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    gone = {"native": "built without CUDA"}
+    monkeypatch.setattr(backends, "missing", lambda backend, device: gone.get(backend))
+    cuda = torch.device("cuda")
+    assert backends.automatic(cuda) == "warp (native: built without CUDA)"
+    gone["warp"] = "not installed"
+    assert backends.automatic(cuda) == "reference (native: built without CUDA; warp: not installed)"
+    gone["reference"] = "no device"
+    assert backends.automatic(cuda) == "nothing (no device)"
+    gone.clear()
+    assert backends.automatic(cuda) == "native"
+
+
 @pytest.mark.warp
 def test_what_warp_has_no_kernel_of_runs_as_plain_torch_with_its_operations_on_warp() -> None:
     run = backends.resolve_composed("routed_mlp", backend="warp", device=CPU, dtype=torch.float32)

@@ -10,12 +10,14 @@ import os
 import shlex
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
 
+import torch
 import tyro
 
 from voronerf.app.cli.display import TrainingDisplay, busy, say, tracked
@@ -29,7 +31,7 @@ from voronerf.app.train.callbacks import CHECKPOINT_EVERY, Checkpoints, Divergen
 from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.defaults import why_no_occupancy
-from voronerf.app.train.loop import Callback, run
+from voronerf.app.train.loop import HALVES, Callback, run
 from voronerf.app.train.resume import load
 from voronerf.app.train.run_directory import (
     check_stored_paths,
@@ -43,6 +45,7 @@ from voronerf.app.train.run_directory import (
     write_curve,
 )
 from voronerf.app.train.state import State
+from voronerf.ops._core import backends
 
 #: Bytes of a picture's name without its end, which most file systems take.
 LONGEST_NAME = 255 - len(".png")
@@ -143,6 +146,22 @@ def _remove_empty(folder: Path) -> None:
         folder.rmdir()  # fails if something was written, and is then not needed
 
 
+def _compile_kernels(config: TrainConfig) -> None:
+    """Compiles what a step calls of Warp, with a bar, and says on a GPU what runs the operations."""
+    device, dtype = torch.device(config.device), HALVES.get(config.precision, torch.float32)
+    if device.type == "cuda" and config.backend == "auto":
+        say(f"operations run on {backends.automatic(device)}")
+    if backends.chosen("grouped_mlp", device, dtype, backend=config.backend) != "warp":
+        return
+    from voronerf import kernels
+
+    start = time.perf_counter()
+    for compiled in tracked(kernels.loads(device, dtype), "compiling Warp kernels"):
+        compiled()
+    if (seconds := time.perf_counter() - start) > 1:
+        say(f"Warp compiled kernels in {seconds:.0f} s, and keeps them in {kernels.describe()['cache']}")
+
+
 def run_training(
     config: TrainConfig,
     scene: Scene,
@@ -166,6 +185,7 @@ def run_training(
     longest = max(scene.test.names, key=lambda name: len(os.fsencode(name)))
     if panels and len(os.fsencode(longest)) > LONGEST_NAME:
         raise ConfigError(f"--panels must be 0 with image names of more than {LONGEST_NAME} bytes, got {longest}")
+    _compile_kernels(config)
     with held(out):
         display = TrainingDisplay(scene.name, quiet=quiet)
         with display.progress:

@@ -187,6 +187,17 @@ def missing(backend: str, device: torch.device) -> str | None:
     return reason
 
 
+def automatic(device: torch.device) -> str:
+    """What "auto" takes on a device, and why not what it prefers: one line, such as "warp (native: no GPU code)"."""
+    reasons: list[str] = []
+    for name in ORDER[device.type]:
+        reason = missing(name, device)
+        if reason is None:
+            return f"{name} ({'; '.join(reasons)})" if reasons else name
+        reasons.append(f"{name}: {reason}")
+    return f"nothing ({reason})"
+
+
 def _import(module: str) -> ModuleType:
     """A backend's module. Run from its source folder, the package has no ``voronerf.kernels``, which lie beside it.
 
@@ -263,6 +274,7 @@ def describe() -> dict[str, Any]:
         "torch": torch.__version__,
         "threads": torch.get_num_threads(),
         "cuda devices": [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())],
+        "auto": {f"on {name}": automatic(torch.device(name)) for name in ORDER},
         "native": _describe("voronerf.ops._core.native"),
         "warp": _describe("voronerf.kernels"),
     }
