@@ -58,6 +58,9 @@ STEPS: dict[str, Callable[[Any, Tensor], Tensor]] = {
     "small matrices": lambda net, h: torch.bmm(h.view(-1, 2, 4), h.view(-1, 4, 2)).flatten(1).repeat(1, 2),
     "a matrix and a vector": lambda net, h: h * (h @ net.gain)[:, None],
     "a parameter beside samples": lambda net, h: torch.cat([h[:, 2:], net.gain[None, :2].expand(len(h), 2)], 1),
+    "some entries of a parameter": lambda net, h: h * net.gain.flip(0) + (h.unsqueeze(-1) * net.gain[1::2]).sum(-1),
+    "a parameter without dimensions": lambda net, h: h * net.single,
+    "a product added to one row": lambda net, h: torch.addmm(net.gain[None], h, net.a.weight @ net.a.weight.t()),
     "constants beside samples": lambda net, h: torch.cat([h[:, 2:], torch.arange(2.0).repeat(len(h), 1)], 1),
     "writing into zeros": written(torch.zeros_like),
     "writing into new memory": written(lambda h: torch.empty(len(h), 8).fill_(0.5)),
@@ -71,7 +74,7 @@ class Around(nn.Module):
     def __init__(self, step: Callable[[Any, Tensor], Tensor]) -> None:
         super().__init__()
         self.a, self.b, self.step = nn.Linear(3, 8), nn.Linear(8, 2), [step]
-        self.gain = nn.Parameter(torch.ones(8))
+        self.gain, self.single = nn.Parameter(torch.ones(8)), nn.Parameter(torch.tensor(0.7))
 
     def forward(self, x: Tensor) -> Tensor:
         return self.b(self.step[0](self, torch.tanh(self.a(x))))
@@ -152,9 +155,17 @@ class Slope(Around):
         return torch.cat([y, F.normalize(slope, dim=-1), self.b(self.a(slope))], -1)
 
 
+class Field(Slope):
+    """nerfstudio's SDFField: the gradient by positions that ``forward`` computes, which it makes require one."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x * 0.5 + 0.1)
+
+
 BETWEEN: dict[str, tuple[Callable[[], nn.Module], str]] = {
     "a custom function bound early": (lambda: Around(lambda net, h: bound_early(h)), "Exponential.apply"),
     "a gradient": (lambda: Slope(lambda net, h: h.square()), "grad"),
+    "a gradient by new positions": (lambda: Field(lambda net, h: h.square()), "grad"),
     "a gradient of a sum, by what was computed": (lambda: Around(by_sum), "sum, grad"),
     "no gradient": (lambda: Around(lambda net, h: h * torch.no_grad()(torch.lgamma)(h + 1.5)), "torch.lgamma"),
 }

@@ -37,7 +37,7 @@ class ParameterEntries:
         every = torch.arange((of.meta["value"] if isinstance(of, fx.Node) else of).numel())
         self._whole = torch.equal(numbers, every)
         self._turned = codes.dim() == 2 and torch.equal(codes.t().flatten(), every)
-        self._numbers = numbers
+        self._numbers = numbers.clone()  # which can be saved for a backward pass, also where it is of inference mode
 
     def of_values(self, values: Mapping[Any, Any]) -> Tensor:
         """Its entries, [k, ...], or [1, ...] where cells share it."""
@@ -122,7 +122,7 @@ class Fused:
             return
         try:
             self._lower(node)
-        except NotAStep as error:
+        except Exception as error:  # NotAStep, or arguments of a form that nobody wrote steps for: PyTorch computes it
             self._why[node] = f"{name_of(node.target)}{node.meta['line']}, which is no step: {error}"
             self._ready[node] = max((self._at(source) for source in node.all_input_nodes), default=0)
             for value in node.meta["results"]:

@@ -624,7 +624,9 @@ class _Recording(TorchDispatchMode):
         for i in range(m):
             add = None
             if bias is not None:
-                add = self.lowering.vector(bias, bias.codes.expand(width).flatten())
+                if bias.codes.numel() not in (1, width):
+                    raise NotAStep("a product that is added to a matrix")
+                add = self.lowering.vector(bias, bias.codes.reshape(-1).expand(width))
             parts = self.lowering.parts(numbers[0, i])
             if len(parts) > _FEW:
                 parts = [(self.b.move(flat.shape[1], parts), 0)]

@@ -33,7 +33,7 @@ _TOTALS = find("any all sum", torch, torch.Tensor)  # a number that may not be u
 
 def differentiable(value: Tensor) -> Tensor:
     """A tensor of which gradients are asked for, which what comes after it is computed from."""
-    return value.view_as(value)
+    return value.view_as(value) if value.requires_grad else value.detach().requires_grad_()
 
 
 class Unfusable(Exception):
