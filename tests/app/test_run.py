@@ -92,6 +92,13 @@ def test_how_a_run_is_rendered_may_differ(folder, scene) -> None:
 
 def test_what_cannot_be_opened(folder, scene, tmp_path) -> None:
     refuses("there is no checkpoint in it", open_run, tmp_path, scene=scene, error=CheckpointError)
-    refuses("--device must be cpu or cuda, got 'meta'", open_run, folder, scene=scene, device="meta", error=ConfigError)
+    refuses(
+        "--device must be auto, cpu or cuda, got 'meta'",
+        open_run,
+        folder,
+        scene=scene,
+        device="meta",
+        error=ConfigError,
+    )
     with pytest.raises(ConfigError, match="--occupancy needs a scene with a box or --contraction"):
         open_run(folder, scene=replace(scene, box=None), occupancy=True)

@@ -15,7 +15,7 @@ from voronerf.app.evaluate.scores import Track, evaluate, in_silence, mean_score
 from voronerf.app.files import json_text, read_json, write_text
 from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene, load_scene
-from voronerf.app.train.build import check_device, make_picture_grid, make_renderer
+from voronerf.app.train.build import make_picture_grid, make_renderer, present_device
 from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.resume import open_routers, stored_values
@@ -207,7 +207,7 @@ def open_run(
         samples: Samples per ray of each pass; None for those of the training.
         occupancy: Skip empty space, found by evaluating the field once. A run trained with occupancy always uses its
             own grid, because its field has learnt nothing about empty space.
-        device: Torch device.
+        device: As for `--device`, such as "cpu", "cuda:0" or "auto".
         backend: Backend of the operations.
 
     Raises:
@@ -238,7 +238,7 @@ def open_run(
         >>> folder.cleanup()
     """
     path = Path(path)
-    check_device(device)
+    device = present_device(device)
     check_folders(path)
     checkpoint = last_checkpoint(path, keep=_shows)
     config, _ = stored_values(checkpoint)

@@ -18,7 +18,7 @@ from torch import Tensor
 from voronerf.app.run import Run, shown_scene
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import placed, read_scene
-from voronerf.app.train.build import check_device
+from voronerf.app.train.build import present_device
 from voronerf.app.train.checkpoint import (
     Checkpoint,
     CheckpointError,
@@ -136,7 +136,7 @@ def open_run(
         downscale: Factor on the images; None for that of the training.
         allow_outside: Also read images that lie outside of the scene folder.
         samples: Samples per ray, one number; None for those of the run.
-        device: Torch device.
+        device: As for `--device`, such as "cpu", "cuda:0" or "auto".
         backend: Backend of the operations.
 
     Raises:
@@ -150,7 +150,7 @@ def open_run(
         ...     return open_run(joined).render(0).colour
     """
     path = Path(path)
-    check_device(device)
+    device = present_device(device)
     check_folders(path)
     checkpoint = last_checkpoint(path)
     config = config_of(checkpoint)

@@ -215,7 +215,7 @@ def test_bad_input_is_one_line(run, tmp_path, fails):
     fails("there is no such folder", "train --data", tmp_path / "none", *small)
     fails("is not a scene", "train --data", tmp_path, *small)
     fails("--cells must lie in 2..10000 on every level", "train --cells 0", *small)
-    fails("--device must name a device", "train --device gpu", *small)
+    fails("--device must be auto, cpu or a GPU that is present, got 'gpu'", "train --device gpu", *small)
     fails("must not hold a run already", "train --downscale 20 --out", run)
     fails(f"no run at {out}: there is nothing to resume", "train --resume", *small)
     fails("--resume needs --out", "train --resume")

@@ -4,9 +4,11 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+import torch
 from helpers import refuses
+from tiny_runs import small
 
-from voronerf.app.train.build import check_device
+from voronerf.app.train.build import build, present_device
 from voronerf.app.train.config import CHOICES, RESUMABLE, ConfigError, TrainConfig, differences
 from voronerf.app.train.defaults import resolve
 
@@ -44,7 +46,7 @@ def test_json_of_something_else(text):
         ({"downscale": 0}, "--downscale must be at least 1, got 0"),
         ({"rays": 0}, "--rays must be at least 1, got 0"),
         ({"width": 1}, "--width must be at least 2, got 1"),
-        ({"lr": 0.0}, "--lr must be positive, got 0.0"),
+        ({"lr": 0.0}, "--lr must be a positive number, got 0.0"),
         ({"average": 1.0}, r"--average must lie in \[0, 1\), got 1.0"),
         ({"cells": (0,)}, r"--cells must lie in 2..10000 on every level \(none for one network\), got \(0,\)"),
         ({"cells": (20_000,)}, r"--cells must lie in 2..10000 on every level .*, got \(20000,\)"),
@@ -86,11 +88,24 @@ def test_every_choice_of_words_is_checked():
 
 @pytest.mark.parametrize(
     ("name", "rule"),
-    [(name, "be cpu or cuda") for name in ("meta", "mps")]
-    + [(name, "name a device that is present") for name in ("gpu7", "cuda:99")],
+    [(name, "be auto, cpu or cuda") for name in ("meta", "mps")]
+    + [(name, "be auto, cpu or a GPU that is present") for name in ("gpu7", "cuda:99")],
 )
 def test_a_device_that_is_not_there(name, rule):
-    refuses(f"--device must {rule}, got '{name}'", check_device, name, error=ConfigError)
+    refuses(f"--device must {rule}, got '{name}'", present_device, name, error=ConfigError)
+
+
+@pytest.mark.parametrize(
+    ("gpu", "backend", "device"), [(True, "native", "cuda"), (True, "reference", "cpu"), (False, "", "cpu")]
+)
+def test_auto_is_a_gpu_that_has_kernels(monkeypatch, gpu, backend, device):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    monkeypatch.setattr("voronerf.ops._core.backends.chosen", lambda *_: backend)
+    assert present_device("auto") == device
+
+
+def test_a_training_on_auto_keeps_the_device_that_it_has(scene):
+    assert build(small(device="auto"), scene).config.device == present_device("auto")
 
 
 def test_defaults_of_the_architectures(scene):

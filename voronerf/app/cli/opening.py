@@ -40,7 +40,7 @@ class Opening:
     occupancy: bool = False
     """Skip empty space, found by evaluating the field once; a run trained with --occupancy always uses its own grid."""
     device: str = "cpu"
-    """Torch device."""
+    """cpu, cuda, cuda:1, ...; auto is a GPU that this package has kernels for, else the CPU."""
     backend: str = "auto"
     """Backend of the operations."""
 

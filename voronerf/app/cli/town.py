@@ -18,7 +18,7 @@ from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.files import json_text, write_text
 from voronerf.app.scenes import BUILTIN, load_scene
 from voronerf.app.scenes.record import read_scene
-from voronerf.app.train.build import check_device
+from voronerf.app.train.build import present_device
 from voronerf.app.train.callbacks import CHECKPOINT_EVERY
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
@@ -182,8 +182,8 @@ def train_territories(
         checkpoint_every: Seconds of training between checkpoints.
         panels: Test views drawn as panels at the end.
     """
-    device = torch.device(f"cuda:{local_rank()}" if config.device == "cuda" else config.device)
-    check_device(str(device))
+    name = present_device(config.device)
+    device = torch.device(present_device(f"cuda:{local_rank()}") if name == "cuda" else name)
     config = replace(config, device=str(device))
     group = Group.join(device)
     try:

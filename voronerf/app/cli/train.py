@@ -26,7 +26,7 @@ from voronerf.app.evaluate.lpips import find_lpips
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.run import open_run
 from voronerf.app.scenes import Scene, SceneError, load_scene
-from voronerf.app.train.build import build, check_device
+from voronerf.app.train.build import build, present_device
 from voronerf.app.train.callbacks import CHECKPOINT_EVERY, Checkpoints, Divergence, Scores, TensorBoard
 from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
@@ -90,7 +90,7 @@ def train(
         port: Port that --view listens at; 0 is any that is free.
         explain: Only say how a training step is computed, and what keeps it from a faster way.
     """
-    check_device(config.device)
+    present_device(config.device)  # before a scene is read
     if panels < 0 or not checkpoint_every > 0:
         name, value = ("panels", panels) if panels < 0 else ("checkpoint-every", checkpoint_every)
         raise ConfigError(f"--{name} must be {'0 or more' if panels < 0 else 'positive'}, got {value}")

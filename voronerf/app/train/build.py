@@ -66,7 +66,7 @@ def build(
         >>> state.step, state.router.num_cells
         (3, 4)
     """
-    config = resolve(config, scene)
+    config = resolve(replace(config, device=present_device(config.device)), scene)
     if config.parameters is not None:
         config = replace(config, width=solve_width(config, config.parameters))
         if config.lr is None:
@@ -301,12 +301,24 @@ def _check_fits(config: TrainConfig, name: str, needed: int) -> None:
         raise ConfigError(f"{name} needs {needed / 2**30:.1f} GiB of memory or more, there are {there / 2**30:.1f}")
 
 
-def check_device(name: str) -> None:
-    """Raises ConfigError unless ``name`` is a torch device that is present."""
+def present_device(name: str) -> str:
+    """A torch device that is present; for "auto" a GPU that has kernels of this package, else the CPU.
+
+    Raises:
+        ConfigError: For another device.
+    """
+    if name == "auto":
+        there = torch.cuda.is_available()
+        return (
+            "cuda"
+            if there and backends.chosen("routed_mlp", torch.device("cuda"), torch.float32) != "reference"
+            else "cpu"
+        )
     try:
         if torch.device(name).type not in ("cpu", "cuda"):
-            raise ConfigError(f"--device must be cpu or cuda, got {name!r}")
+            raise ConfigError(f"--device must be auto, cpu or cuda, got {name!r}")
         float(torch.zeros((), device=name))
     except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"--device must name a device that is present, got {name!r}: {reason}") from None
+        reason = str(error).splitlines()[0].partition(": ")[0]
+        raise ConfigError(f"--device must be auto, cpu or a GPU that is present, got {name!r}: {reason}") from None
+    return name

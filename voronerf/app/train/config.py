@@ -68,7 +68,7 @@ class RunSettings:
     seed: int = 0
     """Seed of every random choice."""
     device: str = "cpu"
-    """Torch device, such as cpu or cuda:0."""
+    """cpu, cuda, cuda:1, ...; auto is a GPU that this package has kernels for, else the CPU."""
     backend: str = "auto"
     """Backend of the operations: auto, native, warp or reference (see `voronerf info`)."""
     budget: float | None = None

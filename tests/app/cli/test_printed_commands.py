@@ -1,0 +1,199 @@
+"""Every command that a page, a help or a message prints: each is parsed, and those of `voronerf` run on a small run.
+
+Commands are read from the pages' code blocks and inline code, and from the strings of the program. Words in capitals
+stand for what a reader puts there. Only what installs, builds or measures is not run, and is looked up instead.
+"""
+
+import ast
+import itertools
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from cli_commands import TINY, words
+from scene_files import write_blender
+
+from voronerf.app.cli import main
+from voronerf.app.cli.main import COMMANDS, TRAININGS
+from voronerf.app.cli.parsing import parse
+from voronerf.app.render.paths import CameraPath, write_camera_path
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train.config import ConfigError
+from voronerf.nerf import orbit_cameras
+
+ROOT = Path(__file__).resolve().parents[3]
+#: But the changelog, which names commands that are no more.
+PAGES = [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "SECURITY")), *(ROOT / "docs").rglob("*.md")]
+#: What a command of a page begins with.
+PROGRAMS = ("voronerf", "torchrun", "python", "make", "pip", "ns-train", "tensorboard")
+#: Programs that are not this project's.
+FOREIGN = ("tensorboard", "ns-train")
+#: Values that make a command short; an option that is not there is added for these commands.
+SHORT = {"--budget": "0.5", "--frames": "2", "--fit": "0.5", "--resolution": "8", "--density": "0.001", "--count": "20"}
+ADDED = {
+    "train": ("--budget",),
+    "train-territories": ("--budget",),
+    "render": ("--frames",),
+    "export": ("--resolution", "--density", "--count", "--fit"),
+}
+#: What stands for what a page leaves to the reader, and for scenes that are large.
+STAND_INS = {
+    "DIR": "scene",
+    "DATA": "scene",
+    "OUT": "scene",
+    "builtin-city:8x8": "scene",
+    "RUN": "run",
+    "TOWN": "made",
+    "FILE": "path.json",
+    "FILE.json": "path.json",
+}
+#: Commands whose own tests run them.
+ELSEWHERE = {"process": "tests/app/scenes/test_process.py", "demo": "tests/app/cli"}
+
+
+def of_page(path):
+    """Commands of a page, in order: lines of code, and what stands between backquotes."""
+    prose, fence = "", None
+    for line in [*re.sub(r"\\\n *", "", path.read_text()).splitlines(), ""]:
+        if line.startswith("```"):
+            fence = line[3:] if fence is None else None
+        elif fence is None and line.strip() and not line.startswith("    "):
+            prose += line + " "
+            continue
+        inline, prose = re.findall("`([^`]+)`", prose), ""
+        code = [line.strip()] if fence in (None, "bash") else []
+        for found in inline + code:
+            command = " ".join(re.split(" +# ", found)[0].split())
+            if command.split(" ")[0] in PROGRAMS:
+                yield command
+
+
+def of_strings(path):
+    """Commands in the strings of a module, with the name of what a message fills in in capitals."""
+    tree = ast.parse(path.read_text())
+    parts = {id(value) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for value in node.values}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            text = "".join(
+                part.value
+                if isinstance(part, ast.Constant)
+                else re.findall(r"\w+", ast.unparse(part.value))[-1].upper()
+                for part in node.values
+                if isinstance(part, ast.FormattedValue | ast.Constant)
+            )
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in parts:
+            text = node.value
+        else:
+            continue
+        for name, rest in re.findall(r"\bvoronerf ([a-z][a-z-]+)((?: (?:--[a-z-]+|[A-Z]+\b|[0-9.]+\b))*)", text):
+            if name in COMMANDS:
+                yield f"voronerf {name}{rest}"
+
+
+COLLECTED = {str(page.relative_to(ROOT)): list(of_page(page)) for page in sorted(PAGES)}
+MESSAGES = sorted({command for path in (ROOT / "voronerf").rglob("*.py") for command in of_strings(path)})
+EVERY = sorted({command for found in (*COLLECTED.values(), MESSAGES) for command in found})
+
+
+def given(command):
+    """The words of a command of voronerf; None for another program."""
+    parts = shlex.split(command.replace("...", ""), comments=True)
+    if parts[0] == "torchrun":
+        parts = parts[parts.index("voronerf") :] if "voronerf" in parts else None
+    return parts[1:] if parts and parts[0] == "voronerf" else None
+
+
+def test_there_are_commands_to_look_at():
+    named = {parts[0] for command in EVERY if (parts := given(command)) and parts[0] in COMMANDS}
+    assert named == set(COMMANDS) and len(EVERY) > 80
+
+
+@pytest.mark.parametrize("command", EVERY)
+def test_a_printed_command_is_one(command, capsys):
+    found, (program, *rest) = given(command), shlex.split(command)
+    if found is not None:
+        (name, *others) = found or ["--help"]
+        assert name in COMMANDS or name.startswith("--"), f"voronerf has no command {name}"
+        if "--help" in others:
+            others = []
+        numbers = [re.sub("^(FLOAT|SECONDS|N|X)$", "1", word) for word in others]
+        wants_run = name in COMMANDS and name not in ("train", "train-territories", "demo", "info")
+        if name in COMMANDS and (numbers or not wants_run):  # the name alone stands for the command
+            try:
+                parse(name, COMMANDS[name], numbers)
+            except ConfigError as error:  # of a message that names an option
+                assert command in MESSAGES and "Missing value for argument" in str(error), error
+    elif program == "make":
+        assert re.search(rf"^(?!.PHONY)([a-z-]+ )*{rest[0]}\b.*:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    elif program == "python":
+        assert (ROOT / rest[0]).is_file()
+    elif program == "pip":
+        extras = {name for text in re.findall(r"\[([a-z,]+)\]", command) for name in text.split(",")}
+        table = (ROOT / "pyproject.toml").read_text().partition("optional-dependencies]")[2]
+        assert extras <= set(re.findall(r"^(\w+) = \[", table, re.MULTILINE))
+    else:
+        assert program in FOREIGN or program == "torchrun"
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory):
+    """A folder with a scene, a run of it and a camera path."""
+    folder = tmp_path_factory.mktemp("small")
+    write_blender(folder / "scene", builtin_scene(32, train_views=6, test_views=2), 0.7)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.chdir(folder)
+        assert main(words("train --data scene --out run", TINY.replace("--downscale 6", ""))) == 0
+    frames = orbit_cameras(2, radius=3, elevation=10, width=16, height=16, focal=20)
+    write_camera_path(folder / "path.json", CameraPath(frames, fps=5))
+    return folder
+
+
+def shortened(name, parts):
+    """A command with small values, and what its page leaves to the reader."""
+    parts = [STAND_INS.get(word, SHORT.get(before, word)) for before, word in zip(["", *parts], parts)]
+    if "--help" in parts:
+        return parts
+    for option in ADDED.get(name, ()):
+        parts += [] if option in parts else [option, SHORT[option]]
+    if name in TRAININGS and "--data" not in parts and "--resume" not in parts:
+        parts += ["--data", "scene"]
+    return parts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [*(page for page, found in COLLECTED.items() if any(map(given, found))), "messages"])
+def test_printed_commands_run(page, small_run, tmp_path, monkeypatch, capsys):
+    """Those of a page in their order, in one folder; what none of them has made is a copy of the small run."""
+    pytest.importorskip("trimesh", reason="trimesh is not installed")
+    viser = pytest.importorskip("voronerf.app.viewer", reason="viser is not installed")
+    monkeypatch.setattr(viser.Viewer, "serve", lambda viewer: None)  # until Ctrl-C
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(small_run, tmp_path, dirs_exist_ok=True)
+    for number, command in enumerate(MESSAGES if page == "messages" else COLLECTED[page]):
+        name, *parts = given(command) or [""]
+        if name not in COMMANDS or name in ELSEWHERE or (not parts and name != "info"):
+            continue
+        if "cuda" in parts and not torch.cuda.is_available():
+            continue
+        parts = shortened(name, parts)
+        made = next((after for word, after in itertools.pairwise(parts) if word == "--out"), None)
+        if made is not None and "--resume" not in parts:
+            shutil.rmtree(made, ignore_errors=True)
+        if made is None and name == "train":
+            parts += ["--out", f"unnamed-{number}"]
+        for word in parts:
+            is_input = re.fullmatch("(runs|scenes)/[a-z]+", word) and (word != made or "--resume" in parts)
+            if is_input and not Path(word).exists():
+                shutil.copytree("scene" if word.startswith("scenes") else "run", word)
+        capsys.readouterr()
+        try:
+            status = main([name, *parts])
+        except SystemExit as stop:  # of --help
+            status = stop.code
+        said = capsys.readouterr().err
+        assert status == 0 or (command in MESSAGES and "Missing value for argument" in said), f"{command}: {said}"
+        assert json.loads(Path("run/summary.json").read_text())["complete"]
