@@ -27,6 +27,8 @@ from voronerf.router.lower import Entries, Lowering, NotAStep
 from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiable
 from voronerf.router.watch import Inputs, lookup
 
+_HALF = (torch.bfloat16, torch.float16)  # what a run computes in float32 and rounds at its end
+
 
 class ParameterEntries:
     """A parameter of a program: numbered entries of a parameter, [o, i] or [w], which is a tensor or a node's value."""
@@ -307,6 +309,7 @@ class Fused:
         n = values[self._n]
         rows = [_flat(values[source], n) for source in run.inputs]
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
+        half = torch.is_autocast_enabled(grouping.device.type) or any(x.dtype in _HALF for x in rows)
         parameters = [taken.of_values(values).to(dtype) for taken in run.parameters]
         found = grouped_program(
             [x.to(dtype) for x in rows],
@@ -320,8 +323,7 @@ class Fused:
             if isinstance(of, fx.Node):
                 shape, at, m = of.meta["layout"]
                 tensor = tensor.reshape(n * m, *shape).movedim(0, at) if at else tensor.reshape(n * m, *shape)
-                half = of.meta["dtype"] in (torch.bfloat16, torch.float16) and dtype == torch.float32
-                tensor = tensor.to(of.meta["dtype"]) if half else tensor
+                tensor = tensor.to(of.meta["dtype"]) if half and of.meta["dtype"] in _HALF else tensor
             values[of] = tensor
 
 
