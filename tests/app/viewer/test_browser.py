@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import threading
 
 import numpy as np
 import pytest
 from browser import chromium, screenshot, until
 from PIL import Image
+
+from voronerf.app.viewer.pictures import cell_at
 
 pytest.importorskip("viser", reason="viser is not installed")
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
@@ -57,8 +60,44 @@ def test_chromium_shows_the_scene_and_its_cells(run, served, browser) -> None:
     until(lambda: browser.find_elements("xpath", "//*[@role='option'][.='cells']"))[0].click()
     until(lambda: client.look.pane == "cells" and far(colour))
 
-    browser.find_element("xpath", "//*[text()='Cells']").click()
     webdriver.ActionChains(browser).move_to_element(canvas).click().perform()
     body = browser.find_element("tag name", "body")
     until(lambda: f"of {run.diagram.num_cells}" in body.text)
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3])
+def test_a_phone_has_the_panel_beside_all_of_the_scene(run, served, browser, ratio) -> None:
+    metrics = {"width": 390, "height": 844, "deviceScaleFactor": ratio, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    browser.get(served.address)
+    client = until(lambda: next(iter(served.clients.values()), None))
+    body = browser.find_element("tag name", "body")
+    until(lambda: re.search(r"\d+ x 128 pixels in \d+\.\d\d s", body.text))
+    assert "Drag: turn." in body.text and "Click on a cell." in body.text  # the first folder is open
+
+    def seen(part):
+        """Where a part of the page is, if all of it is in the window and nothing lies over its middle."""
+        at = browser.execute_script(
+            "const r = arguments[0].getBoundingClientRect(), x = r.x + r.width / 2, y = r.y + r.height / 2;"
+            "const top = document.elementFromPoint(x, y), over = top && !arguments[0].contains(top);"
+            "return over ? null : [r.left, r.top, r.right, r.bottom]",
+            part,
+        )
+        return at if at and at[0] >= 0 and at[1] > 844 / 3 and at[2] <= 390 and at[3] <= 844 else None
+
+    show = browser.find_element("css selector", "input[value='colour']")
+    until(lambda: seen(show))
+    camera, view = client.camera(128), run.scene.test.cameras
+    assert camera.width / camera.intrinsics[0, 0] >= 0.99 * view.width / view.intrinsics[0, 0]
+
+    title = browser.find_element("xpath", f"//*[text()='{served.subject.name}']")
+    title.click()  # folds the panel
+    until(lambda: not seen(show))
+    webdriver.ActionChains(browser).move_by_offset(195, 422).click().perform()
+    title.click()
+    until(lambda: f"of {run.diagram.num_cells}" in body.text)
+    assert client.picked == cell_at(served.subject, camera, client.look, 0.5, 0.5)
+    show.click()
+    until(lambda: browser.find_elements("xpath", "//*[@role='option'][.='cells']"))[0].click()
+    until(lambda: client.look.pane == "cells")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import socket
 import sys
 import threading
 import time
+import warnings
 from contextlib import closing
 from dataclasses import replace
 from http.client import HTTPConnection
@@ -83,6 +85,48 @@ def test_panes(run, scene, tab) -> None:
     shown = pictures["cells"][solid].astype(float)
     cosine = (hues[leaves] * shown).sum(-1) / np.linalg.norm(hues[leaves], axis=-1) / np.linalg.norm(shown, axis=-1)
     assert np.mean(cosine > 0.98) > 0.9
+
+
+def test_the_field_of_view_and_the_background_are_chosen(run, scene, tab) -> None:
+    seen = tab.rest()
+    solid = run.render(larger(scene.test.cameras, 128), 0).opacity.numpy() > 0.999
+    for name, level in (("black", 0), ("grey", 128), ("white", 255)):
+        tab.set("Background", name)
+        picture = tab.rest()
+        assert np.abs(picture[:8, :8].astype(float) - level).max() < 4
+        assert np.abs(picture[solid].astype(float) - seen[solid]).mean() < 2
+    tab.set("Field of view", 60)
+    picture, cameras = tab.rest(), larger(scene.test.cameras, 128)
+    cameras.intrinsics[:, :2] = 64 / np.tan(np.radians(30))
+    assert apart(picture, run.render(cameras, 0).colour) < 1.5
+
+
+def test_a_narrow_canvas_opens_at_all_of_the_first_view(viewer, scene, tab) -> None:
+    tab.rest()
+    with closing(Tab(viewer, scene.test.cameras, size=(39, 84), number=1)) as phone:
+        phone.until(lambda: "Field of view" in phone.gui and 1 in viewer.clients)
+        fov = np.degrees(viewer.clients[1].handle.camera.fov)
+        across = 2 * np.degrees(np.arctan(np.tan(np.radians(fov / 2)) * 39 / 84))
+        wide = 2 * np.degrees(np.arctan(scene.test.cameras.width / 2 / float(scene.test.cameras.intrinsics[0, 0])))
+        assert abs(across - wide) < 0.1 and abs(phone.gui["Field of view"]["value"] - fov) <= 0.5
+        again = Tab(viewer, replace(scene.test.cameras, intrinsics=scene.test.cameras.intrinsics * 2), number=2)
+        again.rest()  # of a browser that has lost its connection and comes back
+        assert abs(viewer.clients[2].handle.camera.fov - 2 * np.arctan(np.tan(viewer.clients[0].fov / 2) / 2)) < 1e-3
+        again.close()
+
+
+def test_the_line_about_the_picture(viewer, scene, tab) -> None:
+    def said():
+        return " ".join(part["_markdown"] or "" for part in tab.gui.values() if "_markdown" in part)
+
+    tab.rest()
+    tab.until(lambda: "128 x 128 pixels in " in said())
+    for number in range(40):  # one movement soon after the other
+        tab.look(scene.test.cameras, number % 2)
+        viewer.render_next()
+        tab.read()
+    assert re.search(r"rendering (9[6-9]|1..) x \S+ pixels, \d+ frames a second", said())
+    assert min(len(picture) for picture in tab.pictures) >= 96
 
 
 def test_cells_are_described_hidden_and_kept_alone(run, scene, tab) -> None:
@@ -209,6 +253,21 @@ def test_each_tab_has_its_own_view_and_a_closed_one_costs_nothing(viewer, scene,
     tab.until(lambda: len(viewer.clients) == 1)
     while viewer.render_next():
         pass
+
+
+def test_a_tab_may_close_at_any_time(run, scene, capfd) -> None:
+    with warnings.catch_warnings(record=True) as warned, closing(view_run(run, port=0)) as viewer:
+        tab = Tab(viewer, scene.test.cameras)
+        tab.until(lambda: tab.pictures)
+        client = viewer.clients[0]
+        tab.close()
+        while viewer.server.get_clients():
+            time.sleep(0.01)
+        viewer._draw_coarse(client)  # as if it had been begun before
+        socket.create_connection(("127.0.0.1", viewer.port)).close()  # a browser opens some that it does not use
+        with closing(Tab(viewer, scene.test.cameras, number=1)) as other:
+            other.until(lambda: other.pictures)
+    assert not warned and capfd.readouterr().err == ""
 
 
 def test_a_camera_may_stand_anywhere(scene, tab) -> None:

@@ -60,6 +60,12 @@ def frustum(cameras: Cameras, number: int) -> dict[str, Any]:
     return {"fov": fov, "aspect": width / height, "wxyz": wxyz, "position": pose[:3, 3]}
 
 
+def angle_of_view(cameras: Cameras, number: int, aspect: float) -> float:
+    """The vertical angle in radians at which a canvas of an aspect shows all that one of several cameras sees."""
+    of = frustum(cameras, number)
+    return 2 * math.atan(math.tan(of["fov"] / 2) * max(1.0, of["aspect"] / aspect))
+
+
 def crop_camera(camera: Cameras, left: int, top: int, width: int, height: int) -> Cameras:
     """A camera that sees `width` x `height` pixels of another."""
     offset = camera.intrinsics.new_tensor((0, 0, left, top))

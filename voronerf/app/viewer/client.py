@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -16,11 +17,11 @@ from viser.transforms import SO3
 from viser.uplot import Scale, Series
 
 from voronerf.app.evaluate.panels import palette
-from voronerf.app.viewer.cameras import frustum, look_point, make_camera, scene_bounds
+from voronerf.app.viewer.cameras import angle_of_view, frustum, look_point, make_camera, scene_bounds
 from voronerf.app.viewer.crop import CropBox
 from voronerf.app.viewer.door import chosen
 from voronerf.app.viewer.path import Keyframes
-from voronerf.app.viewer.pictures import PANES, Look, cell_at, describe_cell, groups_of
+from voronerf.app.viewer.pictures import BACKGROUNDS, PANES, Look, cell_at, describe_cell, groups_of
 from voronerf.nerf.cameras import Cameras
 
 if TYPE_CHECKING:
@@ -30,7 +31,12 @@ if TYPE_CHECKING:
 SHARP, LARGEST = 512, 2048
 #: Training views that are drawn at most, evenly spread, and the longer side of their pictures.
 MOST_VIEWS, THUMBNAIL = 200, 96
+#: Vertical angles of view in degrees that can be chosen.
+NARROWEST, WIDEST = 5, 120
 NO_CELL = "Click on a cell."
+MOUSE = "Drag: turn. Right drag or two fingers: move. Scroll or pinch: zoom. Click: name the cell."
+#: Seconds without a movement after which pictures are counted anew, and between two changes of the count that is shown.
+PAUSE, SAY = 0.5, 0.25
 #: Pixels around the curve: above, right, below, left. Without them its labels are cut off.
 PADDING = (14, 14, 0, 0)
 
@@ -40,6 +46,8 @@ class Client:
 
     Attributes:
         camera: Its camera, with so many pixels along the longer side.
+        aspect: Width over height of its canvas.
+        fov: Its vertical angle of view in radians.
         look: What it shows.
         longest: Pixels along the longer side of its sharp picture.
         version: Counts what changes its picture.
@@ -48,22 +56,29 @@ class Client:
         wants_sharp: Whether it needs a sharp one when the camera rests.
         drawn_at: When the last sharp picture was done.
         cost: Seconds that it took.
+        state: The line about the picture.
     """
 
     def __init__(self, handle: viser.ClientHandle, viewer: Viewer) -> None:
         self.handle, self.viewer = handle, viewer
         self.longest = SHARP
+        self.times: deque[float] = deque(maxlen=20)  # when the last coarse pictures were drawn
+        self.said_at = 0.0
         self.version, self.moved_at, self.drawn_at, self.cost = 0, 0.0, 0.0, 0.0
         self.wants_coarse = self.wants_sharp = True
         start = viewer.server.initial_camera
+        self.aspect, self.fov = 1.0, start.fov
         self.camera: Callable[[int], Cameras] = partial(make_camera, np.eye(3), start.position, start.fov, 1.0)
         self._look_around()
         self._start()
+        new = math.isclose(self.fov, start.fov, rel_tol=1e-3)  # else it has been connected before
+        self._open(angle_of_view(viewer.subject.scene.test.cameras, 0, self.aspect) if new else self.fov)
         handle.camera.on_update(self._moved)
         handle.scene.on_click()(self._clicked)
 
     def _start(self) -> None:
-        self.look = Look(level=self.viewer.subject.diagram.depth)
+        scene, diagram = self.viewer.subject.scene, self.viewer.subject.diagram
+        self.look = Look(level=diagram.depth, background="black" if scene.background is None else "white")
         self.picked: int | None = None
         self.nodes: dict[str, list[Any]] = {kind: [] for kind in ("centres", "cameras", "crop", "keyframes")}
         self.curve: viser.GuiUplotHandle | None = None
@@ -100,12 +115,15 @@ class Client:
         numbers = (*now.wxyz, *now.position, now.fov)
         there = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)
         if there and np.isfinite(numbers).all() and 0 < now.fov < math.pi:
+            self.aspect, self.fov = now.aspect, now.fov
             self.camera = partial(make_camera, SO3(now.wxyz).as_matrix(), now.position, now.fov, now.aspect)
 
     def change(self, **look: Any) -> None:
         """Asks for new pictures, with other values of its `Look`."""
         self.look = replace(self.look, **look)
         self.version += 1
+        if time.perf_counter() - self.moved_at > PAUSE:
+            self.times = deque(maxlen=20)
         self.moved_at = time.perf_counter()
         self.wants_coarse = self.wants_sharp = True
         self.viewer.wake.set()
@@ -128,17 +146,43 @@ class Client:
             self.handle.camera.position = of["position"]
             self.handle.camera.look_at = look_point(self.viewer.subject.scene, cameras, view).numpy()
             self.handle.camera.up_direction = cameras.poses[view, :3, 1].double().numpy()
-            self.handle.camera.fov = of["fov"]
+            self._open(angle_of_view(cameras, view, self.aspect))
+
+    def _open(self, fov: float) -> None:
+        """Takes another vertical angle of view, in radians, and shows it in the panel."""
+        self.handle.camera.fov = fov
+        self.angle.value = min(max(round(math.degrees(fov)), NARROWEST), WIDEST)  # type: ignore[misc]
+
+    def _choose_angle(self, degrees: int) -> None:
+        if abs(math.degrees(self.handle.camera.fov) - degrees) > 0.5:  # else `_open` has set both
+            self.handle.camera.fov = math.radians(degrees)
+        self._look_around()
+        self.change()
+
+    def count_picture(self, camera: Cameras) -> None:
+        """Says how many pictures a second are drawn while the camera moves, after one more of a camera."""
+        times, now = self.times, time.perf_counter()  # another thread begins a new list
+        times.append(now)
+        if len(times) > 1 and now - self.said_at > SAY:
+            rate = (len(times) - 1) / (now - times[0])
+            self.state.content = f"rendering {camera.width} x {camera.height} pixels, {rate:.0f} frames a second"
+            self.said_at = now
 
     # --- the panel -------------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
         gui, depth = self.handle.gui, self.viewer.subject.diagram.depth
+        gui.add_markdown(MOUSE)
+        self.state = gui.add_markdown("rendering")
         pane = gui.add_dropdown("Show", PANES, initial_value="colour", hint="What each pixel shows.")
         self.on(pane.on_update, lambda: self.change(pane=chosen(pane)))
         size = gui.add_slider("Pixels", 128, LARGEST, 64, SHARP, hint="Along the longer side of a picture at rest.")
         self.on(size.on_update, lambda: self._resize(chosen(size)))
-        with gui.add_folder("Cells", expand_by_default=False):
+        self.angle = gui.add_slider("Field of view", NARROWEST, WIDEST, 1, NARROWEST, hint="Top to bottom, in degrees.")
+        self.on(self.angle.on_update, lambda: self._choose_angle(chosen(self.angle)))
+        behind = gui.add_dropdown("Background", tuple(BACKGROUNDS), initial_value=self.look.background)
+        self.on(behind.on_update, lambda: self.change(background=chosen(behind)))
+        with gui.add_folder("Cells"):
             self.level = gui.add_slider("Level", 1, max(depth, 2), 1, depth, visible=depth > 1)
             self.on(self.level.on_update, lambda: self.change(level=chosen(self.level)))
             self.info = gui.add_markdown(NO_CELL)
@@ -163,7 +207,7 @@ class Client:
             return
         series = (Series(label="s"), Series(label="PSNR [dB]", stroke="#00897b", width=2))
         self.curve = self.handle.gui.add_uplot(
-            (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, padding=PADDING, order=-1
+            (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, padding=PADDING, order=1e9
         )
 
     def on(self, register: Callable[[Callable[[Any], None]], object], work: Callable[[], object]) -> None:

@@ -26,6 +26,10 @@ log = logging.getLogger(__name__)
 #: Bytes of a message; the page sends some hundred.
 LARGEST = 2**16
 
+#: Of websockets: says only what ends the server, and not that somebody connected without a request.
+QUIET = log.getChild("websockets")
+QUIET.setLevel(logging.CRITICAL)
+
 #: Kinds of messages that the viewer takes; the wish for a public address is none of them.
 KINDS = (
     *("ViewerCameraMessage", "GuiUpdateMessage", "ScenePointerMessage", "SceneNodeClickMessage"),
@@ -86,7 +90,7 @@ def guarded(host: str) -> Iterator[None]:
             return process_request(connection, request) if reason is None else connection.respond(403, f"{reason}\n")
 
         made.append(host)
-        return serve(handle, *arguments, process_request=check, **options | {"max_size": LARGEST})
+        return serve(handle, *arguments, process_request=check, **options | {"max_size": LARGEST, "logger": QUIET})
 
     server.serve = guarded_serve  # type: ignore[assignment, misc]
     try:

@@ -25,6 +25,8 @@ from voronerf.nerf.field import Field
 from voronerf.nerf.renderer import RenderedImage, Renderer
 
 PANES = ("colour", "depth", "opacity", "cells")
+#: Grey values of what is behind a scene.
+BACKGROUNDS = {"white": 1.0, "grey": 0.5, "black": 0.0}
 
 
 @dataclass(frozen=True)
@@ -33,12 +35,14 @@ class Look:
 
     Attributes:
         pane: One of `PANES`.
+        background: One of `BACKGROUNDS`, behind the colours.
         level: Of a nested diagram, whose cells are shown; 1 is the coarsest.
         hidden: Leaves that are not rendered.
         crop: Lowest and highest corner of the box that is rendered, or None for the scene's.
     """
 
     pane: str = "colour"
+    background: str = "white"
     level: int = 1
     hidden: frozenset[int] = frozenset()
     crop: tuple[tuple[float, ...], tuple[float, ...]] | None = None
@@ -148,7 +152,9 @@ def picture_of(subject: Subject, image: RenderedImage, look: Look) -> Tensor:
     if look.pane == "cells":
         groups = groups_of(subject.diagram, look.level)[cells_of(subject, image.heaviest)]
         return picture_of_cells(groups, image.opacity, image.colour)
-    return picture_of_colour(image.colour)
+    own = subject.scene.background_colour()
+    other = BACKGROUNDS[look.background] - (image.colour.new_zeros(3) if own is None else own)
+    return picture_of_colour(image.colour + (1 - image.opacity)[..., None] * other)
 
 
 def cell_at(subject: Subject, camera: Cameras, look: Look, x: float, y: float) -> int | None:

@@ -15,6 +15,7 @@ import queue
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -38,7 +39,7 @@ REST = 0.15
 #: Seconds that a picture may take while the camera moves, and a band of the sharp one, after which others have a turn.
 COARSE, BAND = 0.06, 0.1
 #: Pixels along the longer side of a coarse picture, at least.
-SMALLEST = 48
+SMALLEST = 96
 #: Share of a training's time that goes into new pictures while nobody moves.
 REFRESH = 0.05
 #: Hosts that stand for all addresses of this machine.
@@ -61,6 +62,8 @@ class Viewer:
 
     def __init__(self, subject: Subject, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         check_address(host, port)
+        # A tab is closed at any time; what is on its way to it then is lost.
+        warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         self.subject = subject
         self.clients: dict[int, Client] = {}
         self.tasks: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -198,12 +201,14 @@ class Viewer:
         image = render_look(self.subject, camera, client.look)
         self._took(camera.width * camera.height, time.perf_counter() - started)
         self._send(client, camera, image, client.look, quality=70)
+        client.count_picture(camera)
 
     def _draw_sharp(self, client: Client) -> None:
         """Renders in bands; a movement ends it, and other clients get their coarse pictures in between."""
         version, look, camera = client.version, client.look, client.camera(client.longest)
         started, bands = time.perf_counter(), []
         rows = max(1, int(self.rate * BAND / camera.width))
+        client.state.content = f"rendering {camera.width} x {camera.height} pixels"
         for band in render_bands(self.subject, camera, look, rows):
             bands.append(band)
             for other in self.list_clients():
@@ -216,6 +221,7 @@ class Viewer:
         self._took(camera.width * camera.height, time.perf_counter() - started)
         self._send(client, camera, image, look, quality=95)
         client.cost, client.drawn_at = time.perf_counter() - started, time.perf_counter()
+        client.state.content = f"{camera.width} x {camera.height} pixels in {client.cost:.2f} s"
 
     def _send(self, client: Client, camera: Cameras, image: RenderedImage, look: Look, *, quality: int) -> None:
         picture = picture_of(self.subject, image, look)
