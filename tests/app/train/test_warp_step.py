@@ -1,0 +1,69 @@
+"""A default step on Warp reads nothing on the host, shown without a GPU: its tensors are on the meta device.
+
+Such tensors have no values, so that whoever reads one raises. What asks whether a tensor is on the CPU is told that it
+is not, as on a GPU.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+
+import pytest
+import torch
+from tiny_runs import small, steps_of
+from torch import Tensor
+
+from voronerf.app.train import build
+from voronerf.nerf import batches, samplers
+from voronerf.ops._core import backends
+
+pytestmark = pytest.mark.warp
+
+
+def on_meta(tensor: Tensor, memo: dict[int, object]) -> Tensor:
+    """A tensor of the same shape and kind without values, once for each."""
+    if id(tensor) not in memo:
+        found = torch.empty_strided(tensor.shape, tensor.stride(), dtype=tensor.dtype, device="meta")
+        of_parameter = isinstance(tensor, torch.nn.Parameter)
+        memo[id(tensor)] = torch.nn.Parameter(found, tensor.requires_grad) if of_parameter else found
+    return memo[id(tensor)]
+
+
+def test_a_default_step_reads_nothing_on_the_host(scene, monkeypatch):
+    wp = pytest.importorskip("warp")
+    before = steps_of(build(small(backend="warp", field="hashgrid", occupancy=True, split_at=(2,)), scene), 4)
+    for kind in (Tensor, torch.nn.Parameter):
+        monkeypatch.setattr(kind, "__deepcopy__", on_meta)
+    monkeypatch.setitem(copy._deepcopy_dispatch, torch.device, lambda device, memo: torch.device("meta"))
+    monkeypatch.setitem(copy._deepcopy_dispatch, torch.Generator, lambda generator, memo: generator)
+    memo = {id(kept): kept for kept in (before.scene, before.config)}
+    state = copy.deepcopy(before, memo)
+    for name in vars(before.optimizer).keys() - vars(state.optimizer).keys():  # which an optimiser leaves behind
+        setattr(state.optimizer, name, copy.deepcopy(getattr(before.optimizer, name), memo))
+
+    # To PyTorch and Warp the device is unknown; ``random_`` of it needs a generator.
+    empty = torch.empty(1, dtype=torch.int32, device="meta")
+    for module in (batches, samplers):
+        monkeypatch.setattr(module, "draw_seed", lambda device, generator: empty)
+    asked = backends.why_not
+    monkeypatch.setattr(
+        backends, "why_not", lambda op, name, device, dtype: asked(op, name, torch.device("cpu"), dtype)
+    )
+    monkeypatch.setattr(torch, "is_autocast_enabled", lambda *device: False)
+    monkeypatch.setattr(torch, "autocast", lambda *device, **options: contextlib.nullcontext())
+    view, launched = wp.from_torch, []
+    monkeypatch.setattr(wp, "from_torch", lambda tensor: view(torch.empty(tensor.shape, dtype=tensor.dtype)))
+    monkeypatch.setattr(wp, "device_from_torch", lambda device: "cpu")
+    monkeypatch.setattr(wp, "launch", lambda *kernel, **options: launched.append(kernel))
+
+    batch = state.batches.draw(state.rays, state.draws)
+    state.optimizer.zero_grad(set_to_none=True)
+    output = state.ray_loss(batch, state.draws, backward=True)
+    state.renderer.sampler.step_post_backward(output)
+    state.optimizer.update(state.guard, output.loss)
+    state.optimizer.after_step(state.step)
+    state.strategy.step_post_backward(output)
+    assert launched and output.loss.device.type == "meta"
+    with pytest.raises(RuntimeError):
+        float(output.loss)
