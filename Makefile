@@ -19,7 +19,7 @@ SOURCES := $(shell find csrc -type f) setup.py pyproject.toml
 
 PAPER_ARGS ?= --out runs/paper-small --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
 
-.PHONY: demo test test-all bench paper docs check cuda-check arm-check isa-check gpu-check emulate-cuda sanitize attack clean
+.PHONY: demo test test-all bench paper docs check cuda-check warp-check arm-check isa-check gpu-check emulate-cuda sanitize attack clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
@@ -52,6 +52,10 @@ docs: $(VENV)/.built $(VENV)/.docs
 
 cuda-check: $(VENV)/.installed
 	@$(BIN)/python .ci/cuda_check.py $(CUDA_CHECK_ARCHITECTURES)
+
+# The Warp kernels as machine code for the same GPUs, by Warp alone: registers, stack and shared memory. HALF=--half: for 16-bit weights.
+warp-check: $(VENV)/.built $(VENV)/.tools
+	@$(BIN)/python .ci/warp_check.py $(CUDA_CHECK_ARCHITECTURES) $(HALF)
 
 # The C++ of the CPU kernels on 64-bit Arm, in qemu, with CASES random networks and calls: needs g++-aarch64-linux-gnu and qemu-user.
 CASES ?= 12

@@ -89,11 +89,11 @@ _OF_A_STEP = (
 
 def loads(device: torch.device, dtype: torch.dtype) -> list[Callable[[], None]]:
     """Functions that together load the kernels of a training step with weights of a dtype; only new ones compile."""
-    from voronerf.kernels.grouped_mlp import ROWS, kernels
+    from voronerf.kernels.grouped_mlp import THREADS, kernels
 
     where = wp.device_from_torch(device)
     names = [f"voronerf.kernels.{name}" for name in _OF_A_STEP]
     for name in names:
         importlib.import_module(name)
     files = [functools.partial(wp.load_module, name, where) for name in names]
-    return files + [functools.partial(wp.force_load, where, [part.module], ROWS) for part in kernels(dtype)]
+    return files + [functools.partial(wp.force_load, where, [part.module], THREADS) for part in kernels(dtype)]

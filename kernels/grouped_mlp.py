@@ -44,9 +44,9 @@ from voronerf.ops.grouped_linear.activation import activate
 from voronerf.ops.grouped_linear.reference import check_offsets
 from voronerf.ops.grouped_mlp.reference import cells_of, check_direction_index, encode_positions
 
-ROWS, WIDTH = 64, 16
-"""A thread a row; each then has 4 x 4 of the sums of a tile and a column. Wider columns would be emptier: heads have 1
-to 4 outputs."""
+ROWS, WIDTH, THREADS = 64, 16, 128
+"""Wider columns would be emptier: heads have 1 to 4 outputs. Each thread has 4 x 2 sums of a tile and a column; with
+fewer threads a block, registers are spilled (.ci/warp_check.py)."""
 
 _TYPES = {torch.float32: wp.float32, torch.float16: wp.float16, torch.bfloat16: wp.bfloat16}
 
@@ -204,7 +204,7 @@ def _run_backward(
     lowest = 0 if wanted[0] else x.shape[1] // WIDTH
     given = [array(cells, x), array(blocks.view(-1, WIDTH), x), products, array(columns, x), lowest]
     given += [array(gradients, x), array(of_blocks.view(-1, WIDTH), x), array(of_biases.view(-1), x)]
-    launch_tiles(kernels(blocks.dtype)[1], len(cells), ROWS, given, x)
+    launch_tiles(kernels(blocks.dtype)[1], len(cells), THREADS, given, x)
     of_x.copy_(gradients[:, : x.shape[1]])
 
 
@@ -213,7 +213,7 @@ def _columns(x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, products:
     columns = x.new_zeros(x.shape[0], products.activation.shape[0] * WIDTH)
     columns[:, : x.shape[1]] = x
     given = [array(cells, x), array(blocks.view(-1, WIDTH), x), array(biases.view(-1), x), products, array(columns, x)]
-    launch_tiles(kernels(blocks.dtype)[0], len(cells), ROWS, given, x)
+    launch_tiles(kernels(blocks.dtype)[0], len(cells), THREADS, given, x)
     return columns
 
 

@@ -10,6 +10,7 @@ is a Blender scene for the trainings.
         small      every operation once against float64, each case for itself and with a time limit of its own
         large      networks at 2^22 samples: every way against the others and against float64, with gradients
         captured   steps of the route in CUDA graphs, fused and layer by layer
+        warp       every operation of Warp beside native, where Warp is installed
         memcheck   compute-sanitizer over the small cases, where it is installed
     2   roofs      networks, look-ups and sorts at full size, beside the machine's own limits
         sizes      a network at 2^13 to 2^22 samples, 1 to 4,096 cells, all precisions, beside torch's products
@@ -51,7 +52,7 @@ TAIL = 40
 """Lines of a failure that are printed."""
 SPLIT = "--split-compile=0"
 JUDGED = (
-    *("small", "large", "captured", "roofs", "sizes", "step", "profile", "rivals", "training"),
+    *("small", "large", "captured", "warp", "roofs", "sizes", "step", "profile", "rivals", "training"),
     *("memcheck", "racecheck", "synccheck", "initcheck"),
 )
 """Parts that have cases, each right or wrong."""
@@ -70,7 +71,7 @@ class Part:
 
 
 CALLS = {
-    "1": ("machine", "build", "small", "large", "captured", "memcheck"),
+    "1": ("machine", "build", "small", "large", "captured", "warp", "memcheck"),
     "2": ("build", "roofs", "sizes", "step", "profile", "rivals"),
     "3": ("build", "training", "tests", "counters", "racecheck", "synccheck", "initcheck"),
 }
@@ -153,8 +154,9 @@ def parts(out: Path, data: Path | None) -> dict[str, Part]:
         "machine": Part([*own, "machine", str(out)], 15, (), out / "machine.json"),
         "build": part([PYTHON, "setup.py", "build_ext", "--inplace"], 270, built),
         "small": program("small", 75),
-        "large": program("large", 95),
-        "captured": program("captured", 45),
+        "large": program("large", 85),
+        "captured": program("captured", 40),
+        "warp": program("warp", 35) if importlib.util.find_spec("warp") else Part("no warp", 0),
         "roofs": program("roofs", 80),
         "sizes": program("sizes", 80),
         "step": program("step", 65),
@@ -165,7 +167,7 @@ def parts(out: Path, data: Path | None) -> dict[str, Part]:
         "counters": part([profiler, *counted, *own, "profile", str(out / "counted")], 40)
         if profiler
         else Part("no ncu", 0),
-        "memcheck": sanitized("memcheck", 70, apart),
+        "memcheck": sanitized("memcheck", 55, apart),
         "racecheck": sanitized("racecheck", 30),
         "synccheck": sanitized("synccheck", 20),
         "initcheck": sanitized("initcheck", 20),
@@ -220,7 +222,7 @@ def highlights(found: dict[str, Any]) -> list[str]:
         return kept.get(kind, []) if isinstance(kept, dict) else []
 
     lines = []
-    timed = [row for part in ("roofs", "sizes", "step", "rivals") for row in rows(part, "rows")]
+    timed = [row for part in ("warp", "roofs", "sizes", "step", "rivals") for row in rows(part, "rows")]
     for row in timed:
         aim = row["aim"]
         verdict = "" if aim is None else f", {'reached' if row['share'] >= aim else 'MISSED'} {100 * aim:.0f} %"

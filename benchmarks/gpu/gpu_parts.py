@@ -37,7 +37,7 @@ sys.path[:0] = [str(ROOT), *(str(ROOT / place) for place in ("benchmarks/gpu", "
 from gpu_cases import captured_steps, small_cases  # noqa: E402
 from gpu_journal import CASE_SECONDS, Again, Case, Journal, one_by_one, settling  # noqa: E402
 from gpu_large import large_cases  # noqa: E402
-from gpu_timings import profile, rivals, roofs, sizes, step  # noqa: E402
+from gpu_timings import profile, rivals, roofs, sizes, step, warp  # noqa: E402, warp
 
 FILE_SECONDS = 60.0
 """For one file of the tests."""
@@ -239,7 +239,7 @@ def main(arguments: list[str]) -> int:
     seconds = given.case_seconds or PARTS[given.part] * CASE_SECONDS
     again = Again((given.part, str(given.out), given.data), given.start, given.failed, seconds)
     checks = {"small": small, "large": large, "captured": captured}
-    timings = {"roofs": roofs, "sizes": sizes, "step": step, "profile": profile, "rivals": rivals}
+    timings = {"roofs": roofs, "sizes": sizes, "step": step, "profile": profile, "rivals": rivals, "warp": warp}
     if given.part in checks:
         return checks[given.part](again, Journal(given.out, given.part, begun=given.start > 0))
     if given.part in timings:
@@ -250,7 +250,7 @@ def main(arguments: list[str]) -> int:
 
 
 PARTS = {"machine": 1, "small": 1, "large": 3, "captured": 1, "roofs": 2, "sizes": 2, "step": 2, "profile": 3}
-PARTS |= {"rivals": 2, "training": 4, "tests": 1}
+PARTS |= {"rivals": 2, "training": 4, "tests": 1, "warp": 3}
 """Times ``CASE_SECONDS`` that a case may take: a timing makes a batch as well, and a training is one."""
 
 

@@ -397,3 +397,47 @@ def step(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
             name = f"hash + MLP n={hashed} {direction}{', bfloat16' * half}"
             compare(name, inside, "native, encoded before", half=half)
     return rows.measure()
+
+
+def warp(out: Path, again: Again, device: str = "cuda", n: int = 1 << 18) -> int:
+    """Every op that Warp has a kernel of, at n rows: native, then Warp, which must give the same; both are launched.
+
+    The first call of a file of kernels compiles it.
+    """
+    import torch
+    from torch import Tensor
+    from torch.utils._pytree import tree_leaves, tree_map_only
+
+    from voronerf import ops
+    from voronerf.ops._core import backends
+    from voronerf.ops._core.cases import Draw, cases
+
+    rows = Rows(out, "warp", again, device)
+
+    @functools.lru_cache(maxsize=1)
+    def given(op: str) -> dict[str, Any]:
+        case = cases()[op]
+        made = case.make(Draw(n, **next(iter(case.kinds.values()))), n)
+        return {name: tree_map_only(Tensor, lambda part: part.to(device), part) for name, part in made.items()}
+
+    def tensors(found: Any) -> list[Tensor]:
+        return [part for part in tree_leaves(found) if isinstance(part, Tensor)]
+
+    def prepare(op: str, backend: str) -> Run:
+        call = functools.partial(getattr(ops, cases()[op].call or op), **given(op), backend=backend)
+        if backend == "warp" and not cases()[op].in_place:
+            for part, right in zip(tensors(call()), tensors(call.func(**{**call.keywords, "backend": "native"}))):
+                size = float(right.abs().max()) if right.is_floating_point() and right.numel() else 0.0
+                torch.testing.assert_close(part, right, rtol=1e-3, atol=1e-3 * size)
+        return call
+
+    def size(op: str) -> float:
+        return float(sum(part.nbytes for part in tensors(given(op))))
+
+    for op in cases():
+        if "warp" in backends.implemented(op):
+            for backend in ("native", "warp"):
+                name = f"{op} n={n}" + " by Warp" * (backend == "warp")
+                prepared = functools.partial(prepare, op, backend)
+                rows.add(name, prepared, "copy", functools.partial(size, op), captured=False)
+    return rows.measure()

@@ -278,6 +278,17 @@ def test_sizes_and_a_profiled_step(parts, timings, monkeypatch, tmp_path):
     assert row["seconds"] > 0 and row["launches"] == row["waits"] == 0
 
 
+@pytest.mark.warp
+@pytest.mark.native
+def test_operations_of_warp_beside_native_ones(parts, timings, monkeypatch, tmp_path):
+    import harness
+
+    monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
+    assert timings.warp(tmp_path, parts.Again(("warp",), case_seconds=60.0), "cpu", 300) == 0
+    names = {row["name"] for row in read_json(tmp_path / "warp.json")["rows"]}
+    assert {"grouped_mlp n=300", "grouped_mlp n=300 by Warp", "render_loss_gradient n=300 by Warp"} <= names
+
+
 def test_the_summary_says_what_was_reached_and_what_is_wrong(check):
     row = {"limit": "copy", "seconds": 2e-5, "share": 0.5, "aim": None}
     timed = [{**row, "name": f"cell_sort k=16 by {way}"} for way in ("counting", "torch.sort")]
