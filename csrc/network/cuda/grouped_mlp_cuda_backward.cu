@@ -25,20 +25,8 @@ void mlp_tiles_backward_cuda(const MlpCudaPlan& plan, MlpCudaData data, const Ha
   }
   mlp_cuda_prepare(plan, data, parameters, strays, stream);
   if (data.n > 0) {
-    switch (plan.precision) {
-      case MlpPrecision::bfloat16:
-        mlp_backward_launch<HalfProducts<true>>(plan, data, grid, stream);
-        break;
-      case MlpPrecision::float16:
-        mlp_backward_launch<HalfProducts<false>>(plan, data, grid, stream);
-        break;
-      case MlpPrecision::tf32:
-        mlp_backward_launch<FloatProducts<true>>(plan, data, grid, stream);
-        break;
-      case MlpPrecision::float32:
-        mlp_backward_launch<FloatProducts<false>>(plan, data, grid, stream);
-        break;
-    }
+    mlp_with_products(plan.precision,
+                      [&](auto products) { mlp_backward_launch<decltype(products)>(plan, data, grid, stream); });
   }
   if (gradients != nullptr) mlp_cuda_reduce(plan, data, *gradients, stream);
 }

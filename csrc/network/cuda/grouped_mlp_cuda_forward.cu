@@ -73,16 +73,7 @@ void mlp_tiles_cuda(const MlpCudaPlan& plan, MlpCudaData data, const HashEncodin
   data.packed = workspace + parts.packed;
   data.first_task = reinterpret_cast<int32_t*>(workspace + parts.first_task);
   mlp_cuda_prepare(plan, data, parameters, {{data.out}, {plan.out_features}}, stream);
-  switch (plan.precision) {
-    case MlpPrecision::bfloat16:
-      return launch<HalfProducts<true>>(plan, data, grid, stream);
-    case MlpPrecision::float16:
-      return launch<HalfProducts<false>>(plan, data, grid, stream);
-    case MlpPrecision::tf32:
-      return launch<FloatProducts<true>>(plan, data, grid, stream);
-    case MlpPrecision::float32:
-      return launch<FloatProducts<false>>(plan, data, grid, stream);
-  }
+  mlp_with_products(plan.precision, [&](auto products) { launch<decltype(products)>(plan, data, grid, stream); });
 }
 
 }  // namespace voronerf

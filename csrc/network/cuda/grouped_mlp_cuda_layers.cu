@@ -144,10 +144,10 @@ class Call {
     slab_ = {data_.offsets, first_task_, data_.n, data_.k, first, rows};
     VN_LAUNCH(layers_tasks_kernel, 1, kScanThreads, 0, stream_, slab_, first_task_, plan_.tiles);
     for (const int from : {kFromPositions, kFromDirections}) {
-      const MlpLayersInput& input = plan_.input(from);
+      const MlpCudaInput& input = plan_.input(from);
       if (!input.used) continue;
-      VN_LAUNCH((layers_encode_kernel<Products>), blocks_for(rows * input.padded / 2), kThreads, 0, stream_,
-                encoding(input), raw(from), rows, place(input.value));
+      VN_LAUNCH((layers_encode_kernel<Products>), blocks_for(rows * input.padded / 2), kThreads, 0, stream_, input,
+                raw(from), rows, place(input.value));
     }
     for (size_t l = 0; l < plan_.layers.size(); ++l) {
       const MlpLayersLayer& layer = plan_.layers[l];
@@ -182,7 +182,7 @@ class Call {
       float* results;
     } wanted[] = {{kFromPositions, data_.grad_positions}, {kFromDirections, data_.grad_directions}};
     for (const auto& [from, results] : wanted) {
-      const MlpLayersInput& input = plan_.input(from);
+      const MlpCudaInput& input = plan_.input(from);
       if (results == nullptr || !input.used) continue;
       MlpLayersLayer alone{};
       alone.width = input.width;
@@ -191,7 +191,7 @@ class Call {
       gather(from, alone, input.value, static_cast<int>(Activation::none));
       const int64_t features = input.integrated ? input.raw / 2 : input.raw;
       VN_LAUNCH((layers_encode_backward_kernel<Products>), blocks_for(slab_.rows * features), kThreads, 0, stream_,
-                encoding(input), raw(from), slab_, place(input.value), results);
+                input, raw(from), slab_, place(input.value), results);
     }
   }
 
@@ -229,16 +229,6 @@ class Call {
     return dim3(static_cast<unsigned>(plan_.tiles), static_cast<unsigned>(ceil_div<int64_t>(columns, kLayersColumns)));
   }
 
-  MlpCudaInput encoding(const MlpLayersInput& input) const {
-    MlpCudaInput given{};
-    given.raw = input.raw;
-    given.octaves = input.octaves;
-    given.degree = input.degree;
-    given.width = input.width;
-    given.padded = static_cast<int>(input.padded);
-    given.integrated = input.integrated;
-    return given;
-  }
   RawRows raw(int from) const {
     if (from == kFromPositions) return {data_.positions, data_.order, nullptr, slab_.first, 0, plan_.positions.raw};
     return {data_.directions, data_.order, data_.direction_index, slab_.first, data_.r, plan_.directions.raw};
@@ -314,16 +304,9 @@ void run(const MlpLayersPlan& plan, const MlpCudaData& data, const MlpLayersPara
 
 void run(const MlpLayersPlan& plan, const MlpCudaData& data, const MlpLayersParameters& parameters,
          const MlpLayersGradients* gradients, unsigned char* workspace, void* stream) {
-  switch (plan.precision) {
-    case MlpPrecision::bfloat16:
-      return run<HalfProducts<true>>(plan, data, parameters, gradients, workspace, stream);
-    case MlpPrecision::float16:
-      return run<HalfProducts<false>>(plan, data, parameters, gradients, workspace, stream);
-    case MlpPrecision::tf32:
-      return run<FloatProducts<true>>(plan, data, parameters, gradients, workspace, stream);
-    case MlpPrecision::float32:
-      return run<FloatProducts<false>>(plan, data, parameters, gradients, workspace, stream);
-  }
+  mlp_with_products(plan.precision, [&](auto products) {
+    run<decltype(products)>(plan, data, parameters, gradients, workspace, stream);
+  });
 }
 
 }  // namespace

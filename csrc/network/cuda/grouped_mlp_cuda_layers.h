@@ -42,12 +42,6 @@ struct MlpLayersLayer {
   std::vector<int64_t> outputs;  // columns of the network's output
 };
 
-struct MlpLayersInput {
-  int raw, octaves, degree, width;  // as in MlpCudaInput
-  int64_t padded, value;
-  bool integrated, used;
-};
-
 struct MlpLayersPlan {
   MlpPrecision precision;
   bool backward;
@@ -59,10 +53,10 @@ struct MlpLayersPlan {
   int multiprocessors;
   int splits;  // parts of a cell's rows in a slab, for weight gradients
   int64_t out_features;
-  MlpLayersInput positions, directions;
+  MlpCudaInput positions, directions;  // value: columns of a slab's values before it
   std::vector<MlpLayersLayer> layers;
 
-  const MlpLayersInput& input(int from) const { return from == kFromPositions ? positions : directions; }
+  const MlpCudaInput& input(int from) const { return from == kFromPositions ? positions : directions; }
 };
 
 // Null if the table fits, else the rule that it breaks.

@@ -16,21 +16,10 @@ constexpr int64_t kMostPartialBytes = int64_t{512} << 20;  // unless one split h
 
 int64_t pad(int64_t width) { return ceil_div<int64_t>(width, kMlpDepth) * kMlpDepth; }
 
-MlpLayersInput input_of(int64_t raw, const MlpEncoding& encoding) {
-  MlpLayersInput input{};
-  input.raw = static_cast<int>(raw);
-  input.integrated = encoding.kind == MlpEncodingKind::integrated;
-  input.octaves = encoding.kind == MlpEncodingKind::frequency || input.integrated ? encoding.size : -1;
-  input.degree = encoding.kind == MlpEncodingKind::spherical ? encoding.size : 0;
-  input.width = static_cast<int>(encoded_width(raw, encoding));
-  input.padded = pad(input.width);
-  return input;
-}
-
 const char* copy_table(const MlpTable& table, MlpLayersPlan& plan) {
   if (table.position.kind == MlpEncodingKind::hash) return "hash grids must be looked up by tiles";
-  plan.positions = input_of(table.positions, table.position);
-  plan.directions = input_of(table.directions, table.direction);
+  plan.positions = mlp_cuda_input(table.positions, table.position);
+  plan.directions = mlp_cuda_input(table.directions, table.direction);
   for (const MlpLayer& given : table.layers) {
     MlpLayersLayer layer{};
     if (given.inputs.size() > kLayersParts) return "a layer must have at most 64 sources";
@@ -73,8 +62,8 @@ const char* find_readers(MlpLayersPlan& plan) {
 }
 
 void place(MlpLayersPlan& plan, int64_t k) {
-  for (MlpLayersInput* input : {&plan.positions, &plan.directions}) {
-    input->value = plan.columns;
+  for (MlpCudaInput* input : {&plan.positions, &plan.directions}) {
+    input->value = static_cast<int>(plan.columns);
     if (input->used) plan.columns += input->padded;
   }
   for (MlpLayersLayer& layer : plan.layers) {

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "common/cuda_wrappers.h"
+#include "network/grouped_mlp.h"
 
 namespace voronerf {
 
@@ -170,5 +171,20 @@ struct FloatProducts {
     }
   }
 };
+
+// body(products) for what a precision multiplies.
+template <typename Body>
+void mlp_with_products(MlpPrecision precision, const Body& body) {
+  switch (precision) {
+    case MlpPrecision::bfloat16:
+      return body(HalfProducts<true>{});
+    case MlpPrecision::float16:
+      return body(HalfProducts<false>{});
+    case MlpPrecision::tf32:
+      return body(FloatProducts<true>{});
+    case MlpPrecision::float32:
+      return body(FloatProducts<false>{});
+  }
+}
 
 }  // namespace voronerf

@@ -25,18 +25,6 @@ bool is_half(MlpPrecision precision) {
   return precision == MlpPrecision::bfloat16 || precision == MlpPrecision::float16;
 }
 
-MlpCudaInput input_of(int64_t raw, const MlpEncoding& encoding) {
-  MlpCudaInput input{};
-  input.raw = static_cast<int>(raw);
-  input.integrated = encoding.kind == MlpEncodingKind::integrated;
-  input.hashed = encoding.kind == MlpEncodingKind::hash;
-  input.octaves = encoding.kind == MlpEncodingKind::frequency || input.integrated ? encoding.size : -1;
-  input.degree = encoding.kind == MlpEncodingKind::spherical ? encoding.size : 0;
-  input.width = static_cast<int>(encoded_width(raw, encoding));
-  input.padded = pad(input.width);
-  return input;
-}
-
 // Strides of values and weights: 16 bytes more than a multiple of 32, so that eight rows lie in different banks.
 void place_weights(MlpCudaPlan& plan, int skew) {
   for (int l = 0; l < plan.layer_count; ++l) {
@@ -103,11 +91,23 @@ int slot_of(const MlpCudaPlan& plan, int skew) {
 
 }  // namespace
 
+MlpCudaInput mlp_cuda_input(int64_t raw, const MlpEncoding& encoding) {
+  MlpCudaInput input{};
+  input.raw = static_cast<int>(raw);
+  input.integrated = encoding.kind == MlpEncodingKind::integrated;
+  input.hashed = encoding.kind == MlpEncodingKind::hash;
+  input.octaves = encoding.kind == MlpEncodingKind::frequency || input.integrated ? encoding.size : -1;
+  input.degree = encoding.kind == MlpEncodingKind::spherical ? encoding.size : 0;
+  input.width = static_cast<int>(encoded_width(raw, encoding));
+  input.padded = pad(input.width);
+  return input;
+}
+
 const char* mlp_cuda_read_table(const MlpTable& table, MlpCudaPlan& plan) {
   if (table.layers.size() > kMlpCudaLayers) return "a table must have at most 16 layers";
   if (table.outputs.size() > kMlpCudaOutputs) return "a table must have at most 8 outputs";
-  plan.positions = input_of(table.positions, table.position);
-  plan.directions = input_of(table.directions, table.direction);
+  plan.positions = mlp_cuda_input(table.positions, table.position);
+  plan.directions = mlp_cuda_input(table.directions, table.direction);
   plan.layer_count = static_cast<int>(table.layers.size());
   for (int l = 0; l < plan.layer_count; ++l) {
     const MlpLayer& given = table.layers[l];

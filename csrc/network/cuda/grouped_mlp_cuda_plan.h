@@ -75,6 +75,9 @@ struct MlpCudaDevice {
   int64_t cache_bytes;  // of the last level
 };
 
+// Of features with an encoding, without value, stride and used.
+MlpCudaInput mlp_cuda_input(int64_t raw, const MlpEncoding& encoding);
+
 // Fills in what of a plan the table alone says: layers, their sources and widths, which of them are live, inputs and
 // outputs. Null, or the rule that the table breaks.
 const char* mlp_cuda_read_table(const MlpTable& table, MlpCudaPlan& plan);

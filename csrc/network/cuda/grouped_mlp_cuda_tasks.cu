@@ -162,16 +162,8 @@ void mlp_cuda_number_tasks(const MlpCudaData& data, int64_t task_rows, int64_t t
 
 void mlp_cuda_prepare(const MlpCudaPlan& plan, const MlpCudaData& data, const MlpCudaParameters& parameters,
                       const MlpStrays& strays, void* stream) {
-  switch (plan.precision) {
-    case MlpPrecision::bfloat16:
-      return pack<HalfProducts<true>>(plan, data, parameters, strays, stream);
-    case MlpPrecision::float16:
-      return pack<HalfProducts<false>>(plan, data, parameters, strays, stream);
-    case MlpPrecision::tf32:
-      return pack<FloatProducts<true>>(plan, data, parameters, strays, stream);
-    case MlpPrecision::float32:
-      return pack<FloatProducts<false>>(plan, data, parameters, strays, stream);
-  }
+  mlp_with_products(plan.precision,
+                    [&](auto products) { pack<decltype(products)>(plan, data, parameters, strays, stream); });
 }
 
 void mlp_cuda_zero_strays(const MlpCudaData& data, int width, float* rows, void* stream) {
