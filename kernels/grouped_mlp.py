@@ -47,7 +47,6 @@ from voronerf.ops.grouped_mlp.reference import cells_of, check_direction_index, 
 ROWS, WIDTH, THREADS = 64, 16, 128
 """Wider columns would be emptier: heads have 1 to 4 outputs. Each thread has 4 x 2 sums of a tile and a column; with
 fewer threads a block, registers are spilled (.ci/warp_check.py)."""
-
 _TYPES = {torch.float32: wp.float32, torch.float16: wp.float16, torch.bfloat16: wp.bfloat16}
 
 
@@ -237,10 +236,8 @@ register_derivatives(_run, _run_backward, _formula, places=(0, 1, 2), width=5, c
 @constant_result
 @functools.lru_cache(maxsize=256)
 def _plan(text: str, widths: tuple[int, ...]) -> str:
-    """The lists of `Products` and the columns put out, as JSON, of a layer table (``MLP.text``).
-
-    The widths are those of the encoded positions, the directions (0: none are read), and the layers.
-    """
+    """The lists of `Products` and the columns put out, as JSON. Of a table (``MLP.text``) and the widths of the encoded
+    positions, the directions (0: none are read) and the layers."""
     layers, first, source, activation = MLP.parse(text), [0], list[int](), list[int]()
     columns: dict[int | str, range] = {}
     for name, width in zip((POSITIONS, DIRECTIONS, *range(len(layers.layers))), widths):
@@ -256,10 +253,8 @@ def _plan(text: str, widths: tuple[int, ...]) -> str:
 
 @functools.lru_cache(maxsize=256)
 def _products(plan: str, device: torch.device) -> Any:
-    numbers = zip(("first", "source", "activation"), json.loads(plan))
-    return filled(
-        Products(), **{name: torch.tensor(given, dtype=torch.int32, device=device) for name, given in numbers}
-    )
+    first, source, activation, _ = (torch.tensor(part, dtype=torch.int32, device=device) for part in json.loads(plan))
+    return filled(Products(), first=first, source=source, activation=activation)
 
 
 def grouped_mlp(
@@ -352,5 +347,4 @@ def _padded(x: Tensor) -> Tensor:
 
 
 def _octaves(x: Tensor, octaves: int | None) -> Tensor:
-    """Encoded, or as it is without octaves."""
     return x if octaves is None else frequency_encode(x.float(), octaves, True)
