@@ -53,9 +53,9 @@ class Source:
         """The source in a run directory. Of its networks the field alone is taken."""
         run = Path(run)
         name, record = run.name, run / "scene.json"
+        checkpoint = last_checkpoint(run, keep=lambda tensor: is_shown(tensor) or not tensor.startswith("optimizer."))
         if not record.is_file():
             raise ConfigError(f"{run}: must hold a run with the record of its scene, scene.json")
-        checkpoint = last_checkpoint(run, keep=lambda tensor: is_shown(tensor) or not tensor.startswith("optimizer."))
         config, scene, state = config_of(checkpoint), read_scene(record), checkpoint.group("occupancy")
         grid = OccupancyGrid.from_state(state) if state else None
         if is_town(run):

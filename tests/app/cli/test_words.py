@@ -37,6 +37,9 @@ from voronerf.app.train.config import TrainConfig
         ("train --out", "Missing value for argument '--out'"),
         ("train --resume --out /nowhere/at/all", "no run at /nowhere/at/all: there is nothing to resume"),
         ("eval /nowhere/at/all", "no run at /nowhere/at/all: there is no such folder"),
+        ("join /nowhere/a /nowhere/b --out y", "no run at /nowhere/a: there is no such folder"),
+        ("render /nowhere/a --path /nowhere/b.json", "error: /nowhere/b.json: No such file or directory"),
+        ("place a b --out y --at 0 0 0 --scale -1", "--scale, --turn, --at: scale must lie in 1e-9..1e9, got -1.0"),
         ("compare /nowhere/a /nowhere/b", "no run at /nowhere/a: there is no such folder"),
     ],
 )

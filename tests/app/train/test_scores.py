@@ -80,6 +80,11 @@ def test_views_that_are_asked_for_are_scored_beside_the_budget(monkeypatch):
     assert [line["views"] for line in scores.metrics] == [2, 2, 2, 2]
 
 
+def test_as_many_panels_are_drawn_as_a_tenth_of_the_budget_allows(monkeypatch):
+    _, scores, _ = scored(monkeypatch, lambda now: 1.5)
+    assert [scores.affordable(budget, 4) for budget in (None, 5.0, 40.0, 400.0)] == [4, 1, 2, 4]
+
+
 def test_evaluations_of_a_number_of_steps_do_not_depend_on_time(monkeypatch):
     _, scores, _ = scored(monkeypatch, lambda now: 20.0, steps=40, budget=None)
     assert [(line["step"], line["views"]) for line in scores.metrics] == [(10, 8), (20, 8), (30, 8), (40, 8)]

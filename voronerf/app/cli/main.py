@@ -120,7 +120,8 @@ def _run(args: list[str]) -> int:
     except EXPECTED as error:
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
-        print(f"voronerf: error: {one_line(str(error)) or type(error).__name__}", file=sys.stderr)
+        said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
+        print(f"voronerf: error: {one_line(said) or type(error).__name__}", file=sys.stderr)
         return 1
     except (RuntimeError, SystemError) as error:
         text = str(error)

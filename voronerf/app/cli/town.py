@@ -154,7 +154,7 @@ def place(
     try:
         Similarity.of(at, turn, scale)
     except ValueError as error:
-        raise ConfigError(f"--scale, --turn, --at: {error}") from None
+        raise ConfigError(f"--scale, --turn, --at: {str(error).removeprefix('Similarity: ')}") from None
     with busy("placing"):
         made = editing.place(run, thing, at, out, degrees=turn, scale=scale)
     return tell(out, made)

@@ -49,6 +49,8 @@ from voronerf.ops._core import backends
 
 #: Bytes of a picture's name without its end, which most file systems take.
 LONGEST_NAME = 255 - len(".png")
+#: Panels of a training that is not told how many.
+PANELS = 4
 #: What ends a training with a checkpoint: Ctrl-C, kill, a closed terminal, and the warning that Slurm can send.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
 
@@ -67,7 +69,7 @@ def train(
     resume: bool = False,
     file: Annotated[Path | None, tyro.conf.arg(name="config")] = None,
     checkpoint_every: float = CHECKPOINT_EVERY,
-    panels: int = 4,
+    panels: int | None = None,
     tensorboard: bool = False,
     view: bool = False,
     host: str = "127.0.0.1",
@@ -83,7 +85,8 @@ def train(
         resume: Continue the run in --out from its last checkpoint.
         file: JSON of settings by their names, such as the config.json of a run; options that are given come first.
         checkpoint_every: Seconds of training between checkpoints, which are written while it goes on.
-        panels: Test views drawn as panels at the end: truth, render, error, depth, cells.
+        panels: Test views drawn as panels at the end: truth, render, error, depth, cells; default 4, with a --budget as
+            many as a tenth of it allows, and at least one.
         tensorboard: Also write loss, speed, cells and scores for TensorBoard, into the folder tensorboard of the run.
         view: Show the training in a browser, and its result until Ctrl-C.
         host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
@@ -91,9 +94,10 @@ def train(
         explain: Only say how a training step is computed, and what keeps it from a faster way.
     """
     present_device(config.device)  # before a scene is read
-    if panels < 0 or not checkpoint_every > 0:
-        name, value = ("panels", panels) if panels < 0 else ("checkpoint-every", checkpoint_every)
-        raise ConfigError(f"--{name} must be {'0 or more' if panels < 0 else 'positive'}, got {value}")
+    if panels is not None and panels < 0:
+        raise ConfigError(f"--panels must be 0 or more, got {panels}")
+    if not checkpoint_every > 0:
+        raise ConfigError(f"--checkpoint-every must be a positive number of seconds, got {checkpoint_every:g}")
     if view:
         import_viewer().check_address(host, port)
     with busy(f"reading {config.data}"):
@@ -168,7 +172,7 @@ def run_training(
     *,
     resume: bool = False,
     checkpoint_every: float = CHECKPOINT_EVERY,
-    panels: int = 4,
+    panels: int | None = None,
     tensorboard: bool = False,
     watch: Callable[[State, Scores], Callback] | None = None,
     quiet: bool = False,
@@ -183,7 +187,7 @@ def run_training(
     out = config.out
     assert out is not None
     longest = max(scene.test.names, key=lambda name: len(os.fsencode(name)))
-    if panels and len(os.fsencode(longest)) > LONGEST_NAME:
+    if panels != 0 and len(os.fsencode(longest)) > LONGEST_NAME:
         raise ConfigError(f"--panels must be 0 with image names of more than {LONGEST_NAME} bytes, got {longest}")
     _compile_kernels(config)
     with held(out):
@@ -215,6 +219,8 @@ def run_training(
         if not scores.summary["complete"]:
             say(f"stopped; continue with: {continuation('voronerf train', config)}")
             return scores.summary
+        if panels is None:
+            panels = scores.affordable(config.budget, PANELS)
         if panels:
             with state.averaged():
                 write_panels(state.renderer, state.router.diagram, scene, out / "images", views=panels, track=tracked)

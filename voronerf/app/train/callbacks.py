@@ -227,6 +227,10 @@ class Scores(Callback):
         if budget is not None and not last:
             state.count_evaluation(self.clock() - started, min(self.view_seconds * every, SHARE / 2 * budget))
 
+    def affordable(self, budget: float | None, most: int) -> int:
+        """How many views a tenth of a budget in seconds allows, by what one took last; at least one."""
+        return most if budget is None else max(1, min(most, int(SHARE * budget / max(self.view_seconds, 1e-9))))
+
     def _seconds_of(self, lpips: Lpips, state: State) -> float:
         """What LPIPS takes of a view."""
         truth = state.scene.test.truth(0, state.scene.background_colour()).to(state.device)
