@@ -85,10 +85,9 @@ class Group:
             return
         if self.device.type == "cuda":
             torch.cuda.set_device(self.device)  # where torch puts what it sends of Python objects
-        options = {"store": self.store, "rank": self.rank, "world_size": self.size}
+        backend, timeout = "nccl" if self.device.type == "cuda" else "gloo", timedelta(seconds=PATIENCE)
         with waiting():
-            backend = "nccl" if self.device.type == "cuda" else "gloo"
-            dist.init_process_group(backend, timeout=timedelta(seconds=PATIENCE), **options)
+            dist.init_process_group(backend, None, timeout, store=self.store, rank=self.rank, world_size=self.size)
 
     def leave(self) -> None:
         """Leaves together with the others."""
