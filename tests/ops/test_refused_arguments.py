@@ -74,3 +74,22 @@ def test_cells_without_a_table_are_refused_by_every_backend(backend):
     table, cells = torch.rand(2, *call["grid"].table_shape), torch.tensor([0, 1, 2, 0, 0, 0, 0], dtype=torch.int32)
     message = "hash_encode: cells must lie in 0 to 1, got values from 0 to 2"
     refuses(message, ops.hash_encode, call["positions"], table, call["grid"], cells=cells, backend=backend)
+
+
+@pytest.mark.parametrize("op", ["run_sums", "run_gradients"])
+@pytest.mark.parametrize("backend", ["reference", "native"])
+def test_runs_that_are_not_of_the_samples_are_refused(op, backend):
+    """A run without a sample at the end would have the ray of a sample that is not there."""
+    call = cases()[op].make(Draw(3), 9)
+    offsets = call["samples"].run_offsets
+    for change in (
+        torch.cat([offsets, offsets[-1:]]),
+        offsets[:-1],
+        offsets.clone().fill_(0),
+        offsets + 1,
+        offsets - 1,
+    ):
+        given = {**call, "samples": call["samples"]._replace(run_offsets=change.int())}
+        if op == "run_gradients":
+            given["answers"] = torch.zeros(len(change) - 1, 6)
+        refuses(f"{op}: run_offsets must rise from 0 to the", getattr(ops, op), **given, backend=backend)

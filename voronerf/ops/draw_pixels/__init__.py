@@ -23,6 +23,7 @@ def _prepare(given: Any) -> Any:
         if not (checked.sizes["n"] and checked.sizes["p"]):
             raise ValueError("draw_pixels: runs must hold at least one run, got none")
         check_integer("draw_pixels", "bits", runs.bits, 0, 48)
+        check_integer("draw_pixels", "total", runs.total, 1, 2**48)
         if below != runs.total:
             raise ValueError(f"draw_pixels: below must be the {runs.total} pixels of the runs, got {below}")
     return given
