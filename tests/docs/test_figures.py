@@ -83,3 +83,35 @@ def test_tables_of_operations_are_those_of_the_program(page: str, arguments: str
     text = (ROOT / "docs" / f"{page}.md").read_text()
     rows = text[text.index(head) :].split("\n\n")[0].splitlines()
     assert 4 < len(rows) <= 14 and not set(rows) - set(made)
+
+
+def test_the_claims_of_the_first_page() -> None:
+    page = (ROOT / "README.md").read_text()
+
+    def results(name: str) -> Any:
+        assert f"(benchmarks/results/{name})" in page
+        return json.loads((RESULTS / name).read_text())
+
+    routed = [
+        row["speedup_over_best"]
+        for row in results("throughput.json")["results"]
+        if row["op"] == "routed_mlp" and row["backend"] == "native"
+    ]
+    assert f"{min(routed):.0f} to {max(routed):.0f} times" in page
+    hashed = [
+        row["alternatives"]["torch, indexing, sort + loop"] / row["median_ms"]
+        for row in results("throughput_hash_and_step.json")["results"]
+        if row["op"] == "routed_mlp"
+    ]
+    assert f"{min(hashed):.0f} to {max(hashed):.0f} times" in page
+    made = results("foreign_modules.json")["metadata"]
+    fused = f"Of {made['modules']} modules of {made['repositories']} public codebases, "
+    assert f"{fused}{made['fused'] + made['fused in runs']} take" in page
+    (laplacian,) = (
+        row["alternatives"]
+        for row in results("foreign_fields.json")["results"]
+        if row["case"].startswith("siren laplacian n=1024 k=16") and row["direction"] == "forward+backward"
+    )
+    assert round(laplacian["masks"] / laplacian["fuse=True"]) == 5 and "a fifth" in page
+    psnr = {row["program"]: row["psnr"] for row in results("photographs_opensplat.json")["results"][:2]}
+    assert f"{psnr['voronerf']:.1f} dB, where OpenSplat\n  is at {psnr['OpenSplat']:.1f}" in page

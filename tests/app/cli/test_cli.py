@@ -1,6 +1,5 @@
 """The command line as a user meets it: commands, files, and one line for everything that can go wrong."""
 
-import itertools
 import json
 import os
 import re
@@ -11,7 +10,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 
 import imageio_ffmpeg
 import pytest
@@ -26,7 +24,6 @@ from voronerf.app.cli.main import COMMANDS
 from voronerf.app.render.paths import CameraPath, write_camera_path
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.checkpoint import load_checkpoint
-from voronerf.app.train.loop import run as run_steps
 from voronerf.nerf import orbit_cameras
 
 
@@ -172,33 +169,29 @@ def test_folders_with_brackets_and_spaces_are_told_as_they_are(run, tmp_path, ca
     assert f"wrote {copy / 'eval.json'}" in capsys.readouterr().out
 
 
-def test_demo_compares_two_runs(tmp_path, capsys, monkeypatch, fails):
-    # A step takes ten milliseconds however busy the machine is.
-    ticks = itertools.count()
-    clock = partial(run_steps, clock=lambda: 0.0101 * next(ticks))
-    monkeypatch.setattr("voronerf.app.cli.train.run", clock)
-    monkeypatch.setattr("voronerf.app.cli.demo.PICTURE", 32)
-    monkeypatch.setattr("voronerf.app.cli.demo.FRAME", 16)
-    monkeypatch.setattr("voronerf.app.cli.demo.FRAMES", 4)
-    for _ in range(2):  # in the place of the first
-        succeeds("demo --budget 0.3 --size 16 --blocks 1 --cells 3 --out", tmp_path)
-    output = capsys.readouterr().out
-    results = {name: read_json(tmp_path / name / "summary.json") for name in ("one", "cells")}
-    assert (results["one"]["cells"], results["cells"]["cells"]) == (1, 3)
-    for result in results.values():
-        assert result["views"] == 4 and f"{result['psnr']:.2f} dB, SSIM {result['ssim']:.3f}" in output
-    gain = results["cells"]["psnr"] - results["one"]["psnr"]
-    assert f"3 cells are {abs(gain):.2f} dB {'better' if gain >= 0 else 'worse'}" in output
-    assert f"{abs(1 - 10 ** (-gain / 10)):.0%} {'less' if gain >= 0 else 'more'} squared error" in output
-    with Image.open(tmp_path / "wipe.png") as picture:
-        assert picture.width > 2 * 32
-    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "wipe.mp4"))[0] == 4
-    config = read_json(tmp_path / "cells" / "config.json")
-    assert (config["data"], config["downscale"]) == ("builtin-city:1x1", 6)  # 100 // 6 = 16, for who resumes it
-    fails("--size must be 100 over a whole number", "demo --size 60")
-    fails("--cells must be at least 2", "demo --cells 1 --out", tmp_path / "x")
-    fails("blocks must be 1 to 32, got 0", "demo --blocks 0 --out", tmp_path / "x")
-    assert not (tmp_path / "x").exists()
+def test_demo_shows_a_run_and_writes_over_none(tmp_path, capsys, monkeypatch, fails):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("voronerf.app.cli.demo.SIZE", 16)
+    monkeypatch.setattr("voronerf.app.cli.demo.FRAMES", 3)
+    for name in ("demo", "demo-2"):
+        capsys.readouterr()
+        succeeds("demo --budget 0.3")
+        run, output = tmp_path / "runs" / name, capsys.readouterr().out
+        psnr, config = read_json(run / "summary.json")["psnr"], read_json(run / "config.json")
+        assert f"{psnr:.1f} dB after 0.3 s on 8 views" in output and config["data"] == "builtin:16"
+        assert imageio_ffmpeg.count_frames_and_secs(str(run / "turn.mp4"))[0] == 3
+        for picture in ("turn.png", "placed.png"):
+            with Image.open(run / picture) as image:
+                assert image.width >= 16
+    # the command that it prints makes the same run of the same cells
+    (said,) = re.findall("voronerf (place .*), without", output)
+    assert main([*shlex.split(said), "--out", "again"]) == 0
+    files = [sorted((folder / "checkpoints").iterdir())[-1] for folder in (run / "placed", tmp_path / "again")]
+    assert files[0].stat().st_size == files[1].stat().st_size
+    (following,) = re.findall("next: voronerf (.*)", output)
+    assert following.split()[0] in COMMANDS
+    fails("--out must not hold a run already", "demo --out runs/demo")
+    fails("budget must be a positive number", "demo --budget 0")
 
 
 def test_help_has_units(capsys):

@@ -59,6 +59,8 @@ def test_downscale(tmp_path):
     for downscale in (0, -2):
         fails("builtin", f"downscale must be >= 1, got {downscale}", downscale=downscale)
     fails("builtin", "leaves no pixel of 100 x 100", downscale=101)
+    for size in ("0", "1601", "00400", "4e2", "-4"):
+        fails(f"builtin:{size}", "size must be 1 to 1600 pixels")
     write_noise(tmp_path)
     fails(tmp_path, "0.png", "downscaling by 7 leaves no pixel of 8 x 6", downscale=7)
 

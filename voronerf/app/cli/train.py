@@ -59,7 +59,7 @@ WHAT_TO_TRY = """This trains the built-in scene for 480 s, into runs/. Ctrl-C st
   voronerf train --budget 60                the same for a minute
   voronerf train --data DIR --downscale 4   your scene: Blender, transforms.json, COLMAP or LLFF
   voronerf train --view                     watch it in a browser
-  voronerf demo                             one network against 64 cells, in a built-in city
+  voronerf demo                             a picture and a video of the built-in scene in two minutes
   voronerf train --help                     every option"""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,8 @@ from voronerf.app.scenes.transforms import load_transforms
 __all__ = ["Scene", "SceneError", "Split", "builtin_scene", "city_scene", "load_scene"]
 
 BUILTIN_SIZE = 100
-BUILTIN, CITY = "builtin", "builtin-city"  # of one block, or with their number: builtin-city:4x4
+BUILTIN, CITY = "builtin", "builtin-city"  # or with a size, builtin:400, and with blocks, builtin-city:4x4
+MOST_PIXELS = 1600  # a side of the built-in scene
 
 
 class Format(NamedTuple):
@@ -46,7 +48,7 @@ FORMATS = {
 
 def is_builtin(source: str | Path | None) -> bool:
     """Whether a source names a scene that is computed, and no folder."""
-    return source == BUILTIN or str(source).partition(":")[0] == CITY
+    return str(source).partition(":")[0] in (BUILTIN, CITY)
 
 
 def load_scene(
@@ -62,11 +64,11 @@ def load_scene(
     """Loads a scene.
 
     Args:
-        source: "builtin", "builtin-city" of one block or "builtin-city:4x4" of 16; or a folder with
-            `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a COLMAP model in
-            `sparse/0`, or LLFF's `poses_bounds.npy`.
-        downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels divided by it. None is 1,
-            and for photographs the least factor that leaves at most 512 pixels a side.
+        source: "builtin", or "builtin:400" of 400 pixels; "builtin-city" of one block or "builtin-city:4x4" of 16; or a
+            folder with `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a
+            COLMAP model in `sparse/0`, or LLFF's `poses_bounds.npy`.
+        downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels, or the size that is named,
+            divided by it. None is 1, and for photographs the least factor that leaves at most 512 pixels a side.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
             or a link.
         format: of a folder, one of `FORMATS` such as "colmap"; "auto" is the first of them that it holds.
@@ -96,17 +98,19 @@ def load_scene(
     if is_builtin(source):
         if format != "auto" or kind not in ("auto", "object"):
             raise SceneError(f"{source}: format must be auto and kind auto or object, got {format} and {kind}")
-        downscale = downscale or 1
-        if downscale > BUILTIN_SIZE:
-            raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {BUILTIN_SIZE} x {BUILTIN_SIZE}")
-        name, size = str(source), BUILTIN_SIZE // downscale
-        if name != BUILTIN:
-            return city_of(size, name.partition(":")[2] or "1x1", images)
+        name, _, part = str(source).partition(":")
+        if name == BUILTIN and part and not (re.fullmatch(r"[1-9]\d{0,3}", part) and int(part) <= MOST_PIXELS):
+            raise SceneError(f"builtin: the size must be 1 to {MOST_PIXELS} pixels, got {part!r:.60}")
+        full, downscale = int(part) if name == BUILTIN and part else BUILTIN_SIZE, downscale or 1
+        if downscale > full:
+            raise SceneError(f"{source}: downscaling by {downscale} leaves no pixel of {full} x {full}")
+        if name == CITY:
+            return city_of(full // downscale, part or "1x1", images)
         if images == "disk":
             raise SceneError(
                 f"{source}: images must be auto or memory for a built-in scene other than a city, got disk"
             )
-        return builtin_scene(size)
+        return builtin_scene(full // downscale)
     folder = Path(source)
     if not folder.exists():
         raise SceneError(f"{folder}: there is no such folder")

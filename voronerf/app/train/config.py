@@ -37,8 +37,8 @@ class SceneSettings:
     """What is learnt."""
 
     data: str = "builtin"
-    """Scene folder (--format says which there are), or a built-in scene: "builtin", or "builtin-city:4x4", a city of
-    so many blocks."""
+    """Scene folder (--format says which there are), or a built-in scene: "builtin", "builtin:400" of so many
+    pixels, or "builtin-city:4x4", a city of so many blocks."""
     format: Literal["auto", "blender", "colmap", "transforms", "llff"] = "auto"
     """What is read of a scene folder; auto is the first of them that it holds, in this order."""
     kind: Literal["auto", "object", "forward", "inside-out", "unbounded"] = "auto"

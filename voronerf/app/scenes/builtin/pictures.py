@@ -17,6 +17,7 @@ from voronerf.app.scenes.scene import Split
 from voronerf.nerf.cameras import Cameras
 
 SUPERSAMPLES = 3  # on each side of a pixel
+LARGE = 200  # pixels a side, above which two are enough
 LIGHT = normalised(np.array(((0.45, -0.55, 0.70),), dtype=np.float32))[0]
 AMBIENT_DOWN, AMBIENT_UP, DIFFUSE = 0.46, 0.64, 0.50
 LIFT = 2e-3  # a shadow's ray starts this far above the surface
@@ -57,7 +58,8 @@ def render_views(cameras: Cameras, name: str, caster: Caster, keep: Keep | None 
 
 def _images(cameras: Cameras, indices: Sequence[int], caster: Caster) -> NDArray[np.uint8]:
     """Some images, a band of rows at a time; pixels are averages of premultiplied colour and opacity."""
-    size, fine = cameras.width, SUPERSAMPLES
+    size = cameras.width
+    fine = SUPERSAMPLES if size <= LARGE else 2
     images = np.zeros((len(indices), size, size, 4), dtype=np.uint8)
     poses: Array = cameras.poses[list(indices)].numpy()
     focal: Array = cameras.intrinsics[list(indices), 0].numpy()
