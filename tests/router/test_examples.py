@@ -22,7 +22,7 @@ def run(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
 
 
 def test_there_is_a_script_for_each_codebase() -> None:
-    assert len(SCRIPTS) == 9
+    assert len(SCRIPTS) == 10
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)

@@ -1,0 +1,200 @@
+"""Trains fields of other codebases in their own loops: as they are, routed, and as a loop over masks.
+
+Clones of EmilienDupont/coin, Lilac-Lee/Neural_Scene_Flow_Prior and yenchenlin/nerf-pytorch lie in one folder, scenes
+in VORONERF_DATA. A loop ends after so many seconds of processor time; what it imports in vain is replaced.
+
+    python benchmarks/foreign_loops.py coin routed CLONES --json FILE [--seconds 60] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+from harness import metadata
+from PIL import Image
+from torch import Tensor, nn
+
+from voronerf import VoronoiDiagram, VoronoiRouter
+from voronerf.app.scenes import load_scene
+from voronerf.app.scenes.colmap import read_model
+
+CELLS, DATA = 16, Path(os.environ.get("VORONERF_DATA", "data"))
+ABSENT = "cv2 imageio pandas open3d mayavi configargparse pytorch3d.ops.knn pytorch3d.structures.pointclouds visualize"
+NERF = """run_nerf --expname x --dataset_type blender --datadir x --use_viewdirs --white_bkgd --no_batching
+    --N_samples 64 --N_rand 256 --lrate_decay 500 --precrop_iters 100 --basedir"""
+
+
+class Done(Exception):
+    """The time is over."""
+
+
+class Masks(nn.Module):
+    """A module for each cell, called with the samples of its boolean mask."""
+
+    def __init__(self, cells: list[nn.Module], diagram: VoronoiDiagram) -> None:
+        super().__init__()
+        self.cells, self.diagram = nn.ModuleList(cells), diagram
+
+    def forward(self, x: Tensor) -> Tensor:
+        located, out = self.diagram.locate(x[..., : self.diagram.centres.shape[1]]), x.new_zeros(0)
+        for index, cell in enumerate(self.cells):
+            mask = located == index
+            if bool(mask.any()):
+                found = cell(x[mask])
+                out = out if len(out) else x.new_zeros(*x.shape[:-1], found.shape[-1])
+                out[mask] = found
+        return out
+
+
+class Run:
+    """One training: what takes the place of the field, and when it ends."""
+
+    def __init__(self, way: str, seconds: float, clones: Path) -> None:
+        self.way, self.seconds, self.clones, self.steps = way, seconds, clones, -1
+
+    def field(self, make: Callable[[bool], nn.Module], points: Tensor) -> nn.Module:
+        """The repository's own field, ``make(True)``, or narrow ones in the cells of its samples [..., d]."""
+        net = make(self.way == "plain")
+        if self.way in ("masks", "routed"):
+            diagram = VoronoiDiagram.from_points(points, CELLS, generator=torch.Generator().manual_seed(0))
+            net = VoronoiRouter(net, diagram, coords=f"first{points.shape[-1]}", fuse=True)
+            net = Masks([net.cell(i) for i in range(CELLS)], diagram) if self.way == "masks" else net
+        self.began = time.process_time()
+        net.register_forward_pre_hook(lambda *_: self.step() if torch.is_grad_enabled() else None)
+        return net
+
+    def step(self) -> None:
+        self.steps += 1
+        if time.process_time() - self.began > self.seconds:
+            raise Done
+
+
+def coin(run: Run) -> dict[str, float]:
+    """COIN on its Kodak image 15: all pixels in each step, ten layers of 28, learning rate 2e-4, as it comes."""
+    import siren
+    import training
+    import util
+
+    pixels = torch.from_numpy(np.array(Image.open(run.clones / "coin/kodak-dataset/kodim15.png"))) / 255.0
+    coordinates, features = util.to_coordinates_and_features(pixels.permute(2, 0, 1))
+    trainer = training.Trainer(run.field(lambda own: siren.Siren(2, 28, 3, 10), coordinates), lr=2e-4)
+    with contextlib.suppress(Done):
+        trainer.train(coordinates, features, 10**6)
+    return {"loss": min(trainer.logs["loss"]), "psnr": float(max(trainer.logs["psnr"]))}
+
+
+def nearest(x: Tensor, y: Tensor, **_: Any) -> Any:
+    """``pytorch3d.ops.knn_points`` for K = 1: squared distances [1, n, 1] from each of x to the nearest of y."""
+    with torch.no_grad():
+        index = torch.cdist(x, y).argmin(2)
+    return mock.Mock(dists=(x - y[0][index[0]]).square().sum(-1, keepdim=True), idx=index[..., None])
+
+
+def flow(run: Run) -> dict[str, float]:
+    """Neural Scene Flow Prior, width 128 or 64, between two halves of the bonsai's points, one moved in parts."""
+    torch.Tensor.cuda = lambda self, *_, **__: self
+    sys.modules["pytorch3d.ops.knn"].knn_points = nearest
+    sys.modules["pytorch3d.structures.pointclouds"].Pointclouds = type(None)
+    import config
+    import model
+    import optimization
+
+    points = torch.from_numpy(read_model(DATA / "bonsai/sparse/0").points).float()
+    points -= points.median(0).values
+    points = points[points.norm(dim=1) < 4 * points.abs().median()] / points.abs().median()
+    points = points[torch.randperm(len(points), generator=(generator := torch.Generator().manual_seed(0)))[:4096]]
+    shift = 0.2 * torch.randn(8, 3, generator=generator)
+    true = torch.softmax(-8 * torch.cdist(points, points[:8]), 1) @ shift
+    config.add_config(parser := argparse.ArgumentParser())
+    options = parser.parse_args(["--early_patience", "0", "--iters", "1000000"])
+    net, seen = run.field(lambda own: model.Neural_Prior(filter_size=128 if own else 64), points[:2048]), list[float]()
+
+    def noted(function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *args: (found := function(*args), seen.append(float(found[0])))[0]
+
+    optimization.my_chamfer_fn = noted(optimization.my_chamfer_fn)
+    optimization.scene_flow_metrics = noted(optimization.scene_flow_metrics)
+    with contextlib.suppress(Done):
+        list(optimization.solver(points[None, :2048], (points + true)[None, 2048:], true[None, :2048], options, net, 0))
+    losses, errors = seen[::2], seen[1::2]  # end point errors
+    return {"loss": min(losses), "error": errors[int(np.argmin(losses))], "no_flow": float(true.norm(dim=1).mean())}
+
+
+def nerf(run: Run) -> dict[str, float]:
+    """nerf-pytorch's train() on Lego at 100 x 100: one network of width 256, or 64, 256 rays of 64 samples a step."""
+
+    class Parser(argparse.ArgumentParser):
+        def add_argument(self, *names: Any, is_config_file: bool = False, **options: Any) -> Any:
+            return super().add_argument(*names, **options)
+
+    sys.modules["configargparse"].ArgumentParser = Parser
+    import run_nerf
+
+    scene = load_scene(DATA / "lego", downscale=4)
+    images = np.concatenate([scene.train.images, scene.test.images[:4]]) / np.float32(255)
+    poses = np.concatenate([scene.train.cameras.poses, scene.test.cameras.poses[:4]])
+    size, focal, test = images.shape[1], float(scene.train.cameras.intrinsics[0, 0]), np.arange(100, 104)
+    camera = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    rays = [run_nerf.get_rays(size, size, camera, torch.from_numpy(pose[:3, :4])) for pose in poses[:100:10]]
+    z = torch.linspace(2, 6, 64)[:, None]
+    points = torch.stack([o[::10, ::10, None] + d[::10, ::10, None] * z for o, d in rays])
+    create, own, made = run_nerf.create_nerf, run_nerf.NeRF, list[Any]()
+    loaded = images, poses, torch.zeros(1, 4, 4), [size, size, focal], (np.arange(100), test, test)
+    run_nerf.load_blender_data = lambda *_: loaded
+    run_nerf.NeRF = lambda **given: run.field(lambda wide: own(**{**given, "W": 256 if wide else 64}), points)
+    run_nerf.create_nerf = lambda args: made.append(create(args)) or made[0]
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(Done):
+        sys.argv = [*NERF.split(), folder]
+        run_nerf.train()
+    truth, c2w = images[test, ..., :3] * images[test, ..., 3:] + 1 - images[test, ..., 3:], torch.from_numpy(poses)
+    with torch.no_grad():
+        shown = [run_nerf.render(size, size, camera, c2w=c2w[i, :3, :4], **made[0][1])[0].clamp(0, 1) for i in test]
+    errors = np.square(torch.stack(shown).numpy() - truth).mean((1, 2, 3))
+    return {"loss": float(np.mean(errors)), "psnr": float(np.mean(-10 * np.log10(errors)))}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    loops = {"coin": (coin, "coin"), "flow": (flow, "Neural_Scene_Flow_Prior"), "nerf": (nerf, "nerf-pytorch")}
+    parser.add_argument("loop", choices=loops)
+    parser.add_argument("way", choices=("plain", "narrow", "masks", "routed"))
+    parser.add_argument("clones", type=Path)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, required=True, help="a file of rows, to which this one is added")
+    given = parser.parse_args()
+    for name in [*ABSENT.split(), "data"]:
+        for part in (name.rsplit(".", i)[0] for i in range(name.count(".") + 1)):
+            sys.modules[part] = mock.MagicMock(__spec__=ModuleSpec(part, None))
+    function, folder = loops[given.loop]
+    sys.path.insert(0, str(given.clones / folder))
+    torch.manual_seed(given.seed)
+    np.random.seed(given.seed)  # noqa: NPY002  which the loops draw from
+    found = function(run := Run(given.way, given.seconds, given.clones))
+    row = {
+        "loop": given.loop,
+        "way": given.way,
+        "seconds": given.seconds,
+        "seed": given.seed,
+        "steps": run.steps,
+    } | found
+    print(row)
+    known = json.loads(given.json.read_text()) if given.json.exists() else {"metadata": metadata(), "results": []}
+    given.json.write_text(json.dumps({**known, "results": [*known["results"], row]}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
