@@ -4,6 +4,7 @@ __version__ = "0.1.0"
 
 import gc
 import os
+import signal
 import sys
 
 # Whether this is the program and not a library of another.
@@ -14,6 +15,9 @@ if _command := bool(sys.argv) and sys.argv[0].endswith(("/voronerf", "\\voronerf
     # Garbage is collected again in voronerf.app.cli.main: while torch is loaded there is none, and to look for it takes
     # a tenth of the time.
     gc.disable()
+    # Ctrl-C ends the program without a traceback while it is loaded; main asks for KeyboardInterrupt again.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 try:
     import torch as _torch  # noqa: F401

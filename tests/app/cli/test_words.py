@@ -1,6 +1,9 @@
 """What is typed wrong: one plain line, with what was meant; help by groups; and the few words that are no command."""
 
 import re
+import signal
+import subprocess
+import sys
 
 import pytest
 from cli_commands import TINY, words
@@ -81,3 +84,16 @@ def test_none_stands_for_the_default(tmp_path):
     assert main(words("train --out", tmp_path, TINY, "--max-cells None --samples 8 --lpips None")) == 0
     config = TrainConfig.from_json((tmp_path / "config.json").read_text())
     assert config.max_cells is None and config.lpips is None and config.samples == (8,)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_ctrl_c_while_the_program_is_loaded_leaves_no_traceback():
+    code = "import os, signal, sys; sys.argv = ['/bin/voronerf', '--version']; import voronerf; {}"
+    stop = "os.kill(os.getpid(), signal.SIGINT)"
+    main = "from voronerf.app.cli import main; main(); print(signal.getsignal(2) is signal.default_int_handler)"
+    loading, started = (
+        subprocess.run([sys.executable, "-c", code.format(then)], capture_output=True, text=True)
+        for then in (stop, main)
+    )
+    assert loading.returncode == -signal.SIGINT and loading.stderr == ""
+    assert started.stdout == f"voronerf {__version__}\nTrue\n"

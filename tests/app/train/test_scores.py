@@ -80,6 +80,18 @@ def test_views_that_are_asked_for_are_scored_beside_the_budget(monkeypatch):
     assert [line["views"] for line in scores.metrics] == [2, 2, 2, 2]
 
 
+def test_evaluations_change_no_bit_of_a_training(scene):
+    """However many there are, of whole views or of their middle."""
+    found = []
+    for evaluations, middle in ((1, False), (4, False), (4, True)):
+        state = build(small(steps=24, evaluations=evaluations), scene)
+        scores = Scores(None)
+        looks = Each(lambda state, scores=scores, middle=middle: scores._probe(state, 2) if middle else None)
+        run(state, [scores, looks])
+        found.append(weights(state))
+    assert same(found[0], found[1]) and same(found[0], found[2])
+
+
 def test_as_many_panels_are_drawn_as_a_tenth_of_the_budget_allows(monkeypatch):
     _, scores, _ = scored(monkeypatch, lambda now: 1.5)
     assert [scores.affordable(budget, 4) for budget in (None, 5.0, 40.0, 400.0)] == [4, 1, 2, 4]

@@ -83,6 +83,8 @@ def main(args: list[str] | None = None) -> int:
     if not gc.isenabled():  # see voronerf/__init__.py
         gc.freeze()
         gc.enable()
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
     warnings.showwarning = _show_warning
     threading.excepthook = _show_thread_error
     ends_with_checkpoint = bool(args) and args[0] in TRAININGS
