@@ -47,6 +47,7 @@ from voronerf.ops.grouped_mlp.reference import cells_of, check_direction_index, 
 ROWS, WIDTH, THREADS = 64, 16, 128
 """Wider columns would be emptier: heads have 1 to 4 outputs. Each thread has 4 x 2 sums of a tile and a column; with
 fewer threads a block, registers are spilled (.ci/warp_check.py)."""
+_LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)) for activation in ACTIVATIONS}
 _TYPES = {torch.float32: wp.float32, torch.float16: wp.float16, torch.bfloat16: wp.bfloat16}
 
 
@@ -233,9 +234,13 @@ def _formula(x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, plan: str
 register_derivatives(_run, _run_backward, _formula, places=(0, 1, 2), width=5, count=1)
 
 
-@constant_result
-@functools.lru_cache(maxsize=256)
+@constant_result  # torch.compile looks through a cache
 def _plan(text: str, widths: tuple[int, ...]) -> str:
+    return _plan_once(text, widths)
+
+
+@functools.lru_cache(maxsize=256)
+def _plan_once(text: str, widths: tuple[int, ...]) -> str:
     """The lists of `Products` and the columns put out, as JSON. Of a table (``MLP.text``) and the widths of the encoded
     positions, the directions (0: none are read) and the layers."""
     layers, first, source, activation = MLP.parse(text), [0], list[int](), list[int]()
@@ -289,7 +294,7 @@ def grouped_mlp(
             else:
                 seen = spherical_harmonics(directions.float(), layers.direction_degree)
             read[DIRECTIONS] = seen if direction_index is None else seen.index_select(0, direction_index)
-        widths = {name: part.shape[1] for name, part in (*read.items(), *enumerate(weights))}
+        widths = {name: len(range(part.shape[1])) for name, part in (*read.items(), *enumerate(weights))}  # no symbols
         tiles, place, inside = _tiles(offsets, cell)
         x = torch.cat([_padded(part.to(dtype).float()) for part in read.values()], dim=1)
         x = x.new_zeros(len(tiles) * ROWS, x.shape[1]).index_copy(0, place, x)
@@ -310,12 +315,8 @@ def grouped_mlp(
 def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
 ) -> Tensor:
-    """A network of one layer; see ``voronerf.ops.grouped_linear``."""
+    """A network of one layer, whose width is that of the weights; see ``voronerf.ops.grouped_linear``."""
     return grouped_mlp(x, offsets, [weight], [bias], layers=_LINEAR[activation])
-
-
-# Of one layer, whose width is that of the weights.
-_LINEAR = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)) for activation in ACTIVATIONS}
 
 
 def _tiles(offsets: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -342,7 +343,6 @@ def _blocks(weight: Tensor, widths: Sequence[int]) -> Tensor:
 
 
 def _padded(x: Tensor) -> Tensor:
-    """With zeros up to whole columns."""
     return F.pad(x, (0, -x.shape[-1] % WIDTH))
 
 
