@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from voronerf import VoronoiDiagram
+from voronerf import NeRF, VoronoiDiagram
 from voronerf.router import VoronoiRouter
 
 
@@ -247,6 +247,17 @@ def test_centres_in_other_units_are_told_once(generator: torch.Generator) -> Non
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             router(x)
+
+
+def test_centres_of_a_table_in_other_units_are_told_in_training(generator: torch.Generator) -> None:
+    x, d = torch.rand(2000, 3, generator=generator), F.normalize(torch.rand(2000, 3, generator=generator), dim=1)
+    router = VoronoiRouter(NeRF(width=16, depth=2), 100 * torch.rand(8, 3, generator=generator))
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("error")
+        router(x, d)
+    with pytest.warns(UserWarning, match=r"2,000 of 2,000 samples are in one of 8") as told:
+        router(x, d)
+    assert told[0].filename == __file__
 
 
 def test_centres_that_fit_are_not_told(generator: torch.Generator) -> None:

@@ -402,9 +402,12 @@ _MANY = 4  # cells, of which one that has nearly all samples is suspicious
 
 
 @torch.no_grad()
-def doubt_of(rule: Any, source: Tensor | None, positions: Tensor, offsets: Tensor, centres: Tensor) -> str:
-    """Why what a rule has taken from the first tensor, positions [n, d], may be something else; or an empty text."""
-    flat, k, d = positions.detach().flatten(0, -2), len(offsets) - 1, positions.shape[-1]
+def doubt_of(rule: Any, source: Tensor | None, positions: Tensor, counts: Tensor, centres: Tensor) -> str:
+    """Why what a rule has taken from the first tensor, positions [n, d], may be something else; or an empty text.
+
+    ``counts``, [k], are the samples in each cell.
+    """
+    flat, k, d = positions.detach().flatten(0, -2), len(counts), positions.shape[-1]
     if isinstance(rule, str) and source is not None:
         x = source.detach().flatten(0, -2)[:256].float()
         circle = (x[:, :1].square() + x.square() - 1).abs().amax(0) < 1e-3
@@ -415,7 +418,7 @@ def doubt_of(rule: Any, source: Tensor | None, positions: Tensor, offsets: Tenso
             )
         if d == 3 and float((x[:, :3].norm(dim=1) - 1).abs().max()) < 1e-3:
             return f"coords={rule!r} takes unit vectors, such as directions, for positions; pass coords=positions"
-    most = int(offsets.diff().max())
+    most = int(counts.max())
     if k < _MANY or most <= 0.9 * len(flat):
         return ""
     spans = (f"{float(x.min()):.3g} to {float(x.max()):.3g}" for x in (centres, flat))

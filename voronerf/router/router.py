@@ -526,6 +526,10 @@ class VoronoiRouter(nn.Module):
         features = 6 if self.field.layers.integrated else 3
         if positions.ndim != 2 or positions.shape[1] != features:
             raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
+        large = not torch.compiler.is_compiling() and self.num_cells > 1 and len(positions) >= _LARGE
+        if large and self._unseen and torch.is_grad_enabled():
+            places = (positions[:, :3] if coords is None else coords).flatten(0, -2)
+            self._doubt(None, None, places, self.diagram.locate(places).bincount(minlength=self.num_cells))
         given = self._arguments(coords, positions, directions, ray_index)
         return self.field.activate(routed_mlp(**given, backend=self.backend)[0])
 
@@ -645,16 +649,20 @@ class VoronoiRouter(nn.Module):
         )
         call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
         grouping = self._group(method, positions)
-        if self._unseen and layout.n >= _LARGE:
-            self._unseen = False
+        if self._unseen and layout.n >= _LARGE and torch.is_grad_enabled():
             with outside():
                 source = first_tensor(args, kwargs)
                 source = None if source is None else unwrapped(source)
-                doubt = doubt_of(rule, source, unwrapped(positions), grouping.offsets, self.diagram.centres)
-            if doubt:
-                self._dispatch.warn_once("positions", doubt)
+                self._doubt(rule, source, unwrapped(positions), grouping.offsets.diff())
         options = Options(self.fuse, self.way, bool(self.methods), self._names)
         return self._dispatch.evaluate(call, grouping, options, self.frozen_cells).restored(layout)
+
+    def _doubt(self, rule: Any, source: Tensor | None, positions: Tensor, counts: Tensor) -> None:
+        """Warns, at the first large batch of a training, where positions may be something else."""
+        self._unseen = False
+        doubt = doubt_of(rule, source, positions, counts, self.diagram.centres)
+        if doubt:
+            self._dispatch.warn_once("positions", doubt)
 
     _route_uncompiled = not_compiled(_route_as_it_is, _NO_GRAPH)
 
