@@ -240,7 +240,8 @@ class Dispatch:
             ways = ways[-1:]
         if not plan.measured or len(ways) == 1 or n < _FEWEST:
             return ways[0], ways[0].why
-        size = min(n, _SLICE).bit_length() // 2, k  # batches of up to four times as many samples
+        n = min(n, measured_samples(ways))
+        size = n.bit_length() // 2, k  # batches of up to four times as many samples
         if size not in plan.chosen:
             with self._lock, aside(call) as beside:
                 times = measure(ways, beside, grouping)
@@ -249,7 +250,7 @@ class Dispatch:
             others = ", ".join(texts[:first] + texts[first + 1 :])
             plan.chosen[size] = (
                 first,
-                f"{1e3 * times[first]:.3g} ms for {min(n, _SLICE)} samples, {others}" if min(times) else "",
+                f"{1e3 * times[first]:.3g} ms for {n} samples, {others}" if min(times) else "",
             )
         first, own = plan.chosen[size]
         return ways[first], "; ".join(filter(None, (ways[first].why, own)))
@@ -349,13 +350,24 @@ class _Constant(torch.autograd.Function):
         return (None,) * ctx.count
 
 
+def measured_samples(ways: list[Way]) -> int:
+    """Most samples on which ways are measured: more where PyTorch computes a part, whose tensors outgrow the cache."""
+    return _SLICE * 8 if any(way.name == "fused in runs" for way in ways) else _SLICE
+
+
 def measure(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
     """Seconds that each way takes for a part of a batch, forward and, where there are gradients, backward.
 
     The ways take turns, and the least time of each counts; the loop has one turn where it is far behind. A double of
     the module takes what they write and the gradients; random numbers go on as if nothing had run.
     """
-    k, device, picked = grouping.k, grouping.device, call.part(_SLICE) if grouping.rows is None else None
+    most, times = measured_samples(ways), _least_times(ways, call, grouping, _SLICE, 2)
+    return _least_times(ways, call, grouping, most, 1) if min(most, call.layout.n) > 2 * _SLICE else times
+
+
+def _least_times(ways: list[Way], call: Call, grouping: Grouping, most: int, fewest: int) -> list[float]:
+    """The least times of at least so many turns, on so many samples at most."""
+    k, device, picked = grouping.k, grouping.device, call.part(most) if grouping.rows is None else None
     if picked is not None:
         call, rows = picked
         cells = None if grouping.cells is None else grouping.cells.index_select(0, rows)
@@ -390,7 +402,7 @@ def measure(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
 
     times, turns, began = [float("inf")] * len(ways), 0, clock()
     with torch.random.fork_rng([device] if cuda else []):
-        while turns < 2 or (turns < _TURNS and clock() - began < _SECONDS):
+        while turns < fewest or (turns < _TURNS and clock() - began < _SECONDS):
             for i, way in enumerate(ways):
                 if turns == 0 or not isinstance(way, Loop) or times[i] < _BEHIND * min(times):
                     times[i] = min(times[i], seconds(way))
