@@ -39,3 +39,11 @@ def test_a_network_of_any_width(width: int) -> None:
 def test_cells_of_any_size(counts: list[int]) -> None:
     for found, right in zip(gradients(20, counts, "warp"), gradients(20, counts, "reference"), strict=True):
         torch.testing.assert_close(found, right, rtol=1e-4, atol=1e-5)
+
+
+def test_what_a_step_needs_is_loaded_before_it() -> None:
+    kernels = pytest.importorskip("voronerf.kernels")
+    loads = kernels.loads(torch.device("cpu"), torch.float32)
+    assert len(loads) == 10
+    for load in loads:
+        load()
