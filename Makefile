@@ -19,13 +19,17 @@ SOURCES := $(shell find csrc -type f) setup.py pyproject.toml
 
 PAPER_ARGS ?= --out runs/paper-small --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
 
-.PHONY: demo test test-all bench paper docs check cuda-check warp-check arm-check isa-check gpu-check emulate-cuda sanitize attack clean
+.PHONY: demo wheel test test-all bench paper docs check cuda-check warp-check arm-check isa-check gpu-check emulate-cuda sanitize attack clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
 
+# A wheel for this machine and this Python, in dist; a test installs it in a new environment.
+wheel: $(VENV)/.wheel
+
 # A few minutes. test-all has the long parts too, which are marked slow.
 test: CHOICE := -m "not slow"
+test-all: $(VENV)/.wheel
 test test-all: $(VENV)/.built
 	@OMP_NUM_THREADS=$(THREADS) $(BIN)/pytest -q -n $(JOBS) --dist worksteal $(CHOICE) $(if $(REQUIRE),--require $(REQUIRE)) $(TEST_ARGS)
 
@@ -108,6 +112,12 @@ $(VENV)/.tools: requirements-ci.txt $(VENV)/.installed
 
 $(VENV)/.docs: requirements-docs.txt $(VENV)/.tools
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_ARGS) -r requirements-docs.txt
+	@touch $@
+
+# What an earlier build left in build/lib would go into the wheel.
+$(VENV)/.wheel: $(VENV)/.built $(shell find voronerf kernels -name '*.py')
+	@rm -rf build/lib build/lib.* dist/voronerf-*.whl
+	@$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-build-isolation --no-deps --wheel-dir dist .
 	@touch $@
 
 $(VENV)/.built: $(VENV)/.installed $(SOURCES)

@@ -1,10 +1,13 @@
 """The build scripts: commands of build.ninja, from compilers of more than one word, and the check of the CUDA files."""
 
+import importlib.metadata
 import importlib.util
 import os
 import runpy
 import subprocess
 import sys
+import sysconfig
+import venv
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -248,3 +251,58 @@ def test_cuda_check_notes_the_architectures_it_was_asked_for(check, monkeypatch,
     kept = check.json.loads(check.TABLE.read_text())["kernels"]
     assert list(kept[kernel]) == ["sm_90", "sm_100"] and "gone" not in kept
     assert kept[kernel]["sm_100"] == list(old.values()) != kept[kernel]["sm_90"]
+
+
+@pytest.fixture
+def installed(tmp_path):
+    """Runs programs of a new environment with the wheel of `make wheel`, or of VORONERF_WHEEL, and its requirements.
+
+    Nothing is fetched or compiled: the environment has links to what this one has of them.
+    """
+    made = os.environ.get("VORONERF_WHEEL")
+    wheels = [Path(made)] if made else sorted((ROOT / "dist").glob("voronerf-*.whl"), key=os.path.getmtime)
+    if not wheels:
+        pytest.skip("there is no wheel in dist: make wheel")
+    venv.create(tmp_path / "venv", with_pip=True, symlinks=True)
+    folder = tmp_path / "venv" / ("Scripts" if os.name == "nt" else "bin")
+    packages = Path(sysconfig.get_path("purelib", vars={"base": str(tmp_path / "venv")}))
+    (metadata,) = importlib.metadata.distributions(name="voronerf", path=[str(wheels[-1])])
+    link_requirements(metadata, {"viewer"}, packages)
+    environment = {name: text for name, text in os.environ.items() if name not in ("PYTHONPATH", "PIP_FIND_LINKS")}
+
+    def run(program, *arguments):
+        command = [str(folder / program), *map(str, arguments)]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, (command, done.stdout, done.stderr)
+        return done.stdout
+
+    run("pip", "install", "--no-index", "--disable-pip-version-check", wheels[-1])
+    return run
+
+
+def link_requirements(metadata, extras, packages, seen=None) -> None:
+    """Links what a distribution requires, with some of its extras, into a folder."""
+    requirements = pytest.importorskip("packaging.requirements", reason="packaging is not installed")
+    seen = set() if seen is None else seen
+    for text in metadata.requires or ():
+        wanted = requirements.Requirement(text)
+        chosen = [wanted.marker is None or wanted.marker.evaluate({"extra": extra}) for extra in ("", *extras)]
+        if not any(chosen) or wanted.name in seen:
+            continue
+        seen.add(wanted.name)
+        found = importlib.metadata.distribution(wanted.name)
+        for name in {file.parts[0] for file in found.files or () if file.parts[0] not in ("..", "__pycache__")}:
+            if not (packages / name).exists():
+                (packages / name).symlink_to(found.locate_file(name))
+        link_requirements(found, wanted.extras, packages, seen)
+
+
+@pytest.mark.slow
+def test_the_wheel_does_the_main_job_in_a_new_environment(installed):
+    tomllib = pytest.importorskip("tomllib", reason="tomllib comes with Python 3.11")
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    for command in settings["tool"]["cibuildwheel"]["test-command"]:
+        said = installed(*command.split())
+        assert "built with" in said or not command.endswith("info")  # with CUDA or without
+    assert "Building" not in installed("pip", "install", "--no-index", "voronerf[viewer]")
+    installed("python", "-c", "import voronerf.app.viewer, sys; assert '.venv' not in voronerf.__file__")
