@@ -69,7 +69,7 @@ def _train(out: Path, options: list[str], file_size: int | None = None) -> int:
             resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
         status, _, err = run("train", "--out", out, *(["--resume"] if checkpoint_paths(out) else []), *options)
         if status == 1:  # a disk that is full names a file
-            return 1 if "File too large: '" in err and err.startswith("voronerf: ") else 70
+            return 1 if "File too large" in err and str(out) in err and err.startswith("voronerf: ") else 70
         return status
 
     return fork_command(begin)
