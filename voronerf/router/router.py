@@ -529,7 +529,8 @@ class VoronoiRouter(nn.Module):
         large = not torch.compiler.is_compiling() and self.num_cells > 1 and len(positions) >= _LARGE
         if large and self._unseen and torch.is_grad_enabled():
             places = (positions[:, :3] if coords is None else coords).flatten(0, -2)
-            self._doubt(None, None, places, self.diagram.locate(places).bincount(minlength=self.num_cells))
+            cells = self.diagram.locate(places, backend=self.backend)
+            self._doubt(None, None, places, cells.bincount(minlength=self.num_cells))
         given = self._arguments(coords, positions, directions, ray_index)
         return self.field.activate(routed_mlp(**given, backend=self.backend)[0])
 
