@@ -289,7 +289,7 @@ def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, fails)
     ):
         fails(message, train, given)
     monkeypatch.setattr(sys.modules["voronerf.app.train.build"], "SAMPLE_BYTES", 0)
-    fails("count must be at most 2147483647, got 8000000000000", train, "--rays 8000000000000")
+    fails("count must be at most 134217728, got 8000000000000", train, "--rays 8000000000000")
     monkeypatch.setitem(COMMANDS, "info", no_memory_to_import)
     fails("not enough memory; try a smaller --width", "info")
     assert [path.name for path in tmp_path.iterdir()] in ([], ["runs"]) and not list(tmp_path.glob("runs/*"))

@@ -119,7 +119,7 @@ OVERSIZED = {
     "depth": (settings(depth=1_000_000), "--depth must be at least 1 and at most 1000, got 1000000"),
     "octaves": (
         settings(field_options=("position_octaves=1000000000",)),
-        "router.module.trunk.0.weight must have shape [3, 8, 6000000003]",
+        "MLP: position_octaves must be None or 0 to 127, got 1000000000",
     ),
     "average": (flat_average, "optimizer.0.average must have shape [3, 8, 39], got [936]"),
     "centres": (many_centres, "router.module.trunk.0.weight must have shape [2000000, 8, 39], got [3, 8, 39]"),

@@ -140,10 +140,10 @@ def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
     for name in SAMPLERS[config.sampling].networks(config.field_type.cones):
         tensors = checkpoint.group(group(name))
         try:
-            diagram = VoronoiDiagram.from_state(tensors, "diagram.")
+            diagram, shapes = VoronoiDiagram.from_state(tensors, "diagram."), parameter_shapes(config)
         except (ValueError, TypeError) as error:
             raise CheckpointError(f"{checkpoint.source}: {error}") from None
-        for key, (shape, shared) in parameter_shapes(config).items():
+        for key, (shape, shared) in shapes.items():
             wanted = [*([] if shared else [diagram.num_cells]), *shape]
             found = tensors.get(f"module.{key}")
             if found is None or list(found.shape) != wanted:
