@@ -56,7 +56,8 @@ def demo(out: Path | None = None, budget: float = 35.0) -> int:
     above = turn(FRAMES, height=0.3, away=1.25)
     image = open_town(run / "placed", scene=scene).render(above, FRAMES // 8, heaviest=False)
     save_picture(run / "placed.png", picture_of_colour(image.colour))
-    program = "voronerf" if shutil.which("voronerf") else sys.argv[0]
+    path = sys.argv[0] if Path(sys.argv[0]).name == "voronerf" else "python -m voronerf"  # such as .venv/bin/voronerf
+    program = "voronerf" if shutil.which("voronerf") else path
     here = shlex.quote(str(run))
     at = " ".join(f"{x:g}" for x in TOP)
     say(
