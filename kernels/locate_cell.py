@@ -63,6 +63,7 @@ def locate_cell(given: Any, leaves: Tensor) -> None:
     """Leaf of every point in a tree of diagrams; see ``voronerf.ops.locate_cell``."""
     *tables, depth = given
     check_tree(given.child_offsets, given.child, "locate_cell")
-    inputs = [*[array(tensor, leaves) for tensor in tables], depth, array(leaves, leaves)]
+    levels = min(depth, given.child_offsets.shape[0] - 1)  # a tree has no more than diagrams
+    inputs = [*[array(tensor, leaves) for tensor in tables], levels, array(leaves, leaves)]
     launch(_locate_cell_kernel, given.n, inputs, leaves)
     check_leaves(leaves, depth, "locate_cell")
