@@ -13,6 +13,7 @@ from convention_calls import Truncated
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiRouter
+from voronerf.ops._core import backends
 from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.router import rules
 
@@ -144,7 +145,9 @@ def test_an_argument_that_is_called_coords() -> None:
 # Failures -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_backend_that_is_not_there_is_no_reason_for_a_loop() -> None:
+def test_a_backend_that_is_not_there_is_no_reason_for_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backends, "missing", lambda backend, device: "it is not here" if backend == "warp" else None)
+    backends._choose_once.cache_clear()
     router = VoronoiRouter(network(), centres(), coords="first3", backend="warp")
     with pytest.raises(BackendUnavailable, match="warp"):
         router(samples())

@@ -273,9 +273,9 @@ def test_what_cannot_be_joined(runs, tmp_path) -> None:
         ([cones, two], "cannot be joined or cut: its cones"),
         ([one, endless], "must have bounds to be joined"),
         ([one, black], "must have the background of first, white, got none"),
-        ([one, tmp_path], "must hold a run"),
     ):
         refuses(said, town.join, given, tmp_path / "no", error=ConfigError)
+    refuses("there is no checkpoint in it", town.join, [one, tmp_path], tmp_path / "no", error=CheckpointError)
     refuses("an object must have bounds", town.place, one, endless, (0, 0, 0), tmp_path / "no", error=ConfigError)
     assert not (tmp_path / "no").exists()
 
@@ -376,7 +376,7 @@ def test_the_commands(runs, tmp_path, capsys) -> None:
     for command, said in {
         f"join {one} {two} --out {joined}": "--out must not hold a run already",
         f"join {one} --out X": "join needs two runs or more, got 1",
-        f"join {one} {tmp_path / 'none'} --out X": "none: must hold a run",
+        f"join {one} {tmp_path / 'none'} --out X": "none: there is no such folder",
         f"cut {one} --out X": "cut needs one of --box, --sphere and --cells, got none",
         f"cut {one} --out X --box 1 1 1 0 0 0": "--box: Solid: a box must have its second corner above the first",
         f"cut {one} --out X --sphere 9 9 9 0.1": "nothing is left",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import inspect
 import itertools
 import os
@@ -157,8 +158,7 @@ def _compile_kernels(config: TrainConfig) -> None:
         say(f"operations run on {backends.automatic(device)}")
     if backends.chosen("grouped_mlp", device, dtype, backend=config.backend) != "warp":
         return
-    from voronerf import kernels
-
+    kernels = importlib.import_module("voronerf.kernels")
     start = time.perf_counter()
     for compiled in tracked(kernels.loads(device, dtype), "compiling Warp kernels"):
         compiled()
