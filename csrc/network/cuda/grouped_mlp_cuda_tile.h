@@ -69,7 +69,8 @@ __device__ inline const float* mlp_positions(const MlpCudaPlan& plan, const MlpC
 __device__ inline const float* mlp_directions(const MlpCudaPlan& plan, const MlpCudaData& data, int64_t row) {
   const int64_t source = mlp_source_row(data, row);
   return data.directions +
-         (data.direction_index == nullptr ? source : mlp_within(data.direction_index[source], data.r)) * plan.directions.raw;
+         (data.direction_index == nullptr ? source : mlp_within(data.direction_index[source], data.r)) *
+             plan.directions.raw;
 }
 
 __device__ inline float mlp_activate(int activation, float x) {
