@@ -176,7 +176,8 @@ def place(
         raise ConfigError(f"{source.name}: an object must have bounds, which voronerf cut --box or --sphere gives it")
     foot = torch.cat(((box[0] + box[1])[:2] / 2, box[0, 2:]))
     standing = Similarity.of(at, degrees, scale) @ Similarity(translation=-foot.double())
-    return _write(join_sources([Source.of(run), source], [Similarity(), standing], on_top=True), Path(out))
+    scene = source if Path(run) == Path(thing) else Source.of(run)  # networks of one run are stored once
+    return _write(join_sources([scene, source], [Similarity(), standing], on_top=True), Path(out))
 
 
 # Joining --------------------------------------------------------------------------------------------------------------

@@ -188,6 +188,7 @@ def test_demo_shows_a_run_and_writes_over_none(tmp_path, capsys, monkeypatch, fa
     assert main([*shlex.split(said), "--out", "again"]) == 0
     files = [sorted((folder / "checkpoints").iterdir())[-1] for folder in (run / "placed", tmp_path / "again")]
     assert files[0].stat().st_size == files[1].stat().st_size
+    assert len(list((run / "placed").rglob("networks-*.safetensors"))) == 1
     (following,) = re.findall("next: .*voronerf (.*)", output)
     assert following.split()[0] in COMMANDS
     fails("--out must not hold a run already", "demo --out runs/demo")
