@@ -18,17 +18,15 @@ import shlex
 import statistics
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 import tyro
 from harness import metadata
 from rival_ngp import Rival, RivalConfig
-from turns import Training, take_turns
+from turns import CLOCKS, Training, take_turns
 
 from voronerf.app.cli.main import EXPECTED
 from voronerf.app.evaluate.plots import plot_curves
@@ -75,11 +73,6 @@ class Options:
     """Where the plot goes."""
 
 
-def cpu_seconds() -> float:
-    """Process CPU time for each thread."""
-    return time.process_time() / torch.get_num_threads()
-
-
 def parse_side(text: str, common: str) -> tuple[str, TrainConfig | RivalConfig]:
     """Name and settings that an entry of ``--sides`` stands for.
 
@@ -110,7 +103,7 @@ def make_training(
     name: str, config: TrainConfig | RivalConfig, options: Options, scene: Scene, seed: int, out: Path
 ) -> Training | Rival:
     """The training of one side with one seed."""
-    clock = cpu_seconds if options.clock == "cpu" else time.perf_counter
+    clock = CLOCKS[options.clock]
     say: Callable[[str], None] = lambda line: print(f"{name:14} {line}", flush=True)  # noqa: E731
     if isinstance(config, RivalConfig):
         numbers = {"evaluations": options.evaluations, "eval_views": options.eval_views, "seed": seed}

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, TypeVar
 
+import torch
+
 from voronerf.app.scenes import Scene
 from voronerf.app.train import (
     Callback,
@@ -21,6 +23,12 @@ from voronerf.app.train import (
     load,
     train,
 )
+
+#: What counts as a second: wall time, or process CPU time for each thread.
+CLOCKS: dict[str, Callable[[], float]] = {
+    "wall": time.perf_counter,
+    "cpu": lambda: time.process_time() / torch.get_num_threads(),
+}
 
 
 class TakesTurns(Protocol):

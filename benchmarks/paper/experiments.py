@@ -27,6 +27,7 @@ KILO_START, KILO_LATE = f"512 uniform cells after {KILO_FIRST_STEPS} steps", "51
 KILO_CELLS = "16 x 16 Voronoi cells"
 SPLIT_TIMES = (0.05, 0.1, 0.2, 0.4, 0.6)
 COUNTS = (4, 8, 12, 16, 32)
+DEFAULTS = "voronerf train"
 
 
 class Scores(NamedTuple):
@@ -133,6 +134,8 @@ def _crossed(samplings: Sequence[str]) -> Callable[[Settings, str], list[Variant
 
 
 def _published(variant: str, scene: str) -> Scores | None:
+    if variant == DEFAULTS:  # beside the paper's best: mip-NeRF with hierarchical samples and cells
+        variant = row_name("mipnerf", "hierarchical", cells_name(PUBLISHED_CELLS))
     for (field, sampling, where), scores in PUBLISHED.items():
         for network, score in zip((WIDE, cells_name(PUBLISHED_CELLS)), scores):
             if (where, row_name(field, sampling, network)) == (scene, variant):
@@ -207,6 +210,15 @@ EXPERIMENTS: dict[str, Experiment] = {
         "table",
         "Hierarchical NeRF and mip-NeRF on several scenes: one network against cells.",
         _crossed(SAMPLINGS[1:]),
+        scenes=lambda: default_scenes(3),
+        published=_published,
+    ),
+    "at-size": Experiment(
+        "table",
+        "The defaults of `voronerf train`, beside the paper's best. With --downscale 1 in the paper's own size.",
+        lambda settings, scene: [
+            Variant(DEFAULTS, {name: getattr(TrainConfig(), name) for name in (*AS_PUBLISHED, "rays", "samples")})
+        ],
         scenes=lambda: default_scenes(3),
         published=_published,
     ),

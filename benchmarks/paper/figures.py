@@ -241,6 +241,7 @@ PLOTS: dict[str, Callable[[Path, Sequence[Row]], Path]] = {
     "split-kinds": curves,
     "early-late": curves,
     "cell-count": counts,
+    "at-size": curves,
     "seams": curves,
     "nested-2d": curves,
     "balance": balance,

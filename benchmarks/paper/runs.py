@@ -16,9 +16,9 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from turns import Training, take_turns
+from turns import CLOCKS, Training, take_turns
 
 from paper import looks
 from voronerf.app.evaluate.lpips import find_lpips
@@ -59,6 +59,8 @@ class Settings:
     """Folder for runs, JSON, tables and pictures."""
     turn: float = 5.0
     """Seconds that a variant trains before the next one has its turn."""
+    clock: Literal["wall", "cpu"] = "wall"
+    """What counts as a second: wall time, or where others use the machine too, process CPU time / threads."""
     rays: int = 1024
     """Rays per step."""
     samples: int = 64
@@ -158,10 +160,10 @@ def make_run(variant: Variant, scene: str, seed: int, settings: Settings) -> Run
     """The training that a variant stands for, with the directory that its settings and the scene's name give it."""
     values = {name: getattr(settings, name) for name in ("budget", "evaluations", "eval_views", "rays", "backend")}
     values |= {"seed": seed, "data": scene_source(scene), "downscale": factor(scene, settings)}
-    values |= {**AS_PUBLISHED, **variant.changes}
-    passes = SAMPLERS[values.get("sampling", "stratified")].passes  # several share the samples of one
+    passes = SAMPLERS[variant.changes.get("sampling", "stratified")].passes  # several share the samples of one
     first = settings.samples // passes
-    config = TrainConfig(**values, samples=(*[first] * (passes - 1), settings.samples - first * (passes - 1)))
+    values["samples"] = (*[first] * (passes - 1), settings.samples - first * (passes - 1))
+    config = TrainConfig(**{**values, **AS_PUBLISHED, **variant.changes})
     short, more = Path(scene).name, {"final_views": settings.final_views, "looks": looks.VERSION}
     text = json.dumps({**config.to_values(), "data": short, **more}, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -189,7 +191,13 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
     names = {run.folder: f"{run.variant.name:28}" for run in group}
     for run in group:
         resume, name = bool(checkpoint_paths(run.folder)), names[run.folder]
-        training = Training(run.config, scene, on_event=lambda line, name=name: say(f"{name} {line}"), resume=resume)
+        training = Training(
+            run.config,
+            scene,
+            clock=CLOCKS[settings.clock],
+            on_event=lambda line, name=name: say(f"{name} {line}"),
+            resume=resume,
+        )
         batches = BATCHES.get(run.config.field)
         if batches is not None and not resume:
             training.state.strategy.reservoir = SampleReservoir(RESERVOIR, batches)

@@ -1,7 +1,6 @@
 """benchmarks/paper.py: trainings in turns, and the files of tiny experiments."""
 
 import contextlib
-import functools
 import itertools
 import json
 import math
@@ -21,7 +20,7 @@ from paper.report import ABOUT
 from PIL import Image
 
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.train import ConfigError
+from voronerf.app.train import ConfigError, TrainConfig
 from voronerf.app.train.build import count_parameters, solve_width
 from voronerf.app.train.defaults import resolve
 
@@ -35,7 +34,7 @@ def steady_clock(monkeypatch):
     ticks = itertools.count()
     clock = SimpleNamespace(perf_counter=lambda: 0.0101 * next(ticks), time=time.time)
     monkeypatch.setattr(nested, "time", clock)
-    monkeypatch.setattr(runs, "Training", functools.partial(turns.Training, clock=clock.perf_counter))
+    monkeypatch.setitem(turns.CLOCKS, "wall", clock.perf_counter)
 
 
 @pytest.fixture
@@ -115,6 +114,14 @@ def test_experiments_write_their_files_and_are_not_run_again(settings, capsys, m
     assert (settings.out / "density-pictures.png").is_file()
     refuses("trained again", paper.repeat, replace(settings, budget=0.3), ("density",), error=AssertionError)
     refuses("experiments are convergence, ", paper.repeat, settings, ("nothing",), error=ConfigError)
+
+
+def test_defaults_at_size(settings):
+    run = EXPERIMENTS["at-size"].runs(settings)[0]
+    changed = {"data", "out", "budget", "downscale", "evaluations", "eval_views", "backend"}
+    given, default = run.config.to_values(), TrainConfig().to_values()
+    assert {name for name in given if given[name] != default[name]} <= changed
+    assert EXPERIMENTS["at-size"].published(run.variant.name, "ship").psnr == 29.007
 
 
 def one(settings, seed=0, scene="builtin", **changes):
