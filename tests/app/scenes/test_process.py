@@ -145,12 +145,23 @@ def test_cameras_far_from_all_others_count_as_missing():
     origins[7] *= 9
     assert lost_cameras(origins).nonzero().flatten().tolist() == [7]
     assert camera_faults(origins) == []  # one is not all
+    origins[20:32] *= 30 + torch.arange(12)[:, None] ** 2
+    assert lost_cameras(origins).nonzero().flatten().tolist() == [7, *range(20, 32)]
     assert "depths from 0.02 to 3.52e+04" in camera_faults(circle(), torch.tensor([[0.02, 5.0], [1.0, 3.52e4]]))[0]
     lenses = [colmap_lens("OPENCV", (736, 700, 400, 266, 0.1, 0, p1, 0.01)) for p1 in (0.02, -0.09)]
     assert [camera_faults(circle(), lenses=[(lens, 800)]) for lens in lenses] == [
         [],
         ["a lens is tilted, p1 -0.09 and p2 0.01"],
     ]
+
+
+def test_cameras_beside_a_burst_are_not_lost():
+    burst = torch.tensor([1.0, 0, 0.2]) + 1e-3 * torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
+    origins = torch.cat((burst.double(), circle(37)))
+    assert not lost_cameras(origins).any()
+    assert lost_cameras(torch.cat((origins, 5 * circle(1)))).nonzero().flatten().tolist() == [77]
+    path = torch.cat((0.01 * torch.arange(75), torch.tensor([0.9, 1.05])))[:, None] * torch.ones(3)
+    assert not lost_cameras(path).any()
 
 
 def test_a_scene_says_what_is_wrong_with_its_cameras(tmp_path):
