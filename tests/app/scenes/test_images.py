@@ -69,11 +69,11 @@ def test_one_image_with_alpha_gives_all_alpha(tmp_path):
     paths = [tmp_path / "a.png", tmp_path / "b.png"]
     Image.new("RGB", (3, 2), (1, 2, 3)).save(paths[0])
     Image.new("RGBA", (3, 2), (4, 5, 6, 7)).save(paths[1])
-    images, sizes, _ = read_images(paths, 1)
+    images, sizes, *_ = read_images(paths, 1)
     assert sizes.tolist() == [[3, 2], [3, 2]]
     assert images[:, 0, 0].tolist() == [[1, 2, 3, 255], [4, 5, 6, 7]]
     Image.new("RGB", (2, 3), (7, 8, 9)).save(paths[0])
-    images, sizes, _ = read_images(paths, 1)
+    images, sizes, *_ = read_images(paths, 1)
     assert images.shape == (2, 3, 3, 4) and sizes.tolist() == [[2, 3], [3, 2]]
     assert (images[0, :, :2] == torch.tensor([7, 8, 9, 255])).all() and not images[0, :, 2:].any()
 

@@ -186,19 +186,57 @@ def test_nerfstudio_files(tmp_path):
     refuses("applied_transform is not a pose", load_scene, tmp_path, error=SceneError)
 
 
+@pytest.mark.parametrize("tag", [3, 6, 8])
+@pytest.mark.parametrize("lens", [("OPENCV", (21, 19, 5, 6, 0.02, 0.01, 0.03, -0.02)), ("THIN_PRISM_FISHEYE", None)])
+def test_an_orientation_tag_turns_pixels_and_cameras_alike(tmp_path, tag, lens):
+    """Each pixel keeps its ray, its colour, its mask and its depth: that of the stored image, which COLMAP has seen."""
+    lens = lens if lens[1] else (lens[0], (21, 19, 5, 6, 0.02, 0.01, 0.03, -0.02, 0.01, 0.002, 0.04, 0.03))
+    poses, generator = POSES.numpy(), np.random.default_rng(1)
+    exif, turns = Image.Exif(), {3: 2, 6: -1, 8: 1}[tag]
+    exif[0x0112] = tag
+    for folder in ("plain", "tagged"):
+        write_colmap(tmp_path / folder, poses, [(13, 10)] * COUNT, POINTS, lenses=[lens] * COUNT)
+        (tmp_path / folder / "images").mkdir()
+    for index in range(COUNT):
+        picture = Image.fromarray(generator.integers(0, 255, (10, 13, 3), np.uint8))
+        picture.save(tmp_path / f"plain/images/{index:02}.jpg")
+        # The second has no tag, so that sizes differ.
+        picture.save(tmp_path / f"tagged/images/{index:02}.jpg", **({} if index == 1 else {"exif": exif}))
+    for downscale in (1, 2):
+        plain, tagged = (
+            load_scene(tmp_path / folder, downscale=downscale, normalise=False) for folder in ("plain", "tagged")
+        )
+        for one, other in ((plain.train, tagged.train), (plain.test, tagged.test)):
+            for index, name in enumerate(one.names):
+                turned = 0 if name == "01" else turns
+                width, height = one.cameras.size(index)
+                rays = [split.cameras.image_rays(index).directions for split in (one, other)]
+                rays = [rays[0].reshape(height, width, 3), rays[1].reshape(*other.truth(index, None).shape)]
+                torch.testing.assert_close(torch.rot90(rays[0], turned), rays[1], atol=2e-6, rtol=0)
+                assert torch.equal(torch.rot90(one.truth(index, None), turned), other.truth(index, None))
+        found = [sorted(split.sparse_depth.distances.tolist()) for split in (plain.train, tagged.train)]
+        assert found[0] == pytest.approx(found[1], abs=1e-5)
+
+
 @pytest.mark.parametrize("format", ["colmap", "llff", "transforms"])
-def test_pixels_are_taken_as_stored_whatever_the_orientation_tag_says(tmp_path, format):
-    """As COLMAP, LLFF and nerfstudio do: their cameras are those of the stored pixels."""
-    tag = Image.Exif()
-    tag[0x0112] = 6  # turned by a quarter
-    write_both(tmp_path, exif=tag)
-    if format == "transforms":
+def test_up_is_that_of_the_pictures_which_people_see(tmp_path, format):
+    """A camera that was held upright stores its pictures on their side, with a tag, and COLMAP sees them so."""
+    exif, on_side = Image.Exif(), POSES.clone()
+    exif[0x0112] = 6
+    on_side[:, :3, 0], on_side[:, :3, 1] = -POSES[:, :3, 1], POSES[:, :3, 0]
+    for folder, poses, save in (("upright", POSES, {}), ("tagged", on_side, {"exif": exif})):
+        write_images(tmp_path / folder, [SIZE] * COUNT, **save)
         frames = [
             {"file_path": f"images/{index:02d}.jpg", "transform_matrix": pose.tolist()}
-            for index, pose in enumerate(POSES)
+            for index, pose in enumerate(poses)
         ]
-        (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
-    assert load_scene(tmp_path, format=format).train.images.shape == (7, 10, 12, 3)
+        (tmp_path / folder / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
+        write_colmap(tmp_path / folder, poses, [SIZE] * COUNT, POINTS)
+        write_llff(tmp_path / folder, poses, SIZE, 20.0, (2.5, 5.5))
+    upright, tagged = (load_scene(tmp_path / folder, format=format) for folder in ("upright", "tagged"))
+    torch.testing.assert_close(upright.transform, tagged.transform, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(upright.train.cameras.poses, tagged.train.cameras.poses, atol=1e-5, rtol=0)
+    assert upright.train.images.shape == (7, 10, 12, 3) and tagged.train.images.shape == (7, 12, 10, 3)
 
 
 def test_which_folder_of_images_and_by_how_much_they_are_reduced(tmp_path, monkeypatch):

@@ -182,6 +182,16 @@ def test_a_video_is_taken_apart(tmp_path, monkeypatch):
     assert len(list((tmp_path / "out/images").iterdir())) == 5
 
 
+def test_reduced_images_keep_the_orientation_tag(tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "LEAST_SIDE", 4)
+    tag = Image.Exif()
+    tag[0x0112] = 6
+    write_images(tmp_path, [(12, 10)] * 2, exif=tag)
+    process._write_reduced(sorted((tmp_path / "images").iterdir()), tmp_path / "images_2", 2)
+    with Image.open(tmp_path / "images_2/00.jpg") as reduced:
+        assert reduced.size == (6, 5) and reduced.getexif()[0x0112] == 6
+
+
 def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):
     write_images(tmp_path, [(12, 10)] * 2)
     (tmp_path / "text.mp4").write_text("no video")

@@ -68,6 +68,10 @@ def test_sizes_and_masks(tmp_path):
     assert torch.equal(found[0].images, found[1].images) and torch.equal(found[0].sizes, found[1].sizes)
     masks = [read_masks([None, mask, None], paths, found[0].sizes, 1, on_disk=on_disk) for on_disk in (False, True)]
     assert torch.equal(*masks) and int(masks[0][1].sum()) == 8
+    for on_disk in (False, True):
+        turned = read_masks([None, mask, None], paths, found[0].sizes, 1, on_disk=on_disk, turns=[0, 3, 2])
+        assert turned.shape == (3, 10, 12) and torch.equal(turned[1, :8, :11], torch.rot90(masks[0][1, :11, :8], 3))
+        assert torch.equal(turned[::2], masks[0][::2, :10])
 
 
 def test_what_does_not_fit_into_memory_is_on_disk(folder, monkeypatch):

@@ -60,7 +60,7 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
 
     downscale = reading.downscale or 1
     paths = [frame.path for frame in (*train_frames, *test_frames)]
-    images, sizes, on_disk = read_images(paths, downscale, keep=reading.images, name=folder.resolve().name)
+    images, sizes, on_disk, _ = read_images(paths, downscale, keep=reading.images, name=folder.resolve().name)
     count = len(train_frames)
     train = _split(train_frames, images[:count], sizes[:count], downscale, on_disk)
     test = _split(test_frames, images[count:], sizes[count:], downscale, on_disk)

@@ -8,12 +8,12 @@ import zlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 from torch import Tensor
 
 from voronerf.app.scenes.errors import SceneError
@@ -23,6 +23,8 @@ from voronerf.ops._core.checks import available_memory
 #: Decided by the content of a file. Pillow would read others too, some of them by starting another program.
 FORMATS = ("PNG", "JPEG")
 UNREADABLE = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
+#: Quarters anticlockwise that make an image upright, by its orientation tag. Mirrors are no turns, and stay.
+TURNS = {3: 2, 6: 3, 8: 1}
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_DEPTH = 24  # offset of the bits a channel
 #: Share of the free memory that a scene may need; the rest is for the networks.
@@ -36,11 +38,13 @@ BAND = 2**20
 
 
 class Header(NamedTuple):
-    """What an image file says of itself: (width, height), an alpha channel, bytes of memory to decode it."""
+    """What an image file says of itself: (width, height), an alpha channel, bytes of memory to decode it, and by how
+    many quarters its orientation tag turns it anticlockwise."""
 
     size: tuple[int, int]
     alpha: bool
     decoded: int
+    turns: int
 
 
 def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
@@ -71,18 +75,21 @@ def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
 def read_header(path: Path, factor: int) -> Header:
     """Reads the header of an image file, without its pixels."""
     with _opened(path) as file:
-        size, alpha = file.size, _has_alpha(file)
+        size, alpha, turns = file.size, _has_alpha(file), 0
+        if file.format == "JPEG":  # of PNG, Pillow would decode the pixels
+            with contextlib.suppress(*UNREADABLE):  # a broken tag is none
+                turns = TURNS.get(file.getexif().get(ExifTags.Base.Orientation, 1), 0)
         if factor > min(size):
             raise SceneError(f"{path}: downscaling by {factor} leaves no pixel of {size[0]} x {size[1]}")
         _reduce_while_decoding(file, factor)
         # Pillow keeps colours in four bytes a pixel.
-        return Header(size, alpha, file.width * file.height * (1 if len(file.getbands()) == 1 else 4))
+        return Header(size, alpha, file.width * file.height * (1 if len(file.getbands()) == 1 else 4), turns)
 
 
 def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
     """Decodes one image file.
 
-    Orientation tags are ignored: poses and intrinsics belong to the pixels as stored. JPEG files are reduced by up to 8
+    As it is stored, whatever its orientation tag: so do poses and intrinsics have it. JPEG files are reduced by up to 8
     while they are decoded, from the low frequencies of each block of 8 x 8 pixels, which saves time and memory.
 
     Returns:
@@ -109,15 +116,23 @@ class Decoded(NamedTuple):
             upper left corner and zeros around them.
         sizes: int64 [c, 2], (width, height) of the files.
         on_disk: the images are mapped from a file of the cache, and must not be written to.
+        turns: by how many quarters each image was turned anticlockwise.
     """
 
     images: Tensor
     sizes: Tensor
     on_disk: bool
+    turns: list[int]
 
 
 def read_images(
-    paths: Sequence[Path], factor: int, *, keep: str = "auto", name: str = "images", most_channels: int = 4
+    paths: Sequence[Path],
+    factor: int,
+    *,
+    keep: str = "auto",
+    name: str = "images",
+    most_channels: int = 4,
+    upright: bool = False,
 ) -> Decoded:
     """Decodes images; memory holds the result and one image, or several small ones.
 
@@ -127,10 +142,12 @@ def read_images(
         keep: in "memory"; on "disk", see `voronerf.app.scenes.store`; or "auto": on disk what does not fit into memory.
         name: of the scene.
         most_channels: 3 leaves alpha out.
+        upright: turn images by their orientation tags.
     """
     headers = [read_header(path, factor) for path in paths]
     sizes = torch.tensor([header.size for header in headers])
-    size = sizes.amax(0).tolist()
+    turns = [header.turns if upright else 0 for header in headers]
+    size = _turned(sizes, turns).amax(0).tolist()
     differ = bool((sizes != sizes[:1]).any())
     channels = min(4 if any(header.alpha for header in headers) else 3, most_channels)
     shape = (len(paths), size[1] // factor, size[0] // factor, channels)
@@ -140,7 +157,7 @@ def read_images(
     needed, free = len(paths) * pixels * channels + max(decoded, pixels * VIEW), available_memory()
 
     def make(index: int) -> NDArray[np.uint8]:
-        found = read_image(paths[index], factor)
+        found = np.rot90(read_image(paths[index], factor), turns[index])
         if found.shape == shape[1:]:
             return found
         image = np.zeros(shape[1:], dtype=np.uint8)
@@ -151,7 +168,7 @@ def read_images(
 
     if keep == "disk" or (keep == "auto" and needed > SHARE * free):
         sources = [str(path.absolute()) for path in paths]
-        return Decoded(stored(name, [sources, factor], _times(paths), shape, make, threads), sizes, True)
+        return Decoded(stored(name, [sources, factor, turns], _times(paths), shape, make, threads), sizes, True, turns)
     if needed > SHARE * free:
         raise SceneError(
             f"{paths[0]}: {len(paths)} images of {'up to ' * differ}{size[0]} x {size[1]} need {needed / 2**30:.2f} "
@@ -165,7 +182,12 @@ def read_images(
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(fill, range(len(paths))))
-    return Decoded(torch.from_numpy(images), sizes, False)
+    return Decoded(torch.from_numpy(images), sizes, False, turns)
+
+
+def _turned(sizes: Tensor, turns: Sequence[int]) -> Tensor:
+    """(width, height) of images, int64 [c, 2], after so many quarters."""
+    return torch.where((torch.tensor(turns) % 2 == 1)[:, None], sizes.flip(1), sizes)
 
 
 def _times(paths: Sequence[Path | None]) -> list[tuple[int, int, int] | None]:
@@ -182,6 +204,7 @@ def read_masks(
     *,
     on_disk: bool = False,
     name: str = "images",
+    turns: Sequence[int] | None = None,
 ) -> Tensor | None:
     """Decodes the masks of images: black pixels do not count, nor does a block that has one.
 
@@ -192,36 +215,39 @@ def read_masks(
         factor: of the reduction.
         on_disk: map them from a file of the cache, as the images.
         name: of the scene.
+        turns: by how many quarters each image was turned, and its mask will be.
 
     Returns:
         bool [c, h, w], False around smaller images; None if no image has a mask.
     """
     if not any(masks):
         return None
-    width, height = (sizes.amax(0) // factor).tolist()
+    turns = turns or [0] * len(masks)
+    width, height = (_turned(sizes, turns).amax(0) // factor).tolist()
     shape = (len(masks), height, width)
 
     def make(index: int) -> NDArray[np.uint8]:
         mask, path, size = masks[index], paths[index], sizes[index].tolist()
         width, height = (side // factor for side in size)
-        place = np.zeros(shape[1:], dtype=np.uint8)
-        place[:height, :width] = 1
-        if mask is None:
-            return place
-        with _opened(mask) as file:
-            if list(file.size) != size:
-                raise SceneError(
-                    f"{mask}: is {file.size[0]} x {file.size[1]} pixels, {path.name} is {size[0]} x {size[1]}"
-                )
-            kept = np.asarray(file.convert("L"))[: height * factor, : width * factor] > 0
-        place[:height, :width] = kept.reshape(height, factor, width, factor).all(axis=(1, 3))
-        if not place.any():
+        kept: Any = np.ones((height, width), dtype=bool)
+        if mask is not None:
+            with _opened(mask) as file:
+                if list(file.size) != size:
+                    raise SceneError(
+                        f"{mask}: is {file.size[0]} x {file.size[1]} pixels, {path.name} is {size[0]} x {size[1]}"
+                    )
+                kept = np.asarray(file.convert("L"))[: height * factor, : width * factor] > 0
+            kept = kept.reshape(height, factor, width, factor).all(axis=(1, 3))
+        if not kept.any():
             raise SceneError(f"{mask}: must leave a pixel, or with --downscale a block of pixels, of {path.name}")
+        kept = np.rot90(kept, turns[index])
+        place = np.zeros(shape[1:], dtype=np.uint8)
+        place[: kept.shape[0], : kept.shape[1]] = kept
         return place
 
     if on_disk:
         sources = [None if mask is None else str(mask.absolute()) for mask in masks]
-        return stored(f"{name}-masks", [sources, factor], _times(masks), shape, make, 1).view(torch.bool)
+        return stored(f"{name}-masks", [sources, factor, turns], _times(masks), shape, make, 1).view(torch.bool)
     return torch.from_numpy(np.stack([make(index) for index in range(len(masks))])).view(torch.bool)
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from voronerf.app.scenes.carving import carve_box
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import read_images, read_masks
-from voronerf.app.scenes.lenses import PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
+from voronerf.app.scenes.lenses import FISHEYE, PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
 from voronerf.app.scenes.scene import Scene, SparseDepth, Split
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
 from voronerf.nerf.cameras import Cameras, focus_point
@@ -128,21 +128,27 @@ def photograph_scene(
     views, count = [views[index] for index in order], int((~held_out).sum())
     paths = [view.path for view in views]
     name = folder.resolve().name
-    images, sizes, on_disk = read_images(paths, factor, keep=reading.images, name=name)
-    masks = read_masks([view.mask for view in views], paths, sizes, factor, on_disk=on_disk, name=name)
+    images, sizes, on_disk, turns = read_images(paths, factor, keep=reading.images, name=name, upright=True)
+    masks = read_masks([view.mask for view in views], paths, sizes, factor, on_disk=on_disk, name=name, turns=turns)
     alpha = images.shape[-1] == 4 and any(bool((image[..., 3] < 255).any()) for image in images)
 
     poses = torch.stack([view.pose for view in views])
     kind = _kind(poses, alpha, reading.kind, source)
     if kind != "object" and images.shape[-1] == 4:
         # its own store: a part of each pixel cannot be drawn from a mapped file without a copy
-        opaque = read_images(paths, factor, keep="disk", name=name, most_channels=3).images if on_disk else None
+        opaque = (
+            read_images(paths, factor, keep="disk", name=name, most_channels=3, upright=True).images
+            if on_disk
+            else None
+        )
         images = images[..., :3].contiguous() if opaque is None else opaque
     bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64)
-    frame = find_frame(poses, kind, bounds if len(bounds) else None, normalise=reading.normalise)
+    upright = _turned(Cameras(poses, torch.ones(len(poses), 4), 1, 1), turns).poses
+    frame = find_frame(upright, kind, bounds if len(bounds) else None, normalise=reading.normalise)
     cameras = _cameras(frame.poses(poses), views, sizes, source)
     contraction = _contraction(kind, frame, cameras)
-    cameras = cameras.downscaled(factor)
+    # Last, since the rows and columns that a reduction drops are those of the files.
+    cameras = _turned(cameras.downscaled(factor), turns)
     try:
         _ = cameras.lenses
     except ValueError as error:
@@ -344,6 +350,31 @@ def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) 
     others = models if bool((models != PERSPECTIVE).any()) else None
     distortion = bent if others is not None or bool(bent.any()) else None
     return Cameras.of_images(poses.float(), torch.tensor(intrinsics), sizes, distortion, others)
+
+
+def _turned(cameras: Cameras, turns: Sequence[int]) -> Cameras:
+    """Cameras of images that are turned anticlockwise by so many quarters each: of the same rays, in another order.
+
+    A quarter brings what is at (x, y) to (y, width - x), so that u becomes v, and v becomes -u.
+    """
+    if not any(turns):
+        return cameras
+    poses, intrinsics, bent = cameras.poses.clone(), cameras.intrinsics.clone(), cameras.distortion
+    bent = torch.zeros(len(cameras), 8) if bent is None else bent.clone()
+    prism = torch.zeros(len(cameras), dtype=torch.bool) if cameras.models is None else cameras.models == FISHEYE
+    sizes = torch.tensor([cameras.size(index) for index in range(len(cameras))])
+    for step in range(3):
+        own = torch.tensor(turns) > step
+        right, up = poses[own, :3, :2].unbind(-1)
+        poses[own, :3, :2] = torch.stack((-up, right), -1)
+        fx, fy, cx, cy = intrinsics[own].unbind(-1)
+        intrinsics[own] = torch.stack((fy, fx, cy, sizes[own, 0] - cx), -1)
+        bent[own, 2:4] = torch.stack((-bent[own, 3], bent[own, 2]), -1)  # p1 and p2
+        both = own & prism
+        bent[both, 6:8] = torch.stack((bent[both, 7], -bent[both, 6]), -1)  # s1 and s2
+        sizes[own] = sizes[own].flip(1)
+    distortion = None if cameras.distortion is None else bent
+    return Cameras.of_images(poses, intrinsics, sizes, distortion, cameras.models)
 
 
 def _without_dark_corners(cameras: Cameras, masks: Tensor | None, source: Path, views: Sequence[View]) -> Tensor | None:

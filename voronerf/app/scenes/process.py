@@ -416,8 +416,8 @@ def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
     part = _emptied(folder.with_name(f".{folder.name}"))
     for path in files:
         with Image.open(path) as image:
-            quality = {} if path.suffix.lower() == ".png" else {"quality": 95}
-            image.reduce(factor).save(part / path.name, **quality)
+            kept = {} if path.suffix.lower() == ".png" else {"quality": 95, "exif": image.getexif()}
+            image.reduce(factor).save(part / path.name, **kept)
     os.replace(part, folder)
 
 
