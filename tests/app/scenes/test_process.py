@@ -1,6 +1,7 @@
 """`voronerf process` on pictures of two walls with a pattern, and on models that have faults."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -78,7 +79,9 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
     )
     seen.clear()
     process.process(pictures, out, say=said.append, progress=lambda *now: seen.append(now))
-    assert "pairs" not in {stage for stage, *_ in seen}  # they were chosen before
+    stages = {stage for stage, *_ in seen}
+    assert "pairs" not in stages  # they were chosen before
+    assert any(stage.startswith("global mapping: ") for stage in stages)  # as COLMAP's log tells
     assert said[-1].startswith(f"wrote {out}: cameras of {COUNT} of {COUNT} images")
     kept = {"images", "images_2", "sparse", "transforms.json", "colmap"}
     assert {path.name for path in out.iterdir()} == kept
@@ -101,6 +104,10 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
     listed = json.loads((out / "transforms.json").read_text())["frames"]
     for frame, image in zip(listed, images):
         np.testing.assert_allclose(frame["transform_matrix"], image.pose)
+
+    shutil.rmtree(out / "sparse")
+    process.process(pictures, out, mapper="incremental", progress=lambda *now: seen.append(now))
+    assert max(done for stage, done, _ in seen if stage == "incremental mapping") >= COUNT - 2
 
 
 def models(tmp_path, monkeypatch, pictures, **found):

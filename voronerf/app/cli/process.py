@@ -76,6 +76,9 @@ class StageDisplay:
     def show(self, stage: str, done: int, total: int) -> None:
         """Shows how much of a stage is done; a total of 0 is not known."""
         if stage not in self.tasks:
+            for task in self.progress.tasks:
+                if task.total is None:  # of unknown length, and over now
+                    self.progress.update(task.id, completed=1, total=1)
             self.tasks[stage] = self.progress.add_task(stage, total=None, count="")
             if not console.is_terminal:
                 say(stage)

@@ -55,8 +55,13 @@ SEQUENTIAL = 10
 LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
 #: Mean error of the points of a sound model, in pixels.
 LARGEST_ERROR = 2.0
+#: The global mapper places cameras by the longest tracks, until each image has so many; triangulation adds the others.
+TRACKS = 200
 #: Reduced images are written while their longer side has so many pixels.
 LEAST_SIDE = 256
+
+#: The start of the names of COLMAP's logs, and what they say when a stage of the global mapper begins.
+LOG, BEGINS = "log.", re.compile(r"=== Running (?:iterative )?(.+) ===")
 
 Progress = Callable[[str, int, int], None]
 Pair = tuple[str, str]
@@ -126,6 +131,7 @@ def process(
             raise ValueError(f"process: {argument} must be one of {', '.join(known)}, got {value!r:.60}")
     if max_features < 100:
         raise ValueError(f"process: max_features must be at least 100, got {max_features}")
+    os.environ.setdefault("GLOG_logbuflevel", "-1")  # COLMAP reads it when it is loaded: its log is not held back
     try:
         import pycolmap
     except ImportError:
@@ -134,9 +140,12 @@ def process(
         raise SceneError(f"{source}: there is no such video or folder")
     settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features)
     work = _begin(out, settings)
-    level = pycolmap.logging.Level
-    pycolmap.logging.minloglevel = (level.INFO if verbose else level.FATAL).value
-    pycolmap.logging.alsologtostderr = verbose
+    log, level = pycolmap.logging, pycolmap.logging.Level
+    log.minloglevel, log.logtostderr, log.alsologtostderr = level.INFO.value, False, verbose
+    log.stderrthreshold = level.FATAL.value
+    log.set_log_destination(level.INFO, work / LOG)
+    for other in (level.WARNING, level.ERROR):  # which are in that log, too
+        log.set_log_destination(other, "")
     if not (images := out / "images").is_dir():
         _gather(source, out, frames)
     files = listed_images(images)
@@ -364,15 +373,23 @@ def _map(stages: Stages, name: str) -> Model | None:
     if not folder.is_dir():
         part = _emptied(stages.work / f".{name}")
         errors: list[Exception] = []
+        placed: list[None] = []
 
         def find() -> None:
             try:
                 if name == "global":
                     options = colmap.GlobalPipelineOptions(random_seed=0)
+                    options.mapper.track_required_tracks_per_view = TRACKS
                     colmap.global_mapping(stages.work / "database.db", stages.images, part, options)
                 else:
                     options = colmap.IncrementalPipelineOptions(random_seed=0)
-                    colmap.incremental_mapping(stages.work / "database.db", stages.images, part, options)
+                    colmap.incremental_mapping(
+                        stages.work / "database.db",
+                        stages.images,
+                        part,
+                        options,
+                        next_image_callback=lambda: placed.append(None),
+                    )
             except Exception as error:
                 errors.append(error)
 
@@ -380,8 +397,10 @@ def _map(stages: Stages, name: str) -> Model | None:
         thread = threading.Thread(target=find, daemon=True)
         thread.start()
         while thread.is_alive():
-            stages.progress(f"{name} mapping", 0, 0)
             thread.join(0.5)
+            logs = sorted(stages.work.glob(f"{LOG}*")) if name == "global" else []
+            begun = BEGINS.findall(logs[-1].read_text(errors="replace")) if logs else []
+            stages.progress(": ".join((f"{name} mapping", *begun[-1:])), len(placed), 0)
         with _told("mapping"):
             for failure in errors:
                 raise failure
