@@ -21,6 +21,7 @@ from scene_files import write_blender
 from voronerf.app.cli import main
 from voronerf.app.cli.display import TrainingDisplay
 from voronerf.app.cli.main import COMMANDS
+from voronerf.app.export import space
 from voronerf.app.render.paths import CameraPath, write_camera_path
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.checkpoint import load_checkpoint
@@ -103,16 +104,18 @@ def test_settings_of_a_file(run, tmp_path, fails):
     fails("--config must be left out with --resume", "train --resume --config", run / "config.json", "--out", run)
 
 
-def test_exports_of_a_run(run, tmp_path, capsys, fails):
+def test_exports_of_a_run(run, tmp_path, capsys, fails, monkeypatch):
     pytest.importorskip("trimesh", reason="trimesh is not installed")
     pytest.importorskip("skimage", reason="scikit-image is not installed")
+    pytest.importorskip("fast_simplification", reason="fast-simplification is not installed")
     files = [tmp_path / name for name in ("mesh.glb", "cells.glb")]
-    options = "--resolution 8 --density 0.01"  # of a run of a few steps
-    succeeds("export", run, "--mesh", files[0], "--cells", files[1], options)
+    monkeypatch.setattr(space, "SOLID", 0.01)  # of a run of a few steps
+    succeeds("export", run, "--mesh", files[0], "--cells", files[1], "--resolution 8 --faces 50")
     assert all(file.stat().st_size for file in files)
-    assert "3 of 3 cells" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "3 of 3 cells" in output and re.search(r"\b[1-5]?\d triangles, closed", output)
     fails("no surface in the box", "export", run, "--crop 9 9 9 9.5 9.5 9.5 --points", tmp_path / "points.ply")
-    fails("export needs a file: --splat, --points, --mesh", "export", run)
+    fails("export needs a file: --points, --mesh or --cells", "export", run)
     fails("the file must end in .glb", "export", run, "--cells cells.stl")
     fails("--crop must be x y z of a corner and of", "export", run, "--crop 0 0 0 1 1 0 --mesh", files[0])
 

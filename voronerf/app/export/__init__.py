@@ -1,9 +1,8 @@
-"""A trained run as files for other programs: splats, points, a mesh, cells, videos."""
+"""A trained run as files for other programs: points, a mesh, cells, videos."""
 
 from voronerf.app.export.cells import cell_meshes, export_cells
 from voronerf.app.export.mesh import export_mesh
 from voronerf.app.export.points import export_points
-from voronerf.app.export.splats import export_splats
 from voronerf.app.export.video import export_video
 
 __all__ = [
@@ -11,6 +10,5 @@ __all__ = [
     "export_cells",
     "export_mesh",
     "export_points",
-    "export_splats",
     "export_video",
 ]

@@ -1,29 +1,27 @@
 """The surface of a trained run as a coloured mesh.
 
-The density of the field on a grid gives the surface, by marching cubes. What no camera sees into, the field has not
-learnt: behind the first surface it may be empty or full. So space that lies behind a surface in every view counts as
-solid, and the mesh has an outside only. Parts that are small beside the largest, such as fog in the air, are left out.
+The pictures of training views say how far away the surface is that each pixel shows. These distances are fused into one
+function, the signed distance from the surface along the rays, truncated, and averaged over the views (Curless and Levoy
+1996). It is zero on the surface. What one view takes for a surface and others look through is averaged away. A node of
+the grid has a value where a view sees it or where it lies shortly behind a surface; only blocks of nodes near what some
+pixel shows are filled.
 """
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample, max_pool3d
 
 from voronerf.app.export.space import (
-    VIEWS,
-    Nodes,
     Track,
-    ask,
+    View,
     box_of,
     check_export,
-    density_at,
-    hidden_and_seen,
     in_silence,
     placed,
     views_of,
@@ -34,17 +32,21 @@ from voronerf.app.train.config import ConfigError
 from voronerf.ops._core.checks import available_memory
 
 SUFFIXES = (".ply", ".glb", ".obj")
-#: Cubes along the longest side of the box, if memory allows.
-RESOLUTION = 256
-#: Share of the longest side of the box over which the density of the surface lets half of the light pass. Smaller ones
-#: leave out what a short training has made a faint fog, larger ones take fog around surfaces for a part of them.
-HALVING = 1 / 30
+#: Cubes along the longest side of the box, if memory allows, and triangles.
+RESOLUTION, FACES = 256, 100_000
+#: Pixels along the longer side of the pictures, at the most.
+LONGEST = 512
+#: Cubes before and behind a surface in which its distance is averaged. Fewer leave holes where views disagree, more let
+#: the two sides of a thin thing meet.
+REACH = 8
+#: Nodes along the side of a block, and blocks that are filled at a time.
+BLOCK, BLOCKS = 8, 256
 #: Bytes of memory that a node takes at the most, in marching cubes.
-NODE = 40
-#: Pixels along the longer side of the views, at least.
-VIEW_SIDE = 128
-#: Volume of the smallest part that is kept, as a share of the largest.
-SMALLEST = 1e-3
+NODE = 16
+#: Triangles of the smallest part that is kept, as a share of the largest part's.
+SMALLEST = 0.02
+#: Colours count by this power of the cosine between a view's direction and the normal.
+FRONTAL = 4
 
 
 def export_mesh(
@@ -52,30 +54,30 @@ def export_mesh(
     path: Path | str,
     *,
     resolution: int | None = None,
-    density: float | None = None,
+    faces: int = FACES,
     box: Tensor | None = None,
     to_files: bool = False,
     track: Track = in_silence,
 ) -> Any:
     """Writes the surface of a run as .ply, .glb or .obj, and returns it as a ``trimesh.Trimesh``.
 
-    Each vertex has a colour and a normal. The mesh of a scene with a box is watertight. That of an unbounded scene is
-    open: its surfaces end where the box ends, and where no camera looks.
+    Each vertex has the colour that the training views show there. The mesh of a scene with a box is closed: what is
+    behind a surface in every view counts as solid. That of an unbounded scene ends where the box ends, and where no
+    camera looks. Parts with few triangles beside the largest are left out.
 
     Args:
         run: The run.
         path: File to write, .ply, .glb or .obj.
         resolution: Cubes along the longest side of the box; default 256, or what fits into memory.
-        density: Of the surface, per scene unit; default that of which a thirtieth of that side lets half of the light
-            pass.
+        faces: Triangles at the most.
         box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
         to_files: Positions are those of the scene's files, rather than the scene's.
         track: Shows progress: yields the items of a sequence, and is given its name.
 
     Raises:
-        ConfigError: A resolution that does not fit into memory, a density that is not positive, no box, or no surface
-            in it.
-        ImportError: trimesh, scikit-image or scipy is missing.
+        ConfigError: A resolution that does not fit into memory, fewer than 4 faces, no box, or views that show no
+            surface in it.
+        ImportError: trimesh, scikit-image, scipy or fast-simplification is missing.
         ValueError: Another suffix.
         OSError: The file cannot be written.
 
@@ -83,59 +85,69 @@ def export_mesh(
         >>> from voronerf.app import Run
         >>> from voronerf.app.export import export_mesh
         >>> def volume(run: Run) -> float:
-        ...     return export_mesh(run, "scene.glb", resolution=128).volume
+        ...     return export_mesh(run, "scene.glb", faces=20_000).volume
     """
     path = Path(path)
     check_export(path, SUFFIXES)
-    mesh = placed(run, _surface(run, resolution, density, box, track), to_files)
+    mesh = placed(run, _surface(run, resolution, faces, box, track), to_files)
     write_geometry(path, mesh)
     return mesh
 
 
-def _surface(run: Run, resolution: int | None, density: float | None, box: Tensor | None, track: Track) -> Any:
+def _surface(run: Run, resolution: int | None, faces: int, box: Tensor | None, track: Track) -> Any:
     import trimesh
-    from scipy import ndimage
+    from scipy.ndimage import minimum_filter
     from skimage.measure import marching_cubes
 
+    if faces < 4:
+        raise ConfigError(f"--faces must be at least 4, got {faces}")
     closed = run.scene.box is not None and box is None
-    box = box_of(run, box)
-    nodes = Nodes.fill(box, _resolution(box, resolution))
-    halving = HALVING * float((box[1] - box[0]).max())
-    level = math.log(2) / halving if density is None else density
-    if not 0 < level < math.inf:
-        raise ConfigError(f"--density must be positive and finite, got {density}")
-    found = density_at(run, nodes, track)
-    dense = (found > level).numpy()
-    hidden, seen = _views_of(run, nodes, track)
-    # Free is what is empty, not hidden, and connected to what a camera sees to be free.
-    labels, _ = ndimage.label(~dense & ~hidden)
-    free = np.isin(labels, np.unique(labels[seen & (labels > 0)]))
-    solid = _largest_parts(~free, ndimage)
-    if not solid.any() or not dense.any():
-        raise ConfigError(f"--density must be lower: nothing in the box is as dense as {level:g}")
-    # The opacity of a cube of that side, 0.5 at the surface; what was decided otherwise than by density gets 0 or 1.
-    opacity = (1 - torch.exp(found * (-math.log(2) / level))).numpy()
-    opacity[solid & ~dense] = 1
-    opacity[~solid & dense] = 0
-    del labels, free, hidden, seen
+    low, high = box_of(run, box)
+    extent = high - low
+    side = float(extent.max()) / _resolution(extent, resolution)
+    blocks = (extent / side / BLOCK).long() + 1
+    cameras = run.scene.train.cameras
+    cameras = cameras.downscaled(-(-max(cameras.width, cameras.height) // LONGEST))
+    views = views_of(run, cameras, track)
+    value, seen = _fused(low, side, blocks, views, closed, track)
+    shape = tuple(slice(count) for count in ((extent / side).round().long().clamp_min(1) + 1).tolist())
+    distance = value[shape].numpy()
     if closed:
-        opacity = np.pad(opacity, 1)
-    vertices, faces, _, _ = marching_cubes(opacity, 0.5, gradient_direction="ascent")
-    vertices -= float(closed)
-    if not closed:
-        faces = faces[_of_density(vertices, dense, ndimage)[faces].all(-1)]
-    mesh: Any = trimesh.Trimesh(nodes.positions(torch.from_numpy(vertices.copy())).numpy(), faces, process=False)
-    mesh.remove_unreferenced_vertices()
-    normals = torch.from_numpy(np.ascontiguousarray(mesh.vertex_normals, dtype=np.float32))
-    points = torch.from_numpy(np.ascontiguousarray(mesh.vertices, dtype=np.float32))
-    # Just inside, where the field was trained; a vertex may lie in an empty cell of the occupancy grid.
-    colour, _ = ask(run, points - nodes.side / 2 * normals, -normals, side=nodes.side, everywhere=True)
+        distance = np.pad(distance, 1, constant_values=1)
+    empty = ConfigError(f"{run.path}: the training views show no surface in the box")
+    if not distance.min() < 0 < distance.max():
+        raise empty
+    vertices, triangles, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
+    if closed:
+        vertices -= 1
+    else:  # cubes with eight nodes that were seen
+        whole = minimum_filter(seen[shape].numpy(), size=2, origin=-1)
+        triangles = triangles[whole[tuple(vertices[triangles].mean(1).astype(np.int64).T)]]
+    if len(triangles) == 0:
+        raise empty
+    mesh: Any = trimesh.Trimesh(low.numpy() + side * vertices, triangles, process=False)
+    mesh = _without_loose(mesh)
+    if len(mesh.faces) > faces:  # which parts where the surface is thin
+        mesh = _without_loose(mesh.simplify_quadric_decimation(face_count=faces))
+    points = torch.from_numpy(np.array(mesh.vertices, dtype=np.float32))
+    normals = torch.from_numpy(np.array(mesh.vertex_normals, dtype=np.float32))
+    colour = _colours(points, normals, views, REACH * side)
     mesh.visual.vertex_colors = (colour.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     return mesh
 
 
-def _resolution(box: Tensor, wanted: int | None) -> int:
-    extent = box[1] - box[0]
+def _without_loose(mesh: Any) -> Any:
+    """A mesh without parts of few triangles."""
+    from trimesh.graph import connected_component_labels
+
+    part = connected_component_labels(mesh.face_adjacency, len(mesh.faces))
+    sizes = np.bincount(part)
+    mesh.update_faces((sizes >= SMALLEST * sizes.max())[part])
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def _resolution(extent: Tensor, wanted: int | None) -> int:
     share = float((extent / extent.max()).prod())
     most = int((available_memory() / 2 / NODE / share) ** (1 / 3))
     if wanted is None:
@@ -145,28 +157,81 @@ def _resolution(box: Tensor, wanted: int | None) -> int:
     return wanted
 
 
-def _views_of(run: Run, nodes: Nodes, track: Track) -> tuple[Any, Any]:
-    cameras = run.scene.train.cameras
-    cameras = cameras.downscaled(max(max(cameras.width, cameras.height) // VIEW_SIDE, 1))
-    views = views_of(run, cameras, VIEWS, track)
-    hidden, seen = np.empty(nodes.shape, dtype=bool), np.empty(nodes.shape, dtype=bool)
-    for first, last in track(nodes.slabs(), "what the views see"):
-        parts = hidden_and_seen(nodes.slab(first, last), views, nodes.side)
-        hidden[first:last], seen[first:last] = (part.view(last - first, *nodes.shape[1:]).numpy() for part in parts)
-    return hidden, seen
+def _fused(
+    low: Tensor, side: float, blocks: Tensor, views: list[View], closed: bool, track: Track
+) -> tuple[Tensor, Tensor]:
+    """The truncated distances of blocks of nodes, positive before a surface, and which of the nodes were seen."""
+    counts: list[int] = blocks.tolist()
+    value, seen = torch.ones(counts), torch.zeros([BLOCK * count for count in counts], dtype=torch.bool)
+    near = torch.zeros(counts, dtype=torch.bool)
+    reach = REACH * side
+    if closed:  # far from a surface too, what is behind one counts as solid; what is between needs all nodes
+        middles = low + side * (BLOCK * near.logical_not().nonzero() + (BLOCK - 1) / 2)
+        value = _distance(middles, views, reach)[0].view(counts)
+        greatest, least = (sign * max_pool3d(sign * value[None], 3, 1, 1)[0] for sign in (1, -1))
+        near |= greatest != least
+    corners = torch.cartesian_prod(*[torch.tensor((-1.0, 1.0))] * 3)
+    for view in views:
+        points = view.surface[((view.surface > low) & (view.surface < low + BLOCK * side * blocks)).all(-1)]
+        for corner in corners:
+            place = ((points + reach * corner - low) / (BLOCK * side)).long()
+            near[torch.minimum(place.clamp_min(0), blocks - 1).unbind(-1)] = True
+    for axis in range(3):
+        value = value.repeat_interleave(BLOCK, axis)
+    inside = torch.cartesian_prod(*[torch.arange(BLOCK)] * 3)
+    for part in track(near.nonzero().split(BLOCKS), "fusing"):
+        nodes = (BLOCK * part[:, None] + inside).reshape(-1, 3)
+        value[nodes.unbind(-1)], seen[nodes.unbind(-1)] = _distance(low + side * nodes, views, reach)
+    return value, seen
 
 
-def _largest_parts(solid: Any, ndimage: Any) -> Any:
-    labels, count = ndimage.label(solid)
-    if count == 0:
-        return solid
-    sizes = np.bincount(labels.reshape(-1))
-    sizes[0] = 0
-    return (sizes >= SMALLEST * sizes.max())[labels] & solid
+def _distance(points: Tensor, views: list[View], reach: float) -> tuple[Tensor, Tensor]:
+    """Mean distances [n] of points [n, 3] from the surfaces behind them, in reaches and at most 1; and which were seen.
+
+    Without a view that sees a point, or a surface shortly before it, it is -1 behind a surface and 1 outside of all
+    pictures.
+    """
+    total, count, inside = (torch.zeros(len(points)) for _ in range(3))
+    for view in views:
+        _, gap = _gap(points, view)
+        known = gap > -reach
+        total += torch.where(known, (gap / reach).clamp_max(1), 0)
+        count += known
+        inside += gap == gap
+    return torch.where(count > 0, total / count.clamp_min(1), torch.where(inside > 0, -1.0, 1.0)), count > 0
 
 
-def _of_density(vertices: Any, dense: Any, ndimage: Any) -> Any:
-    """Which vertices lie beside a dense node, rather than where no camera has looked."""
-    near = ndimage.binary_dilation(dense, iterations=1)
-    whole = np.minimum(vertices.round().astype(np.int64), np.array(dense.shape) - 1)
-    return near[tuple(whole.T)]
+def _gap(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
+    """Where a view has points in its picture [n, 2], and how far behind them the surface is [n]; NaN outside of it."""
+    height, width = view.colour.shape[:2]
+    pixels, depth = view.camera.project(points, 0)
+    limit = pixels.new_tensor((width, height))
+    inside = (depth > 0) & ((pixels >= 0) & (pixels < limit)).all(-1)
+    x, y = torch.where(inside[:, None], pixels, 0).long().unbind(-1)
+    gap = view.distance.view(-1)[y * width + x] - (points - view.camera.origins[0]).norm(dim=-1)
+    return pixels, torch.where(inside, gap, torch.nan)
+
+
+def _colours(points: Tensor, normals: Tensor, views: list[View], margin: float) -> Tensor:
+    """The colours [n, 3] that views show of points: means, in which what is near and frontal counts most."""
+    from scipy.spatial import cKDTree
+
+    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
+    for view in views:
+        pixels, gap = _gap(points, view)
+        away = view.camera.origins[0] - points
+        distance = away.norm(dim=-1)
+        cosine = (away * normals).sum(-1) / distance
+        seen = ((gap.abs() < margin) & (cosine > 0)).nonzero()[:, 0]
+        height, width = view.colour.shape[:2]
+        places = (2 * pixels[seen] / pixels.new_tensor((width, height)) - 1)[None, None]
+        colour = grid_sample(view.colour.permute(2, 0, 1)[None], places, padding_mode="border", align_corners=False)
+        share = cosine[seen] ** FRONTAL * (view.camera.intrinsics[0, 0] / distance[seen]).square()
+        total[seen] += share[:, None] * colour[0, :, 0].T
+        weight[seen] += share
+    known = weight > 0
+    if known.any():  # what no view sees has the colour of the nearest vertex that one does
+        total[known] /= weight[known, None]
+        nearest = cKDTree(points[known].numpy()).query(points[~known].numpy())[1]
+        total[~known] = total[known][torch.from_numpy(nearest)]
+    return total

@@ -62,7 +62,7 @@ def _surface(run: Run, count: int, box: Tensor | None) -> Any:
     cameras = cameras.downscaled(max(max(cameras.width, cameras.height) // side, 1))
     low, high = box_of(run, box)
     points, colours, towards = [], [], []
-    for view in views_of(run, cameras, VIEWS):
+    for view in views_of(run, cameras):
         shown = ((view.surface >= low) & (view.surface <= high)).all(-1)
         points.append(view.surface[shown])
         colours.append(view.colour[shown])
