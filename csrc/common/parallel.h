@@ -9,8 +9,6 @@
 #include <cstdint>
 #include <exception>
 
-#include "common/trace.h"
-
 #ifdef VN_STD_THREADS
 #include <thread>
 #include <vector>
@@ -25,9 +23,7 @@ namespace voronerf {
 template <typename Body>
 void parallel(int threads, const Body& body) {
   if (threads <= 1) {
-    if (trace != nullptr) trace->begin();
     body(0);
-    if (trace != nullptr) trace->end();
     return;
   }
 #ifdef VN_STD_THREADS
@@ -50,7 +46,6 @@ class Items {
 
   // Takes the next run, items [begin, end); false if none is left.
   bool take(int64_t& begin, int64_t& end) {
-    if (trace != nullptr) trace->run();
     begin = next_.fetch_add(run_, std::memory_order_relaxed);
     end = std::min(begin + run_, count_);
     return begin < count_;

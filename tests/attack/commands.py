@@ -5,18 +5,14 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
-import pkgutil
 import re
 from pathlib import Path
 
 from attempts import REFUSED, RIGHT, Failed
 
-from voronerf import ops
 from voronerf.app.cli import main
 
-# Not in every attempt again; and a file that changes meanwhile then changes no attempt.
-every_op = [module.name for module in pkgutil.walk_packages(ops.__path__, "voronerf.ops.")]
-for slow in ("matplotlib.pyplot", "imageio_ffmpeg", "rich._emoji_codes", *every_op):
+for slow in ("matplotlib.pyplot", "imageio_ffmpeg", "rich._emoji_codes"):  # not in every attempt again
     importlib.import_module(slow)
 
 LONGEST = 1000

@@ -107,7 +107,10 @@ def test_a_table_that_does_not_fit_into_memory(monkeypatch):
 
 @pytest.mark.parametrize(
     ("side", "contraction", "budget", "samples", "entries"),
-    [(100, "none", 480, 64, 15), (20, "none", 480, 48, 14), (20, "sphere", 149, 128, 17), (20, "sphere", 150, 256, 19)],
+    [
+        *((100, "none", 37, 64, 15), (100, "none", 38, 128, 15), (20, "none", 480, 96, 14)),
+        *((20, "sphere", 149, 128, 17), (20, "sphere", 150, 256, 19)),
+    ],
 )
 def test_large_images_and_long_trainings_get_more_of_both(side, contraction, budget, samples, entries):
     scene = builtin_scene(side, train_views=2, test_views=1)
@@ -115,3 +118,9 @@ def test_large_images_and_long_trainings_get_more_of_both(side, contraction, bud
     given = dict(text.split("=", 1) for text in config.field_options)
     assert config.samples == (samples,) and given.get("log2_entries") == (entries and str(entries))
     assert resolve(TrainConfig(samples=(7,), contraction=contraction), scene).samples == (7,)
+    # Four times as fast, and in steps on machines of any speed.
+    given = [(TrainConfig(contraction=contraction, budget=budget / 4), 4.0)]
+    given += [(TrainConfig(contraction=contraction, steps=100 * budget), speed) for speed in (0.01, 1.0, 64.0)]
+    for settings, speed in given:
+        found = resolve(settings, scene, speed)
+        assert (found.samples, found.field_options) == (config.samples, config.field_options)

@@ -143,6 +143,20 @@ def test_resume_needs_no_setting_again(run, tmp_path):
         assert steps is None or read_json(copy / "summary.json")["steps"] == steps
 
 
+def test_defaults_follow_the_speed_of_the_machine_that_began(tmp_path, monkeypatch):
+    """They stay when a machine of another speed goes on."""
+    out, tiny = tmp_path / "run", TINY.replace("--steps 16", "").replace("--samples 8", "").replace("--depth 2", "")
+    monkeypatch.setattr("voronerf.app.cli.train.machine_speed", lambda: 1024.0)
+    succeeds("train --data builtin --budget 0.2 --out", out, tiny)
+    begun = read_json(out / "config.json")
+    assert begun["samples"] == [96]
+    monkeypatch.setattr("voronerf.app.cli.train.machine_speed", lambda: 1.0)
+    succeeds("train --resume --budget 0.3 --out", out)
+    assert read_json(out / "config.json") == begun | {"budget": 0.3}
+    succeeds("train --data builtin --budget 0.2 --out", tmp_path / "slow", tiny)
+    assert read_json(tmp_path / "slow" / "config.json")["samples"] == [48]
+
+
 def test_a_stopped_run_goes_on_with_the_command_that_it_prints(tmp_path, monkeypatch, capsys, fails):
     """Its scene lies neither in the run nor in the working directory, and the command does not name it."""
     data, out, elsewhere = tmp_path / "a scene", tmp_path / "a run", tmp_path / "elsewhere"

@@ -10,7 +10,7 @@ from tiny_runs import small
 
 from voronerf.app.train.build import build, present_device
 from voronerf.app.train.config import CHOICES, RESUMABLE, ConfigError, TrainConfig, differences
-from voronerf.app.train.defaults import resolve
+from voronerf.app.train.defaults import PEAK, machine_speed, resolve
 
 
 @pytest.mark.parametrize(
@@ -121,6 +121,17 @@ def test_defaults_of_the_architectures(scene):
     ):
         config = resolve(TrainConfig(**settings), scene)
         assert (config.width, config.depth, config.lr) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("peak", "speed"), [(0.01, 1), (0.7, 1), (1.4, 1), (1.5, 2), (2.8, 2), (2.9, 4), (8, 8), (90, 64)]
+)
+def test_a_faster_machine_is_so_by_a_power_of_two(monkeypatch, peak, speed):
+    """A slower one, or one that others use meanwhile, is as the one of the rules."""
+    monkeypatch.setattr("voronerf.ops._core.native.measure_peak", lambda kind: peak * PEAK)
+    assert machine_speed() == speed
+    monkeypatch.setattr("voronerf.ops._core.native.missing", lambda device: "not built")
+    assert machine_speed() == 1
 
 
 def test_differences_name_what_cannot_change():

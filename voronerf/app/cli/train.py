@@ -31,7 +31,7 @@ from voronerf.app.train.build import build, present_device
 from voronerf.app.train.callbacks import CHECKPOINT_EVERY, Checkpoints, Divergence, Scores, TensorBoard
 from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.defaults import why_no_occupancy
+from voronerf.app.train.defaults import machine_speed, why_no_occupancy
 from voronerf.app.train.loop import HALVES, Callback, run
 from voronerf.app.train.resume import load
 from voronerf.app.train.run_directory import (
@@ -195,7 +195,10 @@ def run_training(
         with display.progress:
             for note in scene.notes:
                 display.on_event(f"{scene.name}: {note}")
-            state = build(config, scene, on_event=display.on_event)
+            # A run that goes on keeps its settings.
+            measured = config.budget is not None and not resume and present_device(config.device) == "cpu"
+            speed = machine_speed() if measured else 1.0
+            state = build(config, scene, on_event=display.on_event, speed=speed)
             if resume:
                 load(state, last_checkpoint(out))
             lpips, source = find_lpips(config.lpips, config.data, scene.test.cameras.smallest[::-1])

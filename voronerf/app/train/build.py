@@ -44,6 +44,7 @@ def build(
     *,
     batches: RayBatches | None = None,
     on_event: Callable[[str], None] | None = None,
+    speed: float = 1.0,
 ) -> State:
     """All that a training needs, before its first step.
 
@@ -52,6 +53,8 @@ def build(
         scene: The scene that ``config.data`` names.
         batches: Of rays; None for those of all training views of the scene.
         on_event: Called with a line of text for each split, evaluation and checkpoint.
+        speed: Of the machine, for the defaults of a training with a budget: see
+            :func:`voronerf.app.train.defaults.machine_speed`.
 
     Raises:
         ConfigError: For settings that do not fit the scene, or networks that do not fit into memory.
@@ -66,7 +69,7 @@ def build(
         >>> state.step, state.router.num_cells
         (3, 4)
     """
-    config = resolve(replace(config, device=present_device(config.device)), scene)
+    config = resolve(replace(config, device=present_device(config.device)), scene, speed)
     if config.parameters is not None:
         config = replace(config, width=solve_width(config, config.parameters))
         if config.lr is None:

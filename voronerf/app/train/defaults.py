@@ -6,10 +6,13 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import torch
+
 from voronerf.app.scenes import Scene
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.nerf.contraction import Perspective
 from voronerf.nerf.samplers import SAMPLERS, usual_samples
+from voronerf.ops._core import native
 
 #: Factor of the loss on sparse depths: 0.3 dB more on bonsai, 0.7 to 1.4 on beer, at equal steps and time.
 SPARSE_DEPTH = 0.003
@@ -17,12 +20,16 @@ SPARSE_DEPTH = 0.003
 SAMPLES, EACH_SAMPLES = 64, 32
 #: About what a step takes on two cores, for a training that is given in steps.
 STEP_SECONDS = 0.01
+#: Operations a second of the two cores on which the rules were measured: multiply-adds of two threads of Zen 5.
+PEAK = 5.1e11
 
 
-def resolve(config: TrainConfig, scene: Scene) -> TrainConfig:
+def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfig:
     """The settings with every default filled in, but for ``width`` and ``lr`` where ``parameters`` decides them.
 
-    They are contraction, occupancy, sparse depth, samples of a ray, and the options of the field.
+    They are contraction, occupancy, sparse depth, samples of a ray, and the options of the field. A machine of twice
+    the ``speed`` does in a second what that of the rules does in two. Settings that are given in steps do not depend on
+    it, since the same seed should give the same networks everywhere.
     """
     kind, boxed = config.field_type, scene.box is not None
     if config.contraction == "auto":
@@ -41,13 +48,15 @@ def resolve(config: TrainConfig, scene: Scene) -> TrainConfig:
         raise ConfigError(f"--sparse-depth needs a COLMAP model with points, got {config.sparse_depth:g} without")
     if config.sparse_depth is None:
         config = replace(config, sparse_depth=SPARSE_DEPTH if points else 0.0)
-    seconds = STEP_SECONDS * (config.steps or 0) if config.budget is None else config.budget
+    seconds = STEP_SECONDS * (config.steps or 0) if config.budget is None else config.budget * speed
     if config.samples is None:
         passes = SAMPLERS[config.sampling].passes
         samples = EACH_SAMPLES if passes > 1 else SAMPLES
         if config.occupancy:
             side = 0.0 if scene.box is None else float((scene.box[1] - scene.box[0]).amax())
-            samples = usual_samples(side / pixel, contracted=contracted, seconds=seconds)
+            # The rule was measured with hash grids: a step of a larger network takes several times as long.
+            long = seconds if contracted or kind.scene_options is not None else 0.0
+            samples = usual_samples(side / pixel, contracted=contracted, seconds=long)
         config = replace(config, samples=(samples,) * passes)
     options: dict[str, Any] = {}
     if "position_octaves" in kind.options:
@@ -63,6 +72,17 @@ def resolve(config: TrainConfig, scene: Scene) -> TrainConfig:
     if config.lr is None and config.parameters is None:
         config = replace(config, lr=kind.learning_rate(config.network_options))
     return config
+
+
+def machine_speed() -> float:
+    """How many times as fast this CPU is as the two cores on which the rules were measured: 1, 2, 4 and so on.
+
+    Measured in 0.1 s by the multiply-adds of all threads. Powers of two, since the same machine should have the same
+    settings tomorrow; at least 1, so that a moment in which others use it cannot make them worse than before.
+    """
+    if native.missing(torch.device("cpu")) is not None:
+        return 1.0
+    return 2.0 ** max(0, round(math.log2(native.measure_peak("float32") / PEAK)))
 
 
 def why_no_occupancy(config: TrainConfig) -> str | None:
