@@ -55,8 +55,8 @@ __attribute__((noinline)) void block(const Product& p, int64_t row, int64_t colu
       } while (--depth > 0);
     }
   } while (++source != end);
-  // Every way to finish stores by itself: merging them would send the sums through the stack. Comparisons are written
-  // so that NaN passes, as in torch; a slope selects, since 0 times an infinite gradient would be NaN.
+  // Every way to finish stores by itself: merging them would send the sums through the stack. The order of operands
+  // lets NaN pass, as in torch; a slope selects, since 0 times an infinite gradient would be NaN.
   const F32 zero = splat(0.0f);
   const int64_t c_stride = p.c_stride;
   float* const c = p.c == nullptr ? nullptr : p.c + row * c_stride + column;
@@ -67,8 +67,8 @@ __attribute__((noinline)) void block(const Product& p, int64_t row, int64_t colu
     float* const pairs = p.pairs + row * pairs_stride + column / 2;
     for (int r = 0; r < R; ++r) {
       for (int v = 0; v + 1 < V; v += 2) {
-        const F32 low = sum[r][v] < lowest ? lowest : sum[r][v];
-        const F32 high = sum[r][v + 1] < lowest ? lowest : sum[r][v + 1];
+        const F32 low = max(lowest, sum[r][v]);
+        const F32 high = max(lowest, sum[r][v + 1]);
         store(pairs + r * pairs_stride + v * kLanes / 2, joined(low, high));
         if (c != nullptr) {
           store(c + r * c_stride + v * kLanes, low);
@@ -85,7 +85,7 @@ __attribute__((noinline)) void block(const Product& p, int64_t row, int64_t colu
     }
   } else if (p.finish == Finish::relu) {
     for (int r = 0; r < R; ++r) {
-      for (int v = 0; v < V; ++v) store(c + r * c_stride + v * kLanes, sum[r][v] < zero ? zero : sum[r][v]);
+      for (int v = 0; v < V; ++v) store(c + r * c_stride + v * kLanes, max(zero, sum[r][v]));
     }
   } else {
     const float* const slope = p.slope + row * c_stride + column;

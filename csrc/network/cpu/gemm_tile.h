@@ -28,7 +28,9 @@ namespace VN_ISA_NAMESPACE {
 inline namespace pairs {
 #endif
 
-constexpr int64_t kPanel = 64;  // columns of a packed panel of B
+// Columns of a packed panel of B, which a column of blocks reads in a straight line: 16 of 64 would lie in a quarter of
+// the sets of the first-level cache, where C's columns are too.
+constexpr int64_t kPanel = VN_ISA == 2 ? 64 : 16;
 
 // One source of a concatenated A: `depth` values of k, in rows of `stride` floats.
 struct Source {

@@ -13,6 +13,7 @@ namespace voronerf {
 namespace {
 
 constexpr RowLimits kRows{96, 2048}, kGradientRows{384, 4096};
+constexpr int64_t kTaskUnit = 96;  // whole tiles
 
 void check(const LinearInputs& in) {
   // The products walk their operands with loops that test at the end.
@@ -39,6 +40,7 @@ LinearCall describe(const LinearInputs& in, const LinearGradients* gradients, Is
   layer.packed_width = ceil_div(in.o, unit);
   layer.slope_kept = in.activation == Activation::sine;
   call.source.width = in.i;
+  call.tile = tile_rows();
   call.inputs_padded = pad(in.i, 2 * kGranule);
   call.partial = (in.i + 1) * layer.padded;
 
@@ -50,10 +52,10 @@ LinearCall describe(const LinearInputs& in, const LinearGradients* gradients, Is
   if (in.bfloat16) call.wide = take(in.o * in.i + in.o);
   layer.packed = take(layer.packed_depth * layer.padded);
   layer.bias = take(layer.padded);
-  call.input = take(kLinearTile * call.inputs_padded);
-  call.value = take(kLinearTile * layer.padded);
+  call.input = take(call.tile * call.inputs_padded);
+  call.value = take(call.tile * layer.padded);
   // Packing takes four rows of it.
-  call.scratch_input = take(std::max(kLinearTile / 2 * call.inputs_padded, 4 * (layer.packed_depth + kGranule)));
+  call.scratch_input = take(std::max(call.tile / 2 * call.inputs_padded, 4 * (layer.packed_depth + kGranule)));
   if (gradients == nullptr) return call;
   call.backward = true;
   call.grad_out = gradients->out;
@@ -61,13 +63,13 @@ LinearCall describe(const LinearInputs& in, const LinearGradients* gradients, Is
   call.grad_weight = gradients->weight;
   call.grad_bias = gradients->bias;
   if (!in.bfloat16) call.wide = take(in.o);
-  if (layer.slope_kept) layer.slope = {take(kLinearTile * layer.padded), layer.padded};
+  if (layer.slope_kept) layer.slope = {take(call.tile * layer.padded), layer.padded};
   call.slope = layer.slope.offset;
-  call.gradient = take(kLinearTile * layer.padded);
-  call.scratch_output = take(kLinearTile / 2 * layer.padded);
+  call.gradient = take(call.tile * layer.padded);
+  call.scratch_output = take(call.tile / 2 * layer.padded);
   if (call.grad_x != nullptr) {
     call.source.packed = take(layer.packed_width * pad(in.i, kGranule));
-    call.input_gradient = take(kLinearTile * pad(in.i, kGranule));
+    call.input_gradient = take(call.tile * pad(in.i, kGranule));
   }
   if (call.grad_weight != nullptr) call.own_partial = take(call.partial);
   return call;
@@ -116,7 +118,7 @@ void grouped_linear_cpu(const LinearInputs& in, void* out, Isa isa, int threads)
   LinearCall call = describe(in, nullptr, isa);
   call.out = out;
   zero_strays(in, in.o, out);
-  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kRows, kLinearTile, 0);
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kRows, kTaskUnit, 0);
   if (tasks.tasks.empty()) return;
   const Workspace workspace(call.workspace * std::max(threads, 1));
   run_tasks(tasks, call, workspace.data(), isa, threads,
@@ -128,7 +130,7 @@ void grouped_linear_backward_cpu(const LinearInputs& in, const LinearGradients& 
   const LinearCall call = describe(in, &gradients, isa);
   if (gradients.x != nullptr) zero_strays(in, in.i, gradients.x);
   const bool parameters = gradients.weight != nullptr;
-  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kGradientRows, kLinearTile, call.partial);
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, kGradientRows, kTaskUnit, call.partial);
   const int64_t partials = parameters ? tasks.first_partial[in.k] : 0, team = std::max(threads, 1);
   const Workspace workspace(call.workspace * team + partials * call.partial);
   float* memory = workspace.data();

@@ -3,7 +3,7 @@
 // One layer has as many bytes as flops to move: what has the form of an operand is read where it lies, and results go
 // straight to where they belong, from registers. float32 rows of whole vectors do so, and with bfloat16 products rows
 // of an even width (read) or of whole vectors (written), since such a row is pairs already; anything else passes
-// through a tile of 96 rows in the first cache level.
+// through a tile of rows in the first cache level.
 #include "network/cpu/grouped_linear_isa.h"
 
 #define VN_HALF 0

@@ -10,6 +10,7 @@ namespace voronerf {
 struct LinearCall {
   MlpPlanLayer layer;     // sizes and activation, as the packing of weights and the activations read them
   MlpPlanSource source;   // its one source, x
+  int64_t tile;           // rows
   int64_t inputs_padded;  // to whole pairs of vectors
   bool bfloat16, half;    // storage; operands
   bool backward;
@@ -19,8 +20,6 @@ struct LinearCall {
   const void *x, *weight, *bias, *grad_out;
   void *out, *grad_x, *grad_weight, *grad_bias;
 };
-
-constexpr int64_t kLinearTile = 96;  // rows of a tile, as in grouped_mlp_plan.cpp
 
 // Packs a cell's weights into a workspace.
 VN_DECLARE_FOR_ISA(void linear_pack(const LinearCall& call, int64_t cell, float* workspace))

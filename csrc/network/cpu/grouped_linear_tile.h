@@ -234,14 +234,14 @@ void pack_linear(const LinearCall& call, int64_t cell, float* workspace) {
 }
 
 void run_linear_forward(const LinearCall& call, int64_t begin, int64_t end, float* workspace) {
-  for (int64_t row = begin; row < end; row += kLinearTile) {
-    LinearTile{call, workspace, row, smaller(kLinearTile, end - row)}.forward();
+  for (int64_t row = begin; row < end; row += call.tile) {
+    LinearTile{call, workspace, row, smaller(call.tile, end - row)}.forward();
   }
 }
 
 void run_linear_backward(const LinearCall& call, int64_t begin, int64_t end, float* workspace, float* partial) {
-  for (int64_t row = begin; row < end; row += kLinearTile) {
-    LinearTile{call, workspace, row, smaller(kLinearTile, end - row)}.backward(partial, row == begin);
+  for (int64_t row = begin; row < end; row += call.tile) {
+    LinearTile{call, workspace, row, smaller(call.tile, end - row)}.backward(partial, row == begin);
   }
 }
 

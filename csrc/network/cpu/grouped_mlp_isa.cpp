@@ -1,10 +1,10 @@
 // The CPU kernels of grouped_mlp, once for each instruction set.
 //
-// A tile of 96 samples goes through all layers while its values stay in the first two cache levels; nothing of the size
-// of n times a layer is ever written. A cell's weights are packed once by each thread that works on it,
-// [inputs][outputs] in panels of 64 columns, so that the products (gemm_tile.h) read them in order. The backward pass
-// computes the tile's activations again, then walks the layers from the last to the first: parameter gradients are
-// summed over all tiles of a task in one partial, which stays in cache as well.
+// A tile of samples goes through all layers while its values stay in the first two cache levels; nothing of the size of
+// n times a layer is ever written. A cell's weights are packed once by each thread that works on it, [inputs][outputs]
+// in panels, so that the products (gemm_tile.h) read them in order. The backward pass computes the tile's activations
+// again, then walks the layers from the last to the first: parameter gradients are summed over all tiles of a task in
+// one partial, which stays in cache as well.
 #include "network/cpu/grouped_mlp_isa.h"
 
 #define VN_HALF 0
@@ -55,8 +55,12 @@ void mlp_reduce(const MlpPlan& plan, const MlpData& data, int64_t cell, int64_t 
     const float* from = sum + s.row * layer.padded;
     float* to = weights + s.row;
     const int64_t by_o = s.by_outputs ? padded_width(s) : 1, by_input = s.by_outputs ? 1 : layer.padded;
+    int64_t first = 0;
+    for (; !s.by_outputs && first + 4 <= s.width; first += 4) {
+      transpose_four(from + first * by_input, by_input, layer.width, to + first, layer.depth);
+    }
     for (int64_t o = 0; o < layer.width; ++o) {
-      for (int64_t c = 0; c < s.width; ++c) to[o * layer.depth + c] = from[c * by_input + o * by_o];
+      for (int64_t c = first; c < s.width; ++c) to[o * layer.depth + c] = from[c * by_input + o * by_o];
     }
   }
   for (int64_t o = 0; bias != nullptr && o < layer.width; ++o) bias[o] = partials[layer.partial_bias + o];

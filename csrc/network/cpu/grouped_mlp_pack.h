@@ -1,5 +1,5 @@
-// Weights of a cell in the order in which the products of grouped_mlp read them: in panels of 64 columns, so that a
-// block walks memory in a straight line.
+// Weights of a cell in the order in which the products of grouped_mlp read them: in panels (gemm_tile.h), so
+// that a block walks memory in a straight line.
 #pragma once
 
 #include "network/cpu/bfloat16_tile.h"
@@ -20,14 +20,17 @@ VN_INLINE int64_t padded_width(const MlpPlanSource& source) {
 VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t count, float* to, int64_t to_stride) {
   int64_t i = 0;
 #if VN_ISA == 1 || VN_ISA == 2
-  for (; i + 4 <= count; i += 4) {
-    __m128 a = _mm_loadu_ps(from + i), b = _mm_loadu_ps(from + from_stride + i);
-    __m128 c = _mm_loadu_ps(from + 2 * from_stride + i), d = _mm_loadu_ps(from + 3 * from_stride + i);
-    _MM_TRANSPOSE4_PS(a, b, c, d);
-    _mm_storeu_ps(to + i * to_stride, a);
-    _mm_storeu_ps(to + (i + 1) * to_stride, b);
-    _mm_storeu_ps(to + (i + 2) * to_stride, c);
-    _mm_storeu_ps(to + (i + 3) * to_stride, d);
+  for (; i + 8 <= count; i += 8) {  // columns i and i + 4 side by side
+    const __m256 a = _mm256_loadu_ps(from + i), b = _mm256_loadu_ps(from + from_stride + i);
+    const __m256 c = _mm256_loadu_ps(from + 2 * from_stride + i), d = _mm256_loadu_ps(from + 3 * from_stride + i);
+    const __m256 ab = _mm256_unpacklo_ps(a, b), cd = _mm256_unpacklo_ps(c, d);
+    const __m256 ab_high = _mm256_unpackhi_ps(a, b), cd_high = _mm256_unpackhi_ps(c, d);
+    const __m256 columns[] = {_mm256_shuffle_ps(ab, cd, 0x44), _mm256_shuffle_ps(ab, cd, 0xee),
+                              _mm256_shuffle_ps(ab_high, cd_high, 0x44), _mm256_shuffle_ps(ab_high, cd_high, 0xee)};
+    for (int64_t j = 0; j < 4; ++j) {
+      _mm_storeu_ps(to + (i + j) * to_stride, _mm256_castps256_ps128(columns[j]));
+      _mm_storeu_ps(to + (i + 4 + j) * to_stride, _mm256_extractf128_ps(columns[j], 1));
+    }
   }
 #elif VN_ISA == 3
   for (; i + 4 <= count; i += 4) {
@@ -62,8 +65,8 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
 
 #if VN_HALF
 
-// Weights [o][depth] -> panels [pairs of inputs][<= 64 of o, padded to 16 with 0]; each source starts a pair. Rows are
-// narrowed four at a time into `scratch`, then transposed, a pair being as wide as a float.
+// Weights [o][depth] -> panels [pairs of inputs][<= kPanel of o, padded to 16 with 0]; each source starts a pair. Rows
+// are narrowed four at a time into `scratch`, then transposed, a pair being as wide as a float.
 [[maybe_unused]] void pack_forward(const float* weights, const MlpPlanLayer& layer, float* packed, float* scratch) {
   const int64_t stride = layer.packed_depth + kGranule;
   for (int64_t first = 0; first < layer.padded; first += kPanel) {
@@ -86,7 +89,7 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
   }
 }
 
-// The inputs of one source: weights [o][depth] -> panels [pairs of o][<= 64 of its width, padded to 16 with 0].
+// The inputs of one source: weights [o][depth] -> panels [pairs of o][<= kPanel of its width, padded to 16 with 0].
 [[maybe_unused]] void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPlanSource& source,
                                     float* packed) {
   const int64_t padded = padded_width(source);
@@ -106,7 +109,7 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
 
 #else
 
-// weights [o][depth] -> panels [depth][<= 64 of o, padded to 16 with 0].
+// weights [o][depth] -> panels [depth][<= kPanel of o, padded to 16 with 0].
 [[maybe_unused]] void pack_forward(const float* weights, const MlpPlanLayer& layer, float* packed, float*) {
   for (int64_t first = 0; first < layer.padded; first += kPanel) {
     const int64_t columns = smaller(kPanel, layer.padded - first);
@@ -126,7 +129,7 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
   }
 }
 
-// The inputs of one source: weights [o][depth] -> panels [o][<= 64 of its width, padded to 16 with 0].
+// The inputs of one source: weights [o][depth] -> panels [o][<= kPanel of its width, padded to 16 with 0].
 [[maybe_unused]] void pack_backward(const float* weights, const MlpPlanLayer& layer, const MlpPlanSource& source,
                                     float* packed) {
   const int64_t padded = padded_width(source);

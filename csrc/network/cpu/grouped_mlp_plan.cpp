@@ -2,24 +2,12 @@
 
 #include "common/common.h"
 #include "network/cpu/grouped_mlp_planner.h"
+#include "network/cpu/row_tasks.h"
 #include "network/grouped_mlp_layout.h"
 
 namespace voronerf {
 
 namespace {
-
-// Rows of a tile by family of processors: a multiple of all blocks of rows (6, 8, 12), of 48, 96, 144 and 192. 96 is
-// the fastest on AMD's Zen 4 and 5, 48 takes 1.015 times as long there. On Intel it is counted, not measured: with 48
-// what a layer of width 64 reads and writes, 40 KiB, lies in the first-level cache of 48 KiB. With 96 every line of C
-// is stored to the second level, and until it is there a load 4 KiB apart, as there are in every panel of B, waits for
-// it.
-int64_t tile_rows() {
-#if defined(__x86_64__)
-  __builtin_cpu_init();
-  if (__builtin_cpu_is("intel")) return 48;
-#endif
-  return 96;
-}
 
 // Outputs that a row of 16 lanes wastes most of: at most a block's rows, and [outputs][inputs] then fits [inputs][16].
 constexpr int64_t kFewOutputs = 6;

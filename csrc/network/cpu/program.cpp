@@ -54,8 +54,9 @@ void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* 
     }
   }
   const auto& header = *reinterpret_cast<const ProgramHeader*>(in.code);
-  const ProgramCall call{in.code, in.constants, in.inputs,     in.turned,  in.n,
-                         outputs, sums,         in.parameters, in.strides, in.order};
+  const int64_t tile = std::min<int64_t>(header.tile, tile_rows());
+  const ProgramCall call{in.code, in.constants,  in.inputs,  in.turned, in.n, outputs,
+                         sums,    in.parameters, in.strides, in.order,  tile};
   const auto clear = [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       for (int64_t o = 0; o < in.outputs; ++o) {
@@ -67,7 +68,7 @@ void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* 
   clear(in.offsets[in.k], in.n);
   const bool summed = header.sums > 0;
   const RowTasks tasks = split_rows(in.offsets, in.k, in.n, summed ? kSumRows : kRows, kTaskUnit, header.partial);
-  const int64_t tiles = header.packed, own_partial = tiles + int64_t{header.columns} * header.tile + kSlack;
+  const int64_t tiles = header.packed, own_partial = tiles + header.columns * tile + kSlack;
   const int64_t stride = ceil_div(own_partial + header.partial, kGranule) * kGranule;
   const int64_t partials = summed ? tasks.first_partial[in.k] : 0;
   const Workspace workspace(stride * threads + partials * header.partial);

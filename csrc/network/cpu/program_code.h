@@ -67,6 +67,7 @@ struct ProgramCall {
   const float* const* parameters;
   const int64_t* strides;
   const int32_t* order;
+  int64_t tile;  // rows
 };
 
 VN_DECLARE_FOR_ISA(void program_pack(const ProgramCall& call, int64_t cell, float* packed))

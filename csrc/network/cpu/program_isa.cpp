@@ -66,8 +66,8 @@ void program_pack(const ProgramCall& call, int64_t cell, float* packed) {
 void program_run(const ProgramCall& call, int64_t begin, int64_t end, const float* packed, float* tiles,
                  float* partial) {
   const auto& header = *reinterpret_cast<const ProgramHeader*>(call.code);
-  for (int64_t row = begin; row < end; row += header.tile) {
-    ProgramTile{call, header, packed, tiles, partial, row, smaller(header.tile, end - row), row == begin}.run();
+  for (int64_t row = begin; row < end; row += call.tile) {
+    ProgramTile{call, header, packed, tiles, partial, row, smaller(call.tile, end - row), row == begin}.run();
   }
 }
 

@@ -79,7 +79,7 @@ struct ProgramTile {
   const ProgramPack* packs() const {
     return reinterpret_cast<const ProgramPack*>(call.code + sizeof(ProgramHeader) / 4);
   }
-  float* at(int32_t slot) const { return tiles + int64_t{slot} * header.tile; }
+  float* at(int32_t slot) const { return tiles + int64_t{slot} * call.tile; }
   Rows operand(const ProgramOperand& o) const {
     if (o.parameter) return {packed + packs()[o.slot].at, 0, o.spread != 0};
     return {at(o.slot) + o.start, o.stride, o.spread != 0};

@@ -54,6 +54,14 @@ void check_offsets(const std::string& op, const int32_t* offsets, int64_t k, int
   }
 }
 
+int64_t tile_rows() {
+#if defined(__x86_64__)
+  __builtin_cpu_init();
+  if (__builtin_cpu_is("intel") || !__builtin_cpu_supports("avx512f")) return 48;
+#endif
+  return 96;
+}
+
 RowTasks split_rows(const int32_t* offsets, int64_t k, int64_t n, RowLimits limits, int64_t unit, int64_t partial) {
   int64_t target = std::clamp(n / kTasks, limits.fewest, limits.most);
   if (partial > 0) target = std::max(target, n / std::max<int64_t>(kPartialFloats / partial, 1));
