@@ -11,6 +11,7 @@
 #include <stdexcept>
 
 #include "common/cuda_device.h"
+#include "common/trace.h"
 
 namespace voronerf {
 
@@ -273,7 +274,16 @@ py::object to_python(const Type* type, const Result& result) {
   }
 }
 
-py::object run(const Bound& bound, Values& values) {
+// A call that was traced (common/trace.h).
+struct Traced {
+  const std::string* name;
+  double seconds;
+  Trace regions;
+};
+bool tracing = false;
+std::vector<Traced> traced_calls;
+
+py::object run(const Function& function, const Bound& bound, Values& values) {
   void* stream = nullptr;
   [[maybe_unused]] int device = 0;
   const size_t own = bound.given.size() - (bound.machine != nullptr);
@@ -288,6 +298,9 @@ py::object run(const Bound& bound, Values& values) {
     values.replace(own, &stream);
   }
   Result result{};
+  Trace regions;
+  if (tracing) trace = &regions;
+  const double began = tracing ? Trace::now() : 0.0;
   {
     std::optional<py::gil_scoped_release> released;
     if (bound.machine != nullptr) released.emplace();
@@ -296,6 +309,10 @@ py::object run(const Bound& bound, Values& values) {
     if (bound.machine == &type_of<Cuda>()) current.emplace(device);
 #endif
     bound.call(bound.function, values.places(), &result);
+  }
+  if (tracing) {
+    trace = nullptr;
+    traced_calls.push_back({&function.name, Trace::now() - began, regions});
   }
   return to_python(bound.result, result);
 }
@@ -310,7 +327,7 @@ py::object call_any(const Function& function, const py::args& given) {
            values.load(frame, *bound.given[i], PyTuple_GET_ITEM(given.ptr(), static_cast<Py_ssize_t>(i)))) {
       ++i;
     }
-    if (i == given.size()) return run(bound, values);
+    if (i == given.size()) return run(function, bound, values);
   }
   throw py::type_error(function.name + ": incompatible function arguments");
 }
@@ -345,7 +362,8 @@ constexpr const char* kStub =
     "cuda_architectures: str\n"
     "cuda_major: int\n"
     "\n"
-    "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n";
+    "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n"
+    "def trace(on: bool) -> list[tuple[str, float, int, float, list[float]]]: ...\n";
 
 // What is bound, as a stub for type checkers (voronerf/ops/_core/_C.pyi), and the classes that it needs.
 class Declarations {
@@ -456,6 +474,18 @@ void bind_all(PyObject* python) {
     for (const auto& entry : names) {
       dtypes()[py::cast<std::string>(entry.first)] = py::reinterpret_borrow<py::object>(entry.second).release().ptr();
     }
+  });
+  // Whether calls are traced from now on; of those before, name, seconds, regions, the seconds in these, and what they
+  // would take on each number of Trace::kTeams.
+  bound.def("trace", [](bool on) {
+    tracing = on;
+    py::list found;
+    for (const Traced& call : std::exchange(traced_calls, {})) {
+      py::list shared;
+      for (const double seconds : call.regions.shared) shared.append(seconds);
+      found.append(py::make_tuple(*call.name, call.seconds, call.regions.regions, call.regions.inside, shared));
+    }
+    return found;
   });
   const std::string text = declarations.stub();
   bound.attr("stub") = text;

@@ -9,6 +9,8 @@
 #include <cstdint>
 #include <exception>
 
+#include "common/trace.h"
+
 #ifdef VN_STD_THREADS
 #include <thread>
 #include <vector>
@@ -23,7 +25,9 @@ namespace voronerf {
 template <typename Body>
 void parallel(int threads, const Body& body) {
   if (threads <= 1) {
+    if (trace != nullptr) trace->begin();
     body(0);
+    if (trace != nullptr) trace->end();
     return;
   }
 #ifdef VN_STD_THREADS
@@ -46,6 +50,7 @@ class Items {
 
   // Takes the next run, items [begin, end); false if none is left.
   bool take(int64_t& begin, int64_t& end) {
+    if (trace != nullptr) trace->run();
     begin = next_.fetch_add(run_, std::memory_order_relaxed);
     end = std::min(begin + run_, count_);
     return begin < count_;

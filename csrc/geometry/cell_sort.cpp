@@ -1,9 +1,9 @@
 // Stable counting sort on the CPU: a histogram a chunk, one scan over (cell, chunk), a scatter a chunk. Every row has
 // one possible place in a stable order, so neither the chunks nor the threads can change the result.
 //
-// A thread takes kRun neighbouring chunks at a time: their histograms, and the places of their rows within a cell, lie
-// side by side, and a cache line shared between threads costs more than the counting (5.9 ns a row for single chunks at
-// k = 256, against 1.5 on one thread).
+// A thread takes up to kRun neighbouring chunks at a time: their histograms, and the places of their rows within a
+// cell, lie side by side, and a cache line shared between threads costs more than the counting (5.9 ns a row for single
+// chunks at k = 256, against 1.5 on one thread).
 #include "geometry/cell_sort.h"
 
 #include <algorithm>
@@ -15,15 +15,16 @@ namespace voronerf {
 
 namespace {
 
-constexpr int kRun = 16;
+constexpr int64_t kRun = 16, kRuns = 8;  // of few chunks, so many runs at least
 
 }  // namespace
 
 bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,
                    int threads) {
   const int64_t rows = cell_sort_chunk_rows(k), chunks = cell_sort_chunks(n, k);
+  const int64_t run = std::clamp<int64_t>(chunks / kRuns, 1, kRun);
   std::atomic<bool> valid{true};
-  parallel_for(chunks, kRun, threads, [&](int64_t chunk) {
+  parallel_for(chunks, run, threads, [&](int64_t chunk) {
     int32_t* count = workspace + chunk * k;
     std::fill(count, count + k, 0);
     bool inside = true;
@@ -60,7 +61,7 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32
     }
   }
 
-  parallel_for(chunks, kRun, threads, [&](int64_t chunk) {
+  parallel_for(chunks, run, threads, [&](int64_t chunk) {
     int32_t* place = workspace + chunk * k;
     for (int64_t i = chunk * rows, end = std::min(n, i + rows); i < end; ++i) {
       order[place[cells[i]]++] = static_cast<int32_t>(i);

@@ -9,7 +9,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kPixels = 256;  // of a task
+constexpr int64_t kPixels = 64;  // of a task
 
 }  // namespace
 

@@ -15,7 +15,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kRays = 128;  // of a task
+constexpr int64_t kRays = 32;  // of a task
 
 void count_block(Isa isa, const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts, int64_t begin,
                  int64_t end) {
@@ -43,9 +43,7 @@ void fill_block(Isa isa, const MarchInputs& in, const uint32_t* mask, const int3
 
 template <typename Run>
 void for_each_block(int64_t r, int threads, const Run& run) {
-  const int64_t blocks = ceil_div(r, kRays);
-#pragma omp parallel for schedule(dynamic) num_threads(threads) if (threads > 1 && blocks > 1)
-  for (int64_t b = 0; b < blocks; ++b) run(b * kRays, std::min(r, (b + 1) * kRays));
+  parallel_for(ceil_div(r, kRays), 1, threads, [&](int64_t b) { run(b * kRays, std::min(r, (b + 1) * kRays)); });
 }
 
 }  // namespace

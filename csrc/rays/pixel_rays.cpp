@@ -12,7 +12,7 @@ namespace voronerf {
 
 namespace {
 
-constexpr int64_t kRays = 64;  // of a task
+constexpr int64_t kRays = 32;  // of a task
 
 }  // namespace
 

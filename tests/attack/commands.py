@@ -5,14 +5,18 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
+import pkgutil
 import re
 from pathlib import Path
 
 from attempts import REFUSED, RIGHT, Failed
 
+from voronerf import ops
 from voronerf.app.cli import main
 
-for slow in ("matplotlib.pyplot", "imageio_ffmpeg", "rich._emoji_codes"):  # not in every attempt again
+# Not in every attempt again; and a file that changes meanwhile then changes no attempt.
+every_op = [module.name for module in pkgutil.walk_packages(ops.__path__, "voronerf.ops.")]
+for slow in ("matplotlib.pyplot", "imageio_ffmpeg", "rich._emoji_codes", *every_op):
     importlib.import_module(slow)
 
 LONGEST = 1000

@@ -1,8 +1,10 @@
 """The reservoir of importance samples against sorting every batch by hand."""
 
+import pytest
 import torch
 from helpers import refuses, same, seeded
 
+from voronerf.diagram import VoronoiDiagram, split_diagram
 from voronerf.diagram.reservoir import SampleReservoir
 
 
@@ -99,9 +101,23 @@ def test_a_state_restores_the_reservoir_bit_for_bit_and_no_other():
     refuses("state must hold added, got points, importance", restored.load_state_dict, state)
 
 
+@pytest.mark.parametrize("d", [1, 2, 4])
+def test_samples_of_other_dimensions_decide_a_split(d):
+    points, importance = torch.rand(400, d), torch.rand(400)
+    points[0] = torch.nan
+    reservoir = SampleReservoir(100, batches=2, d=d)
+    for half in (slice(0, 200), slice(200, 400)):
+        reservoir.add(points[half], importance[half])
+    kept, _ = reservoir.samples()
+    assert kept.shape == (100, d) and kept.isfinite().all()
+    diagram = VoronoiDiagram(torch.zeros(1, d))
+    assert split_diagram(diagram, *reservoir.samples(), 4).diagram.num_cells == 4
+
+
 def test_bad_input_gets_one_clear_line():
-    refuses("at least 1, got 0 and 5", SampleReservoir, 0, batches=5)
-    refuses("at least 1, got 5 and 0", SampleReservoir, 5, batches=0)
+    refuses("at least 1, got 0, 5 and 3", SampleReservoir, 0, batches=5)
+    refuses("at least 1, got 5, 0 and 3", SampleReservoir, 5, batches=0)
+    refuses("at least 1, got 5, 5 and 0", SampleReservoir, 5, batches=5, d=0)
     add = SampleReservoir(5, batches=5).add
     refuses("got [4, 2] and [4]", add, torch.zeros(4, 2), torch.zeros(4))
     refuses("got [4, 3] and [3]", add, torch.zeros(4, 3), torch.zeros(3))

@@ -15,7 +15,7 @@ class SampleReservoir:
     """The heaviest samples of the last `batches` batches.
 
     Every batch gives its `quota = ceil(capacity / batches)` heaviest samples, or all it has if they are fewer. At most
-    `batches * quota` samples are held, 16 bytes each; then each new batch replaces the oldest one. Samples with an
+    `batches * quota` samples of d coordinates are held; then each new batch replaces the oldest one. Samples with an
     importance of 0, or with a position or importance that is not finite, are not kept.
 
     `add` reads no device value on the host, so the host of a training loop can run ahead of its GPU.
@@ -38,13 +38,20 @@ class SampleReservoir:
         2
     """
 
-    def __init__(self, capacity: int = 10_000, batches: int = 100, *, device: torch.device | str = "cpu") -> None:
-        """Makes an empty reservoir for so many samples of so many batches, both at least 1, or raises ValueError."""
-        if capacity < 1 or batches < 1:
-            raise ValueError(f"SampleReservoir: capacity and batches must be at least 1, got {capacity} and {batches}")
+    def __init__(
+        self, capacity: int = 10_000, batches: int = 100, *, d: int = 3, device: torch.device | str = "cpu"
+    ) -> None:
+        """Makes an empty reservoir for so many samples, of d coordinates and of so many batches.
+
+        Raises:
+            ValueError: a number below 1.
+        """
+        if min(capacity, batches, d) < 1:
+            given = f"{capacity}, {batches} and {d}"
+            raise ValueError(f"SampleReservoir: capacity, batches and d must be at least 1, got {given}")
         self.capacity, self.batches = capacity, batches
         self.quota = -(-capacity // batches)
-        self._points = torch.zeros(batches, self.quota, 3, device=device)
+        self._points = torch.zeros(batches, self.quota, d, device=device)
         self._importance = torch.zeros(batches, self.quota, device=device)
         self._added = 0
 
@@ -53,23 +60,23 @@ class SampleReservoir:
         """Keeps the heaviest samples of one batch.
 
         Args:
-            points: floating [..., 3], scene units.
+            points: floating [..., d], scene units.
             importance: floating [...]; any scale, since only ratios count.
 
         Raises:
             ValueError: shapes that do not match.
         """
-        if points.dim() == 0 or points.shape[-1] != 3 or points.shape[:-1] != importance.shape:
+        d = self._points.shape[-1]
+        if points.dim() == 0 or points.shape[-1] != d or points.shape[:-1] != importance.shape:
             raise ValueError(
-                "SampleReservoir.add: points must have shape [..., 3] and importance the same without the 3, "
+                f"SampleReservoir.add: points must have shape [..., {d}] and importance the same without the {d}, "
                 f"got {list(points.shape)} and {list(importance.shape)}"
             )
         device = self._points.device
-        points = points.reshape(-1, 3).to(device, torch.float32)
+        points = points.reshape(-1, d).to(device, torch.float32)
         importance = importance.reshape(-1).to(device, torch.float32)
         # What is finite differs from itself by 0, the rest by NaN: less than half the time of isfinite and all.
-        x, y, z = points.unbind(1)
-        finite = (x - x) + (y - y) + (z - z) + (importance - importance) == 0
+        finite = sum((x - x for x in points.unbind(1)), importance - importance) == 0
         counted = torch.where((importance > 0) & finite, importance, 0)
         kept, index = counted.topk(min(self.quota, importance.shape[0]))
         slot = self._added % self.batches
@@ -79,12 +86,12 @@ class SampleReservoir:
         self._added += 1
 
     def samples(self) -> tuple[Tensor, Tensor]:
-        """The kept samples, oldest batch first: points float32 [m, 3] and importance float32 [m], all > 0; m = 0 before
+        """The kept samples, oldest batch first: points float32 [m, d] and importance float32 [m], all > 0; m = 0 before
         the first batch."""
         start = self._added % self.batches if self._added > self.batches else 0
         importance = self._importance.roll(-start, 0).reshape(-1)
         kept = importance > 0
-        return self._points.roll(-start, 0).reshape(-1, 3)[kept], importance[kept]
+        return self._points.roll(-start, 0).flatten(0, 1)[kept], importance[kept]
 
     def __len__(self) -> int:
         return int((self._importance > 0).sum())

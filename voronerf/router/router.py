@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import finer_diagram
 from voronerf.ops._core.backends import BACKENDS
-from voronerf.ops._core.checks import of_one_dtype
+from voronerf.ops._core.checks import of_one_dtype, trust
 from voronerf.ops._core.compiler import not_compiled
 from voronerf.ops._core.layers import for_last_output
 from voronerf.ops.routed_mlp import routed_mlp
@@ -503,7 +503,8 @@ class VoronoiRouter(nn.Module):
     @property
     def by_table(self) -> bool:
         """Whether a layer table describes all that the module computes."""
-        if self._layered and not torch.compiler.is_compiling():  # which would trace it, and keeps what was found before
+        # While it compiles, and while a loop repeats its calls, what was found before holds.
+        if self._layered and not torch.compiler.is_compiling() and not trust.on:
             self._by_table = described_by_table(self.module)
         return self._by_table
 

@@ -137,27 +137,44 @@ struct Taught {
   std::vector<int32_t> rows, order, offsets;  // numbers as sorted, and of the caller; [k+1]. Empty: all rows
 };
 
-// Empty too where the few without a gradient would not pay for copies.
-Taught taught_rows(const MlpTable& table, const MlpInputs& in, const float* gradient) {
+// Empty too where the few without a gradient would not pay for copies. Blocks of rows list their own, which are then
+// put together.
+Taught taught_rows(const MlpTable& table, const MlpInputs& in, const float* gradient, int threads) {
+  constexpr int64_t kBlock = 1024;
   int64_t width = 0;
   for (const int output : table.outputs) width += table.layers[output].width;
-  Taught found;
-  found.offsets.assign(in.k + 1, 0);
-  found.rows.reserve(in.n);
-  for (int64_t c = 0; c < in.k; ++c) {
-    for (int32_t i = in.offsets[c]; i < in.offsets[c + 1]; ++i) {
+  const int64_t first = in.offsets[0], all = in.offsets[in.k] - first, blocks = ceil_div(all, kBlock);
+  std::vector<int32_t> lists(all), begins(blocks + 1, 0);
+  parallel_for(blocks, 1, threads, [&](int64_t block) {
+    int32_t* to = lists.data() + block * kBlock;
+    int32_t count = 0;
+    const int64_t begin = first + block * kBlock, end = std::min(first + all, begin + kBlock);
+    for (int64_t i = begin; i < end; ++i) {
       const float* row = gradient + (in.order == nullptr ? i : in.order[i]) * width;
       bool zero = true;
       for (int64_t o = 0; o < width; ++o) zero &= row[o] == 0.0f;
-      if (!zero) found.rows.push_back(i);
+      to[count] = static_cast<int32_t>(i);
+      count += zero ? 0 : 1;
     }
-    found.offsets[c + 1] = static_cast<int32_t>(found.rows.size());
-  }
-  const int64_t all = in.offsets[in.k] - in.offsets[0], kept = static_cast<int64_t>(found.rows.size());
+    begins[block + 1] = count;
+  });
+  for (int64_t block = 0; block < blocks; ++block) begins[block + 1] += begins[block];
+  const int64_t kept = begins[blocks];
   if (8 * kept > 7 * all) return {};
-  found.order = found.rows;
-  if (in.order != nullptr) {
-    for (int32_t& row : found.order) row = in.order[row];
+  Taught found;
+  found.rows.resize(kept);
+  found.order.resize(kept);
+  parallel_for(blocks, 1, threads, [&](int64_t block) {
+    const int32_t* from = lists.data() + block * kBlock;
+    for (int64_t i = begins[block]; i < begins[block + 1]; ++i) {
+      const int32_t row = *from++;
+      found.rows[i] = row;
+      found.order[i] = in.order == nullptr ? row : in.order[row];
+    }
+  });
+  for (int64_t c = 0; c <= in.k; ++c) {
+    const auto place = std::lower_bound(found.rows.begin(), found.rows.end(), in.offsets[c]);
+    found.offsets.push_back(static_cast<int32_t>(place - found.rows.begin()));
   }
   return found;
 }
@@ -260,7 +277,7 @@ void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& given, con
   MlpInputs in = given;
   Taught taught;
   if (gradients.positions == nullptr && gradients.directions == nullptr) {
-    taught = taught_rows(table, given, gradients.output);
+    taught = taught_rows(table, given, gradients.output, threads);
   }
   const bool sifted = !taught.offsets.empty();
   if (sifted) {

@@ -115,14 +115,17 @@ def flat_average(run, checkpoint):
 
 #: Changes of a run, and what is said of it.
 OVERSIZED = {
-    "width": (settings(width=18_000), "router.module.trunk.0.weight must have shape [3, 18000, 39], got [3, 8, 39]"),
+    "width": (
+        settings(width=18_000),
+        "trunk.0.weight must be float32 [3, 18000, 39], got float32 [3, 8, 39]",
+    ),
     "depth": (settings(depth=1_000_000), "--depth must be at least 1 and at most 1000, got 1000000"),
     "octaves": (
         settings(field_options=("position_octaves=1000000000",)),
         "MLP: position_octaves must be None or 0 to 127, got 1000000000",
     ),
     "average": (flat_average, "optimizer.0.average must have shape [3, 8, 39], got [936]"),
-    "centres": (many_centres, "router.module.trunk.0.weight must have shape [2000000, 8, 39], got [3, 8, 39]"),
+    "centres": (many_centres, "trunk.0.weight must be float32 [2000000, 8, 39], got float32 [3, 8, 39]"),
 }
 
 

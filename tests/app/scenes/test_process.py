@@ -67,18 +67,21 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
 
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        process.process(pictures, out, progress=stop)
+        process.process(pictures, out, max_features=300, progress=stop)
     assert not (out / "sparse").exists() and set(seen) == {"features", "pairs", "matches"}
     refuses(
-        "was begun with --max-features 4096, not 500",
+        "was begun with --max-features 300, not 500",
         process.process,
         pictures,
         out,
         max_features=500,
         error=SceneError,
     )
+    with pycolmap.Database.open(out / "colmap/database.db") as opened:
+        counts = [len(opened.read_keypoints(image.image_id)) for image in opened.read_all_images()]
+        assert all(100 < count <= 300 for count in counts)  # SIFT finds more
     seen.clear()
-    process.process(pictures, out, say=said.append, progress=lambda *now: seen.append(now))
+    process.process(pictures, out, max_features=300, say=said.append, progress=lambda *now: seen.append(now))
     stages = {stage for stage, *_ in seen}
     assert "pairs" not in stages  # they were chosen before
     assert any(stage.startswith("global mapping: ") for stage in stages)  # as COLMAP's log tells
@@ -86,7 +89,7 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
     kept = {"images", "images_2", "sparse", "transforms.json", "colmap"}
     assert {path.name for path in out.iterdir()} == kept
     assert Image.open(out / "images_2/00_a.png").size == (WIDTH // 2, HEIGHT // 2)
-    refuses("is a scene already", process.process, pictures, out, error=SceneError)
+    refuses("is a scene already", process.process, pictures, out, max_features=300, error=SceneError)
 
     images = read_model(out / "sparse/0").images
     assert abs(images[0].camera.lens.intrinsics[0] / FOCAL - 1) < 0.05
@@ -106,7 +109,7 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
         np.testing.assert_allclose(frame["transform_matrix"], image.pose)
 
     shutil.rmtree(out / "sparse")
-    process.process(pictures, out, mapper="incremental", progress=lambda *now: seen.append(now))
+    process.process(pictures, out, max_features=300, mapper="incremental", progress=lambda *now: seen.append(now))
     assert max(done for stage, done, _ in seen if stage == "incremental mapping") >= COUNT - 2
 
 

@@ -24,6 +24,7 @@ from voronerf.app.train.checkpoint import (
 )
 from voronerf.app.train.resume import restore_routers
 from voronerf.app.train.run_directory import held
+from voronerf.ops._core import backends
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +123,10 @@ def without(prefix):
         ("SplitStrategy: splits must lie in 0..1, got -1", without("strategy.")),
         ("'draws'", without("generator.draws")),
         ("another architecture", without("router.module.density")),
+        (
+            "density.bias must be float32 [4, 1], got float64 [4, 1]",
+            lambda c: c.tensors.update({(n := "router.module.density.bias"): c.tensors[n].double()}),
+        ),
         ("step must be an integer, got 'x'", lambda c: c.values.update(step="x")),
         ("step, times and stages must be counts, got -1", lambda c: c.values.update(step=-1)),
         ("stage 1: cells must be an integer, got 4.5", lambda c: c.values["stages"][1].update(cells=4.5)),
@@ -210,7 +215,8 @@ def test_turns_leave_checkpoints(tmp_path, scene):
 
 def test_a_change_of_threads_is_said_where_torch_computes(scene, tmp_path):
     before = torch.get_num_threads()
-    for backend, expected in (("auto", []), ("reference", [f"on {before} threads, now there are {before + 1}"])):
+    changed = f"by torch on {before} thread{'s' * (before > 1)}, what follows by torch on {before + 1} threads"
+    for backend, expected in (("auto", []), ("reference", [changed])):
         said = []
         config = small(tmp_path / backend, backend=backend, steps=2, cells=())
         trained(config, scene)
@@ -220,3 +226,15 @@ def test_a_change_of_threads_is_said_where_torch_computes(scene, tmp_path):
         finally:
             torch.set_num_threads(before)
         assert len(said) == len(expected) and all(part in line for part, line in zip(expected, said))
+
+
+def test_a_resume_without_the_compiled_module_is_said(scene, tmp_path, monkeypatch):
+    config, said = small(tmp_path, steps=2, cells=()), []
+    trained(config, scene)
+    monkeypatch.setitem(backends.ORDER, "cpu", ("reference",))
+    backends._choose_once.cache_clear()
+    try:
+        load(build(config, scene, on_event=said.append), load_checkpoint(checkpoint_path(tmp_path)))
+    finally:
+        backends._choose_once.cache_clear()
+    assert "was computed by native operations, what follows by torch on" in "".join(said)

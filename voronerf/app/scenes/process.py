@@ -312,6 +312,10 @@ def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: boo
         listed.unlink(missing_ok=True)
 
     stages.in_parts("features", names, 4, extract)
+    with colmap.Database.open(database) as opened:
+        matched = opened.num_matched_image_pairs() > 0
+    if not matched:  # SIFT gives up to twice as many as it is asked for, and matching takes their product
+        _keep_largest(colmap, database, database, settings.max_features)
     if settings.matching == "sequential":
         steps = {*range(1, SEQUENTIAL + 1), *(2**i for i in range(SEQUENTIAL))}
         pairs = [pair for step in sorted(steps) for pair in zip(names, names[step:])]
@@ -321,15 +325,15 @@ def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: boo
             few, chosen = stages.work / "few.db", stages.work / "pairs.json"
             if not chosen.is_file():
                 if not few.is_file():
-                    _keep_largest(colmap, database, few)
+                    _keep_largest(colmap, database, few, LARGEST_FEATURES)
                 match(few, "pairs", pairs)
                 write_text(chosen, json.dumps(_choose_pairs(colmap, few)))
             pairs = [(a, b) for a, b in json.loads(chosen.read_text())]
     match(database, "matches", pairs)
 
 
-def _keep_largest(colmap: Any, database: Path, few: Path) -> None:
-    """Copies a database with the largest features of each image alone."""
+def _keep_largest(colmap: Any, database: Path, few: Path, most: int) -> None:
+    """Copies a database with the largest features of each image alone; to itself, as well."""
     part = few.with_suffix(".part")
     shutil.copyfile(database, part)
     with colmap.Database.open(part) as opened:
@@ -339,7 +343,7 @@ def _keep_largest(colmap: Any, database: Path, few: Path) -> None:
             # A feature is x, y and a scale, or x, y and an affine shape of 2 x 2.
             a, *rest = places[:, 2:].T
             area = np.abs(a * rest[2] - rest[0] * rest[1]) if len(rest) == 3 else a**2
-            top = np.argsort(-area, kind="stable")[:LARGEST_FEATURES]
+            top = np.argsort(-area, kind="stable")[:most]
             kept[image.image_id] = places[top], type(described)(data=described.data[top], type=described.type)
         opened.clear_keypoints()
         opened.clear_descriptors()

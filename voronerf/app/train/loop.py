@@ -9,9 +9,11 @@ from contextlib import nullcontext
 
 import torch
 
-from voronerf.app.train.state import State
+from voronerf.app.train.state import Stage, State
+from voronerf.nerf.loss import Batch, RenderOutput
 from voronerf.nerf.split import SplitDone
 from voronerf.ops._core import backends
+from voronerf.ops._core.checks import trusting
 from voronerf.ops.adam.reference import judge
 
 #: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
@@ -69,8 +71,8 @@ def train(
         clock: Counts seconds.
     """
     config, strategy, sampler, optimizer = state.config, state.strategy, state.sampler, state.optimizer
-    autocast, one_thread = HALVES.get(config.precision), state.thread_deterministic
-    before = state.step
+    one_thread, before = state.thread_deterministic, state.step
+    checked: Stage | None = None
     while state.fraction < 1 and state.seconds < until and not state.stopped:
         started = clock()
         with backends.torch_on_one_thread() if one_thread else nullcontext():
@@ -81,28 +83,10 @@ def train(
                     optimizer.drop_averages()
                 for callback in callbacks:
                     callback.after_split(state, split)
-            optimizer.set_learning_rate(state.learning_rate())
-            sampler.step_pre_backward(state.renderer.field, state.step, state.generator)
-            if not state.router.training:
-                state.renderer.train()
-            batch = state.batches.draw(state.rays, state.draws)
-            optimizer.zero_grad(set_to_none=True)
-            with (
-                nullcontext() if autocast is None else torch.autocast(state.device.type, autocast, cache_enabled=False)
-            ):
-                output = state.ray_loss(batch, state.draws, backward=autocast is None)
-            if autocast is not None:
-                state.scaler.scale(output.loss).backward()
-            sampler.step_post_backward(output)
-            # The optimiser skips a step that is not finite by a flag on the device, so the host need not wait for it.
-            if state.scaler.is_enabled():
-                judge(state.guard, output.loss.detach(), [])
-                state.scaler.step(optimizer)
-                state.scaler.update()
-            else:
-                optimizer.update(state.guard, output.loss.detach())
-            optimizer.after_step(state.step)
-            strategy.step_post_backward(output)
+            # From the second step of a stage on, all tensors have the kinds and shapes that were checked in the first.
+            with trusting(checked is state.stages[-1]):
+                batch, output = _step(state)
+            checked = state.stages[-1]
         state.count_step(batch)
         if state.device.type == "cpu" or state.step % READ_EVERY == 0:
             state.read_output(output)
@@ -114,6 +98,33 @@ def train(
         with state.averaged():
             sampler.finish(state.renderer.field, config.seed)
         state.add_seconds(clock() - started)
+
+
+def _step(state: State) -> tuple[Batch, RenderOutput]:
+    """A step, but for splits and counters."""
+    optimizer, sampler = state.optimizer, state.sampler
+    autocast = HALVES.get(state.config.precision)
+    optimizer.set_learning_rate(state.learning_rate())
+    sampler.step_pre_backward(state.renderer.field, state.step, state.generator)
+    if not state.router.training:
+        state.renderer.train()
+    batch = state.batches.draw(state.rays, state.draws)
+    optimizer.zero_grad(set_to_none=True)
+    with nullcontext() if autocast is None else torch.autocast(state.device.type, autocast, cache_enabled=False):
+        output = state.ray_loss(batch, state.draws, backward=autocast is None)
+    if autocast is not None:
+        state.scaler.scale(output.loss).backward()
+    sampler.step_post_backward(output)
+    # The optimiser skips a step that is not finite by a flag on the device, so the host need not wait for it.
+    if state.scaler.is_enabled():
+        judge(state.guard, output.loss.detach(), [])
+        state.scaler.step(optimizer)
+        state.scaler.update()
+    else:
+        optimizer.update(state.guard, output.loss.detach())
+    optimizer.after_step(state.step)
+    state.strategy.step_post_backward(output)
+    return batch, output
 
 
 def run(state: State, callbacks: Sequence[Callback] = (), *, clock: Callable[[], float] = time.perf_counter) -> None:

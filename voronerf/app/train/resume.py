@@ -41,7 +41,7 @@ def snapshot(state: State) -> Checkpoint:
     """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
     names = ("step", "seconds", "evaluation_seconds", "reserved_seconds", "rays", "rays_done", "skipped")
     values = {name: getattr(state, name) for name in names}
-    values |= {"config": state.config.to_values(), "threads": torch.get_num_threads()}
+    values |= {"config": state.config.to_values(), "threads": _threads(state)}
     values |= {"stages": [asdict(stage) for stage in state.stages]}
     groups: dict[str, Mapping[str, Any]] = {group(name): r.state_dict() for name, r in state.routers.items()}
     groups |= {"optimizer": optimizer_tensors(state.optimizer), "strategy": state.strategy.state_dict()}
@@ -100,14 +100,17 @@ def load(state: State, checkpoint: Checkpoint) -> None:
             state.draws.set_state(drawn)  # else the run began on another kind of device
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
-    threads = torch.get_num_threads()
-    if stored.threads != threads and state.device.type == "cpu" and not state.thread_deterministic:
-        state.report(
-            f"not bit for bit: {checkpoint.source} was written on {stored.threads} threads, now there are {threads}"
-            ", and torch computes these networks"
-        )
+    counts = stored.threads, _threads(state)
+    before, now = (f"torch on {n} thread{'s' * (n > 1)}" if n else "native operations" for n in counts)
+    if before != now and state.device.type == "cpu":
+        state.report(f"not bit for bit: {checkpoint.source} was computed by {before}, what follows by {now}")
     names = ("step", "seconds", "evaluation_seconds", "reserved_seconds", "rays", "rays_done", "skipped", "stages")
     state.restore(**{name: getattr(stored, name) for name in names})
+
+
+def _threads(state: State) -> int:
+    """Those of torch, on which its sums depend; 0 where native operations compute the networks."""
+    return 0 if state.thread_deterministic else torch.get_num_threads()
 
 
 def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
@@ -136,7 +139,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
 
 
 def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
-    """Compares the networks of a configuration with those in a checkpoint, before memory is taken for either."""
+    """Compares networks with those in a checkpoint, float32 as Adam takes them, before memory is taken for either."""
     for name in SAMPLERS[config.sampling].networks(config.field_type.cones):
         tensors = checkpoint.group(group(name))
         try:
@@ -146,11 +149,11 @@ def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
         for key, (shape, shared) in shapes.items():
             wanted = [*([] if shared else [diagram.num_cells]), *shape]
             found = tensors.get(f"module.{key}")
-            if found is None or list(found.shape) != wanted:
-                came = "nothing" if found is None else list(found.shape)
+            if found is None or list(found.shape) != wanted or found.dtype != torch.float32:
+                came = "nothing" if found is None else f"{str(found.dtype).removeprefix('torch.')} {list(found.shape)}"
                 raise CheckpointError(
                     f"{checkpoint.source}: the checkpoint is of another architecture: {group(name)}.module.{key} "
-                    f"must have shape {wanted}, got {came}"
+                    f"must be float32 {wanted}, got {came}"
                 )
 
 

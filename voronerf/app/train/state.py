@@ -148,7 +148,9 @@ class State:
     def read_output(self, output: RenderOutput) -> None:
         """Reads loss, guard and number of samples of a step, which waits for the device; finds the rays of the next."""
         rows = [] if output.samples.rows is None else [output.samples.rows[0].float()]
-        found = torch.stack([output.loss.detach().float(), self.guard.in_a_row, *rows]).tolist()
+        wanted = [output.loss.detach(), self.guard.in_a_row, *rows]
+        on_host = output.loss.is_cpu  # where a copy of all at once, as from a device, takes longer
+        found = [each.item() for each in wanted] if on_host else torch.stack([each.float() for each in wanted]).tolist()
         self.loss, self.skipped_in_a_row = found[0], int(found[1])
         if isinstance(self.sampler, Occupancy):
             samples = int(found[2]) if rows else len(output.weights)

@@ -248,6 +248,7 @@ class Declaration:
             **{f"{each.name}_kind": each.kind for each in self.arguments},
             **{f"{each.name}_dtypes": each.rule.dtypes for each in self._tensors()},
             "Checked": checks.Checked,
+            "trust": checks.trust,
             "resolve": self._resolve,
             "Inputs": self.Inputs,
             "prepare": self._prepare,
@@ -265,6 +266,8 @@ class Declaration:
         names = ", ".join(each.name for each in self.arguments)
         sizes = {entry for each in self._tensors() for entry in each.rule.shape}
         checked: list[Argument] = []
+        yield "if trust.on:"
+        yield from (f"    {line}" for line in self._run(names))
         yield f"given = Checked('{self.name}')"
         for each in self.arguments:
             if each.kind is Tensor and each.rule.wide and not any(other.rule.wide for other in checked):
@@ -278,6 +281,10 @@ class Declaration:
             yield "given.no_inference()"
         for name in self._small:
             yield f"check_count('{self.name}', '{name}', {name}.numel())"
+        yield from self._run(names)
+
+    def _run(self, names: str) -> Iterator[str]:
+        """The call of the implementation, as Python."""
         if self._prepare is not None:
             yield f"{names}, = prepare(Inputs({names}))"
         first = self.arguments[0].name

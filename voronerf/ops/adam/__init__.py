@@ -18,6 +18,7 @@ from voronerf.ops._core.checks import (
     check_shape,
     check_tensor,
     check_writable,
+    trust,
 )
 from voronerf.ops.adam.reference import Guard, Rule
 
@@ -74,6 +75,24 @@ def adam(
         >>> (table[0] != 0).tolist()
         [False, True, False]
     """
+    if not trust.on:
+        _check_all(rules, parameters, gradients, means, squares, guard, loss)
+    if not rules:
+        return
+    loss = None if loss is None else loss.detach()
+    run = backends.resolve(_OP, backend=backend, device=parameters[0].device, dtype=torch.float32)
+    run(rules, [gradient.contiguous() for gradient in gradients], parameters, means, squares, guard, loss)
+
+
+def _check_all(
+    rules: Sequence[Rule],
+    parameters: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    means: Sequence[Tensor],
+    squares: Sequence[Tensor],
+    guard: Guard | None,
+    loss: Tensor | None,
+) -> None:
     lists = {"parameters": parameters, "gradients": gradients, "means": means, "squares": squares}
     for name, given in {"rules": rules, **lists}.items():
         if not isinstance(given, Sequence):
@@ -107,9 +126,6 @@ def adam(
         if guard is None:
             raise ValueError(f"{_OP}: loss must come with a guard, got none")
         _check_scalar("loss", loss, parameters[0])
-        loss = loss.detach()
-    run = backends.resolve(_OP, backend=backend, device=parameters[0].device, dtype=torch.float32)
-    run(rules, [gradient.contiguous() for gradient in gradients], parameters, means, squares, guard, loss)
 
 
 def _are_plain(*lists: Sequence[Any]) -> bool:

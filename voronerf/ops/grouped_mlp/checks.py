@@ -21,6 +21,7 @@ from voronerf.ops._core.checks import (
     check_shape,
     check_tensor,
     of_one_dtype,
+    trust,
 )
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
 
@@ -134,6 +135,18 @@ def check_routed(
     network = {**_DEFAULTS, **given}
     if network.keys() != _DEFAULTS.keys():
         raise TypeError(f"{op}: unknown arguments {', '.join(network.keys() - _DEFAULTS.keys())}")
+    if not trust.on:
+        _check_routed(op, positions, weights, biases, network)
+    coords, centres = network["coords"], network["centres"]
+    if centres is not None:
+        points = positions[:, :3] if coords is None else coords
+        network["coords"], network["centres"] = of_one_dtype(points, centres)
+    return {"positions": positions, "weights": weights, "biases": biases, **network}
+
+
+def _check_routed(
+    op: str, positions: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor | None], network: dict[str, Any]
+) -> None:
     tables = {name: network[name] for name in ("centres", "child_offsets", "child", "cells")}
     frozen = network["frozen"]
     read = {name: network[name] for name in ("directions", "direction_index", "features")}
@@ -160,10 +173,6 @@ def check_routed(
         raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {sizes['p']}")
     tensors = {"positions": positions, "coords": coords, "frozen": frozen, **tables, "rows": rows, **read}
     check_together(op, weights, biases, tensors)
-    if centres is not None:
-        points = positions[:, :3] if coords is None else coords
-        network["coords"], network["centres"] = of_one_dtype(points, centres)
-    return {"positions": positions, "weights": weights, "biases": biases, **network}
 
 
 def _check_tables(
