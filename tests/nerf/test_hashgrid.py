@@ -82,7 +82,7 @@ def test_the_grid_grows_with_the_images():
     assert [own["log2_entries"] for own in found] == [14, 14, 15, 15, 18]
     for seconds, entries in ((60, 17), (180, 19)):
         contracted = HashGridField.scene_options(1 / 353, box, True, seconds)
-        assert contracted == {"box": box, "finest": 353, "log2_entries": entries}
+        assert contracted == {"box": box, "finest": 353, "log2_entries": entries, "density_scale": 40.0}
 
 
 def test_bad_settings():

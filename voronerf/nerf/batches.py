@@ -30,7 +30,8 @@ class RayBatches:
         far: Distance along a ray at which it ends.
         box: [2, 3] outside of which nothing is; None for none.
         background: [3], the colour behind the scene; None for black.
-        random_background: Whether images with alpha lie over a colour that is drawn for each ray.
+        random_background: Whether images with alpha, and photographs without a background, lie over a colour that is
+            drawn for each ray: what lets light through is never right, so surfaces become opaque.
         masks: bool [c, h, w], False for pixels that are not drawn; None for none.
         sparse: int64 [s] pixels, numbered through all images, that show points of a sparse model, and float32 [s], the
             distances of the points. A share of the rays, `SPARSE`, is drawn from them. None for none.
@@ -72,7 +73,7 @@ class RayBatches:
         self.device = torch.device(self.place if device is None else device)
         self.cameras, self.images, self.near, self.far = cameras.to(self.place), images, float(near), float(far)
         self.box, self.background = (None if each is None else each.to(self.place) for each in (box, background))
-        self.random_background = random_background and images.shape[-1] == 4
+        self.random_background = random_background and (images.shape[-1] == 4 or background is None)
         self.cones, self.fetch, self.backend = cones, fetch, backend
         self.useful = self._useful_pixels(masks, views)
         self.sparse = None

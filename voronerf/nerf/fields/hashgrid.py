@@ -21,6 +21,9 @@ HIDDEN_BIAS = 0.3
 #: larger table takes longer to read and to learn, and shows more in the end.
 CONTRACTED_ENTRIES, LONG_ENTRIES, LONG = 17, 19, 150.0
 
+#: The density scale in contracted space.
+CONTRACTED_DENSITY = 40.0
+
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
@@ -124,16 +127,17 @@ class HashGridField(RadianceField):
         the entries grow more slowly, since larger tables take longer to read and to learn: 2^15 for an object of 88
         pixels, 2^18 for 353. In contracted space, most of what is seen is farther away than the middle, by which a
         pixel is measured: the finest cells are as wide as that pixel, and there are 2^17 entries, or 2^19 in a training
-        of more than two minutes.
+        of more than two minutes. Surfaces there are thinner beside all of space, so the density has a larger scale.
         """
         pixels = max(high - low for low, high in zip(*box)) / pixel
         finest, entries = round((1 if contracted else 2) * pixels), round(1.5 * math.log2(pixels) + 5.3)
         large = LONG_ENTRIES if seconds >= LONG else CONTRACTED_ENTRIES
-        return {
+        found = {
             "box": box,
             "finest": max(finest, 32),
             "log2_entries": large if contracted else min(max(entries, 14), 19),
         }
+        return {**found, "density_scale": CONTRACTED_DENSITY} if contracted else found
 
     def reset_parameters(self) -> None:
         """Features near zero, as published; the layers as in :func:`voronerf.nerf.fields.radiance.reset_layers`."""
