@@ -1,6 +1,6 @@
 """Which part of a training step, and of a picture, is serial, and what more cores would give.
 
-    python benchmarks/cores.py --json benchmarks/results/cores.json    two minutes of one core
+    python benchmarks/cores.py --data lego --json benchmarks/results/cores.json    half a minute of one core
 
 All runs on one thread, by its processor time, so that other processes disturb little. Calls of the compiled module are
 traced (csrc/common/trace.h): each run of items that threads would share is given to whichever of 2, 8, 16 and 32 would
@@ -31,8 +31,8 @@ from voronerf.ops._core import native
 TEAMS = (2, 8, 16, 32)
 BANDWIDTHS = {"40": 40e9, "80": 80e9}
 CASES: dict[str, tuple[dict[str, Any], int, int]] = {
-    "default, up to 4,096 rays": ({"rays": 512}, 400, 64),
-    "default, 512 rays": ({"rays": 64}, 400, 64),
+    "default": ({"rays": 512}, 400, 64),
+    "default, few samples": ({"rays": 64}, 400, 64),
     "nerf": ({"field": "nerf"}, 120, 12),
 }
 """Settings, steps before those that are traced, and how many are."""
@@ -91,7 +91,7 @@ def row(case: str, found: list[dict[str, list[float]]], moved: float, **more: An
 
 
 def measure(case: str, data: Path) -> list[dict[str, Any]]:
-    """The rows of a training's steps and of a picture of its field."""
+    """The rows of a training's steps and, by default, of a picture of its field."""
     settings, warm, count = CASES[case]
     scene = load_scene(str(data))
     state = build(TrainConfig(data=str(data), steps=1500, **settings), scene)
@@ -112,6 +112,8 @@ def measure(case: str, data: Path) -> list[dict[str, Any]]:
     lines = sum(int((each[: len(each) // LINE * LINE].view(-1, LINE) != 0).any(1).sum()) for each in gradients)
     moved = SAMPLE_BYTES * n + ENTRY_BYTES * state.parameter_count + TAUGHT_BYTES * LINE * lines
     rows = [row(case, traced.steps, moved, rays=state.rays, samples=n, parameters=state.parameter_count)]
+    if case != "default":
+        return rows
     state.renderer.train(False)
     view = scene.train
     found = []

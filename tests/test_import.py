@@ -62,13 +62,14 @@ def test_a_missing_torch_is_one_line(tmp_path) -> None:
 def test_threads_of_the_command_sleep_while_they_wait() -> None:
     """A library leaves that to its program, and the command to its user."""
     code = "import os, sys; sys.modules['torch'] = None; sys.argv[0] = {!r}\ntry: import voronerf\n"
-    code += "except BaseException: print(os.environ.get('OMP_WAIT_POLICY'))"
+    code += "except BaseException: print(*map(os.environ.get, ('OMP_WAIT_POLICY', 'GOMP_SPINCOUNT')))"
     for program, given, found in (
-        ("/bin/voronerf", {}, "passive"),
-        ("/bin/voronerf", {"OMP_WAIT_POLICY": "active"}, "active"),
-        ("notebook", {}, "None"),
+        ("/bin/voronerf", {}, "passive 1000"),
+        ("/bin/voronerf", {"OMP_WAIT_POLICY": "active"}, "active None"),
+        ("/bin/voronerf", {"GOMP_SPINCOUNT": "7"}, "passive 7"),
+        ("notebook", {}, "None None"),
     ):
-        env = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"} | given
+        env = {name: value for name, value in os.environ.items() if "OMP_" not in name} | given
         run = subprocess.run([sys.executable, "-c", code.format(program)], env=env, capture_output=True, text=True)
         assert run.stdout.strip() == found, run.stderr
 

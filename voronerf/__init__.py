@@ -12,6 +12,9 @@ if _command := bool(sys.argv) and sys.argv[0].endswith(("/voronerf", "\\voronerf
     # OpenMP's threads spin for milliseconds by default while they wait for each other, on cores that others may need:
     # beside ten busy processes a step of training takes twenty times as long. Read when torch loads its runtime.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # They spin for some ten microseconds before that: to sleep and wake takes as long, many times in a step.
+    if os.environ["OMP_WAIT_POLICY"] == "passive":
+        os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     # Garbage is collected again in voronerf.app.cli.main: while torch is loaded there is none, and to look for it takes
     # a tenth of the time.
     gc.disable()
