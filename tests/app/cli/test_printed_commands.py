@@ -33,12 +33,12 @@ PROGRAMS = ("voronerf", "torchrun", "python", "make", "pip", "ns-train", "tensor
 #: Programs that are not this project's.
 FOREIGN = ("tensorboard", "ns-train")
 #: Values that make a command short; an option that is not there is added for these commands.
-SHORT = {"--budget": "0.5", "--frames": "2", "--fit": "0.5", "--resolution": "8", "--density": "0.001", "--count": "20"}
+SHORT = {"--budget": "0.5", "--frames": "2", "--resolution": "8", "--count": "20"}
 ADDED = {
     "train": ("--budget",),
     "train-territories": ("--budget",),
     "render": ("--frames",),
-    "export": ("--resolution", "--density", "--count", "--fit"),
+    "export": ("--resolution", "--count"),
 }
 #: What stands for what a page leaves to the reader, and for scenes that are large.
 STAND_INS = {
