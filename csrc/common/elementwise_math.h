@@ -55,8 +55,7 @@ struct Exponential {
 };
 
 VN_INLINE Exponential exponential_parts(F32 x) {
-  x = x < splat(-87.0f) ? splat(-87.0f) : x;
-  x = x > splat(88.0f) ? splat(88.0f) : x;
+  x = min(splat(88.0f), max(splat(-87.0f), x));  // the second operand if it is NaN
   const F32 shifted = fma(x, splat(1.44269504f), splat(kRound));
   const F32 n = shifted - splat(kRound);
   F32 r = fma(n, splat(-0.693145752f), x);

@@ -49,7 +49,13 @@ void encode_rows(const Encoding& in, float* out, float* workspace, int64_t strid
     for (int64_t row = 0; row < rows; ++row) {
       float* to = out + (first + row) * in.width;
       const float* value = parts.value + row * stride;
-      for (int64_t column = 0; column < in.width; ++column) to[column] = value[column];
+      // The last vector may write some of the one before again; single floats would take longer than all others.
+      if (in.width < kLanes) {
+        __builtin_memcpy(to, value, sizeof(float) * in.width);
+        continue;
+      }
+      for (int64_t column = 0; column + kLanes < in.width; column += kLanes) store(to + column, load(value + column));
+      store(to + in.width - kLanes, load(value + in.width - kLanes));
     }
   }
 }

@@ -79,18 +79,22 @@ struct Lanes {
 };
 
 // V neighbouring vectors of columns of R rows from `row` on: d <= kLanes, all angles small. Side by side, so that the
-// steps of one fill the time in which another waits. `out` and `pairs` as in `encode`, either may be null.
-template <int R, int V>
+// steps of one fill the time in which another waits. `out` and `pairs` as in `encode`, either may be null. kRaw: some
+// lanes are raw.
+template <int R, int V, bool kRaw>
 VN_INLINE void encode_block(const float* x, int64_t x_stride, int64_t row, const Lanes* lanes, float* out,
                             int64_t stride, float* pairs) {
   F32 value[R * V], angle[R * V], phase[R * V];
   for (int i = 0; i < R * V; ++i) {
-    value[i] = angle[i] = permute(load(x + (row + i / V) * x_stride), lanes[i % V].index) * lanes[i % V].scale;
+    value[i] = permute(load(x + (row + i / V) * x_stride), lanes[i % V].index) * lanes[i % V].scale;
+    if (kRaw) angle[i] = value[i];
     phase[i] = lanes[i % V].phase;
   }
   sines<R * V>(value, phase);
-  for (int i = 0; i < R * V; ++i) value[i] = lanes[i % V].raw ? angle[i] : value[i];
-  for (int i = 0; out != nullptr && i < R * V; ++i) store(out + (row + i / V) * stride + i % V * kLanes, value[i]);
+  for (int i = 0; kRaw && i < R * V; ++i) value[i] = lanes[i % V].raw ? angle[i] : value[i];
+  for (int i = 0; (!VN_HALF || out != nullptr) && i < R * V; ++i) {
+    store(out + (row + i / V) * stride + i % V * kLanes, value[i]);
+  }
 #if VN_HALF
   for (int r = 0; pairs != nullptr && r < R; ++r) {
     float* to = pairs + (row + r) * stride / 2;
@@ -105,12 +109,12 @@ VN_INLINE void encode_block(const float* x, int64_t x_stride, int64_t row, const
 #endif
 }
 
-template <int R, int V>
+template <int R, int V, bool kRaw>
 VN_INLINE void encode_strip(const float* x, int64_t x_stride, int64_t rows, const Lanes* lanes, float* out,
                             int64_t stride, float* pairs) {
   int64_t row = 0;
-  for (; row + R <= rows; row += R) encode_block<R, V>(x, x_stride, row, lanes, out, stride, pairs);
-  for (; row < rows; ++row) encode_block<1, V>(x, x_stride, row, lanes, out, stride, pairs);
+  for (; row + R <= rows; row += R) encode_block<R, V, kRaw>(x, x_stride, row, lanes, out, stride, pairs);
+  for (; row < rows; ++row) encode_block<1, V, kRaw>(x, x_stride, row, lanes, out, stride, pairs);
 }
 
 // Any number of features.
@@ -153,13 +157,18 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
 #if VN_HALF
     for (; pairs != nullptr && column + 2 * kLanes <= stride; column += 2 * kLanes) {
       const Lanes both[] = {{table, stride, column, columns}, {table, stride, column + kLanes, columns}};
-      encode_strip<2, 2>(x, x_stride, rows, both, kept ? out + column : nullptr, stride, pairs + column / 2);
+      encode_strip<2, 2, true>(x, x_stride, rows, both, kept ? out + column : nullptr, stride, pairs + column / 2);
     }
 #endif
     for (; column < stride; column += kLanes) {
       const Lanes one(table, stride, column, columns);
-      encode_strip<kRegisters / 8, 1>(x, x_stride, rows, &one, kept ? out + column : nullptr, stride,
-                                      pairs == nullptr ? nullptr : pairs + column / 2);
+      float* to = kept ? out + column : nullptr;
+      float* paired = pairs == nullptr ? nullptr : pairs + column / 2;
+      if (column < columns.first()) {
+        encode_strip<kRegisters / 8, 1, true>(x, x_stride, rows, &one, to, stride, paired);
+      } else {
+        encode_strip<kRegisters / 8, 1, false>(x, x_stride, rows, &one, to, stride, paired);
+      }
     }
     return;
   }
@@ -181,15 +190,15 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
 // Multiplies encoded rows by the factors of the variances: d <= kLanes, no input among the columns, rows as in
 // `encode`.
 void blur(const float* variances, int64_t x_stride, const float* table, int64_t rows, float* out, int64_t stride) {
-  for (int64_t row = 0; row < rows; ++row, variances += x_stride, out += stride) {
-    const F32 features = load(variances);
-    for (int64_t column = 0; column < stride; column += kLanes) {
-      Bits index;
-      __builtin_memcpy(&index, table + column, sizeof index);
-      const F32 scale = load(table + stride + column);
-      const F32 exponent = permute(features, index) * (splat(-0.5f) * scale * scale);
+  for (int64_t column = 0; column < stride; column += kLanes) {
+    Bits index;
+    __builtin_memcpy(&index, table + column, sizeof index);
+    const F32 scale = load(table + stride + column), slope = splat(-0.5f) * scale * scale;
+    for (int64_t row = 0; row < rows; ++row) {
+      float* at = out + row * stride + column;
+      const F32 exponent = permute(load(variances + row * x_stride), index) * slope;
       const F32 left = exponent < splat(-87.0f) ? splat(0.0f) : exponential(exponent);
-      store(out + column, load(out + column) * left);
+      store(at, load(at) * left);
     }
   }
 }

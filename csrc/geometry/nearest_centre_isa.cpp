@@ -34,15 +34,17 @@ VN_INLINE void search(const F32* x, const F32* y, const F32* z, const float* cen
     near[u] = splat(int32_t{0x7fffffff});
     next[u] = splat(int32_t{0x7f800000});  // infinity
   }
+  I32 index = splat(int32_t{0});
+#pragma GCC unroll 2
   for (int32_t j = 0; j < count; ++j) {
     const F32 cx = splat(centres[3 * j]), cy = splat(centres[3 * j + 1]), cz = splat(centres[3 * j + 2]);
-    const I32 index = splat(j);
     for (int u = 0; u < U; ++u) {
-      const F32 dx = sub(x[u], cx), dy = sub(y[u], cy), dz = sub(z[u], cz);
+      const F32 dx = sub(cx, x[u]), dy = sub(cy, y[u]), dz = sub(cz, z[u]);
       const I32 key = tag(as_integer(fma(dz, dz, fma(dy, dy, mul(dx, dx)))), kept, index);
       next[u] = min(max(key, near[u]), next[u]);
       near[u] = min(key, near[u]);
     }
+    index = add(index, splat(int32_t{1}));
   }
 }
 

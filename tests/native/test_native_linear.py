@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from voronerf.ops import frequency_encode
 from voronerf.ops.grouped_linear import reference as specification
 
 native = pytest.importorskip("voronerf.ops.grouped_linear.native")
@@ -154,3 +155,40 @@ print(sorted(found[1:])[2])
 """
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert int(found) < 2000  # of 65,536 pages; the median of five, since the system may reclaim some
+
+
+def test_large_results_reuse_the_memory_of_those_that_are_gone() -> None:
+    if not sys.platform.startswith("linux"):
+        pytest.skip("elsewhere the allocator decides")
+    x = torch.rand(1 << 17, 3)
+    encode = lambda scale: frequency_encode(x * scale, 12, backend="native")  # noqa: E731  # 37 MB
+    first, second = encode(1.0), encode(2.0)
+    kept, part = first.clone(), second[5:9]
+    assert not torch.equal(first, second) and torch.equal(encode(1.0), kept) and torch.equal(first, kept)
+    del first
+    third = encode(1.0)
+    del second  # a view of it is still held
+    wanted = part.clone()
+    others = [encode(0.5 + i) for i in range(3)]
+    assert torch.equal(part, wanted) and torch.equal(third, kept)
+    assert len({other.untyped_storage().data_ptr() for other in (*others, third, part)}) == 5
+
+
+def test_large_results_of_equal_calls_are_written_to_the_same_pages() -> None:
+    """In a fresh process."""
+    if not sys.platform.startswith("linux"):
+        pytest.skip("elsewhere the allocator decides")
+    program = """
+import resource, torch
+from voronerf.ops import frequency_encode
+faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+found = []
+for n in (1 << 18, (1 << 18) - 100) * 4:
+    x = torch.rand(n, 3)
+    before = faults()
+    frequency_encode(x, 10, backend="native")
+    found.append(faults() - before)
+print(sorted(found[2:])[3])
+"""
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert int(found) < 16  # of 16,128 small pages, or 31 huge ones

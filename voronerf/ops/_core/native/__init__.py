@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import mmap
 import os
 import sys
 import warnings
+import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +78,11 @@ ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
 # Results of at least this many bytes are put on huge pages; for smaller ones the allocator usually has warm memory.
 _LARGE = 1 << 22
+# Those of at least _REUSED bytes, which glibc maps for each call and gives back after it, find the memory of earlier
+# ones, of which _KEPT bytes are kept. This memory is our own: glibc's thresholds are those of the whole process, and an
+# aligned block of its heap does not fit where an equal one lay (one result of 66 MB after another took 250 MB).
+_REUSED, _KEPT = 1 << 25, 1 << 29
+_unused: list[mmap.mmap] = []
 LEAST_GAIN = 1.25
 """Of bfloat16 products over float32 ones, for networks to use them: rounding and pairing operands costs some."""
 _bfloat16_gain = compiled.bfloat16_gain()
@@ -139,9 +146,32 @@ def aligned(tensor: Tensor) -> Tensor:
 
 
 def on_huge_pages(result: Tensor) -> None:
-    """Asks for huge pages for a result that has just been allocated, where it is large and the system gives them."""
-    if result.nbytes >= _LARGE and result.device.type == "cpu":
+    """Gives a result that has just been allocated, where it is large, huge pages, if the system has them, or the memory
+    of an earlier result that is gone."""
+    if result.nbytes < _LARGE or result.device.type != "cpu":
+        return
+    if result.nbytes < _REUSED or sys.platform != "linux":
         compiled.advise_huge_pages(result, result.nbytes)
+        return
+    size = result.nbytes
+    for block in _unused.copy():
+        if size <= len(block) <= size + size // 4:
+            with suppress(ValueError):  # another thread has taken it
+                _unused.remove(block)
+                break
+    else:
+        block = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        with suppress(OSError):  # a kernel without huge pages
+            block.madvise(mmap.MADV_HUGEPAGE)
+    held = (ctypes.c_char * size).from_buffer(block)  # which lives as long as a tensor of this memory
+    weakref.finalize(held, _keep, block).atexit = False
+    result.set_(torch.frombuffer(held, dtype=result.dtype).view(result.shape))
+
+
+def _keep(block: mmap.mmap) -> None:
+    _unused.append(block)
+    while sum(map(len, _unused)) > _KEPT:
+        _unused.pop(0)
 
 
 def refuse_where_deterministic(op: str, tensor: Tensor) -> None:
