@@ -99,7 +99,7 @@ class Ranks:
 def harmed_ranks(rng: random.Random, folder: Path, _given: Path) -> Counter[str]:
     """Whatever happens to a rank, one line tells of it, and the run ends, to the bit, as that of one process."""
     options = [*("--data", "builtin", "--downscale", "8"), *TINY, *rng.choice(VARIANTS), "--territories", "4"]
-    options += ["--steps", "300", "--checkpoint-every", rng.choice(("1e-9", "0.1"))]
+    options += ["--steps", "100", "--checkpoint-every", rng.choice(("1e-9", "0.1"))]
     whole, part = folder / "whole", folder / "part"
     Ranks(whole, 1, options).ends_well()
     Ranks(part, 2, options, file_size=20_000).is_refused("File too large")
