@@ -165,7 +165,8 @@ def on_huge_pages(result: Tensor) -> None:
             block.madvise(mmap.MADV_HUGEPAGE)
     held = (ctypes.c_char * size).from_buffer(block)  # which lives as long as a tensor of this memory
     weakref.finalize(held, _keep, block).atexit = False
-    result.set_(torch.frombuffer(held, dtype=result.dtype).view(result.shape))
+    memory = torch.frombuffer(held, dtype=result.dtype).untyped_storage()
+    result.set_(memory, 0, result.shape, result.stride())
 
 
 def _keep(block: mmap.mmap) -> None:
