@@ -8,6 +8,7 @@ from helpers import on_any_number_of_threads, same
 from tiny_runs import small, steps_of
 
 from voronerf.app.train import build, loop, snapshot
+from voronerf.nerf.samplers import SAMPLERS, Stratified
 from voronerf.ops._core import backends, checks
 
 HASH = {"field": "hashgrid", "width": 16}
@@ -47,6 +48,22 @@ def test_steps_trust_what_the_first_of_a_stage_checked(scene, monkeypatch):
     assert trusted == [False, True, True, False, True, True] and not checks.trust.on
     monkeypatch.setattr(loop, "trusting", lambda on: contextlib.nullcontext())
     assert same(found, trained())
+
+
+def test_what_a_sampler_of_the_users_gives_is_checked_in_every_step(scene, monkeypatch):
+    class Late(Stratified):
+        steps = 0
+
+        def sample(self, *given, **more):
+            self.steps += 1
+            found = super().sample(*given, **more)
+            return found._replace(deltas=found.deltas[:-8], edges=None) if self.steps == 3 else found
+
+    monkeypatch.setitem(SAMPLERS, "late", Late)
+    state = build(small(sampling="late", steps=5), scene)
+    with pytest.raises(ValueError, match="deltas must"):
+        loop.train(state)
+    assert state.step == 2
 
 
 def test_torch_on_one_thread():

@@ -72,6 +72,9 @@ def train(
     """
     config, strategy, sampler, optimizer = state.config, state.strategy, state.sampler, state.optimizer
     one_thread, before = state.thread_deterministic, state.step
+    # What a user's own class gives is checked in every step.
+    parts = (state.ray_loss, sampler, strategy, *(router.module for router in state.routers.values()))
+    known = all(type(part).__module__.startswith("voronerf.") for part in parts)
     checked: Stage | None = None
     while state.fraction < 1 and state.seconds < until and not state.stopped:
         started = clock()
@@ -84,7 +87,7 @@ def train(
                 for callback in callbacks:
                     callback.after_split(state, split)
             # From the second step of a stage on, all tensors have the kinds and shapes that were checked in the first.
-            with trusting(checked is state.stages[-1]):
+            with trusting(known and checked is state.stages[-1]):
                 batch, output = _step(state)
             checked = state.stages[-1]
         state.count_step(batch)
