@@ -242,3 +242,20 @@ def test_an_image_that_cannot_be_read_is_one_line_and_leaves_nothing(tmp_path, p
         (folder / "bad.jpg").write_bytes(content)
         refuses(f"{folder}/bad.jpg: {reason}", process.process, folder, tmp_path / "out", error=SceneError)
         assert not (tmp_path / "out").exists()
+
+
+def test_pictures_with_few_features_are_enlarged(tmp_path, pictures, monkeypatch):
+    octaves, extract = [], pycolmap.extract_features
+
+    def recorded(*given, extraction_options, **more):
+        octaves.append(extraction_options.sift.first_octave)
+        extract(*given, extraction_options=extraction_options, **more)
+
+    monkeypatch.setattr(pycolmap, "extract_features", recorded)
+    monkeypatch.setattr(process, "_map", lambda *_: None)
+    for most, octave in ((100, 0), (8192, -1)):
+        octaves.clear()
+        with pytest.raises(SceneError, match="finds no model"):
+            process.process(pictures, tmp_path / str(most), max_features=most, matching="sequential")
+        assert octaves[0] == 0 and set(octaves[1:]) == {octave}
+        assert not list(tmp_path.rglob("tried.db*"))

@@ -49,6 +49,11 @@ FEW_IMAGES = 40
 #: Of the largest features of an image that choose its pairs; with how many images it is matched, and how many matches
 #: of the largest features make a pair. Images are also matched with this many that follow by name.
 LARGEST_FEATURES, NEIGHBOURS, LEAST_MATCHES, FOLLOWING = 800, 20, 10, 2
+#: Pairs are matched in parts of so many, between blocks of so many images: a part has the features of few images to read.
+PART, BLOCK = 256, 16
+#: Of so many images the pixels are tried as they are. Where these give less than a quarter of the features that are
+#: asked for, all images are enlarged to twice their sides, as SIFT does it, which takes four times as long.
+TRIED = 4
 #: "sequential" matches an image with so many that follow, and with as many at distances of powers of two.
 SEQUENTIAL = 10
 #: Shares of the images with a camera: below the first a model is refused, below the second other mappers are tried.
@@ -289,28 +294,37 @@ def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: boo
     extraction.sift.max_num_features = settings.max_features
     reader = colmap.ImageReaderOptions(camera_model=settings.camera_model)
 
-    def extract(some: Sequence[str]) -> None:
+    def extract(some: Sequence[str], where: Path = database) -> None:
         colmap.extract_features(
-            database,
+            where,
             stages.images,
             image_names=list(some),
             camera_mode=colmap.CameraMode.SINGLE if shared else colmap.CameraMode.PER_IMAGE,
             reader_options=reader,
             extraction_options=extraction,
         )
-        if shared:
+        if shared and where == database:
             reader.existing_camera_id = 1  # for the next images
 
     def match(where: Path, name: str, pairs: Sequence[Pair]) -> None:
-        listed = stages.work / "part.txt"
+        listed, block = stages.work / "part.txt", {image: number // BLOCK for number, image in enumerate(names)}
 
         def match_part(some: Sequence[Pair]) -> None:
             listed.write_text("".join(f"{a} {b}\n" for a, b in some))
             colmap.match_image_pairs(where, pairing_options=colmap.ImportedPairingOptions(match_list_path=listed))
 
-        stages.in_parts(name, pairs, 64, match_part)
+        stages.in_parts(name, sorted(pairs, key=lambda pair: [block[image] for image in pair]), PART, match_part)
         listed.unlink(missing_ok=True)
 
+    tried, some = stages.work / "tried.db", names[:: -(-len(names) // TRIED)]
+    tried.unlink(missing_ok=True)
+    extraction.sift.first_octave = 0
+    with _told("features"):
+        extract(some, tried)
+    with colmap.Database.open(tried) as opened:
+        if opened.num_keypoints() < len(some) * settings.max_features / 4:
+            extraction.sift.first_octave = -1
+    tried.unlink()
     stages.in_parts("features", names, 4, extract)
     with colmap.Database.open(database) as opened:
         matched = opened.num_matched_image_pairs() > 0
