@@ -78,6 +78,9 @@ def test_refuses_what_would_be_read_out_of_bounds():
         "adam: parameter must be a tensor, got float": {"parameters": [1.0]},
         "adam: square must be a dense tensor, got a sparse_coo one": {"squares": [torch.ones(()).to_sparse()]},
         "adam: step must be a tensor, got int": {"rules": [rule._replace(step=1)]},
+        "adam: step must be a dense tensor, got a sparse_coo one": {
+            "rules": [rule._replace(step=torch.zeros(()).to_sparse())]
+        },
         "adam: rules must hold a Rule for each parameter, got tuple": {"rules": [tuple(rule)]},
         "adam: guard must be a Guard, got Tensor": {"guard": torch.ones(())},
         "adam: learning_rate must be a number, got str": {"rules": [rule._replace(learning_rate="x")]},

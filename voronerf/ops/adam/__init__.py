@@ -164,12 +164,17 @@ def _check(tensors: dict[str, Tensor]) -> None:
 def _are_scalars(steps: Sequence[Any], device: torch.device) -> bool:
     """Whether the steps keep all rules."""
     return all(
-        isinstance(step, Tensor) and step.dtype is torch.float32 and not step.shape and step.device == device
+        isinstance(step, Tensor)
+        and step.layout is torch.strided
+        and step.dtype is torch.float32
+        and not step.shape
+        and step.device == device
         for step in steps
     )
 
 
 def _check_scalar(name: str, tensor: Any, parameter: Tensor) -> None:
+    check_tensor(_OP, name, tensor)
     check_shape(_OP, name, tensor, ())
     check_dtype(_OP, name, tensor, (torch.float32,))
     check_same_device(_OP, **{"parameters[0]": parameter, name: tensor})
