@@ -49,7 +49,7 @@ FEW_IMAGES = 40
 #: Of the largest features of an image that choose its pairs; with how many images it is matched, and how many matches
 #: of the largest features make a pair. Images are also matched with this many that follow by name.
 LARGEST_FEATURES, NEIGHBOURS, LEAST_MATCHES, FOLLOWING = 800, 20, 10, 2
-#: Pairs are matched in parts of so many, between blocks of so many images: a part has the features of few images to read.
+#: Pairs are matched in parts of so many, between blocks of so many images, so that a part reads few images' features.
 PART, BLOCK = 256, 16
 #: Of so many images the pixels are tried as they are. Where these give less than a quarter of the features that are
 #: asked for, all images are enlarged to twice their sides, as SIFT does it, which takes four times as long.
