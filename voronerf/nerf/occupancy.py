@@ -169,11 +169,16 @@ class OccupancyGrid:
         Returns:
             float32 [q, 3], world.
         """
-        shape = torch.tensor(self.occupied.shape, device=self.box.device)
+        shape = torch.tensor(self.occupied.shape, dtype=torch.float32, device=self.box.device)
         _, y, z = self.occupied.shape
-        place = torch.stack((voxels // (y * z), voxels // z % y, voxels % z), dim=-1).float()
-        place = place + (0.5 if uniforms is None else uniforms)
-        return torch.lerp(self.box[0], self.box[1], place / shape)
+        # In float64, since torch divides integers slowly; axis by axis, since its loops over three entries are slow.
+        voxels = voxels.double()
+        line = (voxels / z).floor()
+        plane = (line / y).floor()
+        place = torch.stack((plane, line - y * plane, voxels - z * line)).float()
+        place += 0.5 if uniforms is None else uniforms.T
+        low, high = self.box[:, :, None]
+        return torch.lerp(low, high, place / shape[:, None]).T.contiguous()
 
     @torch.no_grad()
     def update(

@@ -189,7 +189,7 @@ def _after_step(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> Non
 def trained_parts(parameters: Sequence[Tensor]) -> list[list[Any]]:
     """For each parameter the parts of its first dimension that an optimiser may change: those of cells not frozen."""
     parts: dict[int, list[Any]] = {}
-    for module, frozen in _FROZEN.items():
+    for module, frozen in _FROZEN.items() if _FROZEN else ():
         edges = torch.nn.functional.pad((~frozen).int(), (1, 1)).diff()
         pairs = zip((edges > 0).nonzero()[:, 0].tolist(), (edges < 0).nonzero()[:, 0].tolist(), strict=True)
         own = [slice(*pair) for pair in pairs]

@@ -25,7 +25,6 @@ from voronerf.ops.adam.reference import Guard, Rule
 _OP = backends.declare("adam", native=Implementation(EVERYWHERE, (torch.float32,)), warp=PLAIN)
 
 
-@torch.no_grad()
 def adam(
     rules: Sequence[Rule],
     parameters: Sequence[Tensor],

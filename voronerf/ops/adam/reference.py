@@ -62,6 +62,7 @@ class Guard(NamedTuple):
         return Guard(found, torch.full((), float(skipped), device=device), in_a_row)
 
 
+@torch.no_grad()
 def adam(
     rules: Sequence[Rule],
     gradients: Sequence[Tensor],
