@@ -46,14 +46,9 @@ AdamStep corrected(const AdamRule& rule) {
           static_cast<float>(rule.decay_sq), static_cast<float>(rule.epsilon * root), rule.every};
 }
 
-}  // namespace
-
-void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
-              float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
-              Isa isa, int threads) {
-  if (left_out(rules, guard, gradients, sizes, isa)) return;
-  std::vector<AdamStep> steps;
-  for (const AdamRule& rule : rules) steps.push_back(corrected(rule));
+// body(tensor, begin, end) for blocks of all tensors.
+template <typename Body>
+void for_blocks(const std::vector<int64_t>& sizes, int threads, const Body& body) {
   struct Block {
     size_t tensor;
     int64_t begin;
@@ -64,8 +59,29 @@ void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const 
   }
   parallel_for(static_cast<int64_t>(blocks.size()), 1, threads, [&](int64_t number) {
     const auto [i, begin] = blocks[number];
-    run_block(isa, steps[i], gradients[i], parameters[i], means[i], squares[i], begin,
-              std::min(sizes[i], begin + kBlock));
+    body(i, begin, std::min(sizes[i], begin + kBlock));
+  });
+}
+
+}  // namespace
+
+void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
+              float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
+              Isa isa, int threads) {
+  if (left_out(rules, guard, gradients, sizes, isa)) return;
+  std::vector<AdamStep> steps;
+  for (const AdamRule& rule : rules) steps.push_back(corrected(rule));
+  for_blocks(sizes, threads, [&](size_t i, int64_t begin, int64_t end) {
+    run_block(isa, steps[i], gradients[i], parameters[i], means[i], squares[i], begin, end);
+  });
+}
+
+void average_cpu(float share, const float* const* parameters, float* const* averages, const std::vector<int64_t>& sizes,
+                 int threads) {
+  for_blocks(sizes, threads, [&](size_t i, int64_t begin, int64_t end) {
+    const float* __restrict__ parameter = parameters[i];
+    float* __restrict__ average = averages[i];
+    for (int64_t j = begin; j < end; ++j) average[j] += share * (parameter[j] - average[j]);
   });
 }
 

@@ -31,7 +31,11 @@ void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const 
               float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
               Isa isa, int threads);
 
-// The same on CUDA in two launches. corrected: [2, number of parameters], working memory.
+// Averages of parameters go a share of the way to them.
+void average_cpu(float share, const float* const* parameters, float* const* averages, const std::vector<int64_t>& sizes,
+                 int threads);
+
+// A step on CUDA, in two launches. corrected: [2, number of parameters], working memory.
 void adam_cuda(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
                float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
                float* corrected, void* stream);

@@ -10,9 +10,8 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from voronerf.ops.adam import Guard, Rule, adam
+from voronerf.ops.adam import Guard, Rule, adam, average
 from voronerf.router import VoronoiRouter
 from voronerf.router.optimizers import trained_parts
 
@@ -165,10 +164,10 @@ class Adam(torch.optim.Adam):
             state = self.state[parameter]
             if _AVERAGE not in state:
                 state[_AVERAGE] = parameter.detach().clone()
-            average = state[_AVERAGE]
-            averages += [average[part] for part in parts]
-            weights += [parameter.detach()[part] for part in parts]
-        get_ema_multi_avg_fn(fading)(averages, weights, None)
+            averages += [state[_AVERAGE][part] for part in parts]
+            weights += [parameter[part] for part in parts]
+        if weights:
+            average(averages, weights, 1 - fading, backend=self.backend)
 
     def drop_averages(self) -> None:
         """Begins all averages anew at the next update."""

@@ -83,6 +83,18 @@ def adam(
     run(rules, [gradient.contiguous() for gradient in gradients], parameters, means, squares, guard, loss)
 
 
+@torch.no_grad()
+def average(averages: Sequence[Tensor], parameters: Sequence[Tensor], share: float, *, backend: str = "auto") -> None:
+    """Moves averages a share of the way to parameters, in place; tensors and backends are those of `adam`."""
+    device = parameters[0].device
+    if device.type == "cpu" and backends.chosen(_OP, device, torch.float32, backend=backend) == "native":
+        from voronerf.ops.adam.native import average as run
+
+        run(averages, parameters, share)
+    else:
+        torch._foreach_lerp_(averages, parameters, share)
+
+
 def _check_all(
     rules: Sequence[Rule],
     parameters: Sequence[Tensor],

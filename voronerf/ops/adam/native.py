@@ -34,3 +34,9 @@ def adam(
         compiled.adam(given, *tensors, parameters[0].new_empty(2 * len(rules)), machine)
     else:
         compiled.adam(given, *tensors, machine)
+
+
+def average(averages: Sequence[Tensor], parameters: Sequence[Tensor], share: float) -> None:
+    """See ``voronerf.ops.adam.average``; on the CPU."""
+    sizes = [parameter.numel() for parameter in parameters]
+    native.compiled.average(share, parameters, averages, sizes, native.cpu())
