@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,7 +11,6 @@ from torch import Tensor
 from voronerf.nerf.cameras import Cameras, Rays
 from voronerf.nerf.loss import Batch
 from voronerf.nerf.occupancy import draw_seed
-from voronerf.nerf.rays import intersect_box
 from voronerf.ops.draw_pixels import Runs, draw_pixels
 
 #: Share of the rays that are drawn through points of a sparse model, where these are learnt from.
@@ -96,9 +96,9 @@ class RayBatches:
             if masks is not None:
                 chosen &= masks[image, :height, :width].to(self.place)
             if self.box is not None:
-                rays = cameras.image_rays(image, backend=self.backend)
-                _, _, hit = intersect_box(rays.origins, rays.directions, self.box, self.near, self.far)
-                chosen &= hit.reshape(height, width)
+                bounds: dict[str, Any] = {"near": self.near, "far": self.far, "box": self.box}
+                _, first, last = cameras.image_rays_between(image, backend=self.backend, **bounds)
+                chosen &= (last > first).reshape(height, width)
             edges = torch.nn.functional.pad(chosen.to(torch.int8), (1, 1)).diff(dim=1)
             row, column = (edges == 1).nonzero(as_tuple=True)
             last = (edges == -1).nonzero(as_tuple=True)[1]

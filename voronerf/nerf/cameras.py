@@ -281,14 +281,20 @@ class Cameras:
 
     def image_rays(self, index: int, *, cones: bool = False, backend: str = "auto") -> Rays:
         """Rays through all pixel centres of one camera, row by row: [height * width], of its own image."""
+        return self.image_rays_between(index, near=0.0, far=1.0, cones=cones, backend=backend)[0]
+
+    def image_rays_between(
+        self, index: int, *, cones: bool = False, backend: str = "auto", **bounds: Any
+    ) -> tuple[Rays, Tensor, Tensor]:
+        """`image_rays`, and where they begin and end [r]; ``bounds`` are those of `voronerf.ops.pixel_rays`."""
         device = self.poses.device
         width, height = self.size(index)
         pixels = torch.arange(height, device=device)[:, None] * self.width + torch.arange(width, device=device)
         blank = torch.zeros(1, self.height, self.width, 3, dtype=torch.uint8, device=device)
         one = self[[index]]
-        rays = one.pixel_rays(blank, pixels.reshape(-1), near=0.0, far=1.0, backend=backend)
+        rays = one.pixel_rays(blank, pixels.reshape(-1), **bounds, backend=backend)
         radii = one.radii(rays.directions, torch.zeros_like(pixels.reshape(-1))) if cones else None
-        return Rays(rays.origins, rays.directions, radii)
+        return Rays(rays.origins, rays.directions, radii), rays.near, rays.far
 
     def pixel_rays(self, images: Tensor, index: Tensor, **options: Any) -> PixelRays:
         """`voronerf.ops.pixel_rays` of these cameras and their images, uint8 [c, height, width, 3 or 4]."""

@@ -6,7 +6,7 @@ r rays, h x w pixels. Units as in `voronerf.nerf.volume`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,6 @@ from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
 from voronerf.nerf.marching import RayColours, render_until_opaque
 from voronerf.nerf.occupancy import OccupancyGrid
-from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.samplers import Occupancy, Sampler, Stratified
 from voronerf.nerf.volume import Rendered, Samples, per_ray, render_samples
 
@@ -196,8 +195,9 @@ class Renderer:
             chunk = 4096 if self.occupancy is None else 131_072
         if chunk < 1:
             raise ValueError(f"Renderer.image: chunk must be >= 1, got {chunk}")
-        rays = cameras.image_rays(index, cones=self.cones, backend=self.backend)
-        first, last, hit = intersect_box(rays.origins, rays.directions, box, near, far)
+        bounds: dict[str, Any] = {"near": near, "far": far, "box": box}
+        rays, first, last = cameras.image_rays_between(index, cones=self.cones, backend=self.backend, **bounds)
+        hit = last > first
         colour = torch.zeros_like(rays.origins)
         colour = colour if background is None else background.to(colour).repeat(len(rays), 1)
         opacity, depth = torch.zeros_like(first), torch.full_like(first, far)
@@ -206,12 +206,15 @@ class Renderer:
             places = rays.origins + far * rays.directions
             places = places if self.contraction is None else self.contraction.points(places)
         every = len(hit) <= chunk and bool(hit.all())
+        wholes = (colour, opacity, depth, *([places] if heaviest else []))
         for rows in (slice(None),) if every else hit.nonzero()[:, 0].split(chunk):
-            seen = self.see(rays[rows], first[rows], last[rows], background, heaviest)
-            for whole, part in zip((colour, opacity, depth), seen):
-                whole[rows] = part.to(whole.dtype)
-            if heaviest:
-                places[rows] = seen.heaviest
+            own: list[Any] = [rays.origins, rays.directions, rays.radii, first, last]
+            if isinstance(rows, Tensor):  # in a quarter of the time of ``[rows]``
+                own = [None if each is None else each.index_select(0, rows) for each in own]
+            seen = self.see(Rays(*own[:3]), own[3], own[4], background, heaviest)
+            for whole, part in zip(wholes, seen):
+                part = part.to(whole.dtype)
+                whole.index_copy_(0, rows, part) if isinstance(rows, Tensor) else whole.copy_(part)
         size = cameras.size(index)[::-1]
         return RenderedImage(
             colour.reshape(*size, 3), opacity.reshape(size), depth.reshape(size), places.reshape(*size, 3)

@@ -92,7 +92,7 @@ def average(averages: Sequence[Tensor], parameters: Sequence[Tensor], share: flo
 
         run(averages, parameters, share)
     else:
-        torch._foreach_lerp_(averages, parameters, share)
+        torch._foreach_lerp_(list(averages), list(parameters), share)
 
 
 def _check_all(
