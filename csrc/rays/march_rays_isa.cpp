@@ -18,7 +18,8 @@ namespace {
 
 typedef int32_t Ints __attribute__((vector_size(4 * kLanes)));
 
-constexpr int64_t kUnit = 16;  // rays that leap together, and samples that are filled in together
+constexpr int64_t kUnit = 16;      // samples that are filled in together
+constexpr int64_t kTogether = 32;  // rays that leap together: of 16, each vector waits for the one before
 
 // Cells of 32 strata from `first`, -1 outside the box.
 template <MarchWhere W, bool Disparity>
@@ -135,8 +136,9 @@ constexpr int32_t kToWalk = -1;  // in the place of a ray's count
 
 // Rays that walk together, a lane each: which ray it is, and at which stratum.
 struct Walk {
-  int32_t ray[kUnit], stratum[kUnit], found[kUnit];
-  float near[kUnit], far[kUnit], from[3][kUnit], along[3][kUnit], length[kUnit], slack[kUnit], share[kUnit];
+  int32_t ray[kTogether], stratum[kTogether], found[kTogether];
+  float near[kTogether], far[kTogether], from[3][kTogether], along[3][kTogether], length[kTogether], slack[kTogether],
+      share[kTogether];
 };
 
 template <bool Disparity>
@@ -171,8 +173,8 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
   Walk walk;
   int64_t next_ray = begin;
   // Lanes whose ray has ended, and lanes that have one.
-  uint32_t ended = (1u << kUnit) - 1, there = ended;
-  for (int64_t j = 0; j < kUnit; ++j) walk.ray[j] = -1;
+  uint32_t ended = ~uint32_t{0} >> (32 - kTogether), there = ended;
+  for (int64_t j = 0; j < kTogether; ++j) walk.ray[j] = -1;
   while (true) {
     for (; ended != 0; ended &= ended - 1) {
       const int64_t j = __builtin_ctz(ended);
@@ -187,9 +189,9 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
       there &= ~(1u << j);
     }
     if (there == 0) break;
-    int32_t cells[kUnit], rooms[kUnit], next[kUnit];
-    float places[3][kUnit], free[kUnit], depth[kUnit], pace[kUnit];
-    for (int64_t j = 0; j < kUnit; ++j) {
+    int32_t cells[kTogether], rooms[kTogether], next[kTogether];
+    float places[3][kTogether], free[kTogether], depth[kTogether], pace[kTogether];
+    for (int64_t j = 0; j < kTogether; ++j) {
       const float o[3] = {walk.from[0][j], walk.from[1][j], walk.from[2][j]};
       const float d[3] = {walk.along[0][j], walk.along[1][j], walk.along[2][j]};
       const MarchRay ray{walk.near[j], walk.far[j], any.count, any.share};
@@ -201,7 +203,7 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
       depth[j] = at;
       pace[j] = pace_of<W>(in, width, o, d, walk.length[j], at, point);
     }
-    for (int64_t j = 0; j < kUnit; j += kLanes) {
+    for (int64_t j = 0; j < kTogether; j += kLanes) {
       const F32 one = splat(1.0f);
       F32 border = one;
       for (int axis = 0; axis < 3; ++axis) {
@@ -211,8 +213,9 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
       }
       store(free + j, border - load(walk.slack + j));
     }
-    for (int64_t j = 0; j < kUnit; ++j) rooms[j] = cells[j] < 0 ? -kMarchRoom : room[cells[j]];
-    for (int64_t j = 0; j < kUnit; ++j) {
+    for (int64_t j = 0; j < kTogether; ++j) rooms[j] = room[cells[j] < 0 ? 0 : cells[j]];
+    for (int64_t j = 0; j < kTogether; ++j) rooms[j] = cells[j] < 0 ? -kMarchRoom : rooms[j];
+    for (int64_t j = 0; j < kTogether; ++j) {
       const float cellwise = static_cast<float>(rooms[j] - 1) + free[j];
       const float to = depth[j] + (cellwise < 0.0f ? 0.0f : cellwise) / pace[j];
       const float share = Disparity ? 1.0f - walk.near[j] / to : to - walk.near[j];
@@ -221,14 +224,14 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
       next[j] = far < one ? one : far;
     }
     uint32_t hits = 0;
-    for (int j = 0; j < kUnit; ++j) hits |= (rooms[j] == 0 ? 1u : 0u) << j;
+    for (int j = 0; j < kTogether; ++j) hits |= (rooms[j] == 0 ? 1u : 0u) << j;
     hits &= there;
     for (; hits != 0; hits &= hits - 1) {
       const int64_t j = __builtin_ctz(hits);
       mask[walk.ray[j] * words + walk.stratum[j] / kMarchWord] |= uint32_t{1} << (walk.stratum[j] % kMarchWord);
       if (++walk.found[j] == in.most) next[j] = strata;
     }
-    for (int64_t j = 0; j < kUnit; ++j) {
+    for (int64_t j = 0; j < kTogether; ++j) {
       walk.stratum[j] = next[j];
       ended |= static_cast<uint32_t>(next[j] >= strata) << j;
     }

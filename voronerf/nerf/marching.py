@@ -20,13 +20,12 @@ from voronerf.ops.render_opaque import NETWORK
 from voronerf.ops.render_opaque.reference import Wave, walk
 from voronerf.router import VoronoiRouter
 
-OPAQUE = 0.02  # a ray ends when it lets less than this through: what is behind counts as of the colour before it
+OPAQUE = 0.05  # a ray ends when it lets less than this through: what is behind counts as of the colour before it
 #: Samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain. Pictures of
 #: contracted space, photographs, have so many rays that a wave's own costs count less.
 WAVE, CONTRACTED_WAVE = 12, 8
-#: The same where one operation takes all waves, which cost next to nothing then. Rays that end in time end with more
-#: light left: so that the picture is as good, they let less through.
-FINE_OPAQUE, FINE_WAVE = 0.015, 4
+#: The same where one operation takes all waves, which cost next to nothing then.
+FINE_WAVE = 4
 
 
 class RayColours(NamedTuple):
@@ -94,10 +93,9 @@ def render_until_opaque(
     """
     contraction = sampler.space.contraction
     network = _network(field, rays, sampler)
-    opaque = OPAQUE if network is None else FINE_OPAQUE
     if network is not None:
         rule = {"spacing": sampler.space.spacing, "backend": sampler.backend, "heaviest": heaviest}
-        rule |= {"wave": FINE_WAVE, "opaque": opaque}
+        rule |= {"wave": FINE_WAVE, "opaque": OPAQUE}
         found = sampler.grid.see(rays, near, far, sampler.picture_samples, **network, **rule)
     else:
         wave = WAVE if contraction is None else CONTRACTED_WAVE
@@ -110,10 +108,10 @@ def render_until_opaque(
             seen = composite(sigma, rgb, *along, ray_offsets=samples.ray_offsets, backend=sampler.backend)
             return Wave(seen, samples.ray_index, samples.ray_offsets, samples.depths, stop)
 
-        found = walk(look, far, sampler.picture_samples, wave, opaque, heaviest)
+        found = walk(look, far, sampler.picture_samples, wave, OPAQUE, heaviest)
     colour, opacity, depth, through, at = found
     depth = normalised(depth, opacity, far)
-    ended = through <= opaque
+    ended = through <= OPAQUE
     colour /= torch.where(ended, opacity, 1)[:, None]
     opacity = torch.where(ended, 1, opacity)
     if background is not None:
