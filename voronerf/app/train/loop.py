@@ -73,7 +73,7 @@ def train(
     config, strategy, sampler, optimizer = state.config, state.strategy, state.sampler, state.optimizer
     one_thread, before = state.thread_deterministic, state.step
     # What a user's own class gives is checked in every step.
-    parts = (state.ray_loss, sampler, strategy, *(router.module for router in state.routers.values()))
+    parts = (state.ray_loss, state.batches, sampler, strategy, *(router.module for router in state.routers.values()))
     known = all(type(part).__module__.startswith("voronerf.") for part in parts)
     checked: Stage | None = None
     while state.fraction < 1 and state.seconds < until and not state.stopped:
