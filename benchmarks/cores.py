@@ -29,6 +29,7 @@ from voronerf.app.train.state import State
 from voronerf.ops._core import native
 
 TEAMS = (2, 8, 16, 32)
+REST = "Python and torch"
 BANDWIDTHS = {"40": 40e9, "80": 80e9}
 CASES: dict[str, tuple[dict[str, Any], int, int]] = {
     "default": ({"rays": 512}, 400, 64),
@@ -67,16 +68,17 @@ def parts(seconds: float, calls: list[Any]) -> dict[str, list[float]]:
         added = whole, inside, *(whole - inside + each for each in shared)
         found[name] = [a + b for a, b in zip(found[name], added, strict=True)]
     rest = seconds - sum(each[0] for each in found.values())
-    found["Python and torch"] = [rest, 0.0, *[rest] * len(TEAMS)]
+    found[REST] = [rest, 0.0, *[rest] * len(TEAMS)]
     return dict(found)
 
 
 def row(case: str, found: list[dict[str, list[float]]], moved: float, **more: Any) -> dict[str, Any]:
-    """A result: medians of the parts over the steps, in microseconds, those that most steps have not by their mean."""
+    """A result: medians of the parts over the steps, in microseconds; the mean of what most steps do not have, and of
+    Python and torch, which take several times as long in every 8th and 16th step."""
     table = {}
     for name in dict.fromkeys(name for each in found for name in each):
         own = [each.get(name, [0.0] * (2 + len(TEAMS))) for each in found]
-        seldom = 2 * sum(name in each for each in found) < len(found)
+        seldom = name == REST or 2 * sum(name in each for each in found) < len(found)
         middle = statistics.mean if seldom else statistics.median
         table[name] = [1e6 * middle(each) for each in zip(*own, strict=True)]
     whole, inside, *on = (sum(column) for column in zip(*table.values(), strict=True))
