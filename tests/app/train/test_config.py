@@ -8,6 +8,7 @@ import torch
 from helpers import refuses
 from tiny_runs import small
 
+from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.build import build, present_device
 from voronerf.app.train.config import CHOICES, RESUMABLE, ConfigError, TrainConfig, differences
 from voronerf.app.train.defaults import PEAK, machine_speed, resolve
@@ -162,3 +163,15 @@ def test_plan(settings, expected):
 
 def test_there_are_at_most_36_settings():
     assert len(dataclasses.fields(TrainConfig)) <= 36
+
+
+def test_long_trainings_of_objects_take_more_rays_a_step():
+    scene = builtin_scene(16, train_views=4, test_views=2)
+
+    def rays(**settings):
+        return resolve(TrainConfig(**settings), scene).rays
+
+    assert [rays(budget=seconds) for seconds in (10, 49, 50, 100, 200, 1e6)] == [512, 512, 1024, 2048, 4096, 4096]
+    assert resolve(TrainConfig(budget=50), scene, speed=4.0).rays == 4096
+    assert rays(steps=10**6) == rays(budget=1e6, field="nerf") == rays(budget=1e6, contraction="sphere") == 512
+    assert rays(budget=1e6, rays=100) == 100

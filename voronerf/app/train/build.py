@@ -116,7 +116,7 @@ def build(
         draws=draws,
         scaler=torch.amp.GradScaler(device.type, enabled=config.precision == "fp16"),
         guard=Guard.on(device),
-        rays=config.rays,
+        rays=int(config.rays or 0),
         on_event=on_event,
     )
 
@@ -284,8 +284,8 @@ def check_backend(config: TrainConfig, device: torch.device) -> None:
 
 def check_memory(config: TrainConfig) -> None:
     """Raises ConfigError, with the sizes, for what does not fit into the machine."""
-    samples = sum(config.samples or ())
-    _check_fits(config, f"--rays {config.rays} with {samples} samples", SAMPLE_BYTES * config.rays * samples)
+    rays, samples = int(config.rays or 0), sum(config.samples or ())
+    _check_fits(config, f"--rays {rays} with {samples} samples", SAMPLE_BYTES * rays * samples)
     width = "" if config.width is None else f" of --width {config.width}"
     name = f"--field {config.field}{width} with {config.final_cells} cells"
     _check_fits(config, name, _parameter_bytes(config) * count_parameters(config))

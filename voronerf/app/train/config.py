@@ -122,9 +122,9 @@ class CellSettings:
 class SamplingSettings:
     """Rays and where they are sampled."""
 
-    rays: int = 512
-    """Rays per training step; where empty space is skipped, of the first steps: hashgrid takes up to eight times as
-    many when few samples of a ray are left."""
+    rays: int | None = None
+    """Rays per training step; default 512, on a hash grid in a box more for a --budget from 50 on. Where empty space is
+    skipped, of the first steps: hashgrid takes up to eight times as many when few samples of a ray are left."""
     sampling: str = "stratified"
     """Samples along a ray: stratified in one pass, or hierarchical, with a second pass where the first found something
     (nerf: a coarse and a fine network)."""

@@ -132,9 +132,10 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
     except ValueError as error:
         raise CheckpointError(str(error)) from None
     config = TrainConfig.from_json(json.dumps(stored.config), source)
-    most = int(config.rays * config.field_type.ray_growth)
-    if not config.rays <= stored.rays <= most:
-        raise CheckpointError(f"{source}: rays must lie in {config.rays} to {most} by its settings, got {stored.rays}")
+    least = int(config.rays or 0)
+    most = int(least * config.field_type.ray_growth)
+    if not least <= stored.rays <= most:
+        raise CheckpointError(f"{source}: rays must lie in {least} to {most} by its settings, got {stored.rays}")
     return config, stored
 
 

@@ -157,7 +157,7 @@ class State:
             self.rays = next_rays(
                 self.rays,
                 samples,
-                rays=self.config.rays,
+                rays=int(self.config.rays or 0),
                 samples=self.sampler.samples,
                 growth=self.config.field_type.ray_growth,
                 contracted=self.config.contraction != "none",
