@@ -18,9 +18,9 @@ from voronerf.ops._core import native
 SPARSE_DEPTH = 0.003
 #: Samples of a ray in one pass and in each of two, where empty space is not skipped.
 SAMPLES, EACH_SAMPLES = 64, 32
-#: Rays of a step. On a hash grid in a box, a training of more than `FULL` seconds has twice as many for each doubling of
-#: its time, until there are `MOST_RAYS`: beyond some 4,000 steps, more rays a step teach more than more steps.
-RAYS, MOST_RAYS, FULL = 512, 4096, 25.0
+#: Rays of a step. On a hash grid in a box, a training of four times `SHORT` seconds has twice as many, one of sixteen
+#: times as long four times as many, up to `MOST_RAYS`: beyond some 4,000 steps, more rays a step teach more.
+RAYS, MOST_RAYS, SHORT = 512, 4096, 10.0
 #: About what a step takes on two cores, for a training that is given in steps.
 STEP_SECONDS = 0.01
 #: Operations a second of the two cores on which the rules were measured: multiply-adds of two threads of Zen 5.
@@ -30,9 +30,9 @@ PEAK = 5.1e11
 def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfig:
     """The settings with every default filled in, but for ``width`` and ``lr`` where ``parameters`` decides them.
 
-    They are contraction, occupancy, sparse depth, rays, samples of a ray, and the options of the field. A machine of twice
-    the ``speed`` does in a second what that of the rules does in two. Settings that are given in steps do not depend on
-    it, since the same seed should give the same networks everywhere.
+    They are contraction, occupancy, sparse depth, rays, samples of a ray, and the options of the field. A machine of
+    twice the ``speed`` does in a second what that of the rules does in two. Settings that are given in steps do not
+    depend on it, since the same seed should give the same networks everywhere.
     """
     kind, boxed = config.field_type, scene.box is not None
     if config.contraction == "auto":
@@ -53,8 +53,8 @@ def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfi
         config = replace(config, sparse_depth=SPARSE_DEPTH if points else 0.0)
     seconds = STEP_SECONDS * (config.steps or 0) if config.budget is None else config.budget * speed
     if config.rays is None:
-        grows = config.budget is not None and kind.scene_options is not None and not contracted and seconds > FULL
-        rays = RAYS * 2 ** math.floor(math.log2(seconds / FULL)) if grows else RAYS
+        grows = config.budget is not None and kind.scene_options is not None and not contracted and seconds > SHORT
+        rays = RAYS * 2 ** math.floor(math.log(seconds / SHORT, 4) + 1e-9) if grows else RAYS
         config = replace(config, rays=min(rays, MOST_RAYS))
     if config.samples is None:
         passes = SAMPLERS[config.sampling].passes
