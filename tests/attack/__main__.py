@@ -55,6 +55,7 @@ def main() -> int:
         parser.error(f"PART must be one of {', '.join(PARTS)}, got {unknown[0]}")
 
     torch.set_num_threads(1)
+    os.environ["RUST_BACKTRACE"] = "0"  # safetensors would wait for ever where memory is out
     until = time.monotonic() + 60 * options.minutes
     tallies: dict[str, Tally] = {}
     with tempfile.TemporaryDirectory(prefix="attack-") as scratch:

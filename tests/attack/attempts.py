@@ -137,6 +137,7 @@ class _Worker:
 
 def _attempts(part: Part, seeds: list[int], given: Path, folder: Path, pipe: int) -> None:
     (folder / "group").write_text(str(os.getpid()))
+    os.environ["VORONERF_CACHE"] = str(folder / "cache")  # images on disk go with the attempts
     for seed in seeds:
         place = folder / str(seed)
         place.mkdir()

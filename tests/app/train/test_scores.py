@@ -119,8 +119,13 @@ def test_infinite_scores_are_null_in_files(tmp_path, scene, monkeypatch):
                 assert found["psnr"] is None
                 assert found["not_finite"] == {"psnr": "inf", "psnr_of_mean_error": "inf"}
         assert write_curve(tmp_path) is None
-    (tmp_path / "metrics.jsonl").write_text('{"step": "x"}')
-    refuses("metrics.jsonl: line 1: step must be an integer, got 'x'", trained, config, scene, resume=True)
+    for line, message in (
+        ('{"step": "x"}', "step must be an integer, got 'x'"),
+        ('{"step": 2, "psnr": "x"}', "psnr must be a number or null, got 'x'"),
+        ('{"step": 2}', "psnr must be a number or null, got 'none'"),
+    ):
+        (tmp_path / "metrics.jsonl").write_text(line)
+        refuses(f"metrics.jsonl: line 1: {message}", trained, config, scene, resume=True)
 
 
 @pytest.mark.parametrize("value", [float("inf"), float("nan"), 1e19])

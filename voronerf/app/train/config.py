@@ -320,7 +320,7 @@ def check_config(config: TrainConfig) -> None:
     for name in ("rays", "evaluations", "eval_views", "downscale", "parameters"):
         value = getattr(config, name)
         need(value is None or value >= 1, name, "be at least 1")
-    need(config.width is None or config.width >= 2, "width", "be at least 2")
+    need(config.width is None or 2 <= config.width <= 65536, "width", "be at least 2 and at most 65536")
     need(config.depth is None or 1 <= config.depth <= 1000, "depth", "be at least 1 and at most 1000")
     need(config.lr is None or 0 < config.lr < float("inf"), "lr", "be a positive number")
     need(0 <= config.average < 1, "average", "lie in [0, 1)")

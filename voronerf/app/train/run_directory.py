@@ -139,6 +139,10 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     for number, line in enumerate(metrics, 1):
         if not isinstance(line.get("step"), int):
             raise ValueError(f"{path}: line {number}: step must be an integer, got {line.get('step')!r:.60}")
+        if not isinstance(line.get("psnr", ""), (int, float, type(None))):
+            raise ValueError(
+                f"{path}: line {number}: psnr must be a number or null, got {line.get('psnr', 'none')!r:.60}"
+            )
     return metrics
 
 

@@ -24,7 +24,8 @@ def _prepare(given: Any) -> Any:
     if occupied.numel() < 1:
         raise ValueError(f"{op}: occupied must have at least one cell, got {list(occupied.shape)}")
     if not isinstance(network, Mapping) or not {"weights", "biases", "layers"} <= network.keys():
-        raise ValueError(f"{op}: network must hold weights, biases and layers, got {network!r:.60}")
+        got = ", ".join(map(str, network)) or "nothing" if isinstance(network, Mapping) else repr(network)
+        raise ValueError(f"{op}: network must hold weights, biases and layers, got {got:.60}")
     if unknown := [name for name in network if name not in NETWORK]:
         raise TypeError(f"{op}: network must hold {', '.join(NETWORK)} alone, got {', '.join(map(str, unknown))}")
     reads = getattr(network["layers"], "uses_directions", False)

@@ -37,6 +37,7 @@ CASE = Case(
     _make,
     refused={
         "network must hold weights, biases and layers, got 3": {"network": 3},
+        "network must hold weights, biases and layers, got features": {"network": {"features": torch.zeros(2, 3)}},
         "wave must be at least 1, got 0": {"wave": 0},
         "opaque must lie in [0, 1), got 1.0": {"opaque": 1.0},
         "density_scale must be positive, got 0": {"density_scale": 0},
