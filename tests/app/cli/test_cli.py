@@ -299,7 +299,7 @@ def test_what_does_not_fit_into_memory_is_one_line(tmp_path, monkeypatch, fails)
     monkeypatch.chdir(tmp_path)
     train = f"train --data builtin --device cpu {TINY}"
     for message, given in (
-        ("--width 1000000 with 3 cells needs", "--width 1000000"),
+        ("--width 65536 with 3 cells needs", "--width 65536 --depth 1000"),
         ("--parameters 1000000000000 needs", f"--field kilonerf --parameters {10**12}"),
         ("--rays 1000000000 with 8 samples needs", "--rays 1000000000"),
         ("--rays 64 with 1000000000 samples needs", "--samples 1000000000"),
