@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import faulthandler
 import os
 import random
 import resource
 import shutil
 import signal
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Container
@@ -150,18 +152,38 @@ def _value(rng: random.Random, name: str, kind: Any) -> str:
     return str(rng.choice([number for number in NUMBERS if "float" in str(kind) or isinstance(number, int)]))
 
 
+#: What is printed when libraries end a process that has no memory (Pillow by SIGSEGV), or when Python waits for ever
+#: in ``Thread.start`` (python/cpython#140746).
+BENEATH = ("PanicException", "out of memory", "memory allocation", "allocate", "in _getdecoder\n", "in start\n")
+
+
 def memory(rng: random.Random, folder: Path) -> str:
     """A limit of the address space, as by ``ulimit -v``, above what the process has."""
-    taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    limit = taken + rng.randrange(1 << 20, 1 << 29)
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    extra = rng.randrange(1 << 20, 1 << 29)
     large = rng.choice(("--width 64", "--width 2000", "--rays 20000", "--samples 500", "--seed 1"))
-    try:
-        return judged("train", "--data", "blender", "--out", folder / "run", *TINY, *FIELDS["nerf"], *large.split())
-    except BaseException as error:
-        if type(error).__name__ == "PanicException":  # of safetensors, where its own allocation fails
-            return REFUSED
-        raise
+    command = ("train", "--data", "blender", "--out", folder / "run", *TINY, *FIELDS["nerf"])
+    said, ends = folder / "said", (RIGHT, None, REFUSED)
+
+    def limited() -> int:
+        os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT), 2)
+        faulthandler.enable(2)
+        sys.unraisablehook = lambda _: None  # Matplotlib's callbacks cannot raise a MemoryError
+        faulthandler.dump_traceback_later(20, exit=True, file=2)
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (taken + extra, taken + extra))
+        try:
+            return ends.index(judged(*command, *large.split()))
+        except BaseException as error:
+            os.write(2, f"{type(error).__name__}: {error}".encode())
+            raise
+
+    status = os.waitstatus_to_exitcode(os.waitpid(fork_command(limited), 0)[1])
+    if status in (0, 2):
+        return ends[status]
+    text = said.read_text(errors="replace")
+    if "Failed: " in text or not any(words in text for words in BENEATH):
+        raise Failed(f"ended with status {status}: {text[:1000]}")
+    return REFUSED
 
 
 def places(rng: random.Random, folder: Path) -> str:
