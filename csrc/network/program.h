@@ -1,46 +1,112 @@
-// A program of steps on the rows of each cell, with the values of a tile of rows in cache; see
-// voronerf/ops/_core/program.py for the steps. The gradient of a program is a program, so there is one function for all
-// derivatives.
+// A program of steps on the rows of each cell, with the values of a tile of rows in cache: everything that is done with
+// networks of cells. voronerf/ops/_core/program.py says what the steps are. The gradient of a program is a program, so
+// there is one function for all derivatives.
 //
-// n rows, k cells, w columns. All tensors are float32 and contiguous. Rows outside all cells (before offsets[0], from
-// offsets[k] on) give 0. Results do not depend on the number of threads. With `order` [n], the row i that the offsets
-// speak of is row order[i] of inputs and outputs.
+// n rows, r rays, k cells, w columns. Tensors are contiguous. Rows outside all cells (before offsets[0], from
+// offsets[k] on) give 0, and add nothing. Results do not depend on the number of threads.
+//
+// With `order` [n], the row i that the offsets speak of is row order[i] of inputs and outputs. Rows are gathered and
+// scattered by the tiles, so that nothing is permuted in memory.
 #pragma once
 
 #include <cstdint>
+#include <memory>
 #include <vector>
 
 #include "common/isa.h"
+#include "encoding/hash_encode.h"
+#include "network/program_code.h"
 
 namespace voronerf {
 
+struct ProgramInput {
+  int32_t width;
+  bool ray;  // [r, w], read by ray_index
+};
+struct ProgramOutput {
+  int32_t width;
+  bool ray;        // [r, w], the sum over the samples of each ray; of the rows in the order of the cells
+  int32_t memory;  // of a ray output: of its rows before they are summed
+};
+
+// A hash grid at the points of an input, looked up to memory [n][stride] of the call.
+struct ProgramLookup {
+  int32_t input, parameter, grid, memory;
+};
+// The gradient of a table, from memory that holds the gradient of what was looked up.
+struct ProgramScatter {
+  int32_t input, parameter, grid, memory, sum;
+};
+
+// As Python describes a program.
+struct ProgramTable {
+  std::vector<ProgramPack> packs;
+  std::vector<ProgramStep> steps;
+  std::vector<ProgramOperand> operands;
+  std::vector<ProgramSum> sums;
+  std::vector<ProgramInput> inputs;
+  std::vector<ProgramOutput> outputs;
+  std::vector<int32_t> memories;  // floats of a row of each
+  std::vector<ProgramLookup> lookups;
+  std::vector<ProgramScatter> scatters;
+  std::vector<HashGrid> grids;
+  int32_t sum_tensors;  // how many, those of scatters included
+  int32_t parameters;   // how many
+  int32_t tile, columns, packed, partial, scratch, scratch_width;
+  bool half;  // products of bfloat16 pairs: packs and slots are laid out for them
+};
+
+// A program that is ready to run.
+struct Program {
+  ProgramTable table;
+};
+std::unique_ptr<Program> make_program(const ProgramTable& table);
+
+// Tensors of a call.
 struct ProgramInputs {
-  const int32_t* code;     // as voronerf/ops/grouped_program/native.py writes it and program_code.h reads it
-  const float* constants;  // the numbers of functions
-  const float* const* inputs;
-  const int32_t* turned;  // for each input: 1 where it is [w, n], as PyTorch's look-ups in planes give it
-  const float* const* parameters;
-  const int64_t* strides;  // floats from one cell's parameter to the next: 0 where all cells share it
-  const int64_t* widths;   // columns of each output
-  int64_t outputs;
+  const void* const* inputs;       // [n, w] or [r, w]; float32 or bfloat16
+  const int32_t* input_types;      // TableType of each
+  const int32_t* turned;           // 1: it is [w, n], as PyTorch's look-ups in planes give it; float32
+  const void* const* parameters;   // [k, ...] or [1, ...]; float32, but tables of hash grids may be 16 bits
+  const int32_t* parameter_types;  // TableType of each
+  const int64_t* strides;          // entries from one cell's parameter to the next: 0 where all cells share it
   const int32_t* offsets;
-  const int32_t* order;  // or null
-  int64_t n, k;
+  const int32_t* order;      // or null
+  const int32_t* ray_index;  // [n], or null without inputs and outputs of rays
+  int64_t n, r, k;
+  // For each lookup memory [n][stride] of the caller's, filled by the call unless it is `ready`; null entries, or null:
+  // what was looked up is not kept.
+  float* const* kept;
+  bool ready;
+  // Rows that are 0 in all inputs from this one on add nothing to any sum; -1: there are none such.
+  int64_t gradients;
+  const char* caller;  // the operation that errors name
 };
 
-// What the host must know of a program for CUDA.
-struct ProgramSizes {
-  int64_t columns, partial;                   // of the values of a row; floats of the sums of a task
-  int64_t inputs, parameters, outputs, sums;  // how many
+struct ProgramResults {
+  void* const* outputs;  // float32, or as output_types says
+  const int32_t* output_types;
+  float* const* sums;  // [k, ...] each; of a table [tables, entries, features]
 };
 
-// Throws std::invalid_argument for offsets that fall or exceed n, and for an order that leaves the rows.
-void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* const* sums, Isa isa, int threads);
+// Throws std::invalid_argument for offsets that fall or exceed n, for an order that leaves the rows, and for a
+// ray_index that names no ray.
+void grouped_program_cpu(const Program& program, const ProgramInputs& in, const ProgramResults& results, Isa isa,
+                         int threads);
 
-// On CUDA `code` and `constants` are on the device too; strides, turned and widths are not. Both throw
-// std::invalid_argument where the values of a few rows do not fit into shared memory.
-int64_t grouped_program_workspace_cuda(const ProgramSizes& sizes, int64_t n, int64_t k);
-void grouped_program_cuda(const ProgramInputs& in, const ProgramSizes& sizes, float* const* outputs, float* const* sums,
-                          unsigned char* workspace, void* stream);
+// What products take on CUDA; sums are float32.
+enum class ProgramPrecision : int { float32, tf32, bfloat16, float16 };
+
+// The records of a program for the device, and what is there of them: `code` has program_code_bytes(program) bytes, on
+// the host; the caller copies it to the device.
+int64_t program_code_bytes_cuda(const Program& program);
+void program_code_cuda(const Program& program, unsigned char* code);
+
+// Both throw std::invalid_argument where the values of a few rows do not fit into shared memory. Offsets, an order and
+// a ray_index that leave the rows cannot be refused without a host read: they touch nothing outside.
+int64_t grouped_program_workspace_cuda(const Program& program, int64_t n, int64_t r, int64_t k);
+void grouped_program_cuda(const Program& program, const unsigned char* code, const ProgramInputs& in,
+                          const ProgramResults& results, ProgramPrecision precision, unsigned char* workspace,
+                          void* stream);
 
 }  // namespace voronerf
