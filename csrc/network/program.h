@@ -26,7 +26,7 @@ struct ProgramInput {
 struct ProgramOutput {
   int32_t width;
   bool ray;        // [r, w], the sum over the samples of each ray; of the rows in the order of the cells
-  int32_t memory;  // of a ray output: of its rows before they are summed
+  int32_t memory;  // of a ray output: of its rows before they are summed; of another one: itself; -1: none
 };
 
 // A hash grid at the points of an input, looked up to memory [n][stride] of the call.

@@ -322,6 +322,13 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
   for (const ProgramOutput& output : table.outputs) {
     if (output.ray) places[static_cast<size_t>(output.memory)] = take(in.n * output.width);
   }
+  for (size_t o = 0; o < table.outputs.size(); ++o) {
+    const ProgramOutput& output = table.outputs[o];
+    const bool here = !output.ray && in.order == nullptr && results.output_types[o] == TableType::float32;
+    if (here && output.memory >= 0) {
+      memories[static_cast<size_t>(output.memory)] = static_cast<float*>(results.outputs[o]);
+    }
+  }
   const Workspace workspace(floats + kSlack);
   float* const memory = workspace.data();
   for (size_t m = 0; m < memories.size(); ++m) {

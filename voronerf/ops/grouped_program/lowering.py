@@ -123,7 +123,7 @@ class _Lowering:
         self.memories: list[int] = []
         self.lookups: list[tuple[Lookup, int]] = []
         self.scatters: list[tuple[Lookup, int, int]] = []
-        self.outputs: list[Any] = []
+        self.own: dict[int, int] = {}  # the memory of outputs that values may be made in
         self.work = self._in_order()
         self.readers: dict[int, list[tuple[Step, int]]] = {}
         for step in self.work:
@@ -207,10 +207,9 @@ class _Lowering:
             number = self.pack("vector", c.index, c.start, width, width, self.shape(c.index))
             return self.compiled.ProgramOperand(parameter=True, slot=number, stride=0, **(given | {"start": 0}))
         value = self.values[c.index]
+        given |= {"memory": value.memory, "input": value.input}
         if product:
-            whole = c.start == 0 and c.width == value.width
-            given |= {"input": value.input, "pairs": value.pairs if whole else _NONE}
-        given["memory"] = value.memory
+            given["pairs"] = value.pairs if _all_of(c, value.width) else _NONE
         return self.compiled.ProgramOperand(
             parameter=False, slot=max(value.slot, 0), stride=value.stride, **given
         )
@@ -261,6 +260,8 @@ class _Lowering:
         more, or in a place of its own."""
         value = _Value(step.width, stride or _padded(step.width))
         self.values[step.out] = value
+        if step.op not in ("input", "encode"):
+            value.memory = self._own_output(step)
         scattered = [reader for reader, place in self.readers.get(step.out, []) if reader.op == "scatter" and place]
         if scattered:
             value.memory = self.memory(value.stride)
@@ -277,12 +278,22 @@ class _Lowering:
         value.slot = self.slots.take(value.stride)
         return value
 
+    def _own_output(self, step: Step) -> int:
+        """The memory of an output that is a whole value and whose rows end with whole vectors: it can be made there."""
+        for reader, _ in self.readers.get(step.out, []):
+            if reader.op == "output" and step.width % _GRANULE == 0 and _all_of(reader.operands[0], step.width):
+                number, first = map(int, reader.numbers)
+                if number not in self.program.by_ray and self.program.outputs[number].width == step.width and not first:
+                    return self.own.setdefault(number, self.memory(step.width))
+        return _NONE
+
     def _input(self, step: Step, dying: set[int]) -> None:
         number, readers = int(step.numbers[0]), self.readers.get(step.out, [])
         encoded = [reader.op in ("encode", "scatter") and place == 0 for reader, place in readers]
         value = self.make(step, dying, stride=step.width if readers and all(encoded) else 0)
         plain = number not in self.program.rays
-        if plain and readers and all(self._product(reader, place) for reader, place in readers):
+        whole = value.stride == step.width and not all(encoded)  # no vector reads beyond a row
+        if plain and readers and (whole or all(self._product(reader, place) for reader, place in readers)):
             value.input = number
         self.emit("input", value=value, number=number, in_place=value.input != _NONE)
 
@@ -399,9 +410,12 @@ class _Lowering:
         outputs = []
         for number, c in enumerate(program.outputs):
             ray = number in program.by_ray
-            outputs.append(compiled.ProgramOutput(c.width, ray, self.memory(c.width) if ray else _NONE))
+            outputs.append(compiled.ProgramOutput(c.width, ray, self.memory(c.width) if ray else self.own.get(number, _NONE)))
         steps = [
-            step._replace(memory=outputs[step.number].memory) if step.op == "output" else step for step in self.steps
+            step._replace(memory=outputs[step.number].memory)
+            if step.op == "output" and step.number in program.by_ray
+            else step
+            for step in self.steps
         ]
         whole = any(step.op == "encode" and step.name == "spherical" for step in self.work)
         fewest, most = (_WHOLE if whole else _ROWS[0]), _ROWS[1]
