@@ -29,15 +29,24 @@ _FEW = 4  # outputs of a layer that has a product of its own (few_outputs_tile.h
 
 @custom_op("grouped_program_native")
 def grouped_program(
-    inputs: Sequence[Tensor], parameters: Sequence[Tensor], offsets: Tensor, order: Tensor | None, text: str
+    inputs: Sequence[Tensor],
+    parameters: Sequence[Tensor],
+    offsets: Tensor,
+    order: Tensor | None,
+    ray_index: Tensor | None,
+    text: str,
 ) -> Iterator[list[Tensor]]:
     """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
-    program, n, k = Program.parse(text), inputs[0].shape[0], offsets.shape[0] - 1
-    results = [inputs[0].new_empty(n, columns.width) for columns in program.outputs]
-    sums = [inputs[0].new_empty(k, *shape) for shape in program.sums]
+    program, k = Program.parse(text), offsets.shape[0] - 1
+    n, new = (inputs[0] if ray_index is None else ray_index).shape[0], inputs[0].new_empty
+    rays = inputs[program.rays[0]].shape[0] if program.rays else 0
+    counts = [rays if i in program.by_ray else n for i in range(len(program.outputs))]
+    results = [new(count, columns.width) for count, columns in zip(counts, program.outputs)]
+    sums = [new(count, *shape) for count, shape in zip(program.cells_of_sums(parameters, k), program.sums)]
     yield [*results, *sums]
-    if program.orders > _ORDERS:
-        for made, found in zip((*results, *sums), in_torch(inputs, parameters, offsets, order, text), strict=True):
+    if program.orders > _ORDERS or program.rays or program.grids or any(step.op == "encode" for step in program.steps):
+        every = in_torch(inputs, parameters, offsets, order, ray_index, text)
+        for made, found in zip((*results, *sums), every, strict=True):
             made.copy_(found)
         return
     plan, machine = _plan(text), native.machine(inputs[0])
@@ -68,15 +77,15 @@ def grouped_program(
 
 
 def _keep(ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
-    rows, parameters, offsets, order, ctx.text = inputs
+    rows, parameters, offsets, order, ray_index, ctx.text = inputs
     ctx.count, ctx.k = len(rows), offsets.shape[0] - 1
     ctx.shared = [p.shape[0] == 1 for p in parameters]
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*rows, *parameters, offsets, order)
+    ctx.save_for_backward(*rows, *parameters, offsets, order, ray_index)
 
 
 def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
-    *saved, offsets, order = ctx.saved_tensors
+    *saved, offsets, order, ray_index = ctx.saved_tensors
     rows, parameters, count = saved[: ctx.count], saved[ctx.count :], ctx.count
     wanted = asked_for(ctx, saved)
     found: list[Tensor | None] = [None] * len(saved)
@@ -86,13 +95,14 @@ def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
         which = tuple(wanted[:count]), tuple(wanted[count:]), tuple(given[:split]), tuple(given[split:])
         more = [[g.contiguous() for g in part if g is not None] for part in (arriving[:split], arriving[split:])]
         own = gradient(program, *which)
-        results = grouped_program([*rows, *more[0]], [*parameters, *more[1]], offsets, order, own.text)
+        results = grouped_program([*rows, *more[0]], [*parameters, *more[1]], offsets, order, ray_index, own.text)
         following = iter(results)
         found = [next(following) if want else None for want in wanted]
         for i, shared in enumerate(ctx.shared, start=count):
             if shared and ctx.k > 1 and found[i] is not None:
                 found[i] = found[i].sum(0, keepdim=True)  # type: ignore[union-attr]
-    return found[:count], found[count:], None, None, None
+        found = [None if g is None else g.to(t.dtype) for g, t in zip(found, saved, strict=True)]
+    return found[:count], found[count:], None, None, None, None
 
 
 grouped_program.register_autograd(_gradients, setup_context=_keep)
