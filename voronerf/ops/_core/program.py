@@ -191,7 +191,7 @@ class Program:
         parts = [self.inputs, self.parameters, self.steps, self.outputs, self.sums, self.rays, self.by_ray, self.grids]
         object.__setattr__(self, "text", json.dumps(parts))
         object.__setattr__(self, "orders", max(map(_order, self.steps), default=0))
-        read = {int(step.numbers[1]) for step in self.steps if step.op == "scatter" or step.name == "hash"}
+        read = {int(step.numbers[1]) for step in self.steps if _reads_table(step)}
         object.__setattr__(self, "tables", tuple(sorted(read)))
         of_sums = {step.out: int(step.numbers[1]) for step in self.steps if step.op == "scatter"}
         object.__setattr__(self, "sum_tables", tuple(of_sums.get(index) for index in range(len(self.sums))))
@@ -520,6 +520,10 @@ def _sums(step: Step) -> bool:
     return step.op in ("outer", "columns", "scatter")
 
 
+def _reads_table(step: Step) -> bool:
+    return step.op == "scatter" or (step.op == "encode" and step.name == "hash")
+
+
 # Gradients ------------------------------------------------------------------------------------------------------------
 
 
@@ -601,7 +605,7 @@ def gradient(
         else:
             depends = any(c.index in (active if c.of == VALUE else wanted) for c in at)
             depends = depends or (step.op == "linear" and int(step.numbers[0]) in wanted)
-            depends = depends or (step.name == "hash" and int(step.numbers[1]) in wanted)
+            depends = depends or (_reads_table(step) and int(step.numbers[1]) in wanted)
         if depends and step.name != "stop":
             active.add(step.out)
     widths = {step.out: step.width for step in b.steps}

@@ -55,8 +55,8 @@ def grouped_program(
         program: what to do.
         order: int32 [n]: row i that the offsets speak of is row ``order[i]`` of inputs and results, which need not be
             sorted then. None for rows that are sorted.
-        ray_index: int32 [n], values 0 to r - 1: the ray of each row of inputs and results, which ``order`` does not
-            change. None for a program without inputs of rays.
+        ray_index: int32 [n], values 0 to r - 1: the ray of each row of inputs and results, so that ``order`` leads to
+            ``ray_index[order[i]]``. None for a program without inputs of rays.
         backend: "auto", "reference" or "native".
 
     Returns:
@@ -94,7 +94,7 @@ def grouped_program(
     run = backends.resolve(_OP, backend=backend, device=inputs[0].device, dtype=dtype)
     if dtype in _HALF:
         inputs = [x.float() for x in inputs]
-        parameters = [p if i in program.tables else p.float() for i, p in enumerate(parameters)]
+        parameters = [p if _among(i, program.tables) else p.float() for i, p in enumerate(parameters)]
     results: list[Tensor] = run(inputs, parameters, offsets, order, ray_index, program.text)
     return [tensor.to(dtype) for tensor in results] if dtype in _HALF else results
 
@@ -136,12 +136,12 @@ def _check(
     if sizes["k"] < 1:
         raise ValueError(f"{_OP}: offsets must be of at least one cell, got {list(offsets.shape)}")
     for i, (x, width) in enumerate(zip(inputs, program.inputs)):
-        check_shape(_OP, f"inputs[{i}]", x, ("r" if i in program.rays else "n", width), sizes)
+        check_shape(_OP, f"inputs[{i}]", x, ("r" if _among(i, program.rays) else "n", width), sizes)
         check_dtype(_OP, f"inputs[{i}]", x, backends.COORDINATES if i == 0 else (inputs[0].dtype,))
     for i, (p, shape) in enumerate(zip(parameters, program.parameters)):
         check_tensor(_OP, f"parameters[{i}]", p)
         check_shape(_OP, f"parameters[{i}]", p, (1 if p.shape[:1] == (1,) else "k", *shape), sizes)
-        known = (inputs[0].dtype, *(_TABLES if i in program.tables else ()))
+        known = (inputs[0].dtype, *(_TABLES if _among(i, program.tables) else ()))
         check_dtype(_OP, f"parameters[{i}]", p, tuple(dict.fromkeys(known)))
     if (ray_index is not None) != bool(program.rays):
         rule = "given for a program with" if program.rays else "None for a program without"
@@ -150,7 +150,7 @@ def _check(
     if ray_index is not None:
         check_shape(_OP, "ray_index", ray_index, ("n",), sizes)
         check_dtype(_OP, "ray_index", ray_index, INDEX)
-        first = program.rays[0]
+        first = next(i for i in range(len(inputs)) if _among(i, program.rays))
         if not sizes["r"] and sizes["n"]:
             found = list(inputs[first].shape)
             raise ValueError(f"{_OP}: inputs[{first}] must hold a row for the ray_index, got {found}")
@@ -164,6 +164,11 @@ def _check(
     named.update({f"parameters[{i}]": p for i, p in enumerate(parameters)})
     check_same_device(_OP, **named)
     check_no_inference(_OP, **named)
+
+
+def _among(i: int, numbers: Sequence[int]) -> bool:
+    """Whether a number is one of a program's, which torch.compile may take for sizes and not find by ``in``."""
+    return any(i == number for number in numbers)
 
 
 def _check_rays(ray_index: Tensor, r: int) -> None:

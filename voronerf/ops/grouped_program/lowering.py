@@ -47,13 +47,11 @@ class Lowered:
         program: that of the compiled module.
         lookups: those whose values may be kept, [n, width] each in the order of the cells.
         widths: floats of a row of each.
-        scatters: the parameter of each sum that is the gradient of a table; other sums are not in it.
     """
 
     program: native.compiled.Program
     lookups: tuple[Lookup, ...]
     widths: tuple[int, ...]
-    scatters: dict[int, int]
 
 
 @functools.lru_cache(maxsize=1024)
@@ -401,7 +399,7 @@ class _Lowering:
     def finished(self) -> Lowered:
         """The compiled program."""
         program, compiled = self.program, self.compiled
-        scattered = {out: lookup.parameter for lookup, _, out in self.scatters}
+        scattered = [out for _, _, out in self.scatters]
         for i, shape in enumerate(program.sums):
             if i not in scattered and not any(record[0] == i for record in self.sums):
                 size = shape[0] * (shape[1] if len(shape) > 1 else 1)
@@ -445,7 +443,6 @@ class _Lowering:
             compiled.make_program(table),
             tuple(lookup for lookup, _ in self.lookups),
             tuple(self.memories[memory] for _, memory in self.lookups),
-            scattered,
         )
 
 

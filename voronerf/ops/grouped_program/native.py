@@ -89,10 +89,8 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
         first.new_empty(r if i in program.by_ray else n, columns.width) for i, columns in enumerate(program.outputs)
     ]
     here, new = first.device, torch.empty
-    tables = {step.out: parameters[int(step.numbers[1])].shape[0] for step in program.steps if step.op == "scatter"}
-    sums = [
-        new(tables.get(i, k), *shape, device=here, dtype=torch.float32) for i, shape in enumerate(program.sums)
-    ]
+    counts = program.cells_of_sums(parameters, k)
+    sums = [new(count, *shape, device=here, dtype=torch.float32) for count, shape in zip(counts, program.sums)]
     lowered = lower(how.text, _half(how.products, first)) if compiled_runs(how.text) else None
     keeping: list[Tensor] = []
     if lowered is not None and how.keep:

@@ -187,7 +187,7 @@ def along(encode: Callable[[Tensor], Tensor], directions: Sequence[Tensor]) -> C
 
 
 def _slope(encode: Callable[[Tensor], Tensor], direction: Tensor, x: Tensor) -> Tensor:
-    y, back = torch.func.vjp(encode, x)
+    y, back, *_ = torch.func.vjp(encode, x)
     # The gradient of <direction, back(v)> to v; PyTorch's forward mode compiles TorchScript.
     return torch.func.vjp(lambda v: back(v)[0], torch.zeros_like(y))[1](direction)[0]
 
