@@ -140,11 +140,12 @@ class Pool {
     if (!sort(in)) return false;
     call_.rows.forward(in, all.raw.data(), own_);
     const SeeOutputs& out = call_.out;
-    add_wave(call_.isa,
-             {all.raw.data(), all.depths.data(), all.deltas.data(), offsets_.data(), number_.data(),
-              call_.rule.density_scale, front_.data(), out.heaviest == nullptr ? nullptr : most_.data(), out.colour,
-              out.opacity, out.depth, out.light, out.heaviest},
-             count_);
+    add_wave(
+        call_.isa,
+        {all.raw.data(), all.depths.data(), all.deltas.data(), offsets_.data(), number_.data(),
+         call_.rule.density_scale, call_.rule.activated, front_.data(),
+         out.heaviest == nullptr ? nullptr : most_.data(), out.colour, out.opacity, out.depth, out.light, out.heaviest},
+        count_);
     return true;
   }
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.march_rays import march_rays
+from voronerf.ops.render_loss.reference import activate
 from voronerf.ops.routed_mlp import routed_mlp
 
 
@@ -65,6 +66,7 @@ def render_opaque(
     samples: int,
     network: Mapping[str, Any],
     density_scale: float,
+    activated: bool,
     wave: int,
     opaque: float,
     spacing: str,
@@ -90,10 +92,9 @@ def render_opaque(
         if seen_by is not None:
             seen_from = {"directions": seen_by[live], "direction_index": march.ray_index}
         raw, _ = routed_mlp(positions=positions, coords=coords, **seen_from, **given, backend=backend)
-        raw = raw.to(near.dtype)
-        density = torch.nn.functional.softplus(raw[:, 3]) * density_scale
+        colours, density = activate(raw.to(near.dtype), density_scale, activated)
         packed: dict[str, Any] = {"ray_offsets": march.ray_offsets, "backend": backend}
-        seen = composite(density, raw[:, :3].sigmoid(), march.depths, march.deltas, **packed)
+        seen = composite(density, colours, march.depths, march.deltas, **packed)
         return Wave(seen, march.ray_index, march.ray_offsets, march.depths, march.stop)
 
     return walk(look, far, samples, wave, opaque, heaviest)
