@@ -33,9 +33,10 @@ def render_loss(
 ) -> RenderLoss:
     """The mean squared error of rendered rays, from what the networks put out for their samples.
 
-    The colour of a sample is ``sigmoid(raw[:, :3])``, its density ``density_scale * softplus(raw[:, 3])``. `composite`
-    makes the colours of the rays of them. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020,
-    equations 3 and 6). The native backend computes loss and gradient in one pass over each ray.
+    The colour of a sample is ``sigmoid(raw[:, :3])``, its density ``density_scale * softplus(raw[:, 3])``. With
+    ``activated`` both are ``raw`` as it is, for networks with other activations. `composite` makes the colours of the
+    rays of them. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020, equations 3 and 6). The
+    native backend computes loss and gradient in one pass over each ray.
 
     Args:
         raw: [m, 4], colour and density before their activations, or ``activated``: float16, bfloat16, float32 or
@@ -72,6 +73,9 @@ def render_loss(
         >>> result.loss.backward()
         >>> raw.grad[:, :3].round(decimals=4)  # lighter
         tensor([[-0.0833, -0.0833, -0.0833]])
+        >>> values = torch.tensor([[0.5, 0.5, 0.5, 50.0]])  # the same wall, of networks that have activated
+        >>> float(render_loss(values, torch.ones(1), offsets, torch.ones(1, 3), activated=True).loss)
+        0.25
     """
 
 

@@ -62,7 +62,7 @@ def render_opaque(
 ) -> RaySums:
     """Renders rays without gradients and without randomness: each is walked until it is opaque.
 
-    Equivalent to ``march_rays``, ``routed_mlp``, the activations of ``render_loss`` and ``composite`` for a few samples
+    Equivalent to ``march_rays``, ``routed_mlp``, activations as in ``render_loss`` and ``composite`` for a few samples
     of each ray at a time, of all rays that are not opaque yet. So the networks are asked about little more than what
     lies in front of the first surface of each ray.
 
