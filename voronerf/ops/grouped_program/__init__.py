@@ -88,8 +88,6 @@ def grouped_program(
         _check(inputs, parameters, offsets, program, order, ray_index)
         if alike is not None and len(_PASSED) < 4096:
             _PASSED.add(alike)
-    if ray_index is not None:
-        _check_rays(ray_index, inputs[program.rays[0]].shape[0])
     dtype = inputs[0].dtype
     run = backends.resolve(_OP, backend=backend, device=inputs[0].device, dtype=dtype)
     if dtype in _HALF:
@@ -169,12 +167,3 @@ def _check(
 def _among(i: int, numbers: Sequence[int]) -> bool:
     """Whether a number is one of a program's, which torch.compile may take for sizes and not find by ``in``."""
     return any(i == number for number in numbers)
-
-
-def _check_rays(ray_index: Tensor, r: int) -> None:
-    """Raises ValueError for an index that names no ray; on the CPU, as it reads the index."""
-    if ray_index.device.type != "cpu" or ray_index.numel() == 0 or torch.compiler.is_compiling():
-        return
-    low, high = (int(bound) for bound in ray_index.aminmax())
-    if low < 0 or high >= r:
-        raise ValueError(f"{_OP}: ray_index must be 0 to {r - 1}, got {low if low < 0 else high}")

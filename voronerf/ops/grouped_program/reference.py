@@ -39,6 +39,9 @@ def grouped_program(
     for i in program.rays:
         assert ray_index is not None
         rays = inputs[i].shape[0]
+        if n and (int(ray_index.min()) < 0 or int(ray_index.max()) >= rays):
+            wrong = int(ray_index.min() if ray_index.min() < 0 else ray_index.max())
+            raise ValueError(f"grouped_program: ray_index must be 0 to {rays - 1}, got {wrong}")
         rows[i] = inputs[i].index_select(0, ray_index)
     run = _Run(program, rows, parameters, offsets, slice(low, high))
     results = [run.columns(columns) for columns in program.outputs]
