@@ -151,9 +151,8 @@ class _Lowering:
         written: list[Step] = []
         for number, c in enumerate(program.outputs):
             step = made.get(c.index) if c.of == VALUE else None
-            if step is None or step.op != "move" or uses[c.index] > 1 or c[2:] != (0, step.width, False):
-                written.append(Step("output", number, c.width, (c,), (number, 0)))
-            elif not _covered(step):
+            alone = step is not None and step.op == "move" and uses[c.index] == 1 and _all_of(c, step.width)
+            if step is None or not alone or not _covered(step):
                 written.append(Step("output", number, c.width, (c,), (number, 0)))
             else:
                 steps.remove(step)
@@ -208,9 +207,7 @@ class _Lowering:
         given |= {"memory": value.memory, "input": value.input}
         if product:
             given["pairs"] = value.pairs if _all_of(c, value.width) else _NONE
-        return self.compiled.ProgramOperand(
-            parameter=False, slot=max(value.slot, 0), stride=value.stride, **given
-        )
+        return self.compiled.ProgramOperand(parameter=False, slot=max(value.slot, 0), stride=value.stride, **given)
 
     def emit(self, op: str, operands: Iterable[Any] = (), value: _Value | None = None, **given: Any) -> None:
         """One step's record."""
@@ -269,10 +266,10 @@ class _Lowering:
             if known is None or c.index not in dying or c.spread or c.start or known.stride != value.stride:
                 continue
             others = [other for other in step.operands if other.of == VALUE and other.index == c.index]
-            if known.slot != _NONE and known.memory == _NONE and known.input == _NONE:
-                if all(other.start == 0 and not other.spread for other in others):
-                    value.slot, known.slot = known.slot, _NONE
-                    return value
+            here = known.slot != _NONE and known.memory == _NONE and known.input == _NONE
+            if here and all(other.start == 0 and not other.spread for other in others):
+                value.slot, known.slot = known.slot, _NONE
+                return value
         value.slot = self.slots.take(value.stride)
         return value
 
@@ -408,7 +405,9 @@ class _Lowering:
         outputs = []
         for number, c in enumerate(program.outputs):
             ray = number in program.by_ray
-            outputs.append(compiled.ProgramOutput(c.width, ray, self.memory(c.width) if ray else self.own.get(number, _NONE)))
+            outputs.append(
+                compiled.ProgramOutput(c.width, ray, self.memory(c.width) if ray else self.own.get(number, _NONE))
+            )
         steps = [
             step._replace(memory=outputs[step.number].memory)
             if step.op == "output" and step.number in program.by_ray

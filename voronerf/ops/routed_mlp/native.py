@@ -30,7 +30,7 @@ def routed_mlp(
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
     network, where = prepared(positions, weights, biases, **given)
     route = find(positions, where, weights[0].shape[0])
-    out = network.run("routed_mlp", route.offsets, route.order)
+    out = network.run(route.offsets, route.order)
     if where.rows is None or native.on_cuda(out):
         return out, route.cells
     return first_rows(out, route.cells, where.rows)
@@ -51,7 +51,7 @@ def prepared(
     cell."""
     where = Where(**places)
     cells, rows = where.cells, where.rows
-    network = as_network(Given(positions, weights, biases, layers, directions, direction_index, features))
+    network = as_network(Given(positions, weights, biases, layers, directions, direction_index, features), "routed_mlp")
     if rows is not None and cells is not None and native.on_cuda(cells):
         where = where._replace(cells=torch.where(torch.arange(cells.shape[0], device=cells.device) < rows, cells, -1))
     if cells is None and weights[0].shape[0] == 1:
