@@ -323,6 +323,8 @@ def check(program: Program) -> None:
             if not (count in (1 + extra, 2 + extra) and fits(operands[0], rows=True)):
                 return False
             depth = operands[0].width
+            if not (depth and width):  # the products walk them with loops that test at the end
+                return False
             inside = (depth, start + width) if transposed else (width, start + depth)
             others = all(fits(each, width, rows=each.of == VALUE) for each in operands[1:])
             return inside[0] == o and inside[1] <= i and others and not tables.setdefault(matrix, False)

@@ -69,7 +69,8 @@ class Route(NamedTuple):
 
 def find(positions: Tensor, where: Where, k: int) -> Route:
     """The cells of samples, and their order by cell; None where there is one cell."""
-    cells, order, offsets = locate_and_sort(positions, where, k)
+    coords = None if where.coords is None else where.coords.detach()
+    cells, order, offsets = locate_and_sort(positions.detach(), where._replace(coords=coords), k)
     return Route(cells if where.cells is None else where.cells, order if order.numel() else None, offsets)
 
 
@@ -97,3 +98,14 @@ def locate_and_sort(positions: Tensor, where: Where, k: int) -> Iterator[tuple[T
         else:
             locate_cell.find(found, coords, centres, (child_offsets, child, depth), "routed_mlp", rows)
     cell_sort.sort(found if cells is None else cells, order, offsets, "routed_mlp")
+
+
+def _setup(ctx: Any, inputs: Any, output: tuple[Tensor, ...]) -> None:
+    ctx.mark_non_differentiable(*output)
+
+
+def _nothing(ctx: Any, *gradients: None) -> tuple[Any, ...]:
+    return None, Where(*(None,) * len(Where._fields)), None  # type: ignore[arg-type]
+
+
+locate_and_sort.register_autograd(_nothing, setup_context=_setup)  # integers, which torch.func asks for all the same
