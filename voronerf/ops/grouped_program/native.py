@@ -6,6 +6,7 @@ derivatives than the compiled module has runs in PyTorch.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -88,7 +89,9 @@ def program_of(rows: Rows, how: How) -> Program:
         return Program.parse(how.text)
     p, q = int(rows.inputs[0].shape[1]), int(rows.inputs[1].shape[1]) if len(rows.inputs) > 1 else 0
     widths = tuple([int(weight.shape[1]) for weight in rows.parameters[: len(how.biased)]])
-    return MLP.parse(how.text).program(p, q, widths, tuple([bias == "1" for bias in how.biased]), rows.ray_index is not None)
+    return MLP.parse(how.text).program(
+        p, q, widths, tuple([bias == "1" for bias in how.biased]), rows.ray_index is not None
+    )
 
 
 @custom_op("grouped_program_native")
@@ -99,10 +102,10 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
     n = (first if ray_index is None else ray_index).shape[0]
     r = inputs[program.rays[0]].shape[0] if program.rays else 0
     counts = [r if i in program.by_ray else n for i in range(len(program.outputs))]
-    outputs = [first.new_empty(count, columns.width) for count, columns in zip(counts, program.outputs)]
+    outputs = [first.new_empty((count, columns.width)) for count, columns in zip(counts, program.outputs)]
     float32: dict[str, Any] = {"dtype": torch.float32, "device": first.device}
     counts = program.cells_of_sums(parameters, k)
-    sums = [new(count, *shape, **float32) for count, shape in zip(counts, program.sums)]
+    sums = [new((count, *shape), **float32) for count, shape in zip(counts, program.sums)]
     lowered = lower(program.text, _half(how.products, first)) if compiled_runs(program.text) else None
     keeps = [new(n * sum(lowered.widths) if lowered else 0, **float32)] if how.keep else []
     yield [*outputs, *sums, *keeps]
@@ -142,14 +145,16 @@ def program_inputs(
         caller: the op that errors name.
     """
     inputs, parameters, offsets, order, ray_index, _ = rows
-    turned = [int(not x.is_contiguous() and x.dim() == 2 and _columns_lie_together(x, n)) for x in inputs]
+    turned = [0 if x.is_contiguous() else int(_columns_lie_together(x, n)) for x in inputs]
+    if any(turned):
+        inputs = [x.t() if turn else x for x, turn in zip(inputs, turned)]
     return native.compiled.ProgramInputs(
-        inputs=[x.t() if turn else x for x, turn in zip(inputs, turned)],
+        inputs=inputs,
         input_types=_types(inputs),
         turned=turned,
-        parameters=[native.aligned(p) for p in parameters],
+        parameters=[native.aligned(p) for p in parameters] if native.on_cuda(offsets) else parameters,
         parameter_types=_types(parameters),
-        strides=[p[0].numel() if p.shape[0] > 1 else 0 for p in parameters],
+        strides=[p.shape[1:].numel() if p.shape[0] > 1 else 0 for p in parameters],
         offsets=offsets,
         order=order,
         ray_index=ray_index,
@@ -217,27 +222,39 @@ def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted
     """
     program, count = program_of(rows, how), len(rows.inputs)
     split, given = len(program.outputs), tuple([g is not None for g in arriving])
-    own = gradient(program, tuple(wanted[:count]), tuple(wanted[count:]), given[:split], given[split:])
+    own = _gradient(program.text, count, split, tuple(wanted), given)
     more = [[g for g in part if g is not None] for part in (arriving[:split], arriving[split:])]
-    kept = rows.kept if program.grids and compiled_runs(own.text) and _lookups(own) == _lookups(program) else None
-    rays = any(i >= count for i in own.rays)
-    sifts = not own.outputs and not more[1] and not rays and all(g.dtype == torch.float32 for g in more[0])
-    following = how._replace(text=own.text, biased="", keep=False, gradients=count if sifts else -1)
-    call = rows._replace(inputs=[*rows.inputs, *more[0]], parameters=[*rows.parameters, *more[1]], kept=kept)
-    if torch.is_grad_enabled():  # a pass of its own, whose look-ups its gradient may have
-        found = run_program(call, following)
-    else:
-        found = run(call, following)
-    results = found[: len(own.outputs)]
-    learning = [p for p, want in zip(rows.parameters, wanted[count:]) if want]
-    for total, p in zip(found[len(own.outputs) :], learning, strict=True):
+    sifts = own.sifts and not more[1] and all(g.dtype == torch.float32 for g in more[0])
+    following = How(own.text, "", how.caller, how.products, False, count if sifts else -1)
+    inputs, parameters, *others, kept = rows
+    call = Rows([*inputs, *more[0]], [*parameters, *more[1]], *others, kept if own.keeps else None)
+    # Of a pass that is differentiated again, what is looked up may be kept once more.
+    found = run_program(call, following) if torch.is_grad_enabled() else run(call, following)
+    results, learning = found[: own.outputs], [p for p, want in zip(parameters, wanted[count:]) if want]
+    for total, p in zip(found[own.outputs :], learning, strict=True):
         total = total.sum(0, keepdim=True) if p.shape[0] == 1 and total.shape[0] > 1 else total
-        results.append(total.to(p.dtype))
+        results.append(total if p.dtype == total.dtype else total.to(p.dtype))
     return results
 
 
-def _lookups(program: Program) -> Any:
-    return lower(program.text, False).lookups
+class _Gradient(NamedTuple):
+    """The program of gradients: its text, how many of its results are gradients of inputs, whether it sifts rows (see
+    `How.gradients`), and whether what the program kept is what it looks up."""
+
+    text: str
+    outputs: int
+    sifts: bool
+    keeps: bool
+
+
+@functools.lru_cache(maxsize=1024)
+def _gradient(text: str, count: int, split: int, wanted: tuple[bool, ...], given: tuple[bool, ...]) -> _Gradient:
+    program = Program.parse(text)
+    own = gradient(program, wanted[:count], wanted[count:], given[:split], given[split:])
+    sifts = not own.outputs and all(i < count for i in own.rays)
+    keeps = bool(program.grids) and compiled_runs(own.text) and compiled_runs(text)
+    keeps = keeps and lower(own.text, False).lookups == lower(text, False).lookups
+    return _Gradient(own.text, len(own.outputs), sifts, keeps)
 
 
 run.register_autograd(_gradients, setup_context=_keep)
