@@ -4,6 +4,7 @@
 //
 //   VN_LAUNCH((kernel<64>), grid, block, bytes, stream, arguments...)     checked
 //   VN_SHARED(name, float[8][64]);   VN_DYN_SHARED(float4, name);
+//   kernel(const VN_GRID_CONSTANT Struct argument)     which functions may have by reference without a copy
 //
 // Below them are the instructions that CUDA C++ has no function for.
 #pragma once
@@ -12,7 +13,9 @@
 
 #ifdef VN_EMULATE
 #include "emulation.h"
+#define VN_GRID_CONSTANT
 #else
+#define VN_GRID_CONSTANT __grid_constant__
 #include <cuda_bf16.h>
 #include <cuda_fp16.h>
 
