@@ -89,6 +89,10 @@ class Frame {
           return true;
         }
         return false;
+      case Type::Kind::text:
+        if (!PyUnicode_Check(given)) return false;
+        *static_cast<const char**>(place) = PyUnicode_AsUTF8(given);  // which the string keeps
+        return *static_cast<const char**>(place) != nullptr;
       case Type::Kind::tensor:
         return load_tensor(type, given, *static_cast<void**>(place));
       case Type::Kind::tensors:

@@ -1,15 +1,14 @@
-#include "bindings/bind.h"
-#include "network/program.h"
+#include "bindings/program.h"
 
 namespace voronerf {
 
-VN_STRUCT(ProgramInputs, code, constants, inputs, turned, parameters, strides, widths, outputs, offsets, order, n, k);
-VN_STRUCT(ProgramSizes, columns, partial, inputs, parameters, outputs, sums);
-
 VN_BINDINGS(module) {
+  module.plain("make_program", &make_program);
   module.cpu("grouped_program", VN_CPU(grouped_program_cpu));
   module.cuda("grouped_program", VN_CUDA(grouped_program_cuda));
-  module.cuda("grouped_program_workspace", VN_CUDA(grouped_program_workspace_cuda));
+  module.plain("grouped_program_workspace", VN_CUDA(grouped_program_workspace_cuda));
+  module.plain("program_code_bytes", VN_CUDA(program_code_bytes_cuda));
+  module.plain("program_code", VN_CUDA(program_code_cuda));
 }
 
 }  // namespace voronerf

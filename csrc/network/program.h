@@ -62,14 +62,14 @@ struct Program {
 };
 std::unique_ptr<Program> make_program(const ProgramTable& table);
 
-// Tensors of a call.
+// Tensors of a call. Of each input and parameter: its type, and how it lies.
 struct ProgramInputs {
-  const void* const* inputs;       // [n, w] or [r, w]; float32 or bfloat16
-  const int32_t* input_types;      // TableType of each
-  const int32_t* turned;           // 1: it is [w, n], as PyTorch's look-ups in planes give it; float32
-  const void* const* parameters;   // [k, ...] or [1, ...]; float32, but tables of hash grids may be 16 bits
-  const int32_t* parameter_types;  // TableType of each
-  const int64_t* strides;          // entries from one cell's parameter to the next: 0 where all cells share it
+  const void* const* inputs;  // [n, w] or [r, w]; float32 or bfloat16
+  std::vector<TableType> input_types;
+  std::vector<int32_t> turned;    // it is [w, n], as PyTorch's look-ups in planes give it; float32
+  const void* const* parameters;  // [k, ...] or [1, ...]; float32, but tables of hash grids may have 16 bits
+  std::vector<TableType> parameter_types;
+  std::vector<int64_t> strides;  // entries from one cell's parameter to the next: 0 where all cells share it
   const int32_t* offsets;
   const int32_t* order;      // or null
   const int32_t* ray_index;  // [n], or null without inputs and outputs of rays
@@ -78,14 +78,15 @@ struct ProgramInputs {
   // what was looked up is not kept.
   float* const* kept;
   bool ready;
-  // Rows that are 0 in all inputs from this one on add nothing to any sum; -1: there are none such.
+  // Rows that are 0 in all inputs from this one on, float32 and of no rays, add nothing to any sum; -1: there are none
+  // such.
   int64_t gradients;
   const char* caller;  // the operation that errors name
 };
 
 struct ProgramResults {
-  void* const* outputs;  // float32, or as output_types says
-  const int32_t* output_types;
+  void* const* outputs;  // of output_types
+  std::vector<TableType> output_types;
   float* const* sums;  // [k, ...] each; of a table [tables, entries, features]
 };
 

@@ -14,6 +14,8 @@
 
 namespace voronerf {
 
+constexpr int kGranule = 16;  // columns of every slot are padded to a multiple of this
+
 enum class ProgramOp : int { input, output, linear, function, binary, total, move, encode, outer, columns };
 enum class ProgramBinary : int { add, sub, mul, div, gate };
 enum class ProgramFinish : int { none, relu, relu_slope };
@@ -27,7 +29,8 @@ enum class ProgramFunction : int { VN_FUNCTIONS(VN_NUMBER) };
 //   turned   the same as panels [o][width]
 //   vector   entries [start, start + width)
 //   few, few_turned   as the first two for up to four outputs, [1 or 4][inputs] (few_outputs_tile.h)
-//   waves    no parameter: the table of an encoding (frequency_encode_tile.h), `o` octaves of `i` features, [3][width]
+//   waves    no parameter: the table of an encoding (frequency_encode_tile.h), `o` octaves of `i` features, which come
+//            first themselves if start is 1, [3][width]
 enum class ProgramPackKind : int { matrix, turned, vector, few, few_turned, waves };
 struct ProgramPack {
   ProgramPackKind kind;

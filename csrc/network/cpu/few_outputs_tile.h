@@ -4,7 +4,7 @@
 #pragma once
 
 #include "network/cpu/gemm_tile.h"
-#include "network/cpu/grouped_mlp_plan.h"
+#include "network/program_code.h"
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {

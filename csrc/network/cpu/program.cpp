@@ -2,12 +2,13 @@
 #include "network/program.h"
 
 #include <algorithm>
+#include <cstring>
 #include <stdexcept>
 #include <string>
 
 #include "common/common.h"
 #include "common/parallel.h"
-#include "network/cpu/program_code.h"
+#include "network/cpu/program_rows.h"
 #include "network/cpu/row_tasks.h"
 
 namespace voronerf {
@@ -15,79 +16,385 @@ namespace voronerf {
 namespace {
 
 constexpr RowLimits kRows{96, 1024}, kSumRows{384, 4096};
-constexpr int64_t kTaskUnit = 48, kGranule = 16, kSlack = 128;
+constexpr int64_t kTaskUnit = 48;  // tasks are whole tiles or halves of one
+constexpr int64_t kSlack = 128;    // floats behind the slots that vectors may read and write
 
-void pack(Isa isa, const ProgramCall& call, int64_t cell, float* packed) {
-  VN_FOR_ISA(isa, program_pack(call, cell, packed))
-}
-void run(Isa isa, const ProgramCall& call, const RowTask& task, const float* packed, float* tiles, float* partial) {
-  VN_FOR_ISA(isa, program_run(call, task.begin, task.end, packed, tiles, partial))
-}
-void reduce(Isa isa, const ProgramCall& call, int64_t cell, float* partials, int64_t count) {
-  VN_FOR_ISA(isa, program_reduce(call, cell, partials, count))
+int64_t aligned(int64_t floats) { return ceil_div<int64_t>(floats, kGranule) * kGranule; }
+
+void check_range(const ProgramInputs& in, const char* name, const int32_t* values, int64_t end) {
+  bool beyond = false;  // what is below 0, too, as an unsigned number
+  for (int64_t i = 0; i < in.n; ++i) beyond |= static_cast<uint32_t>(values[i]) >= static_cast<uint32_t>(end);
+  if (!beyond) return;
+  const auto [low, high] = std::minmax_element(values, values + in.n);
+  throw std::invalid_argument(std::string(in.caller) + ": " + name + " must be 0 to " + std::to_string(end - 1) +
+                              ", got " + std::to_string(*low < 0 ? *low : *high));
 }
 
-// Parameters of a cell on their way to the cache, as of grouped_mlp.
+// Parameters of a cell on their way to the cache: of many small cells, each would be waited for. Large ones take so
+// long to run that reading them does not show, and would push out what is in use.
 void fetch(const ProgramCall& call, int64_t cell) {
   constexpr int64_t kLine = 16, kMostFetched = 1 << 15;  // floats
-  const auto& header = *reinterpret_cast<const ProgramHeader*>(call.code);
-  if (header.packed > kMostFetched) return;
-  const auto* packs = reinterpret_cast<const ProgramPack*>(call.code + sizeof(ProgramHeader) / 4);
-  for (int32_t p = 0; p < header.packs; ++p) {
-    const int64_t stride = call.strides[packs[p].parameter];
-    const float* from = call.parameters[packs[p].parameter] + cell * stride;
+  if (call.code.packed > kMostFetched) return;
+  for (int32_t p = 0; p < call.code.pack_count; ++p) {
+    const ProgramPack& pack = call.code.packs[p];
+    if (pack.kind == ProgramPackKind::waves) continue;
+    const int64_t stride = call.strides[pack.parameter];
+    const float* from = static_cast<const float*>(call.parameters[pack.parameter]) + cell * stride;
     for (int64_t i = 0; i < stride; i += kLine) __builtin_prefetch(from + i, 0, 2);
   }
 }
 
+// Rows of no cell.
+void clear_strays(const ProgramInputs& in, const ProgramResults& results, const ProgramTable& table) {
+  for (size_t o = 0; o < table.outputs.size(); ++o) {
+    if (table.outputs[o].ray) continue;
+    const bool half = results.output_types[o] == TableType::bfloat16;
+    const int64_t bytes = table.outputs[o].width * (half ? 2 : 4);
+    char* const out = static_cast<char*>(results.outputs[o]);
+    const auto clear = [&](int64_t begin, int64_t end) {
+      if (in.order == nullptr) {
+        std::memset(out + begin * bytes, 0, static_cast<size_t>((end - begin) * bytes));
+      } else {
+        for (int64_t i = begin; i < end; ++i) std::memset(out + in.order[i] * bytes, 0, static_cast<size_t>(bytes));
+      }
+    };
+    clear(0, in.offsets[0]);
+    clear(in.offsets[in.k], in.n);
+  }
+}
+
+// Rows with a gradient, which alone add to sums; those without are samples that no light reaches, say.
+struct Sifted {
+  std::vector<int32_t> rows, order, offsets;  // numbers as sorted, and of the caller; [k+1]. Empty: all rows
+};
+
+// Empty too where the few without a gradient would not pay for copies. Blocks of rows list their own, which are then
+// put together.
+Sifted sift(const ProgramTable& table, const ProgramInputs& in, int threads) {
+  constexpr int64_t kBlock = 1024;
+  const int64_t first = in.offsets[0], all = in.offsets[in.k] - first, blocks = ceil_div(all, kBlock);
+  std::vector<int32_t> lists(all), begins(blocks + 1, 0);
+  parallel_for(blocks, 1, threads, [&](int64_t block) {
+    int32_t* to = lists.data() + block * kBlock;
+    int32_t count = 0;
+    const int64_t begin = first + block * kBlock, end = std::min(first + all, begin + kBlock);
+    for (int64_t i = begin; i < end; ++i) {
+      const int64_t row = in.order == nullptr ? i : in.order[i];
+      bool zero = true;
+      for (size_t input = static_cast<size_t>(in.gradients); input < table.inputs.size(); ++input) {
+        const int64_t width = table.inputs[input].width;
+        const float* from = static_cast<const float*>(in.inputs[input]) + row * width;
+        for (int64_t c = 0; c < width; ++c) zero &= from[c] == 0.0f;
+      }
+      to[count] = static_cast<int32_t>(i);
+      count += !zero;
+    }
+    begins[block + 1] = count;
+  });
+  for (int64_t block = 0; block < blocks; ++block) begins[block + 1] += begins[block];
+  const int64_t count = blocks > 0 ? begins[blocks] : 0;
+  Sifted found;
+  constexpr int64_t kPart = 16;  // of the rows at least are left out
+  if (count > all - all / kPart) return found;
+  found.rows.resize(count);
+  found.order.resize(count);
+  parallel_for(blocks, 1, threads, [&](int64_t block) {
+    const int32_t* from = lists.data() + block * kBlock;
+    for (int32_t i = begins[block]; i < begins[block + 1]; ++i) {
+      const int32_t row = *from++;
+      found.rows[i] = row;
+      found.order[i] = in.order == nullptr ? row : in.order[row];
+    }
+  });
+  found.offsets.resize(in.k + 1);
+  for (int64_t cell = 0; cell <= in.k; ++cell) {
+    found.offsets[cell] = static_cast<int32_t>(
+        std::lower_bound(found.rows.begin(), found.rows.end(), in.offsets[cell]) - found.rows.begin());
+  }
+  return found;
+}
+
+// Rows [n, width] in the order of the cells, summed over the samples of each ray in that order.
+void sum_by_ray(const ProgramInputs& in, int64_t width, const float* rows, float* out) {
+  std::fill(out, out + in.r * width, 0.0f);
+  for (int64_t i = in.offsets[0]; i < in.offsets[in.k]; ++i) {
+    float* to = out + in.ray_index[in.order == nullptr ? i : in.order[i]] * width;
+    for (int64_t c = 0; c < width; ++c) to[c] += rows[i * width + c];
+  }
+}
+
+// A grid at rows [begin, end), one level after the other, whose entries then stay in cache.
+void lookup_by_level(const HashEncoding& grid, int64_t begin, int64_t end, float* out, int64_t stride, Isa isa,
+                     int threads) {
+  constexpr int64_t kLine = 64, kTask = 1 << 14;  // bytes, rows
+  const int64_t runs = ceil_div(end - begin, kTask);
+  parallel_for(grid.count * runs, 1, threads, [&](int64_t item) {
+    const int64_t level = item / runs, first = begin + item % runs * kTask, last = std::min(end, first + kTask);
+    const int64_t entry = grid.features * (grid.in.type == TableType::float32 ? 4 : 2);
+    const char* table = static_cast<const char*>(grid.in.table) + grid.levels[level].offset * entry;
+    const int64_t size = grid.levels[level].entries * entry;
+    for (int64_t byte = 0; 8 * kLine * (last - first) > size && byte < size; byte += kLine) {
+      __builtin_prefetch(table + byte, 0, 2);
+    }
+    hash_level_cpu(grid, level, out, stride, first, last, isa);
+  });
+}
+
+ProgramCode code_of(const ProgramTable& table) {
+  const auto count = [](const auto& records) { return static_cast<int32_t>(records.size()); };
+  ProgramCode code{};
+  code.packs = table.packs.data();
+  code.steps = table.steps.data();
+  code.operands = table.operands.data();
+  code.sums = table.sums.data();
+  code.pack_count = count(table.packs);
+  code.step_count = count(table.steps);
+  code.sum_count = count(table.sums);
+  code.tile = table.tile;
+  code.columns = table.columns;
+  code.packed = table.packed;
+  code.partial = table.partial;
+  code.scratch = table.scratch;
+  code.scratch_width = table.scratch_width;
+  return code;
+}
+
 }  // namespace
 
-void grouped_program_cpu(const ProgramInputs& in, float* const* outputs, float* const* sums, Isa isa, int threads) {
-  check_offsets("grouped_program", in.offsets, in.k, in.n);
-  if (in.order != nullptr) {
-    bool beyond = false;  // what is below 0, too, as an unsigned number
-    for (int64_t i = 0; i < in.n; ++i) beyond |= static_cast<uint32_t>(in.order[i]) >= static_cast<uint32_t>(in.n);
-    if (beyond) {
-      const auto [low, high] = std::minmax_element(in.order, in.order + in.n);
-      throw std::invalid_argument("grouped_program: order must lie in 0 to " + std::to_string(in.n - 1) +
-                                  ", got values from " + std::to_string(*low) + " to " + std::to_string(*high));
+std::unique_ptr<Program> make_program(const ProgramTable& table) { return std::make_unique<Program>(Program{table}); }
+
+ProgramRows::ProgramRows(const Program& program, const ProgramInputs& in, Isa isa)
+    : table_(program.table),
+      isa_(isa),
+      tile_(std::min<int64_t>(table_.tile, tile_rows())),
+      rays_(new bool[table_.inputs.size()]),
+      turned_(new bool[table_.inputs.size()]) {
+  for (size_t i = 0; i < table_.inputs.size(); ++i) {
+    input_widths_.push_back(table_.inputs[i].width);
+    rays_[i] = table_.inputs[i].ray;
+    turned_[i] = in.turned[i] != 0;
+  }
+  for (const ProgramOutput& output : table_.outputs) output_widths_.push_back(output.width);
+  for (const HashGrid& grid : table_.grids) {
+    HashInputs none{};
+    for (const GridLevel& level : grid.levels) none.entries += level.entries;
+    grids_.push_back(hash_encoding(none, grid));
+  }
+}
+
+int64_t ProgramRows::workspace() const { return aligned(aligned(table_.packed) + table_.columns * tile_ + kSlack); }
+
+ProgramCall ProgramRows::call(const ProgramInputs& in, const ProgramResults& results, bool* in_place) const {
+  for (size_t i = 0; i < table_.inputs.size(); ++i) {
+    const bool plain = in.input_types[i] == TableType::float32 && !turned_[i] && !rays_[i];
+    in_place[i] = plain && in.order == nullptr;
+  }
+  ProgramCall call{};
+  call.code = code_of(table_);
+  call.inputs = in.inputs;
+  call.input_types = in.input_types.data();
+  call.input_widths = input_widths_.data();
+  call.turned = turned_.get();
+  call.rays = rays_.get();
+  call.in_place = in_place;
+  call.parameters = in.parameters;
+  call.parameter_types = in.parameter_types.data();
+  call.strides = in.strides.data();
+  call.outputs = results.outputs;
+  call.output_types = results.output_types.data();
+  call.output_widths = output_widths_.data();
+  call.sums = results.sums;
+  call.grids = grids_.data();
+  call.order = in.order;
+  call.ray_index = in.ray_index;
+  call.n = in.n;
+  call.tile = tile_;
+  return call;
+}
+
+void ProgramRows::pack(const ProgramCall& call, int64_t cell, bool first, float* own) const {
+  float* const tiles = own + aligned(table_.packed);
+#if VN_HAS_HALF
+  if (table_.half) return avx512::program_half_pack(call, cell, first, own, tiles);
+#endif
+  VN_FOR_ISA(isa_, program_pack(call, cell, first, own, tiles))
+}
+
+void ProgramRows::run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, float* own,
+                      float* partial) const {
+  float* const tiles = own + aligned(table_.packed);
+#if VN_HAS_HALF
+  if (table_.half) return avx512::program_half_run(call, cell, begin, end, own, tiles, partial);
+#endif
+  VN_FOR_ISA(isa_, program_run(call, cell, begin, end, own, tiles, partial))
+}
+
+void ProgramRows::reduce(const ProgramCall& call, int64_t cell, float* partials, int64_t count) const {
+  VN_FOR_ISA(isa_, program_reduce(call, cell, partials, count))
+}
+
+void ProgramRows::forward(const ProgramInputs& in, const ProgramResults& results, Own& own) const {
+  constexpr size_t kFew = 16;  // inputs and memories of a network; more would need memory for each call
+  VN_CHECK(table_.inputs.size() <= kFew && table_.memories.size() <= kFew, "a program of rows has at most 16 inputs");
+  bool in_place[kFew];
+  float* memories[kFew] = {};
+  bool filled[kFew] = {};
+  ProgramCall made = call(in, results, in_place);
+  made.memories = memories;
+  made.filled = filled;
+  for (int64_t cell = 0; cell < in.k; ++cell) {
+    if (in.offsets[cell] == in.offsets[cell + 1]) continue;
+    if (cell != own.packed) pack(made, cell, own.packed < 0, own.memory);
+    own.packed = cell;
+    run(made, cell, in.offsets[cell], in.offsets[cell + 1], own.memory, nullptr);
+  }
+}
+
+void grouped_program_cpu(const Program& program, const ProgramInputs& given, const ProgramResults& results, Isa isa,
+                         int threads) {
+  const ProgramTable& table = program.table;
+  check_offsets(given.caller, given.offsets, given.k, given.n);
+  if (given.order != nullptr) check_range(given, "order", given.order, given.n);
+  if (given.ray_index != nullptr) check_range(given, "ray_index", given.ray_index, given.r);
+  ProgramInputs in = given;
+  Sifted sifted;
+  if (given.gradients >= 0) sifted = sift(table, given, threads);
+  const bool fewer = !sifted.offsets.empty();
+  if (fewer) {
+    in.n = static_cast<int64_t>(sifted.rows.size());
+    in.order = sifted.order.data();
+    in.offsets = sifted.offsets.data();
+  }
+  const ProgramRows rows(program, in, isa);
+  std::unique_ptr<bool[]> in_place(new bool[table.inputs.size()]), filled(new bool[table.memories.size()]());
+  std::vector<float*> memories(table.memories.size(), nullptr);
+  ProgramCall call = rows.call(in, results, in_place.get());
+  call.memories = memories.data();
+  call.filled = filled.get();
+  clear_strays(in, results, table);
+
+  // The memory of the call: threads, partials, memories of n rows, and points in the order of the cells.
+  const bool summed = !table.sums.empty();
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, summed ? kSumRows : kRows, kTaskUnit, table.partial);
+  const int64_t own_partial = rows.workspace(), stride = aligned(own_partial + table.partial);
+  const int64_t partials = summed ? tasks.first_partial[in.k] : 0;
+  int64_t floats = stride * threads + aligned(partials * table.partial);
+  const auto take = [&floats](int64_t count) {
+    const int64_t at = floats;
+    floats += aligned(count);
+    return at;
+  };
+  std::vector<int64_t> places(table.memories.size(), -1), points(table.inputs.size(), -1);
+  const auto gather = [&](int32_t input) {
+    auto& place = points[static_cast<size_t>(input)];
+    if (in.order != nullptr && place < 0) place = take(in.n * 3);
+  };
+  for (size_t l = 0; l < table.lookups.size(); ++l) {
+    const ProgramLookup& lookup = table.lookups[l];
+    float* const kept = in.kept == nullptr ? nullptr : in.kept[l];
+    const auto m = static_cast<size_t>(lookup.memory);
+    if (kept == nullptr) continue;
+    if (fewer) {
+      VN_CHECK(in.ready, "what is kept of rows with a gradient is ready");
+      places[m] = take(in.n * table.memories[m]);
+    } else {
+      memories[m] = kept;
+    }
+    const bool shared = in.strides[static_cast<size_t>(lookup.parameter)] == 0 || in.k == 1;
+    filled[m] = in.ready || shared;
+    if (!in.ready && shared) gather(lookup.input);
+  }
+  for (const ProgramScatter& scatter : table.scatters) {
+    places[static_cast<size_t>(scatter.memory)] = take(in.n * table.memories[static_cast<size_t>(scatter.memory)]);
+    gather(scatter.input);
+  }
+  for (const ProgramOutput& output : table.outputs) {
+    if (output.ray) places[static_cast<size_t>(output.memory)] = take(in.n * output.width);
+  }
+  const Workspace workspace(floats + kSlack);
+  float* const memory = workspace.data();
+  for (size_t m = 0; m < memories.size(); ++m) {
+    if (places[m] >= 0) memories[m] = memory + places[m];
+  }
+  constexpr int64_t kRun = 512;  // rows that are copied at a time
+  if (fewer) {
+    for (size_t l = 0; l < table.lookups.size(); ++l) {
+      const auto m = static_cast<size_t>(table.lookups[l].memory);
+      const float* const kept = in.kept == nullptr ? nullptr : in.kept[l];
+      if (kept == nullptr) continue;
+      const int64_t width = table.memories[m];
+      parallel_for(in.n, kRun, threads, [&](int64_t row) {
+        std::copy_n(kept + sifted.rows[static_cast<size_t>(row)] * width, width, memories[m] + row * width);
+      });
     }
   }
-  const auto& header = *reinterpret_cast<const ProgramHeader*>(in.code);
-  const int64_t tile = std::min<int64_t>(header.tile, tile_rows());
-  const ProgramCall call{in.code, in.constants,  in.inputs,  in.turned, in.n, outputs,
-                         sums,    in.parameters, in.strides, in.order,  tile};
-  const auto clear = [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      for (int64_t o = 0; o < in.outputs; ++o) {
-        std::fill_n(outputs[o] + (in.order == nullptr ? i : in.order[i]) * in.widths[o], in.widths[o], 0.0f);
-      }
-    }
+  const auto points_of = [&](int32_t input) {
+    const int64_t place = points[static_cast<size_t>(input)];
+    return place < 0 ? static_cast<const float*>(in.inputs[input]) : memory + place;
   };
-  clear(0, in.offsets[0]);
-  clear(in.offsets[in.k], in.n);
-  const bool summed = header.sums > 0;
-  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, summed ? kSumRows : kRows, kTaskUnit, header.partial);
-  const int64_t tiles = header.packed, own_partial = tiles + header.columns * tile + kSlack;
-  const int64_t stride = ceil_div(own_partial + header.partial, kGranule) * kGranule;
-  const int64_t partials = summed ? tasks.first_partial[in.k] : 0;
-  const Workspace workspace(stride * threads + partials * header.partial);
-  float* partial = workspace.data() + stride * threads;
-  for_each_task(
-      tasks, workspace.data(), stride, threads, [&](int64_t cell, float* own, bool) { pack(isa, call, cell, own); },
-      [&](int64_t cell) { fetch(call, cell); },
-      [&](const RowTask& task, float* own) {
-        const bool alone = task.partial < 0;
-        float* to = alone ? own + own_partial : partial + task.partial * header.partial;
-        run(isa, call, task, own, own + tiles, to);
-        if (alone && summed) reduce(isa, call, task.cell, to, 1);
-      });
-  if (!summed) return;
-  parallel_for(in.k, 1, threads, [&](int64_t cell) {
-    const int64_t count = tasks.partials(cell);
-    const bool empty = in.offsets[cell + 1] == in.offsets[cell];
-    if (count > 0 || empty) reduce(isa, call, cell, partial + tasks.first_partial[cell] * header.partial, count);
-  });
+  for (size_t i = 0; i < points.size(); ++i) {
+    if (points[i] < 0) continue;
+    const float* const from = static_cast<const float*>(in.inputs[i]);
+    float* const to = memory + points[i];
+    parallel_for(in.n, kRun, threads, [&](int64_t row) { std::copy_n(from + 3 * in.order[row], 3, to + 3 * row); });
+  }
+  const auto grid_of = [&](int32_t number, int32_t parameter, int32_t input) {
+    HashEncoding grid = rows.grids()[static_cast<size_t>(number)];
+    grid.in.table = in.parameters[parameter];
+    grid.in.type = in.parameter_types[static_cast<size_t>(parameter)];
+    grid.in.tables = 1;
+    grid.in.positions = points_of(input);
+    return grid;
+  };
+
+  // Look-ups in a table of all cells, level by level: the entries of one level stay in cache.
+  for (const ProgramLookup& lookup : table.lookups) {
+    const auto m = static_cast<size_t>(lookup.memory);
+    if (in.ready || memories[m] == nullptr || !filled[m]) continue;
+    const HashEncoding grid = grid_of(lookup.grid, lookup.parameter, lookup.input);
+    lookup_by_level(grid, in.offsets[0], in.offsets[in.k], memories[m], table.memories[m], isa, threads);
+  }
+
+  if (!tasks.tasks.empty()) {
+    float* const partial = memory + stride * threads;
+    for_each_task(
+        tasks, memory, stride, threads,
+        [&](int64_t cell, float* own, bool first) { rows.pack(call, cell, first, own); },
+        [&](int64_t cell) { fetch(call, cell); },
+        [&](const RowTask& task, float* own) {
+          const bool alone = task.partial < 0;
+          float* const to = alone ? own + own_partial : partial + task.partial * table.partial;
+          rows.run(call, task.cell, task.begin, task.end, own, to);
+          if (alone && summed) rows.reduce(call, task.cell, to, 1);
+        });
+  }
+  if (summed) {
+    float* const partial = memory + stride * threads;
+    parallel_for(in.k, 1, threads, [&](int64_t cell) {
+      const int64_t count = tasks.partials(cell);
+      const bool empty = in.offsets[cell + 1] == in.offsets[cell];
+      if (count > 0 || empty) rows.reduce(call, cell, partial + tasks.first_partial[cell] * table.partial, count);
+    });
+  }
+
+  // The gradients of tables, level by level: the rows are added up in their order by any number of threads.
+  for (const ProgramScatter& scatter : table.scatters) {
+    const auto m = static_cast<size_t>(scatter.memory);
+    const HashEncoding grid = grid_of(scatter.grid, scatter.parameter, scatter.input);
+    const bool shared = in.strides[static_cast<size_t>(scatter.parameter)] == 0;
+    const int64_t tables = shared ? 1 : in.k, size = grid.in.entries * grid.features;
+    float* const to = results.sums[scatter.sum];
+    parallel_for(tables * grid.count, 1, threads, [&](int64_t item) {
+      const int64_t one = item / grid.count, level = item % grid.count;
+      hash_level_backward_cpu(grid, level, memories[m], table.memories[m], in.offsets[shared ? 0 : one],
+                              in.offsets[shared ? in.k : one + 1], to + one * size, isa);
+    });
+  }
+  for (size_t o = 0; o < table.outputs.size(); ++o) {
+    const ProgramOutput& output = table.outputs[o];
+    if (!output.ray) continue;
+    sum_by_ray(in, output.width, memories[static_cast<size_t>(output.memory)], static_cast<float*>(results.outputs[o]));
+  }
 }
 
 }  // namespace voronerf

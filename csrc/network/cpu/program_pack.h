@@ -1,0 +1,168 @@
+// Parameters of a cell in the order in which the products read them: in panels (gemm_tile.h), so that a block walks
+// memory in a straight line.
+#pragma once
+
+#include "encoding/frequency_encode_tile.h"
+#include "network/cpu/program_isa.h"
+
+namespace voronerf {
+namespace VN_ISA_NAMESPACE {
+namespace {
+
+// Four rows of `from` become the four columns of `to`; by fours, since weights of small networks are packed often.
+VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t count, float* to, int64_t to_stride) {
+  int64_t i = 0;
+#if VN_ISA == 1 || VN_ISA == 2
+  for (; i + 8 <= count; i += 8) {  // columns i and i + 4 side by side
+    const __m256 a = _mm256_loadu_ps(from + i), b = _mm256_loadu_ps(from + from_stride + i);
+    const __m256 c = _mm256_loadu_ps(from + 2 * from_stride + i), d = _mm256_loadu_ps(from + 3 * from_stride + i);
+    const __m256 ab = _mm256_unpacklo_ps(a, b), cd = _mm256_unpacklo_ps(c, d);
+    const __m256 ab_high = _mm256_unpackhi_ps(a, b), cd_high = _mm256_unpackhi_ps(c, d);
+    const __m256 columns[] = {_mm256_shuffle_ps(ab, cd, 0x44), _mm256_shuffle_ps(ab, cd, 0xee),
+                              _mm256_shuffle_ps(ab_high, cd_high, 0x44), _mm256_shuffle_ps(ab_high, cd_high, 0xee)};
+    for (int64_t j = 0; j < 4; ++j) {
+      _mm_storeu_ps(to + (i + j) * to_stride, _mm256_castps256_ps128(columns[j]));
+      _mm_storeu_ps(to + (i + 4 + j) * to_stride, _mm256_extractf128_ps(columns[j], 1));
+    }
+  }
+#elif VN_ISA == 3
+  for (; i + 4 <= count; i += 4) {
+    F32 rows[4];
+    for (int row = 0; row < 4; ++row) rows[row] = load(from + row * from_stride + i);
+    transpose(rows);
+    for (int column = 0; column < 4; ++column) store(to + (i + column) * to_stride, rows[column]);
+  }
+#endif
+  for (; i < count; ++i) {
+    for (int64_t row = 0; row < 4; ++row) to[i * to_stride + row] = from[row * from_stride + i];
+  }
+}
+
+VN_INLINE int64_t padded(int64_t width) { return (width + kGranule - 1) / kGranule * kGranule; }
+
+// A product's operand along `depth`, with bfloat16 in pairs: as many steps.
+VN_INLINE int64_t steps_of(int64_t depth) { return VN_HALF ? (depth + 1) / 2 : depth; }
+
+// The matrix as it lies in memory: outputs of the product next to each other (`turned`), or its depth.
+struct Matrix {
+  const float* from;
+  int64_t stride;  // from one row in memory to the next
+  int64_t outputs, depth;
+  bool turned;
+
+  float at(int64_t o, int64_t k) const { return turned ? from[k * stride + o] : from[o * stride + k]; }
+};
+
+// [outputs][depth] -> [1 or 4][depth], filled up with 0; the depth in whole vectors.
+[[maybe_unused]] void pack_few(const Matrix& m, float* to) {
+  constexpr int64_t kStep = (VN_HALF ? 2 : 1) * kLanes;
+  for (int64_t o = 0; o < (m.outputs == 1 ? 1 : 4); ++o) {
+    for (int64_t k = 0; k < m.depth; k += kStep, to += kLanes) {
+      float values[kStep];
+      for (int64_t i = 0; i < kStep; ++i) values[i] = o < m.outputs ? m.at(o, k + i) : 0.0f;
+#if VN_HALF
+      store(to, joined(load(values), load(values + kLanes)));
+#else
+      store(to, load(values));
+#endif
+    }
+  }
+}
+
+#if VN_HALF
+
+// -> panels [pairs of depth][<= kPanel outputs, padded with 0]. Rows are narrowed four at a time into `free`, then
+// transposed, a pair being as wide as a float.
+[[maybe_unused]] void pack_panels(const Matrix& m, float* to, float* free) {
+  const int64_t all = padded(m.outputs), depth = steps_of(m.depth);
+  for (int64_t first = 0; first < all; first += kPanel) {
+    const int64_t columns = all - first < kPanel ? all - first : kPanel;
+    float* const panel = to + first * depth;
+    if (m.turned) {
+      for (int64_t k = 0; k < m.depth; k += 2) {
+        for (int64_t c = 0; c < columns; c += kGranule) {
+          const int64_t count = m.outputs - first - c;
+          const float* from = m.from + k * m.stride + first + c;
+          const F32 even = load_some(from, count);
+          const F32 odd = k + 1 < m.depth ? load_some(from + m.stride, count) : splat(0.0f);
+          store(panel + k / 2 * columns + c, interleave(even, odd));
+        }
+      }
+      continue;
+    }
+    const int64_t stride = depth + kGranule;
+    for (int64_t column = 0; column < columns; column += 4) {
+      for (int64_t row = 0; row < 4; ++row) {
+        const int64_t o = first + column + row;
+        float* const pairs = free + row * stride;
+        if (o < m.outputs) {
+          narrow_row(m.from + o * m.stride, m.depth, pairs);
+        } else {
+          for (int64_t k = 0; k < depth; ++k) pairs[k] = 0.0f;
+        }
+      }
+      transpose_four(free, stride, depth, panel + column, columns);
+    }
+  }
+}
+
+#else
+
+// -> panels [depth][<= kPanel outputs, padded with 0].
+[[maybe_unused]] void pack_panels(const Matrix& m, float* to, float*) {
+  const int64_t all = padded(m.outputs);
+  for (int64_t first = 0; first < all; first += kPanel) {
+    const int64_t columns = all - first < kPanel ? all - first : kPanel;
+    const int64_t count = m.outputs - first < columns ? m.outputs - first : columns;
+    float* const panel = to + first * m.depth;
+    if (m.turned) {
+      for (int64_t k = 0; k < m.depth; ++k) {
+        const float* row = m.from + k * m.stride + first;
+        for (int64_t c = 0; c < count; ++c) panel[k * columns + c] = row[c];
+        for (int64_t c = count; c < columns; ++c) panel[k * columns + c] = 0.0f;
+      }
+      continue;
+    }
+    for (int64_t column = 0; column < columns; column += 4) {
+      const int64_t o = first + column;
+      if (o + 4 <= m.outputs) {
+        transpose_four(m.from + o * m.stride, m.stride, m.depth, panel + column, columns);
+        continue;
+      }
+      for (int64_t k = 0; k < m.depth; ++k) {
+        for (int64_t c = 0; c < 4; ++c) panel[k * columns + column + c] = o + c < m.outputs ? m.at(o + c, k) : 0.0f;
+      }
+    }
+  }
+}
+
+#endif
+
+[[maybe_unused]] void pack_cell(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free) {
+  for (int32_t p = 0; p < call.code.pack_count; ++p) {
+    const ProgramPack& pack = call.code.packs[p];
+    float* const to = packed + pack.at;
+    if (pack.kind == ProgramPackKind::waves) {
+      if (first) encode_table(to, pack.width, {pack.i, pack.o, pack.start != 0});
+      continue;
+    }
+    const float* from =
+        static_cast<const float*>(call.parameters[pack.parameter]) + cell * call.strides[pack.parameter] + pack.start;
+    if (pack.kind == ProgramPackKind::vector) {
+      for (int64_t c = 0; c < padded(pack.width); ++c) to[c] = c < pack.width ? from[c] : 0.0f;
+      continue;
+    }
+    const bool turned = pack.kind == ProgramPackKind::turned || pack.kind == ProgramPackKind::few_turned;
+    const bool few = pack.kind == ProgramPackKind::few || pack.kind == ProgramPackKind::few_turned;
+    const Matrix matrix{from, pack.i, turned ? pack.width : pack.o, turned ? pack.o : pack.width, turned};
+    if (few) {
+      pack_few(matrix, to);
+    } else {
+      pack_panels(matrix, to, free);
+    }
+  }
+}
+
+}  // namespace
+}  // namespace VN_ISA_NAMESPACE
+}  // namespace voronerf

@@ -1,0 +1,450 @@
+"""Programs as the compiled module reads them: the records of csrc/network/program_code.h. Made once for each program.
+
+Letters: n rows, k cells, w columns of a value.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from voronerf.ops._core import native
+from voronerf.ops._core.program import (
+    PARAMETER,
+    VALUE,
+    Columns,
+    Program,
+    Step,
+    encoded_columns,
+    merged,
+)
+from voronerf.ops.hash_encode.native import compiled_grid
+
+_ORDERS = 3  # of derivatives that the compiled module has
+_FLOATS = 96 << 10  # of the values of a tile: they share the second cache level with the weights
+_ROWS = (24, 96)  # of a tile, whole blocks of the products (gemm_tile.h)
+_WHOLE = 48  # rows of a tile where harmonics write whole vectors of rows
+_GRANULE = 16
+_FEW = 4  # outputs of a layer that has a product of its own (few_outputs_tile.h)
+_NONE = -1
+
+
+class Lookup(NamedTuple):
+    """A hash grid at the points of an input: which value of a program it is."""
+
+    input: int
+    parameter: int
+    grid: int
+
+
+@dataclass(frozen=True)
+class Lowered:
+    """A program that is ready to run.
+
+    Attributes:
+        program: that of the compiled module.
+        lookups: those whose values may be kept, [n, width] each in the order of the cells.
+        widths: floats of a row of each.
+        scatters: the parameter of each sum that is the gradient of a table; other sums are not in it.
+    """
+
+    program: native.compiled.Program
+    lookups: tuple[Lookup, ...]
+    widths: tuple[int, ...]
+    scatters: dict[int, int]
+
+
+@functools.lru_cache(maxsize=1024)
+def compiled_runs(text: str) -> bool:
+    """Whether the compiled module has all derivatives that a program takes."""
+    program = Program.parse(text)
+    sums = [step.out for step in program.steps if step.op == "scatter"]
+    return program.orders <= _ORDERS and len(sums) == len(set(sums))
+
+
+@functools.lru_cache(maxsize=1024)
+def lower(text: str, half: bool) -> Lowered:
+    """The records of a program, given by its text, for products of float32 or, if ``half``, of pairs of bfloat16."""
+    return _Lowering(merged(Program.parse(text)), half).lowered()
+
+
+def _padded(width: int, to: int = _GRANULE) -> int:
+    return -(-width // to) * to
+
+
+class _Slots:
+    """Places of values in the workspace of a tile, in columns; one that is free again is used again."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._free: list[tuple[int, int]] = []  # (width, place)
+
+    def take(self, width: int) -> int:
+        """A place for so many columns."""
+        fitting = [slot for slot in self._free if slot[0] == width]
+        if fitting:
+            self._free.remove(fitting[-1])
+            return fitting[-1][1]
+        self.size += width
+        return self.size - width
+
+    def give(self, width: int, place: int) -> None:
+        """It is free again."""
+        self._free.append((width, place))
+
+
+@dataclass
+class _Value:
+    """Where a value is: its slot, rows of ``stride`` floats, and what else a step may read it from."""
+
+    width: int
+    stride: int
+    slot: int = _NONE
+    memory: int = _NONE
+    input: int = _NONE  # which may be read in place
+    pairs: int = _NONE
+    floats: bool = True  # whether anything reads them, where there are pairs
+
+
+class _Lowering:
+    """Records on their way."""
+
+    def __init__(self, program: Program, half: bool) -> None:
+        self.program, self.half = program, half
+        self.compiled = native.compiled
+        self.slots, self.values = _Slots(), dict[int, _Value]()
+        self.packs: dict[tuple[Any, ...], tuple[int, int]] = {}  # their number, and where they are
+        self.packed, self.partial = 0, 0
+        self.steps: list[Any] = []
+        self.operands: list[Any] = []
+        self.sums: list[tuple[int, str, int, int, int, int, int, int, int]] = []
+        self.memories: list[int] = []
+        self.lookups: list[tuple[Lookup, int]] = []
+        self.scatters: list[tuple[Lookup, int, int]] = []
+        self.outputs: list[Any] = []
+        self.work = self._in_order()
+        self.readers: dict[int, list[tuple[Step, int]]] = {}
+        for step in self.work:
+            for place, c in enumerate(step.operands):
+                if c.of == VALUE:
+                    self.readers.setdefault(c.index, []).append((step, place))
+        self.scratch_width = self._scratch()
+        self.scratch = self.slots.take(2 * self.scratch_width) if self.scratch_width else 0
+
+    # What there is to do ----------------------------------------------------------------------------------------------
+
+    def _in_order(self) -> list[Step]:
+        """The steps, then those that write outputs; each part of a value that a move only puts together is written."""
+        program, fresh = self.program, 1 + max((s.out for s in self.program.steps if not _sums(s)), default=0)
+        steps, uses = list[Step](), dict[int, int]()
+        for step in program.steps:
+            if step.op == "scatter" and not self._whole(step.operands[1]):
+                g = step.operands[1]
+                steps.append(Step("function", fresh, g.width, (g,), (0, 0.0, 0.0), "copy"))
+                step = step._replace(operands=(step.operands[0], Columns(VALUE, fresh, 0, g.width)))
+                fresh += 1
+            steps.append(step)
+        for c in (*program.outputs, *(c for step in steps for c in step.operands)):
+            if c.of == VALUE:
+                uses[c.index] = uses.get(c.index, 0) + 1
+        made = {step.out: step for step in steps if not _sums(step)}
+        written: list[Step] = []
+        for number, c in enumerate(program.outputs):
+            step = made.get(c.index) if c.of == VALUE else None
+            if step is None or step.op != "move" or uses[c.index] > 1 or c[2:] != (0, step.width, False):
+                written.append(Step("output", number, c.width, (c,), (number, 0)))
+            elif not _covered(step):
+                written.append(Step("output", number, c.width, (c,), (number, 0)))
+            else:
+                steps.remove(step)
+                for part, at in zip(step.operands, step.numbers):
+                    written.append(Step("output", number, part.width, (part,), (number, at)))
+        return [*steps, *written]
+
+    def _whole(self, g: Columns) -> bool:
+        """Whether columns are a whole value that a step makes, which then can live in memory of the call."""
+        made = {step.out: step for step in self.program.steps if not _sums(step)}
+        scattered = [step.operands[1].index for step in self.program.steps if step.op == "scatter"]
+        step = made[g.index]
+        alone = scattered.count(g.index) == 1 and step.op not in ("input", "encode")
+        return alone and g.start == 0 and g.width == step.width and not g.spread
+
+    def _scratch(self) -> int:
+        """Columns of each of the two parts of memory that a step may use."""
+        widths = [0]
+        for step in self.work:
+            if step.op == "encode" and step.name in ("spherical", "hash"):
+                widths.append(_GRANULE)
+            if self.half and step.op == "linear":
+                widths.append(_padded(step.operands[0].width, 2 * _GRANULE) // 2)
+            if self.half and step.op == "outer":
+                widths.append(max(_padded(c.width, 2 * _GRANULE) for c in step.operands) // 2)
+        return _padded(max(widths))
+
+    # Records ----------------------------------------------------------------------------------------------------------
+
+    def pack(self, kind: str, parameter: int, start: int, width: int, floats: int, shape: tuple[int, int]) -> int:
+        """The number of the pack of a part of a parameter."""
+        key = (kind, parameter, *shape, start, width)
+        if key not in self.packs:
+            self.packs[key] = len(self.packs), self.packed
+            self.packed += _padded(floats)
+        return self.packs[key][0]
+
+    def shape(self, parameter: int) -> tuple[int, int]:
+        """Of a matrix; a vector is one row."""
+        shape = self.program.parameters[parameter]
+        return (shape[0], shape[1]) if len(shape) == 2 else (1, shape[0])
+
+    def operand(self, c: Columns, place: int = 0, *, product: bool = False) -> Any:
+        """One operand's record; ``product``: x of a linear step, or what an outer product reads entry by entry."""
+        given: dict[str, Any] = dict.fromkeys(("memory", "input", "pairs"), _NONE)
+        given |= {"start": c.start, "width": c.width, "place": place, "spread": c.spread}
+        if c.of == PARAMETER:
+            width = 1 if c.spread else c.width
+            number = self.pack("vector", c.index, c.start, width, width, self.shape(c.index))
+            return self.compiled.ProgramOperand(parameter=True, slot=number, stride=0, **(given | {"start": 0}))
+        value = self.values[c.index]
+        if product:
+            whole = c.start == 0 and c.width == value.width
+            given |= {"input": value.input, "pairs": value.pairs if whole else _NONE}
+        given["memory"] = value.memory
+        return self.compiled.ProgramOperand(
+            parameter=False, slot=max(value.slot, 0), stride=value.stride, **given
+        )
+
+    def emit(self, op: str, operands: Iterable[Any] = (), value: _Value | None = None, **given: Any) -> None:
+        """One step's record."""
+        operands = list(operands)
+        fields: dict[str, Any] = {"function": "copy", "binary": "add", "encoding": "frequency", "finish": "none"}
+        fields |= {"order": 0, "width": 0, "slot": 0, "stride": 0, "memory": _NONE, "number": 0, "depth": 0}
+        fields |= {"parameter": 0, "pairs": _NONE, "floats": True, "in_place": False, "a": 0.0, "b": 0.0}
+        if value is not None:
+            fields |= {"width": value.width, "slot": max(value.slot, 0), "stride": value.stride}
+            fields |= {"memory": value.memory, "pairs": value.pairs, "floats": value.floats}
+        fields |= {"first": len(self.operands), "count": len(operands)}
+        self.steps.append(self.compiled.ProgramStep(op=op, **(fields | given)))
+        self.operands += operands
+
+    def memory(self, width: int) -> int:
+        """The number of another memory of the call, [n][width]."""
+        self.memories.append(width)
+        return len(self.memories) - 1
+
+    # Steps ------------------------------------------------------------------------------------------------------------
+
+    def lowered(self) -> Lowered:
+        """All records."""
+        last = {c.index: at for at, step in enumerate(self.work) for c in step.operands if c.of == VALUE}
+        for at, step in enumerate(self.work):
+            dying = {c.index for c in step.operands if c.of == VALUE and last[c.index] == at}
+            lower: Callable[[Step, set[int]], None] = getattr(self, f"_{step.op}")
+            lower(step, dying)
+            for value in dying:
+                self.free(value)
+            if not _sums(step) and step.op != "output" and step.out not in last:
+                self.free(step.out)
+        return self.finished()
+
+    def free(self, value: int) -> None:
+        """A value is not needed any more."""
+        known = self.values[value]
+        if known.slot != _NONE:
+            self.slots.give(known.stride, known.slot)
+        if known.pairs != _NONE:
+            self.slots.give(_padded(known.width, 2 * _GRANULE) // 2, known.pairs)
+
+    def make(self, step: Step, dying: set[int], entrywise: Iterable[Columns] = (), stride: int = 0) -> _Value:
+        """Where a step's value is to be: in the place of an operand that is read entry by entry and not needed any
+        more, or in a place of its own."""
+        value = _Value(step.width, stride or _padded(step.width))
+        self.values[step.out] = value
+        scattered = [reader for reader, place in self.readers.get(step.out, []) if reader.op == "scatter" and place]
+        if scattered:
+            value.memory = self.memory(value.stride)
+            return value
+        for c in entrywise:
+            known = self.values[c.index] if c.of == VALUE else None
+            if known is None or c.index not in dying or c.spread or c.start or known.stride != value.stride:
+                continue
+            others = [other for other in step.operands if other.of == VALUE and other.index == c.index]
+            if known.slot != _NONE and known.memory == _NONE and known.input == _NONE:
+                if all(other.start == 0 and not other.spread for other in others):
+                    value.slot, known.slot = known.slot, _NONE
+                    return value
+        value.slot = self.slots.take(value.stride)
+        return value
+
+    def _input(self, step: Step, dying: set[int]) -> None:
+        number, readers = int(step.numbers[0]), self.readers.get(step.out, [])
+        encoded = [reader.op in ("encode", "scatter") and place == 0 for reader, place in readers]
+        value = self.make(step, dying, stride=step.width if readers and all(encoded) else 0)
+        plain = number not in self.program.rays
+        if plain and readers and all(self._product(reader, place) for reader, place in readers):
+            value.input = number
+        self.emit("input", value=value, number=number, in_place=value.input != _NONE)
+
+    def _product(self, step: Step, place: int) -> bool:
+        """Whether an operand is read no further than its columns: as x of a linear step, or broadcast in a sum."""
+        if step.op == "linear":
+            return place == 0
+        return step.op == "outer" and not self.half and place == (0 if self._by_outputs(step) else 1)
+
+    def _linear(self, step: Step, dying: set[int]) -> None:
+        matrix, start, transposed = map(int, step.numbers)
+        o, i = self.shape(matrix)
+        x, relu_slope = step.operands[0], step.name == "relu_slope"
+        depth, added = x.width, step.operands[1 : len(step.operands) - relu_slope]
+        unit = 2 * _GRANULE if self.half else _GRANULE
+        few = step.width <= _FEW and depth % unit == 0 and not relu_slope and all(c.of == PARAMETER for c in added)
+        order = 0 if not few else 1 if step.width == 1 else _FEW
+        kind, width = ("turned", step.width) if transposed else ("matrix", depth)
+        kind = f"few{'_turned' * transposed}" if few else kind
+        deep = -(-depth // 2) if self.half else depth
+        number = self.pack(kind, matrix, start, width, deep * (order or _padded(step.width)), (o, i))
+        records = [self.operand(c, product=not at) for at, c in enumerate(step.operands)]
+        entrywise = [c for c in step.operands[1:] if c[:2] != x[:2]]
+        value = self.make(step, dying, entrywise)
+        readers = self.readers.get(step.out, [])
+        as_pairs = [r.op == "linear" and not p and _all_of(r.operands[0], step.width) for r, p in readers]
+        narrow = self.half and any(as_pairs) and not few and not relu_slope
+        if narrow and value.stride % (2 * _GRANULE) == 0 and step.width % 2 == 0 and value.memory == _NONE:
+            value.pairs, value.floats = self.slots.take(_padded(step.width, 2 * _GRANULE) // 2), not all(as_pairs)
+        finish = step.name or "none"
+        self.emit("linear", records, value, order=order, number=number, depth=depth, finish=finish)
+
+    def _function(self, step: Step, dying: set[int]) -> None:
+        records = [self.operand(c) for c in step.operands]
+        value = self.make(step, dying, step.operands)
+        order, a, b = step.numbers
+        self.emit("function", records, value, function=step.name, order=int(order), a=float(a), b=float(b))
+
+    def _binary(self, step: Step, dying: set[int]) -> None:
+        records = [self.operand(c) for c in step.operands]
+        self.emit("binary", records, self.make(step, dying, step.operands), binary=step.name)
+
+    def _total(self, step: Step, dying: set[int]) -> None:
+        records = [self.operand(c) for c in step.operands]
+        self.emit("total", records, self.make(step, dying), number=int(step.numbers[0]))
+
+    def _move(self, step: Step, dying: set[int]) -> None:
+        records = [self.operand(c, int(at)) for c, at in zip(step.operands, step.numbers)]
+        self.emit("move", records, self.make(step, dying), order=int(_covered(step)))
+
+    def _encode(self, step: Step, dying: set[int]) -> None:
+        size, parameter, order, _ = map(int, step.numbers)
+        records = [self.operand(c) for c in step.operands]
+        value = self.make(step, dying)
+        given: dict[str, Any] = {"encoding": step.name, "order": order, "number": size, "parameter": parameter}
+        if step.name == "hash" and not order:
+            value.memory = self.memory(value.stride)
+            source = self._input_of(step.operands[0])
+            self.lookups.append((Lookup(source, parameter, size), value.memory))
+        elif step.name in ("frequency", "integrated"):
+            raw, first = step.operands[0].width, step.name == "frequency"
+            width = _padded(encoded_columns(step.name, raw, size, self.program.grids))
+            features = raw if first else raw // 2
+            given["number"] = self.pack("waves", 0, int(first), width, 3 * width, (size, features))
+            given["depth"] = size
+        self.emit("encode", records, value, **given)
+
+    def _input_of(self, x: Columns) -> int:
+        (number,) = [int(step.numbers[0]) for step in self.work if step.op == "input" and step.out == x.index]
+        return number
+
+    def _scatter(self, step: Step, dying: set[int]) -> None:
+        grid, parameter, _ = map(int, step.numbers)
+        x, g = step.operands
+        self.scatters.append((Lookup(self._input_of(x), parameter, grid), self.values[g.index].memory, step.out))
+
+    def _output(self, step: Step, dying: set[int]) -> None:
+        number, first = map(int, step.numbers)
+        self.emit("output", [self.operand(step.operands[0])], width=step.width, number=number, depth=first)
+
+    def _by_outputs(self, step: Step) -> bool:
+        """Whether a sum has its inputs next to each other in the partial, which wastes less for few outputs."""
+        o, i = step.operands[0].width, step.operands[1].width
+        return o * _padded(i) < i * _padded(o)
+
+    def _outer(self, step: Step, dying: set[int]) -> None:
+        shape, start, at = self.program.sums[step.out], int(step.numbers[0]), self.partial
+        by_outputs = self._by_outputs(step)
+        o, i = step.operands[0].width, step.operands[1].width
+        stride = _padded(i if by_outputs else o)
+        self.partial += stride * (o if by_outputs else i)
+        kind = "outputs_inputs" if by_outputs else "inputs_outputs"
+        self.sums.append((step.out, kind, at, o, shape[1], start, i, stride, shape[0] * shape[1]))
+        broadcast = 0 if by_outputs else 1
+        records = [self.operand(c, product=place == broadcast) for place, c in enumerate(step.operands)]
+        self.emit("outer", records, number=at, stride=stride, order=int(by_outputs))
+
+    def _columns(self, step: Step, dying: set[int]) -> None:
+        shape, start, at = self.program.sums[step.out], int(step.numbers[0]), self.partial
+        size, stride = shape[0] * (shape[1] if len(shape) > 1 else 1), _padded(step.width)
+        self.partial += stride
+        self.sums.append((step.out, "vector", at, 1, size, start, step.width, stride, size))
+        self.emit("columns", [self.operand(step.operands[0])], number=at, stride=stride, width=step.width)
+
+    def finished(self) -> Lowered:
+        """The compiled program."""
+        program, compiled = self.program, self.compiled
+        scattered = {out: lookup.parameter for lookup, _, out in self.scatters}
+        for i, shape in enumerate(program.sums):
+            if i not in scattered and not any(record[0] == i for record in self.sums):
+                size = shape[0] * (shape[1] if len(shape) > 1 else 1)
+                self.sums.append((i, "none", 0, 0, 0, 0, 0, 0, size))
+        self.sums.sort()
+        outputs = []
+        for number, c in enumerate(program.outputs):
+            ray = number in program.by_ray
+            outputs.append(compiled.ProgramOutput(c.width, ray, self.memory(c.width) if ray else _NONE))
+        steps = [
+            step._replace(memory=outputs[step.number].memory) if step.op == "output" else step for step in self.steps
+        ]
+        whole = any(step.op == "encode" and step.name == "spherical" for step in self.work)
+        fewest, most = (_WHOLE if whole else _ROWS[0]), _ROWS[1]
+        fitting = _FLOATS // max(self.slots.size, 1) // fewest * fewest
+        table = compiled.ProgramTable(
+            packs=[compiled.ProgramPack(*key, at) for key, (_, at) in self.packs.items()],
+            steps=steps,
+            operands=self.operands,
+            sums=[compiled.ProgramSum(*record) for record in self.sums],
+            inputs=[compiled.ProgramInput(w, i in program.rays) for i, w in enumerate(program.inputs)],
+            outputs=outputs,
+            memories=self.memories,
+            lookups=[compiled.ProgramLookup(*lookup, memory) for lookup, memory in self.lookups],
+            scatters=[compiled.ProgramScatter(*lookup, memory, out) for lookup, memory, out in self.scatters],
+            grids=[compiled_grid(text) for text in program.grids],
+            sum_tensors=len(program.sums),
+            parameters=len(program.parameters),
+            tile=min(max(fitting, fewest), most),
+            columns=self.slots.size,
+            packed=self.packed,
+            partial=self.partial,
+            scratch=self.scratch,
+            scratch_width=self.scratch_width,
+            half=self.half,
+        )
+        return Lowered(
+            compiled.make_program(table),
+            tuple(lookup for lookup, _ in self.lookups),
+            tuple(self.memories[memory] for _, memory in self.lookups),
+            scattered,
+        )
+
+
+def _all_of(c: Columns, width: int) -> bool:
+    """Whether columns are all those of a value."""
+    return c.start == 0 and c.width == width and not c.spread
+
+
+def _sums(step: Step) -> bool:
+    return step.op in ("outer", "columns", "scatter")
+
+
+def _covered(step: Step) -> bool:
+    """Whether each column of a move comes from one part."""
+    taken = [column for c, at in zip(step.operands, step.numbers) for column in range(int(at), int(at) + c.width)]
+    return sorted(taken) == list(range(step.width))
