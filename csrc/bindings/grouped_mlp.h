@@ -8,8 +8,6 @@ namespace voronerf {
 
 VN_NAMES(Activation, "none", "relu", "softplus", "sigmoid", "sine");
 VN_NAMES(MlpCaller, "grouped_mlp", "grouped_linear", "routed_mlp");
-VN_NAMES(MlpPrecision, "float32", "bfloat16", "float16", "tf32");
-VN_NAMES(MlpCudaWay, "auto", "chain", "tiles", "layers");
 VN_STRUCT(MlpLayer, width, activation, inputs);
 VN_NAMES(MlpEncodingKind, "none", "frequency", "integrated", "hash", "spherical");
 VN_STRUCT(MlpEncoding, kind, size);

@@ -83,30 +83,4 @@ void grouped_mlp_cpu(const MlpTable& table, const MlpInputs& inputs, float* out,
 void grouped_mlp_backward_cpu(const MlpTable& table, const MlpInputs& inputs, const MlpGradients& gradients, Isa isa,
                               int threads);
 
-// On CUDA: what is multiplied (sums are float32), and the way a call goes: fused with values in registers
-// (grouped_mlp_cuda_chain.h), fused with values in shared memory (grouped_mlp_cuda_plan.h), layer by layer
-// (grouped_mlp_cuda_layers.h). One can be asked for, to compare them.
-enum class MlpPrecision : int { float32 = 0, bfloat16, float16, tf32 };
-enum class MlpCudaWay : int { automatic = 0, chain, tiles, layers };
-
-// How calls of these sizes go on the device that is current: made once, and kept by who makes such calls. parameters:
-// whether their gradients are wanted. Throws std::invalid_argument for a table that breaks a rule of its way.
-struct MlpCudaCall;  // network/cuda/grouped_mlp_cuda_layers.h
-std::unique_ptr<MlpCudaCall> grouped_mlp_call_cuda(const MlpTable& table, int64_t n, int64_t k, bool backward,
-                                                   bool parameters, MlpPrecision precision, MlpCudaWay way);
-// Bytes of workspace.
-int64_t grouped_mlp_workspace_cuda(const MlpCudaCall& call);
-
-// Whether a network looks its hash grid up itself, on the current device; else its positions are to be encoded before.
-bool grouped_mlp_hashes_cuda(const MlpTable& table, MlpPrecision precision, MlpCudaWay way);
-
-// n and k are those of the plan. Offsets that fall or exceed n cannot be refused without a host read: rows outside are
-// not touched.
-void grouped_mlp_cuda(const MlpCudaCall& call, const MlpInputs& inputs, float* out, unsigned char* workspace,
-                      void* stream);
-
-// Of a backward plan. Gradients of directions are one row a sample.
-void grouped_mlp_backward_cuda(const MlpCudaCall& call, const MlpInputs& inputs, const MlpGradients& gradients,
-                               unsigned char* workspace, void* stream);
-
 }  // namespace voronerf

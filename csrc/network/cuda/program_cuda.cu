@@ -14,14 +14,13 @@
 //
 // Budget: 256 threads of up to 128 registers, 16 of which are sums of a product, so that two blocks are resident. What
 // is not a product is not inlined, so that it is compiled once for all kernels.
-#include "network/program.h"
-
 #include <algorithm>
 #include <cstring>
 #include <stdexcept>
 #include <string>
 
 #include "network/cuda/program_cuda_encoding.h"
+#include "network/program.h"
 
 #define VN_ISA_NAMESPACE device
 #define VN_INLINE __device__ __forceinline__
@@ -85,12 +84,11 @@ __device__ __noinline__ void function_step(const ProgramTile& tile, const Progra
   const bool alone = step.count == 1;
   float* const to = tile.slot(step.slot);
   switch (step.function) {
-#define VN_CASE(NAME, ...)                                                                \
-  case ProgramFunction::NAME:                                                             \
-    return for_each_entry(tile.rows, step.width, [&](int row, int column) {               \
-      const float by = alone ? 1.0f : times.at(row, column);                              \
-      to[row * stride + column] =                                                         \
-          by * derivative<device::NAME##_function>(order, x.at(row, column), a, b);       \
+#define VN_CASE(NAME, ...)                                                                                  \
+  case ProgramFunction::NAME:                                                                               \
+    return for_each_entry(tile.rows, step.width, [&](int row, int column) {                                 \
+      const float by = alone ? 1.0f : times.at(row, column);                                                \
+      to[row * stride + column] = by * derivative<device::NAME##_function>(order, x.at(row, column), a, b); \
     });
     VN_FUNCTIONS(VN_CASE)
 #undef VN_CASE
@@ -190,9 +188,8 @@ __device__ __noinline__ void plain_step(const ProgramTile& tile, const ProgramSt
       if (!there || tile.call.memories[step.memory] == nullptr) return encode_step(tile, given, operands);
       const int64_t stride = tile.call.memory_strides[step.memory];
       const float* from = tile.call.memories[step.memory] + tile.begin * stride;
-      return for_each_entry(tile.rows, step.width, [&](int row, int column) {
-        to[row * step.stride + column] = from[row * stride + column];
-      });
+      return for_each_entry(tile.rows, step.width,
+                            [&](int row, int column) { to[row * step.stride + column] = from[row * stride + column]; });
     }
     default: {  // columns
       const Rows x = tile.operand(operands[0]);
@@ -212,9 +209,8 @@ __device__ __noinline__ void keep(const ProgramTile& tile, const ProgramStep& st
   const int64_t stride = call.memory_strides[step.memory];
   float* const to = call.memories[step.memory] + tile.begin * stride;
   const float* from = tile.slot(step.slot);
-  for_each_entry(tile.rows, step.width, [&](int row, int column) {
-    to[row * stride + column] = from[row * step.stride + column];
-  });
+  for_each_entry(tile.rows, step.width,
+                 [&](int row, int column) { to[row * stride + column] = from[row * step.stride + column]; });
 }
 
 // A product. Rows without a sample get what lies in the slots, and are not stored.
@@ -332,8 +328,7 @@ __global__ void __launch_bounds__(kThreads, kResident)
     const int64_t end = begin + call.task_rows < last ? begin + call.task_rows : last;
     for (int64_t row = begin; row < end; row += kHeight) {
       const int left = end - row < kHeight ? static_cast<int>(end - row) : kHeight;
-      const ProgramTile tile{call, slots,   call.partials + task * partial, cell, row, kHeight, left,
-                             row == begin};
+      const ProgramTile tile{call, slots, call.partials + task * partial, cell, row, kHeight, left, row == begin};
       for (int i = 0; i < call.code.step_count; ++i) {
         const ProgramStep& step = call.code.steps[i];
         if (step.op == ProgramOp::linear) {
@@ -383,8 +378,8 @@ __device__ void number_tasks(const CudaRows& rows, int64_t task_rows, int64_t mo
 }
 
 // The first block numbers the tasks, and all clear the outputs of rows of no cell.
-__global__ void __launch_bounds__(kThreads) program_prepare_kernel(const VN_GRID_CONSTANT CudaProgram call,
-                                                                   int64_t most) {
+__global__ void __launch_bounds__(kThreads)
+    program_prepare_kernel(const VN_GRID_CONSTANT CudaProgram call, int64_t most) {
   const CudaRows& rows = call.rows;
   if (blockIdx.x == 0) number_tasks(rows, call.task_rows, most);
   const int64_t low = cell_begin(rows, 0), last = cell_begin(rows, rows.k), high = last < low ? low : last;
@@ -437,8 +432,8 @@ __global__ void __launch_bounds__(kThreads)
     for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < count * grid.count; i += step) {
       const int64_t number = i / count, row = low + i % count, source = source_row(rows, row);
       const GridLevel& level = grid.levels[number];
-      const HashAxes at = hash_axes(
-          grid, level, [&](int axis) { return load_input(call, scatter.input, 3, source, axis); });
+      const HashAxes at =
+          hash_axes(grid, level, [&](int axis) { return load_input(call, scatter.input, 3, source, axis); });
       const float* from = call.memories[scatter.memory] + row * stride + number * kFeatures;
       float given[kFeatures];
 #pragma unroll
@@ -484,28 +479,34 @@ const Device& current_device() {
 }
 
 // Where the slots of a program are in shared memory, whose rows are longer than the program says: a slot moves by what
-// those before it have grown.
+// those before it have grown. A value that a program has in memory alone, the gradient of what was looked up, has a
+// slot here, behind the others.
 class Slots {
  public:
-  explicit Slots(const ProgramTable& table) {
+  explicit Slots(const ProgramTable& table) : own_(table.memories.size(), -1) {
     for (const ProgramStep& step : table.steps) {
       if (makes_value(step)) starts_.push_back(step.slot);
     }
     std::sort(starts_.begin(), starts_.end());
     starts_.erase(std::unique(starts_.begin(), starts_.end()), starts_.end());
     columns_ = table.columns + kProgramSkew * static_cast<int32_t>(starts_.size());
+    for (const ProgramScatter& scatter : table.scatters) {
+      own_[static_cast<size_t>(scatter.memory)] = columns_;
+      columns_ += table.memories[static_cast<size_t>(scatter.memory)] + kProgramSkew;
+    }
   }
   static bool makes_value(const ProgramStep& step) {
     return step.op != ProgramOp::output && step.op != ProgramOp::outer && step.op != ProgramOp::columns;
   }
-  int32_t at(int32_t slot) const {
+  int32_t at(int32_t slot, int32_t memory) const {
+    if (memory >= 0 && own_[static_cast<size_t>(memory)] >= 0) return own_[static_cast<size_t>(memory)];
     const auto before = std::lower_bound(starts_.begin(), starts_.end(), slot) - starts_.begin();
     return slot + kProgramSkew * static_cast<int32_t>(before);
   }
   int32_t columns() const { return columns_; }
 
  private:
-  std::vector<int32_t> starts_;
+  std::vector<int32_t> starts_, own_;
   int32_t columns_;
 };
 
@@ -602,7 +603,9 @@ unsigned blocks_for(int64_t entries) {
 
 }  // namespace
 
-int64_t program_code_bytes_cuda(const Program& program) { return std::max<int64_t>(1, code_places(program.table).bytes); }
+int64_t program_code_bytes_cuda(const Program& program) {
+  return std::max<int64_t>(1, code_places(program.table).bytes);
+}
 
 void program_code_cuda(const Program& program, unsigned char* code) {
   const ProgramTable& table = program.table;
@@ -615,12 +618,12 @@ void program_code_cuda(const Program& program, unsigned char* code) {
       step.memory = -1;
       continue;
     }
-    step.slot = slots.at(step.slot);
+    step.slot = slots.at(step.slot, step.memory);
     step.stride += kProgramSkew;
   }
   for (ProgramOperand& operand : operands) {
     if (operand.parameter) continue;
-    operand.slot = slots.at(operand.slot);
+    operand.slot = slots.at(operand.slot, operand.memory);
     operand.stride += kProgramSkew;
   }
   std::vector<HashEncoding> grids;

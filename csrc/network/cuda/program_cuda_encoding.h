@@ -50,8 +50,7 @@ __device__ __forceinline__ HashAxes hash_axes(const HashEncoding& grid, const Gr
   HashAxes found;
 #pragma unroll
   for (int axis = 0; axis < 3; ++axis) {
-    found.axes[axis] =
-        hash_axis(hash_place(point(axis), grid.low[axis], grid.inverse[axis]).place, level, grid.smooth);
+    found.axes[axis] = hash_axis(hash_place(point(axis), grid.low[axis], grid.inverse[axis]).place, level, grid.smooth);
   }
   return found;
 }

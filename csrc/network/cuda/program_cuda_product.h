@@ -1,11 +1,12 @@
-// Products of a block on CUDA: sums [16 kDown][64] += a [16 kDown][depth] b [64][depth]^T, a thread has 4 kDown of them.
+// Products of a block on CUDA: sums [16 kDown][64] += a [16 kDown][depth] b [64][depth]^T, a thread has 4 kDown of
+// them.
 //
 // Tensor cores: 8 warps, kDown by rows and 8 / kDown by columns; a warp has 16 rows and kDown tiles of 8 columns. What
 // is multiplied lies as float32 in shared memory and is rounded on its way into a fragment, so that one layout serves
 // all precisions. Which of 16 steps of the depth is which in a fragment is free, if it is the same for both sides:
 // lane 4 g + m takes steps m and m + 4 of what lies by rows and 2 m, 2 m + 1 of what lies by columns. With strides of
-// 4 more than a multiple of 16 floats, its 32 lanes are then in 32 different banks. float32: a thread has kDown rows, 16
-// apart, by four columns.
+// 4 more than a multiple of 16 floats, its 32 lanes are then in 32 different banks. float32: a thread has kDown rows,
+// 16 apart, by four columns.
 #pragma once
 
 #include "common/cuda_wrappers.h"
@@ -35,9 +36,7 @@ struct ByColumns {
   int count;
   static constexpr int kLane = 2, kPair = 1;
   __device__ float at(int i, int k) const { return i < count ? data[k * stride + i] : 0.0f; }
-  __device__ float4 four(int i, int k) const {
-    return make_float4(at(i, k), at(i + 1, k), at(i + 2, k), at(i + 3, k));
-  }
+  __device__ float4 four(int i, int k) const { return make_float4(at(i, k), at(i + 1, k), at(i + 2, k), at(i + 3, k)); }
 };
 
 __device__ __forceinline__ float cut_off(float x, float largest) {  // NaN stays NaN
@@ -104,8 +103,8 @@ struct TensorProducts {
 
   // Where sum i is in the block.
   static __device__ __forceinline__ MapPlace place(int i) {
-    const int warp = threadIdx.x / 32;
-    const MapPlace own = accumulator_place(threadIdx.x % 32, i % 4);
+    const int thread = thread_again(), warp = thread / 32;
+    const MapPlace own = accumulator_place(static_cast<unsigned>(thread) % 32, i % 4);
     return {16 * (warp % kDown) + own.row, 8 * (warp / kDown * kDown + i / 4) + own.column};
   }
   static __device__ __forceinline__ float& sum(Sums& sums, int i) { return sums[i / 4][i % 4]; }
@@ -121,9 +120,9 @@ struct TensorProducts {
   // Warps without columns have nothing to do.
   template <typename A, typename B>
   static __device__ __forceinline__ void multiply(Sums& sums, const A& a, const B& b, int depth, int columns) {
-    const int first = place(0).column - 2 * static_cast<int>(threadIdx.x % 4);
-    if (first >= columns) return;
+    if (thread_again() / 32 / kDown * kDown * 8 >= columns) return;
     int k = 0;
+#pragma unroll 1
     for (; k + 16 <= depth; k += 16) block<true>(sums, a, b, k, depth);
     if (k < depth) block<false>(sums, a, b, k, depth);
   }
@@ -131,7 +130,7 @@ struct TensorProducts {
  private:
   template <bool kWhole, typename A, typename B>
   static __device__ __forceinline__ void block(Sums& sums, const A& a, const B& b, int k, int depth) {
-    const int warp = threadIdx.x / 32, group = threadIdx.x % 32 / 4, member = threadIdx.x % 4;
+    const int thread = thread_again(), warp = thread / 32, group = thread % 32 / 4, member = thread % 4;
     const int row = 16 * (warp % kDown) + group, column = 8 * (warp / kDown * kDown) + group;
     // Step `part` of pair p of this lane.
     const auto get = [&](const auto& from, int i, int p, int part) {
@@ -160,7 +159,7 @@ struct FloatProducts {
   using Sums = float[kDown][4];
 
   static __device__ __forceinline__ MapPlace place(int i) {
-    const int thread = threadIdx.x;
+    const int thread = thread_again();
     return {thread / 16 + i / 4 * 16, 4 * (thread % 16) + i % 4};
   }
   static __device__ __forceinline__ float& sum(Sums& sums, int i) { return sums[i / 4][i % 4]; }
@@ -168,9 +167,7 @@ struct FloatProducts {
   // A strip of weights, [32 inputs][64 outputs].
   struct Strip {
     const float* data;
-    __device__ float4 four(int i, int k) const {
-      return *reinterpret_cast<const float4*>(data + k * kStripStride + i);
-    }
+    __device__ float4 four(int i, int k) const { return *reinterpret_cast<const float4*>(data + k * kStripStride + i); }
   };
   static __device__ __forceinline__ int strip_place(int column, int k) { return k * kStripStride + column; }
   static __device__ __forceinline__ Strip strip(const float* data, float) { return {data}; }

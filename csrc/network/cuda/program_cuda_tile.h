@@ -31,7 +31,7 @@ struct CudaProgram {
   const void *inputs[kProgramMost], *parameters[kProgramMost];
   void* outputs[kProgramMost];
   float* sums[kProgramMost];
-  int64_t strides[kProgramMost];    // of parameters, from cell to cell
+  int64_t strides[kProgramMost];      // of parameters, from cell to cell
   float* memories[kProgramMemories];  // [n][stride], or null
   int32_t memory_strides[kProgramMemories], output_widths[kProgramMost];
   uint8_t input_types[kProgramMost], parameter_types[kProgramMost], output_types[kProgramMost];
@@ -88,6 +88,7 @@ __device__ __forceinline__ float load_input(const CudaProgram& call, int input, 
   int64_t row = source, rows = call.rows.n;
   if (call.rays[input]) {
     rows = call.rows.r;
+    if (rows == 0) return 0.0f;
     row = index_within(call.rows.ray_index[source], rows);
   }
   return load_number(call.inputs[input], call.input_types[input],
