@@ -28,7 +28,7 @@ VN_STRUCT(ProgramScatter, input, parameter, grid, memory, sum);
 VN_STRUCT(ProgramTable, packs, steps, operands, sums, inputs, outputs, memories, lookups, scatters, grids, sum_tensors,
           parameters, tile, columns, packed, partial, scratch, scratch_width, half);
 VN_STRUCT(ProgramInputs, inputs, input_types, turned, parameters, parameter_types, strides, offsets, order, ray_index,
-          n, r, k, kept, ready, gradients, caller);
+          n, r, k, kept, ready, gradients, caller, index);
 VN_STRUCT(ProgramResults, outputs, output_types, sums);
 VN_OPAQUE(Program);
 

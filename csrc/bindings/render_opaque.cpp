@@ -1,8 +1,8 @@
 #include "rays/render_opaque.h"
 
 #include "bindings/bind.h"
-#include "bindings/grouped_mlp.h"
 #include "bindings/march_rays.h"
+#include "bindings/program.h"
 
 namespace voronerf {
 

@@ -14,7 +14,7 @@
 #include "common/parallel.h"
 #include "geometry/locate_cell.h"
 #include "geometry/nearest_centre.h"
-#include "network/cpu/grouped_mlp_rows.h"
+#include "network/cpu/program_rows.h"
 #include "network/cpu/row_tasks.h"
 #include "rays/march_rays_isa.h"
 #include "rays/march_rooms.h"
@@ -41,8 +41,8 @@ void add_wave(Isa isa, const SeenWave& in, int64_t r) { VN_FOR_ISA(isa, see_wave
 
 // One call, as its threads read it.
 struct Call {
-  const MlpInputs& network;
-  const MlpRows& rows;
+  const ProgramInputs& network;
+  const ProgramRows& rows;
   const MarchInputs& march;
   const uint8_t* room;
   const SeeCells& cells;
@@ -57,6 +57,7 @@ class Pool {
  public:
   Pool(const Call& call, float* workspace)
       : call_(call),
+        network_(call.network),
         own_{workspace},
         size_(
             std::clamp<int64_t>(std::min(kSamples / call.rule.wave, call.march.r / (kShare * call.threads)), 64, 8192)),
@@ -109,7 +110,8 @@ class Pool {
       std::copy_n(call_.march.origins + 3 * ray, 3, &origins_[3 * count_]);
       std::copy_n(call_.march.directions + 3 * ray, 3, &along_[3 * count_]);
       const int64_t q = call_.directions;
-      if (q > 0) std::copy_n(call_.network.directions + q * ray, q, &directions_[q * count_]);
+      const auto* directions = q > 0 ? static_cast<const float*>(call_.network.inputs[1]) : nullptr;
+      if (q > 0) std::copy_n(directions + q * ray, q, &directions_[q * count_]);
       std::fill_n(call_.out.colour + 3 * ray, 3, 0.0f);
       call_.out.opacity[ray] = call_.out.depth[ray] = 0.0f;
       call_.out.light[ray] = 1.0f;
@@ -131,14 +133,17 @@ class Pool {
     Samples& all = samples_;
     fill_samples(call_.isa, march, mask_.data(), offsets_.data(), all.ray.data(), all.depths.data(), all.deltas.data(),
                  all.positions.data(), stop_.data());
-    MlpInputs in = call_.network;
+    ProgramInputs& in = network_;
     in.n = offsets_[count_];
     in.r = count_;
-    in.positions = all.positions.data();
-    in.directions = call_.directions > 0 ? directions_.data() : nullptr;
-    in.direction_index = call_.directions > 0 ? all.ray.data() : nullptr;
+    const void* inputs[] = {all.positions.data(), directions_.data()};
+    in.inputs = inputs;
+    in.order = nullptr;
+    in.ray_index = call_.directions > 0 ? all.ray.data() : nullptr;
     if (!sort(in)) return false;
-    call_.rows.forward(in, all.raw.data(), own_);
+    void* outputs[] = {all.raw.data()};
+    results_.outputs = outputs;
+    call_.rows.forward(in, results_, own_);
     const SeeOutputs& out = call_.out;
     add_wave(call_.isa,
              {all.raw.data(), all.depths.data(), all.deltas.data(), offsets_.data(), number_.data(),
@@ -149,17 +154,18 @@ class Pool {
   }
 
   // The samples by their cells.
-  bool sort(MlpInputs& in) {
+  bool sort(ProgramInputs& in) {
     const SeeCells& cells = call_.cells;
     in.offsets = cell_offsets_.data();
+    const auto* positions = static_cast<const float*>(in.inputs[0]);
     if (cells.centres == nullptr) {
       cell_offsets_[0] = 0, cell_offsets_[1] = static_cast<int32_t>(in.n);
       return true;
     }
     int32_t *cell = samples_.cell.data(), *order = samples_.order.data();
     if (cells.child == nullptr) {
-      nearest_centre_serial(in.positions, cells.centres, cell, in.n, cells.m, call_.isa);
-    } else if (!locate_cell_cpu(in.positions, cells.centres, cells.child_offsets, cells.child, cell, descent_.data(),
+      nearest_centre_serial(positions, cells.centres, cell, in.n, cells.m, call_.isa);
+    } else if (!locate_cell_cpu(positions, cells.centres, cells.child_offsets, cells.child, cell, descent_.data(),
                                 in.n, cells.m, cells.depth, call_.isa, 1)) {
       return false;
     }
@@ -192,7 +198,9 @@ class Pool {
   }
 
   const Call& call_;
-  MlpRows::Own own_;
+  ProgramInputs network_;
+  ProgramResults results_{nullptr, {TableType::float32}, nullptr};
+  ProgramRows::Own own_;
   const int64_t size_;
   int64_t count_ = 0, next_ = 0, end_ = 0;
   std::vector<int32_t> number_, start_, stop_;
@@ -206,8 +214,8 @@ class Pool {
 
 }  // namespace
 
-bool render_opaque_cpu(const MlpTable& table, const MlpInputs& network, const MarchInputs& march, const SeeCells& cells,
-                       const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads) {
+bool render_opaque_cpu(const Program& program, const ProgramInputs& network, const MarchInputs& march,
+                       const SeeCells& cells, const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads) {
   if (march.r == 0) return true;
   std::unique_ptr<uint8_t[]> memory;
   const uint8_t* room = nullptr;
@@ -215,13 +223,11 @@ bool render_opaque_cpu(const MlpTable& table, const MlpInputs& network, const Ma
     memory.reset(new uint8_t[2 * march.x * march.y * march.z]);
     room = march_rooms(march, memory.get(), threads);
   }
-  const MlpRows rows(table, network, {cells.centres != nullptr, network.directions != nullptr}, isa);
+  const ProgramRows rows(program, network, isa);
+  const std::vector<ProgramInput>& inputs = program.table.inputs;
   const Workspace workspace(rows.workspace() * std::max(threads, 1));
-  const Call call{network, rows,
-                  march,   room,
-                  cells,   rule,
-                  out,     network.directions == nullptr ? 0 : table.directions,
-                  isa,     std::max(threads, 1)};
+  const Call call{network, rows, march, room, cells, rule, out, inputs.size() > 1 ? inputs[1].width : 0, isa,
+                  std::max(threads, 1)};
   Items items(march.r, kRun);
   const int team = static_cast<int>(std::min<int64_t>(threads, ceil_div(march.r, kRun)));
   std::vector<std::unique_ptr<Pool>> pools;  // made here, as nothing may be thrown in a team

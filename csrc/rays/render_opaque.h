@@ -5,7 +5,7 @@
 #include <cstdint>
 
 #include "common/isa.h"
-#include "network/grouped_mlp.h"
+#include "network/program.h"
 #include "rays/march_rays.h"
 
 namespace voronerf {
@@ -31,9 +31,10 @@ struct SeeOutputs {
   float* heaviest;                 // [r], depth of the heaviest sample, far without any; or null
 };
 
-// The march has no uniforms, seed or start. The network has positions [r,3], which are not read, and directions [r,q]
-// or none. False if a place is not at a leaf after `depth` levels.
-bool render_opaque_cpu(const MlpTable& table, const MlpInputs& network, const MarchInputs& march, const SeeCells& cells,
-                       const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads);
+// The march has no uniforms, seed or start. The network is a program of one output of 4 columns, whose inputs are
+// positions, which are not read, and directions [r,q], one a ray, or none. False if a place is not at a leaf after
+// `depth` levels.
+bool render_opaque_cpu(const Program& program, const ProgramInputs& network, const MarchInputs& march,
+                       const SeeCells& cells, const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads);
 
 }  // namespace voronerf

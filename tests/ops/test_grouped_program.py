@@ -8,12 +8,16 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import refuses
+from programs import ByPrograms
+from programs import derivatives as of_every_order
 from torch import Tensor
 
-from voronerf.ops import grouped_program
+from voronerf import HashGrid
+from voronerf.ops import frequency_encode, grouped_program, hash_encode, integrated_encode, spherical_harmonics
 from voronerf.ops._core import native
-from voronerf.ops._core.program import FUNCTIONS, PARAMETER, Builder, Columns, Program, gradient
-from voronerf.ops.grouped_program.case import every_step
+from voronerf.ops._core.program import FUNCTIONS, PARAMETER, VALUE, Builder, Columns, Program, Step, gradient
+from voronerf.ops.grouped_mlp.reference import cells_of
+from voronerf.ops.grouped_program.case import GRID, encoded, every_step
 
 NUMBERS = {"softplus": (3.0, 20.0), "sine": (1.7, 0.3), "clamp": (-0.5, 0.6), "power": (1.5, 0.0), "affine": (2.0, 1.0)}
 SIZES = ([0], [1], [5, 0, 24], [96, 1], [97, 0, 3], [0, 95, 200, 23])
@@ -308,3 +312,298 @@ def test_a_program_of_what_is_not_there_is_refused():
             except ValueError as error:
                 assert str(error).startswith("Program: ") and "\n" not in str(error)
     assert taken == 4  # parameters with more entries than are read, and two steps with more columns, which are 0
+    program = gradient(gradient(encoded(), *ALL), (True,) * 5, (True,) * 3, (True,) * 3, (True,) * 3)
+    assert {"encode", "scatter"} <= {step.op for step in program.steps}
+    kept = []
+    for name in ("inputs", "parameters", "outputs", "steps", "sums", "rays", "by_ray"):
+        for other in larger(getattr(program, name)):
+            try:
+                replace(program, **{name: other})
+                kept.append((name, other))
+            except ValueError as error:
+                assert str(error).startswith("Program: ") and "\n" not in str(error)
+    steps = [new for name, other in kept if name == "steps" for new, old in zip(other, program.steps) if new != old]
+    assert not any(step.op in ("encode", "scatter") for step in steps)
+
+
+ALL = (True,) * 3, (True,) * 3, (True,) * 2, ()
+"""What is asked for of :func:`encoded`, and given."""
+ENCODED = {
+    "frequency": ("frequency", 3, 2),
+    "no octaves": ("frequency", 5, 0),
+    "integrated": ("integrated", 6, 2),
+    "constant": ("spherical", 3, 1),
+    "spherical": ("spherical", 3, 4),
+    "hash": ("hash", 3, 0),
+    "hash of each cell": ("hash", 3, 0),
+    "linear hash": ("hash", 3, 0),
+}
+
+
+def of_encoding(kind: str, ray: bool = False) -> tuple[Program, HashGrid]:
+    """sin(W e(x)) of each row, and e(x) times another input, by ray."""
+    name, raw, size = ENCODED[kind]
+    grid = replace(GRID, interpolation="linear") if kind == "linear hash" else GRID
+    b = Builder()
+    x = b.input(raw, ray=ray)
+    table = b.parameter(*grid.table_shape) if name == "hash" else 0
+    e = b.encode(name, x, b.grid(grid.text) if name == "hash" else size, table)
+    other = b.input(e.width, ray=not ray)
+    h = b.apply("sine", b.linear(e, b.parameter(2, e.width), 2), 1.0)
+    return b.program([h, b.binary("mul", e, other)], by_ray=[1]), grid
+
+
+def formula(kind: str, grid: HashGrid, x: Tensor, table: Tensor | None, cells: Tensor) -> Tensor:
+    """The encoding by its op in PyTorch."""
+    name, _, size = ENCODED[kind]
+    if name == "frequency":
+        return frequency_encode(x, size, backend="reference")
+    if name == "integrated":
+        return integrated_encode(*x.chunk(2, dim=1), size, backend="reference")
+    if name == "spherical":
+        return spherical_harmonics(x, size, backend="reference")
+    assert table is not None
+    own = len(table) > 1
+    return hash_encode(x, table if own else table[0], grid, cells=cells if own else None, backend="reference")
+
+
+def encoding_arguments(program: Program, kind: str, sizes: list[int], rays: int) -> list[Tensor]:
+    """Inputs, then parameters, in float64; a table for each cell where the kind says so."""
+    generator, n, k = torch.Generator().manual_seed(3), sum(sizes) + 5, len(sizes)
+    tensors = [
+        torch.rand(rays if i in program.rays else n, w, generator=generator, dtype=torch.float64)
+        for i, w in enumerate(program.inputs)
+    ]
+    for i, shape in enumerate(program.parameters):
+        few = 1 if i in program.tables and kind != "hash of each cell" else k
+        tensors.append(torch.randn(few, *shape, generator=generator, dtype=torch.float64) / shape[-1] ** 0.5)
+    return tensors
+
+
+@pytest.mark.parametrize("ordered", [False, True], ids=["sorted", "in any order"])
+@pytest.mark.parametrize("ray", [False, True], ids=["of samples", "of rays"])
+@pytest.mark.parametrize("kind", ENCODED)
+def test_encodings_against_autograd(kind: str, ray: bool, ordered: bool) -> None:
+    """Values and three orders of gradients: of the reference, and of gradient programs. Some rows are in no cell."""
+    if ray and kind.endswith(("hash", "cell")):
+        pytest.skip("the positions of a grid are samples")
+    program, grid = of_encoding(kind, ray)
+    sizes, rays = [4, 0, 5], 6
+    tensors = encoding_arguments(program, kind, sizes, rays)
+    offsets = offsets_of(sizes) + 2  # two rows before, three behind
+    n = sum(sizes) + 5
+    generator = torch.Generator().manual_seed(1)
+    order = torch.randperm(n, generator=generator).int() if ordered else None
+    ray_index = torch.randint(0, rays - 1, (n,), generator=generator).int()  # the last ray has no samples
+
+    def by_hand(*leaves: Tensor) -> list[Tensor]:
+        x, other, *parameters = leaves
+        x, other = (x[ray_index.long()], other) if ray else (x, other[ray_index.long()])
+        table = parameters[0] if program.tables else None
+        place = torch.arange(n) if order is None else torch.empty(n).long().index_copy(0, order.long(), torch.arange(n))
+        cells = cells_of(offsets, x)[place]
+        inside = ((place >= offsets[0]) & (place < offsets[-1]))[:, None]
+        e = formula(kind, grid, x, table, cells)
+        h = (parameters[-1][cells.long()] @ e[:, :, None])[:, :, 0].sin()
+        product = torch.where(inside, e * other, 0)
+        return [torch.where(inside, h, 0), e.new_zeros(rays, e.shape[1]).index_add(0, ray_index, product)]
+
+    def by_reference(*leaves: Tensor) -> list[Tensor]:
+        options = {"program": program, "order": order, "ray_index": ray_index, "backend": "reference"}
+        return grouped_program(leaves[:2], leaves[2:], offsets, **options)
+
+    def by_programs(*leaves: Tensor) -> list[Tensor]:
+        return ByPrograms.apply(program.text, offsets, order, ray_index, *leaves)
+
+    expected = of_every_order(by_hand, tensors)
+    for run in (by_reference, by_programs):
+        for found, exact in zip(of_every_order(run, tensors), expected, strict=True):
+            torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["frequency", "integrated", "spherical", "hash", "hash of each cell"])
+def test_gradient_programs_of_encodings_by_differences(kind: str) -> None:
+    """gradcheck and gradgradcheck, whose oracle is no derivative."""
+    program, _ = of_encoding(kind)
+    tensors = [tensor.requires_grad_() for tensor in encoding_arguments(program, kind, [2, 1], 3)]
+    ray_index = torch.arange(8).int() % 3
+
+    def run(*leaves: Tensor) -> tuple[Tensor, ...]:
+        return ByPrograms.apply(program.text, offsets_of([2, 1]), None, ray_index, *leaves)
+
+    assert torch.autograd.gradcheck(run, tensors, fast_mode=True)
+    assert torch.autograd.gradgradcheck(run, tensors, fast_mode=True)
+
+
+def test_which_derivatives_the_compiled_module_has() -> None:
+    """F_0, G_1 and T_0; any other counts as one of a high order."""
+    program = encoded()
+    first = gradient(program, *ALL)
+    assert program.orders == 0 and first.orders == 1
+    numbers = {step.numbers[2:] for step in first.steps if step.op == "encode"}
+    assert numbers == {(0, 0), (1, 1)} and [s.numbers for s in first.steps if s.op == "scatter"] == [(0, 0, 0)]
+    assert gradient(first, (True,) * 5, (False,) * 3, (True,) * 3, (False,) * 3).orders > 3
+    # The second derivative to the table alone looks the new table up.
+    last = [i == 0 for i in range(len(first.sums))]
+    only = gradient(first, (False,) * 3 + (True,) * 2, (False,) * 3, (False,) * 3, tuple(last))
+    assert only.orders <= 3 and 3 in only.tables
+
+
+def test_tables_have_dtypes_of_their_own() -> None:
+    """They are read as they are beside inputs of any dtype, and their gradients have their dtype."""
+    program = encoded()
+    generator = torch.Generator().manual_seed(0)
+    inputs = [torch.rand(4 if i in program.rays else 7, w, generator=generator) for i, w in enumerate(program.inputs)]
+    parameters = [torch.randn(1, *shape, generator=generator) for shape in program.parameters]
+    given = {"program": program, "ray_index": torch.arange(7).int() % 4}
+    for dtype in (torch.float16, torch.bfloat16, torch.float32):
+        table = parameters[0].to(dtype).requires_grad_()
+        for of, backend in ((torch.float32, "native"), (torch.float64, "reference"), (torch.bfloat16, "native")):
+            rows, (_, *others) = [x.to(of) for x in inputs], [p.to(of) for p in parameters]
+            wide = torch.promote_types(of, torch.float32)
+            found = grouped_program(rows, [table, *others], offsets_of([3, 4]), **given, backend=backend)
+            exact = grouped_program(
+                [x.to(wide) for x in rows],
+                [table.to(wide), *(p.to(wide) for p in others)],
+                offsets_of([3, 4]),
+                **given,
+                backend="reference",
+            )
+            for ours, theirs in zip(found, exact, strict=True):
+                assert ours.dtype == of
+                torch.testing.assert_close(ours, theirs.to(of), rtol=1e-2 if of == torch.bfloat16 else 1e-4, atol=1e-5)
+            (slope,) = torch.autograd.grad(found[0].sum(), table)
+            (right,) = torch.autograd.grad(exact[0].sum(), table)
+            assert slope.dtype == dtype
+            torch.testing.assert_close(slope, right, rtol=2e-2, atol=2e-2)
+
+
+@pytest.mark.parametrize("backend", ["reference", "native"])
+def test_the_sum_of_a_shared_table_is_one(backend: str) -> None:
+    """Sums of other parameters and of tables of cells have one entry for each cell."""
+    program = gradient(encoded(), *ALL)
+    rays, n = 4, 7
+    inputs = [torch.rand(rays if i in program.rays else n, w) for i, w in enumerate(program.inputs)]
+    for few in (1, 3):
+        parameters = [torch.randn(few, *shape) for shape in program.parameters]
+        found = grouped_program(
+            inputs,
+            parameters,
+            offsets_of([3, 0, 4]),
+            program=program,
+            ray_index=torch.arange(n).int() % rays,
+            backend=backend,
+        )
+        assert [len(tensor) for tensor in found] == [n, n, rays, few, 3, 3]
+
+
+@pytest.mark.parametrize("what", ["rows", "rays", "nothing"])
+def test_programs_of_rays_of_no_size(what: str) -> None:
+    """No samples, and no rays."""
+    program = encoded()
+    n, rays = {"rows": (0, 3), "rays": (0, 0), "nothing": (0, 0)}[what]
+    inputs = [torch.rand(rays if i in program.rays else n, w) for i, w in enumerate(program.inputs)]
+    parameters = [torch.randn(2, *shape) for shape in program.parameters]
+    given = {"program": program, "ray_index": torch.zeros(n).int()}
+    for backend in ("reference", "native"):
+        found = grouped_program(inputs, parameters, offsets_of([0, 0]), **given, backend=backend)
+        assert [tensor.shape for tensor in found] == [(n, 3), (rays, 3)] and not any(t.any() for t in found)
+
+
+def test_high_derivatives_within_a_custom_op() -> None:
+    """PyTorch calls it where autograd does not see, as torch.compile does: derivatives were 0 there."""
+    b = Builder()
+    x, along = b.input(3), b.input(3)
+    sine = b.function("sine", x, 1.0, order=4)
+    assert sine is not None
+    program = b.program([sine, b.encode("frequency", x, 1, along=[along, along])])
+    rows = [torch.rand(5, 3), torch.rand(5, 3)]
+    found = torch.ops.voronerf.grouped_program_native(rows, [], offsets_of([5]), None, None, program.text)
+    torch.testing.assert_close(found[0], rows[0].sin())
+    second = -rows[1].square() * torch.stack([rows[0].sin(), rows[0].cos()])
+    torch.testing.assert_close(found[1], torch.cat([torch.zeros(5, 3), *second], dim=1))
+
+
+def test_refuses_rays_that_do_not_fit() -> None:
+    """Each message on rays and tables; the others are in the op's case."""
+    program = encoded()
+    inputs = [torch.rand(4 if i in program.rays else 6, w) for i, w in enumerate(program.inputs)]
+    parameters = [torch.rand(1, *shape) for shape in program.parameters]
+    index = torch.tensor([0, 1, 2, 3, 0, 1], dtype=torch.int32)
+
+    def refused(message: str, error: type = ValueError, **changed: object) -> None:
+        given = {"inputs": inputs, "parameters": parameters, "offsets": offsets_of([6]), "program": program}
+        given = {**given, "ray_index": index, **changed}
+        refuses(f"grouped_program: {message}", grouped_program, error=error, **given)
+
+    refused("ray_index must be given for a program with inputs of rays, got None", ray_index=None)
+    refused("ray_index must have shape [n] with n = 6, got [5]", ray_index=index[1:])
+    refused("ray_index must have dtype int32, got int64", TypeError, ray_index=index.long())
+    for wrong in (7, -1, 2**31 - 1, -(2**31)):
+        strange = index.clone()
+        strange[3] = wrong
+        refused(f"ray_index must be 0 to 3, got {wrong}", ray_index=strange)
+    refused("inputs[2] must hold a row for the ray_index, got [0, 3]", inputs=[*inputs[:2], inputs[2][:0]])
+    refused("inputs[2] must have shape [r, 3], got [4, 2]", inputs=[*inputs[:2], inputs[2][:, 1:]])
+    message = "parameters[0] must have dtype float32, bfloat16 or float16, got float64"
+    refused(message, TypeError, parameters=[parameters[0].double(), *parameters[1:]])
+    # An order is no index of rays, also after a call with one has passed.
+    grouped_program(inputs, parameters, offsets_of([6]), program=program, ray_index=index)
+    refused("ray_index must be given for a program with inputs of rays, got None", ray_index=None, order=index)
+
+
+def test_programs_of_rays_and_grids_that_are_not_there_are_refused() -> None:
+    """Each rule of encodings by its message."""
+    program = encoded()
+    refuses("Program: rays must be numbers of inputs, each once, got (3,)", replace, program, rays=(3,))
+    refuses("Program: rays must be numbers of inputs, each once, got (2, 2)", replace, program, rays=(2, 2))
+    rule = "numbers of outputs, each once, of a program with rays"
+    refuses(f"Program: by_ray must be {rule}, got (2,)", replace, program, by_ray=(2,))
+    refuses(f"Program: by_ray must be {rule}, got (1,)", replace, program, rays=())
+    for grids in (("x",), ("{}",), (7,), ("[1]",), ("null",), GRID.text):
+        refuses("Program: grids must be texts of hash grids, got ", replace, program, grids=grids)
+    refuses("Program: steps must be of values, parameters and sums that are there, got ", replace, program, grids=())
+    place, hashed = next((i, step) for i, step in enumerate(program.steps) if step.name == "hash")
+
+    def changed(**fields: object) -> tuple[Step, ...]:
+        return (*program.steps[:place], hashed._replace(**fields), *program.steps[place + 1 :])
+
+    replace(program, steps=(*program.steps, hashed._replace(out=90)))
+    direction = next(step for step in program.steps if step.op == "input" and step.numbers == (2,))
+    spread = Columns(VALUE, hashed.operands[0].index, 0, 3, True)
+    of_a_ray = Columns(VALUE, direction.out, 0, 3)
+    for fields in (
+        {"operands": (of_a_ray,)},
+        {"operands": (spread,)},
+        {"operands": (Columns(PARAMETER, 1, 0, 3),)},
+        {"operands": ()},
+        {"name": "wave"},
+        {"numbers": (0, 0, 0)},
+        {"numbers": (0, 0, 0, 1)},
+        {"numbers": (0, 1, 0, 0)},
+        {"name": "spherical", "numbers": (5, 0, 0, 0)},
+        {"name": "frequency", "numbers": (1, 1, 0, 0)},
+    ):
+        refuses("Program: steps must be of values", replace, program, steps=changed(**fields))
+    # A table is read as one alone, and a sum has one layout.
+    b = Builder(program)
+    refuses("Program: steps must be of values", b.program, [b.binary("mul", of_a_ray, Columns(PARAMETER, 0, 0, 3))])
+    refuses("Program: outputs must be of values", replace, program, outputs=(Columns(PARAMETER, 0, 0, 3),))
+    first = gradient(program, *ALL)
+    scatter = next(step for step in first.steps if step.op == "scatter")
+    column = Step("columns", scatter.out, 3, (of_a_ray,), (0,))
+    for steps in ((*first.steps, column), (first.steps[0], column._replace(out=scatter.out), *first.steps[1:])):
+        refuses("Program: steps must be of values", replace, first, steps=steps)
+    # G_1 has the encoding of its own x.
+    back = next(step for step in first.steps if step.op == "encode" and step.numbers[3] and step.name == "hash")
+    wrong = back._replace(operands=(*back.operands[:2], back.operands[1]))
+    steps = tuple(wrong if step == back else step for step in first.steps)
+    refuses("Program: steps must be of values", replace, first, steps=steps)
+
+
+def test_texts_of_programs() -> None:
+    """All that a program has comes back from its text."""
+    for program in (every_step(), encoded(), gradient(encoded(), *ALL)):
+        assert Program.parse(program.text) == program
+        assert Program.parse(program.text).text == program.text
+    assert gradient(encoded(), *ALL).rays == (2, 4) and gradient(encoded(), *ALL).by_ray == (2,)

@@ -21,13 +21,26 @@ constexpr int64_t kSlack = 128;    // floats behind the slots that vectors may r
 
 int64_t aligned(int64_t floats) { return ceil_div<int64_t>(floats, kGranule) * kGranule; }
 
-void check_range(const ProgramInputs& in, const char* name, const int32_t* values, int64_t end) {
+// Whether values leave 0 to end - 1.
+bool leaves(const int32_t* values, int64_t n, int64_t end) {
   bool beyond = false;  // what is below 0, too, as an unsigned number
-  for (int64_t i = 0; i < in.n; ++i) beyond |= static_cast<uint32_t>(values[i]) >= static_cast<uint32_t>(end);
-  if (!beyond) return;
-  const auto [low, high] = std::minmax_element(values, values + in.n);
-  throw std::invalid_argument(std::string(in.caller) + ": " + name + " must be 0 to " + std::to_string(end - 1) +
-                              ", got " + std::to_string(*low < 0 ? *low : *high));
+  for (int64_t i = 0; i < n; ++i) beyond |= static_cast<uint32_t>(values[i]) >= static_cast<uint32_t>(end);
+  return beyond;
+}
+
+void check(const ProgramInputs& in) {
+  const std::string op = in.caller;
+  check_offsets(op, in.offsets, in.k, in.n);
+  if (in.order != nullptr && leaves(in.order, in.n, in.n)) {
+    const auto [low, high] = std::minmax_element(in.order, in.order + in.n);
+    throw std::invalid_argument(op + ": order must lie in 0 to " + std::to_string(in.n - 1) + ", got values from " +
+                                std::to_string(*low) + " to " + std::to_string(*high));
+  }
+  if (in.ray_index != nullptr && leaves(in.ray_index, in.n, in.r)) {
+    const auto [low, high] = std::minmax_element(in.ray_index, in.ray_index + in.n);
+    throw std::invalid_argument(op + ": " + in.index + " must be 0 to " + std::to_string(in.r - 1) + ", got " +
+                                std::to_string(*low < 0 ? *low : *high));
+  }
 }
 
 // Parameters of a cell on their way to the cache: of many small cells, each would be waited for. Large ones take so
@@ -251,9 +264,7 @@ void ProgramRows::forward(const ProgramInputs& in, const ProgramResults& results
 void grouped_program_cpu(const Program& program, const ProgramInputs& given, const ProgramResults& results, Isa isa,
                          int threads) {
   const ProgramTable& table = program.table;
-  check_offsets(given.caller, given.offsets, given.k, given.n);
-  if (given.order != nullptr) check_range(given, "order", given.order, given.n);
-  if (given.ray_index != nullptr) check_range(given, "ray_index", given.ray_index, given.r);
+  check(given);
   ProgramInputs in = given;
   Sifted sifted;
   if (given.gradients >= 0) sifted = sift(table, given, threads);

@@ -30,7 +30,8 @@ void program_reduce(const ProgramCall& call, int64_t cell, float* partials, int6
     float* const to = call.sums[sum.sum] + cell * sum.size;
     const bool first = s == 0 || code.sums[s - 1].sum != sum.sum;
     const bool alone = first && (s + 1 == code.sum_count || code.sums[s + 1].sum != sum.sum);
-    const bool whole = alone && count > 0 && sum.width == (sum.kind == ProgramSumKind::vector ? sum.size : sum.i);
+    const bool whole = alone && count > 0 && sum.kind != ProgramSumKind::none &&
+                       sum.width == (sum.kind == ProgramSumKind::vector ? sum.size : sum.i);
     if (first && !whole) {
       for (int64_t i = 0; i < sum.size; ++i) to[i] = 0.0f;
     }

@@ -15,12 +15,15 @@ import json
 from dataclasses import dataclass, field, replace
 
 from voronerf.ops._core.grids import HashGrid
+from voronerf.ops._core.program import PARAMETER, Builder, Columns, Program, pruned
 
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
 POSITION_ENCODINGS = ("frequency", "integrated", "hash")
 DIRECTION_ENCODINGS = ("frequency", "spherical")
 POSITIONS = "positions"
 DIRECTIONS = "directions"
+_NUMBERS = {"softplus": (1.0, 20.0), "sine": (1.0, 0.0)}
+"""Of activations that are functions with two numbers."""
 MOST_FEATURES = 2**20
 """Of a layer."""
 
@@ -194,6 +197,37 @@ class MLP:
             (layer.width, self.input_width(index, positions_d, directions_d)) for index, layer in enumerate(self.layers)
         ]
 
+    def program(
+        self, p: int, q: int, widths: tuple[int, ...] | None, biased: tuple[bool, ...], ray: bool = False
+    ) -> Program:
+        """The network as a program, which ``grouped_program`` runs.
+
+        Its inputs are the positions and, if any layer reads them, the directions, raw if the table encodes them. Its
+        parameters are the weight (o, i) of each layer, the bias (o,) of each layer that has one, and the table (e, f)
+        of the grid if there is one, in this order. They are there also if no output depends on them. It has one output,
+        [n, out_features].
+
+        Args:
+            p: columns of the positions.
+            q: columns of the directions; 0 if no layer reads them.
+            widths: output features o of each layer's weight; None for those of the table.
+            biased: which layers have a bias.
+            ray: whether directions have one row for each ray, [r, q].
+
+        Returns:
+            The program, the same one for the same arguments.
+
+        Examples:
+            >>> from voronerf import MLP, Layer
+            >>> table = MLP((Layer(("positions",), 16, "relu"), Layer((0,), 4)), outputs=(1,), position_octaves=6)
+            >>> program = table.program(3, 0, None, (True, False))
+            >>> program.inputs, program.parameters
+            ((3,), ((16, 39), (4, 16), (16,)))
+            >>> [step.name or step.op for step in program.steps]
+            ['input', 'frequency', 'linear', 'relu', 'linear']
+        """
+        return _program(self.text, p, q, widths, biased, ray)
+
 
 @functools.lru_cache(maxsize=64)
 def for_last_output(table: MLP) -> tuple[MLP, tuple[int, ...]]:
@@ -206,6 +240,54 @@ def for_last_output(table: MLP) -> tuple[MLP, tuple[int, ...]]:
     layers = [table.layers[index] for index in kept]
     layers = [replace(layer, inputs=tuple(numbers.get(s, s) for s in layer.inputs)) for layer in layers]
     return replace(table, layers=tuple(layers), outputs=(numbers[table.outputs[-1]],)), kept
+
+
+@functools.lru_cache(maxsize=256)
+def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: tuple[bool, ...], ray: bool) -> Program:
+    """:meth:`MLP.program` of the table whose text this is."""
+    table, b = MLP.parse(text), Builder()
+    if widths is not None:
+        layers = zip(table.layers, widths, strict=True)
+        table = replace(table, layers=tuple(replace(layer, width=width) for layer, width in layers))
+    raw = {POSITIONS: b.input(p)}
+    if table.uses_directions:
+        raw[DIRECTIONS] = b.input(q, ray)
+    weights = [b.parameter(*shape) for shape in table.weight_shapes(p, q)]
+    biases = [
+        Columns(PARAMETER, b.parameter(layer.width), 0, layer.width) if has else None
+        for layer, has in zip(table.layers, biased, strict=True)
+    ]
+    features = None if table.grid is None else b.parameter(*table.grid.table_shape)
+    values: dict[int | str, Columns] = {}
+
+    def source(name: int | str) -> Columns:
+        if name not in values:
+            x = raw[str(name)]
+            octaves = table.position_octaves if name == POSITIONS else table.direction_octaves
+            if name == POSITIONS and table.grid is not None and features is not None:
+                x = b.encode("hash", x, b.grid(table.grid.text), features)
+            elif name == DIRECTIONS and table.direction_degree is not None:
+                x = b.encode("spherical", x, table.direction_degree)
+            elif octaves:
+                x = b.encode("integrated" if name == POSITIONS and table.integrated else "frequency", x, octaves)
+            values[name] = x
+        return values[name]
+
+    for index, layer in enumerate(table.layers):
+        total, start = biases[index], 0
+        for name in layer.inputs:
+            x = source(name)
+            total = b.linear(x, weights[index], layer.width, start, add=total)
+            start += x.width
+        assert total is not None
+        if layer.activation != "none":
+            total = b.apply(layer.activation, total, *_NUMBERS.get(layer.activation, (0.0, 0.0)))
+        values[index] = total
+    parts, at = [], 0
+    for output in table.outputs:
+        parts.append((values[output], at))
+        at += values[output].width
+    return pruned(b.program([b.move(at, parts)]))
 
 
 def encoded_width(features: int, octaves: int | None) -> int:

@@ -1,10 +1,12 @@
 """Programs of a tile: what an op does with the rows of one cell, step by step.
 
 A program takes rows, [n, w] for each of its inputs, and parameters, [k, o, i] or [k, w], one for each cell. Its steps
-make values of rows, [n, w], and sums over the rows of a cell. The gradient of a program is a program
+make values of rows, [n, w], and sums over the rows of a cell. Rows are samples of rays: an input may have one row for
+each ray, [r, w], and an output may be the sum over each ray's samples. The gradient of a program is a program
 (:func:`gradient`), so derivatives of every order run as the program itself does.
 
-Letters: n rows, k cells, w columns of a value, o outputs and i inputs of a matrix.
+Letters: n rows, r rays, k cells, w columns of a value, o outputs and i inputs of a matrix, e entries and f features of
+the table of a hash grid, m the order of a derivative.
 
 The steps:
 
@@ -14,8 +16,16 @@ The steps:
     binary     one of :data:`BINARY` of two values
     total      sums over groups of columns next to each other
     move       columns of values, put next to each other or added up
+    encode     one of :data:`ENCODINGS` of columns, or one of its derivatives
     outer      g^T x, summed over the rows of a cell: the gradient of a matrix
     columns    the sum over the rows of a cell: the gradient of a vector
+    scatter    the gradient of a table, summed over the rows of a cell, or over all rows where cells share the table
+
+Derivatives of an encoding e(x), with the table T where it has one, close under differentiation:
+
+    F_m(x; h_1 .. h_m)        the m-th derivative of e at x along h_1, ..., h_m: as many columns as e(x) has
+    G_m(x, g; h_1 .. h_m-1)   the gradient to x of <g, F_m-1(x; h_1 .. h_m-1)>: as many columns as x has
+    T_m(x, g; h_1 .. h_m)     the gradient to the table of <g, F_m(x; h_1 .. h_m)>, which a scatter adds up
 """
 
 from __future__ import annotations
@@ -30,6 +40,8 @@ from typing import Any, NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from voronerf.ops._core.grids import HashGrid
 
 VALUE, PARAMETER = "value", "parameter"
 _ANY = 1 << 30
@@ -84,6 +96,26 @@ BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }
 """Of two values, by their names in the compiled module."""
 
+ENCODINGS = ("frequency", "integrated", "spherical", "hash")
+"""``frequency_encode`` with the input included, ``integrated_encode`` of means and then variances,
+``spherical_harmonics``, and ``hash_encode``."""
+
+
+def encoded_columns(name: str, raw: int, size: int, grids: Sequence[str] = ()) -> int:
+    """How many columns an encoding gives.
+
+    Args:
+        name: one of :data:`ENCODINGS`.
+        raw: columns that are encoded.
+        size: octaves of "frequency" and "integrated", degree of "spherical", for "hash" the number of the grid.
+        grids: texts of the grids.
+    """
+    if name == "frequency":
+        return raw * (1 + 2 * size)
+    if name == "integrated":
+        return raw * size
+    return size**2 if name == "spherical" else HashGrid.parse(grids[size]).out_features
+
 
 class Columns(NamedTuple):
     """Columns of a value or of a parameter, as a step reads them.
@@ -112,13 +144,17 @@ class Step(NamedTuple):
 
     Attributes:
         op: one of the table above.
-        out: the value that it makes; of outer and columns, the sum that it adds to.
-        width: columns that it makes.
+        out: the value that it makes; of outer, columns and scatter, the sum that it adds to.
+        width: columns that it makes; of a scatter, those of g.
         operands: what it reads. linear: x, then what is added if anything is, then the value of ``relu_slope``;
-            function: x, then what it is multiplied by if anything is.
+            function: x, then what it is multiplied by if anything is. encode, scatter: rows alone, as F_m, G_m and T_m
+            name them; G_1 has the value F_0(x) as a third one, which kernels use. It has no gradient of its own: what
+            it says is known from x and the table.
         numbers: input: (index,). linear: (parameter, start, transposed). function: (order, a, b). total: (columns of a
-            group,). move: for each operand where its columns go. outer, columns: (start,).
-        name: of the function or of the binary one. linear: "relu" or "relu_slope", done on the way.
+            group,). move: for each operand where its columns go. outer, columns: (start,). encode: (size, parameter, m,
+            back), the size as in :func:`encoded_columns`, the parameter that is the table of "hash", else 0, and 0 for
+            F_m or 1 for G_m. scatter: (grid, parameter, m), with the table whose layout the sum has.
+        name: of the function, of the binary one or of the encoding. linear: "relu" or "relu_slope", done on the way.
     """
 
     op: str
@@ -138,45 +174,74 @@ class Program:
     """
 
     inputs: tuple[int, ...]  # columns of each input
-    parameters: tuple[tuple[int, ...], ...]  # shape for one cell of each parameter, (o, i) or (w,)
+    parameters: tuple[tuple[int, ...], ...]  # shape for one cell of each parameter, (o, i), (w,) or (e, f)
     steps: tuple[Step, ...]  # in their order
     outputs: tuple[Columns, ...]  # columns that are results, [n, w] each
     sums: tuple[tuple[int, ...], ...] = ()  # shape for one cell of each result that is a sum over its rows
+    rays: tuple[int, ...] = ()  # inputs that have one row for each ray, [r, w]
+    by_ray: tuple[int, ...] = ()  # outputs that are sums over the samples of each ray, [r, w], 0 without samples
+    grids: tuple[str, ...] = ()  # texts of hash grids
     text: str = field(init=False, compare=False)  # the program as a string, which ops take
-    orders: int = field(init=False, compare=False)  # the highest derivative of a function in it
+    orders: int = field(init=False, compare=False)  # the highest derivative of a function in it; see _order
+    tables: tuple[int, ...] = field(init=False, compare=False)  # parameters that are tables of grids
+    sum_tables: tuple[int | None, ...] = field(init=False, compare=False)  # the table whose layout each sum has
 
     def __post_init__(self) -> None:
         check(self)
-        parts = [self.inputs, self.parameters, self.steps, self.outputs, self.sums]
+        parts = [self.inputs, self.parameters, self.steps, self.outputs, self.sums, self.rays, self.by_ray, self.grids]
         object.__setattr__(self, "text", json.dumps(parts))
-        orders = [int(step.numbers[0]) for step in self.steps if step.op == "function"]
-        object.__setattr__(self, "orders", max(orders, default=0))
+        object.__setattr__(self, "orders", max(map(_order, self.steps), default=0))
+        read = {int(step.numbers[1]) for step in self.steps if step.op == "scatter" or step.name == "hash"}
+        object.__setattr__(self, "tables", tuple(sorted(read)))
+        of_sums = {step.out: int(step.numbers[1]) for step in self.steps if step.op == "scatter"}
+        object.__setattr__(self, "sum_tables", tuple(of_sums.get(index) for index in range(len(self.sums))))
 
     @staticmethod
     @functools.lru_cache(maxsize=1024)
     def parse(text: str) -> Program:
         """The program of a string."""
-        inputs, parameters, steps, outputs, sums = json.loads(text)
+        inputs, parameters, steps, outputs, sums, *others = json.loads(text)
         shapes = [tuple(map(tuple, given)) for given in (parameters, sums)]
         known = [
             Step(op, out, width, tuple(Columns(*each) for each in operands), tuple(numbers), name)
             for op, out, width, operands, numbers, name in steps
         ]
-        return Program(tuple(inputs), shapes[0], tuple(known), tuple(Columns(*each) for each in outputs), shapes[1])
+        results = tuple(Columns(*each) for each in outputs)
+        return Program(tuple(inputs), shapes[0], tuple(known), results, shapes[1], *map(tuple, others))
+
+    def cells_of_sums(self, parameters: Sequence[Tensor], k: int) -> list[int]:
+        """For how many cells each sum has entries: 1 if it is that of a table [1, e, f] that all share, else k."""
+        return [k if table is None else parameters[table].shape[0] for table in self.sum_tables]
 
 
 _WIDEST = 1 << 20  # columns
 _ORDERS = 20  # of derivatives
+_MOST_OCTAVES = 127
+
+
+def _order(step: Step) -> int:
+    """The derivative of a function in a step. Of encodings the compiled module has F_0, G_1 and T_0, and any further
+    derivative counts as one that it has of no function."""
+    if step.op == "function":
+        return int(step.numbers[0])
+    further = step.op == "encode" and step.numbers[2] > step.numbers[3]
+    return _ORDERS if further or (step.op == "scatter" and step.numbers[2] > 0) else 0
 
 
 def check(program: Program) -> None:
     """Raises ValueError unless a program reads and writes what is there alone."""
-    inputs, parameters, sums = program.inputs, program.parameters, program.sums
-    values: dict[int, int] = {}  # their columns
+    inputs, parameters, sums, grids = program.inputs, program.parameters, program.sums, program.grids
+    values: dict[int, Step] = {}  # what makes them
+    tables: dict[int, bool] = {}  # whether a parameter that is read is the table of a grid
+    summed: dict[int, int] = {}  # the table whose gradient a sum is; -1 for none
     _rule("inputs", _sizes(inputs), inputs)
+    _rule("grids", isinstance(grids, tuple) and all(map(_is_grid, grids)), grids, "texts of hash grids")
+    large = {HashGrid.parse(text).table_shape for text in grids}
     for name, shapes in (("parameters", parameters), ("sums", sums)):
-        known = isinstance(shapes, tuple) and all(_sizes(shape) and len(shape) in (1, 2) for shape in shapes)
+        known = isinstance(shapes, tuple)
+        known = known and all((_sizes(shape) and len(shape) in (1, 2)) or shape in large for shape in shapes)
         _rule(name, known, shapes)
+    _rule("rays", _numbers(program.rays, len(inputs)), program.rays, "numbers of inputs, each once")
 
     def fits(columns: Any, *widths: int, rows: bool = False) -> bool:
         """Whether columns are there, of one of these widths if any are given; or even each a column of a value."""
@@ -184,17 +249,61 @@ def check(program: Program) -> None:
             return False
         of, index, start, width, spread = columns
         if of == VALUE:
-            there = values.get(index, -1)
+            there = values[index].width if index in values else -1
         else:
-            there = math.prod(parameters[index]) if of == PARAMETER and index < len(parameters) else -1
+            known = of == PARAMETER and index < len(parameters) and not tables.setdefault(index, False)
+            there = math.prod(parameters[index]) if known else -1
         inside = start + (1 if spread else width) <= there
         return inside and (not widths or width in widths) and not (rows and (spread or of != VALUE))
+
+    def hashed(x: Columns, grid: int, table: int) -> bool:
+        """Whether columns are positions for a grid, a whole input that is not of rays, and a parameter is its table."""
+        maker = values[x.index]
+        whole = maker.op == "input" and maker.numbers[0] not in program.rays and x.width == maker.width == 3
+        there = whole and grid < len(grids) and table < len(parameters)
+        return there and parameters[table] == HashGrid.parse(grids[grid]).table_shape and tables.setdefault(table, True)
+
+    def encodes(step: Step) -> bool:
+        operands, numbers = step.operands, step.numbers
+        if not (operands and all(fits(each, rows=True) for each in operands) and _sizes(numbers) and len(numbers) == 4):
+            return False
+        (x, *rest), (size, table, order, back) = operands, map(int, numbers)
+        sizes = {
+            "frequency": size <= _MOST_OCTAVES,
+            "integrated": 1 <= size <= _MOST_OCTAVES and x.width > 0 and x.width % 2 == 0,
+            "spherical": 1 <= size <= 4 and x.width == 3,
+        }
+        known = hashed(x, size, table) if step.name == "hash" else table == 0 and sizes.get(step.name, False)
+        if not (known and back < 2 and back <= order < _ORDERS):
+            return False
+        encoded = encoded_columns(step.name, x.width, size, grids)
+        widths = [encoded] * back + [x.width] * (order - back)
+        if order == back == 1:
+            value = Step("encode", rest[-1].index, encoded, (x,), (size, table, 0, 0), step.name)
+            if values[rest[-1].index] != value:
+                return False
+            widths.append(encoded)
+        return step.width == (x.width if back else encoded) and [each.width for each in rest] == widths
+
+    def scatters(step: Step) -> bool:
+        operands, numbers = step.operands, step.numbers
+        if not (len(operands) > 1 and all(fits(each, rows=True) for each in operands)):
+            return False
+        if not (_sizes(numbers) and len(numbers) == 3 and numbers[2] < _ORDERS):
+            return False
+        (x, *rest), (grid, table, order) = operands, map(int, numbers)
+        if not (hashed(x, grid, table) and sums[step.out] == parameters[table]):
+            return False
+        encoded = encoded_columns("hash", 3, grid, grids)
+        return [step.width, *(each.width for each in rest)] == [encoded, encoded] + [3] * order
 
     def right(step: Step) -> bool:
         op, _, width, operands, numbers, name = step
         count, whole = len(operands), _sizes(numbers)
         if op == "input":
             return whole and len(numbers) == 1 and numbers[0] < len(inputs) and width == inputs[int(numbers[0])]
+        if op == "encode":
+            return encodes(step)
         if op == "function":
             known = name in FUNCTIONS and len(numbers) == 3 and _sizes(numbers[:1]) and numbers[0] < _ORDERS
             return known and count in (1, 2) and all(fits(each, width) for each in operands)
@@ -216,8 +325,12 @@ def check(program: Program) -> None:
             depth = operands[0].width
             inside = (depth, start + width) if transposed else (width, start + depth)
             others = all(fits(each, width, rows=each.of == VALUE) for each in operands[1:])
-            return inside[0] == o and inside[1] <= i and others
-        if op not in ("outer", "columns") or step.out >= len(sums) or not (whole and len(numbers) == 1):
+            return inside[0] == o and inside[1] <= i and others and not tables.setdefault(matrix, False)
+        if not _sums(step) or step.out >= len(sums):
+            return False
+        if op == "scatter":
+            return scatters(step) and summed.setdefault(step.out, int(numbers[1])) == numbers[1]
+        if not (whole and len(numbers) == 1) or summed.setdefault(step.out, -1) >= 0:
             return False
         shape, start = sums[step.out], int(numbers[0])
         if op == "columns":
@@ -231,12 +344,14 @@ def check(program: Program) -> None:
         made = made and isinstance(step.operands, tuple) and isinstance(step.numbers, tuple)
         _rule("steps", made and right(step) and (_sums(step) or step.out not in values), step)
         if not _sums(step):
-            values[step.out] = step.width
+            values[step.out] = step
     _rule("outputs", isinstance(program.outputs, tuple) and all(map(fits, program.outputs)), program.outputs)
+    known = _numbers(program.by_ray, len(program.outputs)) and bool(program.rays or not program.by_ray)
+    _rule("by_ray", known, program.by_ray, "numbers of outputs, each once, of a program with rays")
 
 
 _FINISHES = ("", "relu", "relu_slope")
-_STEPS = ("input", "linear", "function", "binary", "total", "move", "outer", "columns")
+_STEPS = ("input", "linear", "function", "binary", "total", "move", "encode", "outer", "columns", "scatter")
 
 
 def _sizes(values: Any) -> bool:
@@ -244,9 +359,22 @@ def _sizes(values: Any) -> bool:
     return isinstance(values, tuple) and all(type(value) is int and 0 <= value <= _WIDEST for value in values)
 
 
-def _rule(name: str, kept: bool, given: object) -> None:
+def _numbers(values: Any, count: int) -> bool:
+    """Whether values are different numbers of so many things."""
+    return _sizes(values) and all(value < count for value in values) and len(set(values)) == len(values)
+
+
+def _is_grid(text: Any) -> bool:
+    """Whether something is the text of a grid."""
+    try:
+        return isinstance(text, str) and HashGrid.parse(text).text == text
+    except (ValueError, TypeError, LookupError, AttributeError):
+        return False
+
+
+def _rule(name: str, kept: bool, given: object, rule: str = "of values, parameters and sums that are there") -> None:
     if not kept:
-        raise ValueError(f"Program: {name} must be of values, parameters and sums that are there, got {given!r:.100}")
+        raise ValueError(f"Program: {name} must be {rule}, got {given!r:.100}")
 
 
 class Builder:
@@ -260,14 +388,16 @@ class Builder:
         program = program or Program((), (), (), ())
         self.inputs, self.parameters = list(program.inputs), list(program.parameters)
         self.steps = list(program.steps)
-        self.sums = list(program.sums)
+        self.sums, self.rays, self.grids = list(program.sums), list(program.rays), list(program.grids)
         self._makers = {step.out: step for step in self.steps if not _sums(step)}
         self._values = max(self._makers, default=-1) + 1
-        self._made: dict[Step, Columns] = {}
+        made = self._makers.values()
+        self._made = {step._replace(out=0): Columns(VALUE, step.out, 0, step.width) for step in made}
 
-    def program(self, outputs: Iterable[Columns]) -> Program:
-        """What has been made."""
-        return Program(tuple(self.inputs), tuple(self.parameters), tuple(self.steps), tuple(outputs), tuple(self.sums))
+    def program(self, outputs: Iterable[Columns], by_ray: Iterable[int] = ()) -> Program:
+        """What has been made; ``by_ray`` numbers the outputs that are sums over the samples of each ray."""
+        given = (self.inputs, self.parameters, self.steps, outputs, self.sums, self.rays, by_ray, self.grids)
+        return Program(*map(tuple, given))  # type: ignore[arg-type]
 
     def emit(
         self, op: str, width: int, operands: Sequence[Columns] = (), numbers: Sequence[float] = (), name: str = ""
@@ -281,15 +411,23 @@ class Builder:
             self._values += 1
         return self._made[key]
 
-    def input(self, width: int) -> Columns:
-        """Another input."""
+    def input(self, width: int, ray: bool = False) -> Columns:
+        """Another input, with one row for each ray if ``ray``."""
         self.inputs.append(width)
+        if ray:
+            self.rays.append(len(self.inputs) - 1)
         return self.emit("input", width, (), (len(self.inputs) - 1,))
 
     def parameter(self, *shape: int) -> int:
         """Another parameter: its number."""
         self.parameters.append(shape)
         return len(self.parameters) - 1
+
+    def grid(self, text: str) -> int:
+        """The number of a hash grid, by its text."""
+        if text not in self.grids:
+            self.grids.append(text)
+        return self.grids.index(text)
 
     def linear(
         self, x: Columns, matrix: int, width: int, start: int = 0, transposed: bool = False, add: Columns | None = None
@@ -333,6 +471,29 @@ class Builder:
             return parts[0][0]
         return self.emit("move", width, [columns for columns, _ in parts], [at for _, at in parts])
 
+    def encode(self, name: str, x: Columns, size: int, parameter: int = 0, along: Sequence[Columns] = ()) -> Columns:
+        """An encoding F_0(x), or its derivative F_m along m values.
+
+        Args:
+            name: one of :data:`ENCODINGS`.
+            x: to encode; of "hash" a whole input.
+            size: octaves of "frequency" and "integrated", degree of "spherical", of "hash" the number of the grid.
+            parameter: the table of "hash".
+            along: the directions of the derivative, each as wide as x.
+        """
+        operands = [self.rows(each) for each in (x, *along)]
+        width = encoded_columns(name, x.width, size, self.grids)
+        return self.emit("encode", width, operands, (size, parameter, len(along), 0), name)
+
+    def encode_backward(
+        self, name: str, x: Columns, g: Columns, size: int, parameter: int = 0, along: Sequence[Columns] = ()
+    ) -> Columns:
+        """The gradient to x of ``<g, F_m(x; along)>``, which is G_m+1; arguments as of :meth:`encode`."""
+        operands = [self.rows(each) for each in (x, g, *along)]
+        if not along:
+            operands.append(self.encode(name, x, size, parameter))
+        return self.emit("encode", x.width, operands, (size, parameter, len(along) + 1, 1), name)
+
     def rows(self, columns: Columns) -> Columns:
         """The same as a value of rows, with each of its columns."""
         return self.apply("copy", columns) if columns.of == PARAMETER or columns.spread else columns
@@ -347,9 +508,16 @@ class Builder:
             g = g._replace(spread=False)
         self.steps.append(Step("columns", index, g.width, (self.rows(g),), (start,)))
 
+    def add_scatter(
+        self, index: int, x: Columns, g: Columns, grid: int, parameter: int, along: Sequence[Columns] = ()
+    ) -> None:
+        """Adds the gradient to a table of ``<g, F_m(x; along)>`` to a sum [e, f]."""
+        operands = tuple(self.rows(each) for each in (x, g, *along))
+        self.steps.append(Step("scatter", index, g.width, operands, (grid, parameter, len(along))))
+
 
 def _sums(step: Step) -> bool:
-    return step.op in ("outer", "columns")
+    return step.op in ("outer", "columns", "scatter")
 
 
 # Gradients ------------------------------------------------------------------------------------------------------------
@@ -418,7 +586,9 @@ def gradient(
     Returns:
         A program whose inputs are those of ``program``, then the gradients of its outputs that have one; whose
         parameters are its parameters, then the gradients of its sums; whose outputs are the gradients of inputs, and
-        whose sums are those of parameters.
+        whose sums are those of parameters. Gradients of inputs of rays are summed by ray, those of outputs that are
+        summed by ray are inputs of rays. The gradient of a table that all cells share is [1, e, f], that of any other
+        parameter has k cells.
     """
     b = Builder(replace(program, steps=tuple(step for step in program.steps if not _sums(step)), sums=()))
     wanted = {p: i for i, p in enumerate(p for p, want in enumerate(parameters) if want)}
@@ -431,13 +601,14 @@ def gradient(
         else:
             depends = any(c.index in (active if c.of == VALUE else wanted) for c in at)
             depends = depends or (step.op == "linear" and int(step.numbers[0]) in wanted)
+            depends = depends or (step.name == "hash" and int(step.numbers[1]) in wanted)
         if depends and step.name != "stop":
             active.add(step.out)
     widths = {step.out: step.width for step in b.steps}
     arriving = _Arriving(b, active, wanted, widths)
-    for columns, given in zip(program.outputs, outputs, strict=True):
+    for index, (columns, given) in enumerate(zip(program.outputs, outputs, strict=True)):
         if given:
-            arriving.add(columns, b.input(columns.width))
+            arriving.add(columns, b.input(columns.width, ray=index in program.by_ray))
     of_sums = [b.parameter(*shape) if given else None for shape, given in zip(program.sums, sums, strict=True)]
     found: dict[int, Columns] = {}
     for step in reversed(program.steps):
@@ -457,6 +628,8 @@ def gradient(
             _of_function(b, arriving, step, g)
         elif step.op == "binary":
             _of_binary(b, arriving, step, g)
+        elif step.op == "encode":
+            _of_encode(b, arriving, step, g)
         elif step.op == "total":
             (x,), group = step.operands, int(step.numbers[0])
             if step.width == 1:
@@ -467,11 +640,17 @@ def gradient(
         else:
             for columns, at_ in zip(step.operands, step.numbers, strict=True):
                 arriving.add(columns, g.part(int(at_), columns.width))
-    results = [found.get(i) or b.move(program.inputs[i], []) for i, want in enumerate(inputs) if want]
-    return pruned(b.program(results))
+    asked = [i for i, want in enumerate(inputs) if want]
+    results = [found.get(i) or b.move(program.inputs[i], []) for i in asked]
+    return pruned(b.program(results, [at for at, i in enumerate(asked) if i in program.rays]))
 
 
 def _of_sum(b: Builder, arriving: _Arriving, step: Step, parameter: int) -> None:
+    if step.op == "scatter":
+        # <C, T_m(x, g; h ..)> is <g, F_m(x; h ..)> with C as the table.
+        x, g, *along = step.operands
+        _of_product(b, arriving, "hash", int(step.numbers[0]), parameter, x, g, along)
+        return
     start = int(step.numbers[0])
     if step.op == "columns":
         arriving.add(step.operands[0], Columns(PARAMETER, parameter, start, step.width))
@@ -527,6 +706,38 @@ def _of_binary(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
             arriving.add(y, b.apply("affine", b.binary("div", product, y), -1.0))
     else:
         arriving.add(x, b.binary("gate", g, y))
+
+
+def _of_encode(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
+    size, parameter, order, back = map(int, step.numbers)
+    x, *along = step.operands
+    if back:
+        # Where c arrives, <c, G_m(x, g; h ..)> is <g, F_m(x; h .., c)>. An encoded value has no gradient of its own.
+        g, along = along[0], [*along[1:order], g]
+    _of_product(b, arriving, step.name, size, parameter, x, g, along)
+
+
+def _of_product(
+    b: Builder,
+    arriving: _Arriving,
+    name: str,
+    size: int,
+    parameter: int,
+    x: Columns,
+    g: Columns,
+    along: Sequence[Columns],
+) -> None:
+    """The gradients of ``<g, F_m(x; along)>`` to all that it reads. What has arrived itself wants none."""
+    if arriving.wants(g):
+        arriving.add(g, b.encode(name, x, size, parameter, along))
+    if arriving.wants(x):
+        arriving.add(x, b.encode_backward(name, x, g, size, parameter, along))
+    for place, direction in enumerate(along):
+        if arriving.wants(direction):
+            others = [*along[:place], *along[place + 1 :]]
+            arriving.add(direction, b.encode_backward(name, x, g, size, parameter, others))
+    if name == "hash" and parameter in arriving.sums:
+        b.add_scatter(arriving.sums[parameter], x, g, size, parameter, along)
 
 
 def pruned(program: Program) -> Program:

@@ -1,4 +1,5 @@
-"""A small program for the rows of each cell. n rows, k cells, w columns, o outputs and i inputs of a matrix."""
+"""A small program for the rows of each cell. n rows, r rays, k cells, w columns, o outputs and i inputs of a matrix, e
+entries and f features of a table."""
 
 from __future__ import annotations
 
@@ -24,6 +25,7 @@ from voronerf.ops._core.program import Program
 
 _OP = backends.declare("grouped_program", native=Implementation(EVERYWHERE, FLOATS))
 _HALF = (torch.float16, torch.bfloat16)  # computed in float32
+_TABLES = (torch.float32, torch.bfloat16, torch.float16)  # of hash grids, beside the dtype of the inputs
 
 
 def grouped_program(
@@ -33,30 +35,38 @@ def grouped_program(
     *,
     program: Program,
     order: Tensor | None = None,
+    ray_index: Tensor | None = None,
     backend: str = "auto",
 ) -> list[Tensor]:
     """Runs a program on the rows of each cell, with the cell's parameters.
 
-    A program is a list of steps: layers, activations, sums, products, columns that are moved
+    A program is a list of steps: layers, activations, encodings, sums, products, columns that are moved
     (:mod:`voronerf.ops._core.program`). All values of a tile of rows stay in cache. Gradients of every order to inputs
     and parameters; the gradient of a program is a program itself.
 
     Args:
-        inputs: [n, w] floating point for each input of the program, sorted by cell, n < 2**31; at least one.
+        inputs: [n, w] floating point for each input of the program, sorted by cell, n < 2**31; at least one. [r, w],
+            r < 2**31, for those of ``program.rays``, which have one row for each ray.
         parameters: [k, o, i] or [k, w] for each parameter of the program, or [1, ...] where all cells share it, the
-            dtype of the inputs.
+            dtype of the inputs. The table [k, e, f] or [1, e, f] of a hash grid may be float32, bfloat16 or float16
+            beside inputs of any dtype.
         offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
             give 0. Cells may be empty.
         program: what to do.
         order: int32 [n]: row i that the offsets speak of is row ``order[i]`` of inputs and results, which need not be
             sorted then. None for rows that are sorted.
+        ray_index: int32 [n], values 0 to r - 1: the ray of each row of inputs and results, which ``order`` does not
+            change. None for a program without inputs of rays.
         backend: "auto", "reference" or "native".
 
     Returns:
-        [n, w] for each output of the program, then [k, ...] for each of its sums over the rows of a cell.
+        [n, w] for each output of the program, or [r, w], the sum over the rows of each ray, for those of
+        ``program.by_ray``; then [k, ...] for each of its sums over the rows of a cell, or [1, e, f] for the sum of a
+        table that all cells share. Rows outside all cells add nothing to sums.
 
     Raises:
-        ValueError: on the CPU offsets that fall or exceed n, and an order outside 0 to n - 1.
+        ValueError: on the CPU offsets that fall or exceed n, an order outside 0 to n - 1, and a ray_index outside 0 to
+            r - 1.
 
     Examples:
         >>> import torch
@@ -72,16 +82,20 @@ def grouped_program(
         >>> out.flatten()
         tensor([1., 1.])
     """
-    alike = _alike(program, inputs, parameters, (offsets,) if order is None else (offsets, order))
+    given = ([] if tensor is None else [tensor] for tensor in (offsets, order, ray_index))
+    alike = _alike(program, inputs, parameters, *given)
     if alike not in _PASSED:
-        _check(inputs, parameters, offsets, program, order)
+        _check(inputs, parameters, offsets, program, order, ray_index)
         if alike is not None and len(_PASSED) < 4096:
             _PASSED.add(alike)
+    if ray_index is not None:
+        _check_rays(ray_index, inputs[program.rays[0]].shape[0])
     dtype = inputs[0].dtype
     run = backends.resolve(_OP, backend=backend, device=inputs[0].device, dtype=dtype)
     if dtype in _HALF:
-        inputs, parameters = ([tensor.float() for tensor in tensors] for tensors in (inputs, parameters))
-    results: list[Tensor] = run(inputs, parameters, offsets, order, program.text)
+        inputs = [x.float() for x in inputs]
+        parameters = [p if i in program.tables else p.float() for i, p in enumerate(parameters)]
+    results: list[Tensor] = run(inputs, parameters, offsets, order, ray_index, program.text)
     return [tensor.to(dtype) for tensor in results] if dtype in _HALF else results
 
 
@@ -101,7 +115,12 @@ def _alike(program: Any, *lists: Sequence[Any]) -> Any:
 
 
 def _check(
-    inputs: Sequence[Tensor], parameters: Sequence[Tensor], offsets: Tensor, program: Program, order: Tensor | None
+    inputs: Sequence[Tensor],
+    parameters: Sequence[Tensor],
+    offsets: Tensor,
+    program: Program,
+    order: Tensor | None,
+    ray_index: Tensor | None,
 ) -> None:
     """Raises ValueError and TypeError as :func:`grouped_program` says."""
     sizes: dict[str, int] = {}
@@ -117,17 +136,40 @@ def _check(
     if sizes["k"] < 1:
         raise ValueError(f"{_OP}: offsets must be of at least one cell, got {list(offsets.shape)}")
     for i, (x, width) in enumerate(zip(inputs, program.inputs)):
-        check_shape(_OP, f"inputs[{i}]", x, ("n", width), sizes)
+        check_shape(_OP, f"inputs[{i}]", x, ("r" if i in program.rays else "n", width), sizes)
         check_dtype(_OP, f"inputs[{i}]", x, backends.COORDINATES if i == 0 else (inputs[0].dtype,))
     for i, (p, shape) in enumerate(zip(parameters, program.parameters)):
         check_tensor(_OP, f"parameters[{i}]", p)
         check_shape(_OP, f"parameters[{i}]", p, (1 if p.shape[:1] == (1,) else "k", *shape), sizes)
-        check_dtype(_OP, f"parameters[{i}]", p, (inputs[0].dtype,))
+        known = (inputs[0].dtype, *(_TABLES if i in program.tables else ()))
+        check_dtype(_OP, f"parameters[{i}]", p, tuple(dict.fromkeys(known)))
+    if (ray_index is not None) != bool(program.rays):
+        rule = "given for a program with" if program.rays else "None for a program without"
+        came = "None" if ray_index is None else "an index"
+        raise ValueError(f"{_OP}: ray_index must be {rule} inputs of rays, got {came}")
+    if ray_index is not None:
+        check_shape(_OP, "ray_index", ray_index, ("n",), sizes)
+        check_dtype(_OP, "ray_index", ray_index, INDEX)
+        first = program.rays[0]
+        if not sizes["r"] and sizes["n"]:
+            found = list(inputs[first].shape)
+            raise ValueError(f"{_OP}: inputs[{first}] must hold a row for the ray_index, got {found}")
+        check_count(_OP, f"inputs[{first}]", sizes["r"])
     if order is not None:
         check_shape(_OP, "order", order, ("n",), sizes)
         check_dtype(_OP, "order", order, INDEX)
     check_count(_OP, "inputs[0]", sizes["n"])
-    named = {**{f"inputs[{i}]": x for i, x in enumerate(inputs)}, "offsets": offsets, "order": order}
+    named: dict[str, Tensor | None] = {f"inputs[{i}]": x for i, x in enumerate(inputs)}
+    named.update(offsets=offsets, order=order, ray_index=ray_index)
     named.update({f"parameters[{i}]": p for i, p in enumerate(parameters)})
     check_same_device(_OP, **named)
     check_no_inference(_OP, **named)
+
+
+def _check_rays(ray_index: Tensor, r: int) -> None:
+    """Raises ValueError for an index that names no ray; on the CPU, as it reads the index."""
+    if ray_index.device.type != "cpu" or ray_index.numel() == 0 or torch.compiler.is_compiling():
+        return
+    low, high = (int(bound) for bound in ray_index.aminmax())
+    if low < 0 or high >= r:
+        raise ValueError(f"{_OP}: ray_index must be 0 to {r - 1}, got {low if low < 0 else high}")

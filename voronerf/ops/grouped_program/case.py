@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.program import PARAMETER, Builder, Columns, Program
 
 
@@ -38,15 +39,41 @@ def smooth(width: int = 9) -> Program:
     return b.program([b.apply("tanh", b.linear(h, b.parameter(2, 3), 2))])
 
 
+GRID = HashGrid(levels=2, features=2, log2_entries=10, base=3, finest=12, interpolation="smoothstep")
+
+
+def encoded(width: int = 9) -> Program:
+    """Every encoding, with directions of rays and a sum by ray beside the rows' own result."""
+    b = Builder()
+    x, gaussians, direction = b.input(3), b.input(4), b.input(3, ray=True)
+    parts = [
+        b.encode("frequency", x, 2),
+        b.encode("integrated", gaussians, 2),
+        b.encode("spherical", direction, 3),
+        b.encode("hash", x, b.grid(GRID.text), b.parameter(*GRID.table_shape)),
+    ]
+    places = [sum(part.width for part in parts[:i]) for i in range(len(parts))]
+    total = sum(part.width for part in parts)
+    h = b.linear(b.move(total, list(zip(parts, places))), b.parameter(width, total), width)
+    h = b.linear(b.apply("softplus", h, 1.0, 20.0), b.parameter(3, width), 3)
+    return b.program([h, b.binary("mul", h, direction)], by_ray=[1])
+
+
 def _make(draw: Draw, n: int) -> Arguments:
-    k, jumps = draw.among("k", 3, 1, 2, 17), draw.among("program", "steps", "smooth") == "steps"
-    program = every_step() if jumps else smooth(draw.number("w", 9, 1, 70))
+    k, kind = draw.among("k", 3, 1, 2, 17), draw.among("program", "steps", "smooth", "encoded")
+    jumps = kind == "steps"
+    width = draw.number("w", 9, 1, 70)
+    program = every_step() if jumps else smooth(width) if kind == "smooth" else encoded(width)
     dtype = torch.float32 if jumps else draw.dtype()  # half precision may fall on the other side of a jump
-    inputs = [draw.normal(n, width, dtype=dtype) for width in program.inputs]
+    r = draw.number("rays", 4, 1, 9)
+    inputs = [draw.uniform(r if i in program.rays else n, w, dtype=dtype) for i, w in enumerate(program.inputs)]
+    if kind != "encoded":
+        inputs = [draw.normal(n, w, dtype=dtype) for w in program.inputs]
     parameters = []
-    for shape in program.parameters:
+    for i, shape in enumerate(program.parameters):
         few = draw.among("shared", k, 1)
-        parameters.append((draw.normal(few, *shape, dtype=torch.float64) / shape[-1] ** 0.5).to(dtype))
+        of = draw.among("table's dtype", dtype, torch.bfloat16) if i in program.tables else dtype
+        parameters.append((draw.normal(few, *shape, dtype=torch.float64) / shape[-1] ** 0.5).to(of))
     order = torch.randperm(n, generator=torch.Generator().manual_seed(n)).int()
     return {
         "inputs": inputs,
@@ -54,12 +81,19 @@ def _make(draw: Draw, n: int) -> Arguments:
         "offsets": draw.offsets(n, k),
         "program": program,
         "order": order if draw.among("ordered", False, True) else None,
+        "ray_index": draw.integers(0, r, n) if program.rays else None,
     }
 
 
 CASE = Case(
     _make,
-    {"": {}, "shared, in any order": {"shared": 1, "ordered": True}, "smooth": {"program": "smooth"}},
+    {
+        "": {},
+        "shared, in any order": {"shared": 1, "ordered": True},
+        "smooth": {"program": "smooth"},
+        "encoded": {"program": "encoded"},
+        "encoded, shared, in any order": {"program": "encoded", "shared": 1, "ordered": True},
+    },
     refused={
         "inputs must be 2 tensors (inputs at least one), got 0": {"inputs": []},
         "parameters must be 2 tensors (inputs at least one), got 0": {"parameters": []},
@@ -71,6 +105,9 @@ CASE = Case(
             "parameters": [torch.ones(3, 7, 8).double(), torch.ones(3, 7)]
         },
         "order must have shape [n] with n = 6, got [3]": {"order": torch.zeros(3, dtype=torch.int32)},
+        "ray_index must be None for a program without inputs of rays, got an index": {
+            "ray_index": torch.zeros(6, dtype=torch.int32)
+        },
     },
     differentiable=True,
     hostile="indices",

@@ -6,6 +6,7 @@ derivatives than the compiled module has runs in PyTorch.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -103,30 +104,86 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
         for to, result in zip((*outputs, *sums), made, strict=True):
             to.copy_(result)
         return
+    given = program_inputs(
+        rows._replace(kept=keeping or kept), n, r, ready=bool(kept), gradients=how.gradients, caller=how.caller
+    )
+    results = native.compiled.ProgramResults(outputs=outputs, output_types=_types(outputs), sums=sums)
+    if native.on_cuda(first):
+        _run_on_cuda(how, given, results, program)
+        return
+    for result in (*outputs, *sums, *keeping):
+        native.on_huge_pages(result)
+    native.compiled.grouped_program(lowered.program, given, results, native.cpu())
+
+
+def _run_on_cuda(
+    how: How, given: native.compiled.ProgramInputs, results: native.compiled.ProgramResults, program: Program
+) -> None:
+    """The call, and the sums over the samples of each ray, whose rows the kernels give."""
+    if any(step.op == "scatter" for step in program.steps):
+        native.refuse_where_deterministic(how.caller, given.offsets)
+    products = how.products
+    if products == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32":
+        products = "tf32"
+    outputs = list(results.outputs)
+    here, machine = given.offsets.device, native.machine(given.offsets)
+    for i in program.by_ray:
+        outputs[i] = torch.empty(given.n, outputs[i].shape[1], device=here)
+    to = results._replace(outputs=outputs, output_types=_types(outputs))
+    compiled = lower(how.text, False).program
+    size = native.compiled.grouped_program_workspace(compiled, given.n, given.r, given.k, machine)
+    workspace = torch.empty(size, dtype=torch.uint8, device=here)
+    native.compiled.grouped_program(compiled, _code(how.text, here), given, to, products, workspace, machine)
+    for i in program.by_ray:
+        total = torch.zeros(given.r, outputs[i].shape[1], device=here)
+        if given.n and given.r:
+            total.index_add_(0, given.ray_index.clamp(0, given.r - 1), outputs[i])
+        results.outputs[i].copy_(total)
+
+
+@functools.lru_cache(maxsize=1024)
+def _code(text: str, device: torch.device) -> Tensor:
+    """The records of a program on a device, copied there once."""
+    program = lower(text, False).program
+    code = torch.empty(native.compiled.program_code_bytes(program), dtype=torch.uint8)
+    native.compiled.program_code(program, code)
+    return code.to(device)
+
+
+def program_inputs(
+    rows: Rows, n: int, r: int, *, ready: bool = False, gradients: int = -1, caller: str = "grouped_program"
+) -> native.compiled.ProgramInputs:
+    """The tensors of a program as the compiled module takes them.
+
+    Args:
+        rows: the tensors.
+        n: rows.
+        r: rays.
+        ready: whether what is kept is there already.
+        gradients: see `How`.
+        caller: the op that errors name.
+    """
+    inputs, parameters, offsets, order, ray_index, kept = rows
     turned = [int(not x.is_contiguous() and x.t().is_contiguous() and x.dtype == torch.float32) for x in inputs]
-    memory = keeping or [x if x.numel() else None for x in kept]
-    given = native.compiled.ProgramInputs(
+    return native.compiled.ProgramInputs(
         inputs=[x.t() if turn else x for x, turn in zip(inputs, turned)],
         input_types=_types(inputs),
         turned=turned,
         parameters=[native.aligned(p) for p in parameters],
         parameter_types=_types(parameters),
-        strides=[p.stride(0) if p.shape[0] > 1 else 0 for p in parameters],
+        strides=[p[0].numel() if p.shape[0] > 1 else 0 for p in parameters],
         offsets=offsets,
         order=order,
         ray_index=ray_index,
         n=n,
         r=r,
-        k=k,
-        kept=memory or None,
-        ready=bool(kept),
-        gradients=how.gradients,
-        caller=how.caller,
+        k=offsets.shape[0] - 1,
+        kept=[x if x.numel() else None for x in kept] or None,
+        ready=ready,
+        gradients=gradients,
+        caller=caller,
+        index="ray_index" if caller == "grouped_program" else "direction_index",
     )
-    results = native.compiled.ProgramResults(outputs=outputs, output_types=_types(outputs), sums=sums)
-    for result in (*outputs, *sums, *keeping):
-        native.on_huge_pages(result)
-    native.compiled.grouped_program(lowered.program, given, results, native.cpu())
 
 
 _NAMES = {torch.float32: "float32", torch.bfloat16: "bfloat16", torch.float16: "float16"}
@@ -159,7 +216,7 @@ def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
     saved = ctx.saved_tensors
     (offsets, order, ray_index), kept = saved[count : count + 3], saved[count + 3 :]
     rows, parameters = saved[: ctx.count], saved[ctx.count : count]
-    wanted = asked_for(ctx, saved)[:count]
+    wanted = asked_for(ctx, saved[: count + 3])[:count]
     found: list[Tensor | None] = [None] * count
     arriving = arriving[: ctx.results]
     if any(g is not None for g in arriving) and any(wanted):
@@ -190,7 +247,8 @@ def run_gradient(
         before = dict(zip(lower(how.text, False).lookups, rows.kept, strict=True))
         none = rows.offsets.new_empty(0, dtype=torch.float32)
         kept = [before.get(lookup, none) for lookup in lower(own.text, False).lookups]
-    sifts = not own.outputs and not any(given[split:]) and not set(own.rays) & set(range(count, len(own.inputs)))
+    rays = any(i >= count for i in own.rays)
+    sifts = not own.outputs and not more[1] and not rays and all(g.dtype == torch.float32 for g in more[0])
     following = how._replace(text=own.text, keep=False, gradients=count if sifts else -1)
     inputs = [*rows.inputs, *more[0]]
     found = run(rows._replace(inputs=inputs, parameters=[*rows.parameters, *more[1]], kept=kept), following)

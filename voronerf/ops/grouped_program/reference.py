@@ -1,50 +1,83 @@
-"""Programs of a tile in plain PyTorch. n rows, k cells, w columns of a value."""
+"""Programs of a tile in plain PyTorch. n rows, r rays, k cells, w columns of a value."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import functools
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_range
+from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.program import BINARY, FUNCTIONS, VALUE, Columns, Program, Step
+from voronerf.ops.frequency_encode.reference import frequency_encode
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
 from voronerf.ops.grouped_mlp.reference import cells_of
+from voronerf.ops.hash_encode.reference import interpolate
+from voronerf.ops.integrated_encode.reference import integrated_encode
+from voronerf.ops.spherical_harmonics.reference import spherical_harmonics
 
 
 def grouped_program(
-    inputs: Sequence[Tensor], parameters: Sequence[Tensor], offsets: Tensor, order: Tensor | None, text: str
+    inputs: Sequence[Tensor],
+    parameters: Sequence[Tensor],
+    offsets: Tensor,
+    order: Tensor | None,
+    ray_index: Tensor | None,
+    text: str,
 ) -> list[Tensor]:
     """A program on the rows of each cell; see ``voronerf.ops.grouped_program``. ``text`` is that of a program."""
-    check_offsets("grouped_program", offsets, inputs[0].shape[0])
-    if order is not None:
-        check_range("grouped_program", "order", order, inputs[0].shape[0])
-        inputs = [x.index_select(0, order) for x in inputs]
     program = Program.parse(text)
-    run = _Run(program, inputs, parameters, offsets)
-    results = [run.columns(columns) for columns in program.outputs]
-    rows = torch.arange(len(inputs[0]), device=offsets.device)
-    inside = ((rows >= offsets[0]) & (rows < offsets[-1]))[:, None]
-    results = [torch.where(inside, result, 0) for result in results]
+    n, rays = (inputs[0] if ray_index is None else ray_index).shape[0], None
+    low, *_, high = check_offsets("grouped_program", offsets, n)
     if order is not None:
-        results = [torch.empty_like(result).index_copy(0, order.long(), result) for result in results]
+        check_range("grouped_program", "order", order, n)
+        ray_index = None if ray_index is None else ray_index.index_select(0, order)
+    rows = [x if order is None or i in program.rays else x.index_select(0, order) for i, x in enumerate(inputs)]
+    for i in program.rays:
+        assert ray_index is not None
+        rays = inputs[i].shape[0]
+        rows[i] = inputs[i].index_select(0, ray_index)
+    run = _Run(program, rows, parameters, offsets, slice(low, high))
+    results = [run.columns(columns) for columns in program.outputs]
+    index = torch.arange(n, device=offsets.device)
+    inside = ((index >= low) & (index < high))[:, None]
+    for i, result in enumerate(results):
+        if i in program.by_ray:
+            assert rays is not None and ray_index is not None
+            results[i] = result.new_zeros(rays, result.shape[1]).index_add(0, ray_index[low:high], result[low:high])
+            continue
+        results[i] = torch.where(inside, result, 0)
+        if order is not None:
+            results[i] = torch.empty_like(result).index_copy(0, order.long(), results[i])
     return [*results, *run.sums]
 
 
 class _Run:
-    """The values of a program."""
+    """The values of a program; ``inside`` are the rows of cells."""
 
     def __init__(
-        self, program: Program, inputs: Sequence[Tensor], parameters: Sequence[Tensor], offsets: Tensor
+        self,
+        program: Program,
+        inputs: Sequence[Tensor],
+        parameters: Sequence[Tensor],
+        offsets: Tensor,
+        inside: slice,
     ) -> None:
-        self.inputs, self.offsets, self.k = inputs, offsets, len(offsets) - 1
+        self.inputs, self.offsets, self.k, self.inside = inputs, offsets, len(offsets) - 1, inside
+        self.tables = {i: parameters[i].to(inputs[0].dtype) for i in program.tables}
+        self.grids = [HashGrid.parse(text) for text in program.grids]
         self.parameters = [p.expand(self.k, *p.shape[1:]) for p in parameters]
         self.cells = cells_of(offsets, inputs[0])
         self.values: dict[int, Tensor] = {}
-        self.sums = [inputs[0].new_zeros(self.k, *shape) for shape in program.sums]
+        counts = program.cells_of_sums(parameters, self.k)
+        self.sums = [inputs[0].new_zeros(count, *shape) for count, shape in zip(counts, program.sums)]
         for step in program.steps:
-            if step.op in ("outer", "columns"):
+            if step.op == "scatter":
+                self.sums[step.out] = self.sums[step.out] + self.scattered(step)
+            elif step.op in ("outer", "columns"):
                 self.sums[step.out] = self.sums[step.out] + self.summed(step, self.sums[step.out])
             else:
                 self.values[step.out] = self.value(step)
@@ -75,6 +108,8 @@ class _Run:
             order, a, b = step.numbers
             found = derivative(step.name, operands[0], a, b, int(order))
             return found * operands[1] if len(operands) > 1 else found
+        if step.op == "encode":
+            return self.encoded(step, operands)
         if step.op == "binary":
             return BINARY[step.name](operands[0], operands[1])
         if step.op == "total":
@@ -83,6 +118,40 @@ class _Run:
         for x, at in zip(operands, map(int, step.numbers), strict=True):
             result = result + torch.nn.functional.pad(x, (at, step.width - at - x.shape[1]))
         return result
+
+    def encoded(self, step: Step, operands: Sequence[Tensor]) -> Tensor:
+        """An encoding, or one of its derivatives, [n, w]."""
+        size, parameter, order, back = map(int, step.numbers)
+        table = self.tables.get(parameter) if step.name == "hash" else None
+        encode = functools.partial(self.encoding, step.name, size, table=table, rows=slice(None))
+        with recording():
+            if not back:
+                return along(encode, operands[1:])(operands[0])
+            x, g, *directions = operands[: order + 1]
+            return torch.func.vjp(along(encode, directions), x)[1](g)[0]
+
+    def encoding(self, name: str, size: int, x: Tensor, table: Tensor | None, rows: slice) -> Tensor:
+        """The encoding of some rows, with a table [k, e, f] of cells or [1, e, f] of all of them."""
+        if name == "frequency":
+            return frequency_encode(x, size)
+        if name == "integrated":
+            means, variances = x.chunk(2, dim=1)
+            return integrated_encode(means, variances, size)
+        if name == "spherical":
+            return spherical_harmonics(x, size)
+        assert table is not None
+        return interpolate(x, table, self.grids[size], self.cells[rows] if len(table) > 1 else None)
+
+    def scattered(self, step: Step) -> Tensor:
+        """What a step adds to the sum of a table, [k, e, f] or [1, e, f]."""
+        grid, parameter, _ = map(int, step.numbers)
+        x, g, *directions = (self.columns(columns)[self.inside] for columns in step.operands)
+
+        def encoded(table: Tensor) -> Tensor:
+            return along(functools.partial(self.encoding, "hash", grid, table=table, rows=self.inside), directions)(x)
+
+        with recording():  # the same for every table, as an encoding is linear in it
+            return torch.func.vjp(encoded, torch.zeros_like(self.tables[parameter]))[1](g)[0]
 
     def summed(self, step: Step, like: Tensor) -> Tensor:
         """What a step adds to a sum, [k, ...]."""
@@ -97,6 +166,32 @@ class _Run:
         return flat.reshape(like.shape)
 
 
+@contextlib.contextmanager
+def recording() -> Iterator[None]:
+    """Has autograd record within a custom op too: what PyTorch calls there it does not see, and gradients would be 0.
+
+    There is no public way to ask for this.
+    """
+    left_out = torch._C._dispatch_tls_local_exclude_set()
+    for key in ("AutogradCPU", "AutogradCUDA", "ADInplaceOrView"):
+        left_out = left_out.remove(getattr(torch._C.DispatchKey, key))
+    with torch._C._ForceDispatchKeyGuard(torch._C._dispatch_tls_local_include_set(), left_out):
+        yield
+
+
+def along(encode: Callable[[Tensor], Tensor], directions: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
+    """The derivative of an encoding along directions, which may be differentiated further."""
+    for direction in directions:
+        encode = functools.partial(_slope, encode, direction)
+    return encode
+
+
+def _slope(encode: Callable[[Tensor], Tensor], direction: Tensor, x: Tensor) -> Tensor:
+    y, back = torch.func.vjp(encode, x)
+    # The gradient of <direction, back(v)> to v; PyTorch's forward mode compiles TorchScript.
+    return torch.func.vjp(lambda v: back(v)[0], torch.zeros_like(y))[1](direction)[0]
+
+
 def derivative(name: str, x: Tensor, a: float, b: float, order: int) -> Tensor:
     """A derivative of a function, which may be differentiated further."""
     formula, orders = FUNCTIONS[name]
@@ -105,7 +200,7 @@ def derivative(name: str, x: Tensor, a: float, b: float, order: int) -> Tensor:
     if order > orders:
         return torch.zeros_like(x)
     differentiable = torch.is_grad_enabled() and x.requires_grad
-    with torch.enable_grad():
+    with torch.enable_grad(), recording():
         leaf = x if differentiable else x.detach().requires_grad_()
         found = formula(leaf, a, b)
         for _ in range(order):

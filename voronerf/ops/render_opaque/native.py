@@ -13,8 +13,9 @@ from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
-from voronerf.ops.grouped_mlp import network as grouped_mlp
-from voronerf.ops.grouped_mlp.network import Given, in_float32, table_of
+from voronerf.ops.grouped_mlp.network import Given, as_network
+from voronerf.ops.grouped_program.lowering import lower
+from voronerf.ops.grouped_program.native import program_inputs
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.render_opaque import reference
@@ -40,10 +41,9 @@ def render_opaque(*flat: Any) -> RaySums:
         narrow["features"] = _narrow(features)
         composed: RaySums = partial(reference.render_opaque, backend="native")(*given._replace(network=narrow))
         return composed
-    if features is not None and features.dim() == 3 and weights[0].shape[0] == 1:
-        features = features[0]
-    samples = Given(given.origins, weights, biases, network["layers"], network["directions"], None, features)
-    taken, _ = in_float32(samples, network["layers"].text, "routed_mlp")
+    ray_index = given.near.new_empty(0, dtype=torch.int32)  # of samples that are not there yet
+    samples = Given(given.origins, weights, biases, network["layers"], network["directions"], ray_index, features)
+    taken = as_network(samples)
     child_offsets, child, depth = network["child_offsets"], network["child"], network["depth"]
     if weights[0].shape[0] == 1:
         centres = child_offsets = child = None
@@ -52,8 +52,8 @@ def render_opaque(*flat: Any) -> RaySums:
     found: RaySums = _OP.allocate(given)
     outputs, compiled = _outputs(found), native.compiled
     sound = compiled.render_opaque(
-        table_of(*grouped_mlp.key_of(taken)),
-        grouped_mlp.inputs_of(taken, _no_offsets(weights[0]), None, given.near.new_empty(0)),
+        lower(taken.program.text, False).program,
+        program_inputs(taken.rows(_no_offsets(weights[0])), 0, 0, caller="render_opaque"),
         _rays(given),
         compiled.SeeCells(
             centres=centres,
