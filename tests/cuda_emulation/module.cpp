@@ -3,7 +3,6 @@
 #include <pybind11/stl.h>
 
 #include "bindings/bind.h"
-#include "encoding/encode_math.h"
 #include "emulation.h"
 #include "geometry/cell_sort.h"
 
@@ -18,7 +17,6 @@ void planted(const float* values, float* out, int* counter, int blocks, int thre
 PYBIND11_MODULE(voronerf_emulation, module) {
   voronerf::bind_all(module.ptr());
   bind_index_maps(module);
-  module.def("turns_of_large", &voronerf::turns_of_large);
   module.def("planted",
              [](std::uintptr_t values, std::uintptr_t out, std::uintptr_t counter, int blocks, int threads, int bug) {
                planted(reinterpret_cast<const float*>(values), reinterpret_cast<float*>(out),

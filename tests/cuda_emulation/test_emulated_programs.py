@@ -107,12 +107,13 @@ def test_products_of_every_precision(products: str, widths: list[int], shared_by
     assert products == "float32" or rounded > 1e-5, "operands are rounded"
 
 
+@pytest.mark.parametrize(("capability", "compiled"), [(75, 120), (90, 75)])
 @pytest.mark.parametrize(("products", "exactly"), [("tf32", True), ("bfloat16", True), ("float16", False)])
-def test_products_before_ampere(products: str, exactly: bool) -> None:
-    """Of tf32 and bfloat16 there are none: they are float32's."""
+def test_products_before_ampere(products: str, exactly: bool, capability: int, compiled: int) -> None:
+    """Of tf32 and bfloat16 there are none: they are float32's. So it is in code for an older device."""
     program, sizes = layers_of([17, 70, 33]), [40, 9]
     tensors = tensors_of(program, sizes)
-    with emulated(capability=75, shared_bytes=64 * KIB):
+    with emulated(capability=capability, compiled=compiled, shared_bytes=64 * KIB):
         found = outcome(program, tensors, offsets_of(sizes), products)
         plain = outcome(program, tensors, offsets_of(sizes), "float32")
     assert all(map(torch.equal, found, plain)) == exactly

@@ -320,15 +320,15 @@ __global__ void __launch_bounds__(kThreads, kResident)
   float* slots = shared + kProgramStrip;
   if constexpr (kSpilled) slots = call.spilled + int64_t{blockIdx.x} * call.code.columns * kHeight;
   const CudaRows& rows = call.rows;
-  const int64_t tasks = rows.first_task[rows.k];
-  for (int64_t task = blockIdx.x; task < tasks; task += gridDim.x) {
-    const int64_t cell = last_not_above(rows.first_task, rows.k, task);
+  const int tasks = rows.first_task[rows.k];
+  for (int task = blockIdx.x; task < tasks; task += gridDim.x) {
+    const int cell = static_cast<int>(last_not_above(rows.first_task, rows.k, task));
     const int64_t first = cell_begin(rows, cell), last = first + cell_rows(rows, cell);
     const int64_t begin = first + (task - rows.first_task[cell]) * call.task_rows;
-    const int64_t end = begin + call.task_rows < last ? begin + call.task_rows : last;
-    for (int64_t row = begin; row < end; row += kHeight) {
-      const int left = end - row < kHeight ? static_cast<int>(end - row) : kHeight;
-      const ProgramTile tile{call, slots, call.partials + task * partial, cell, row, kHeight, left, row == begin};
+    const int count = static_cast<int>(last - begin < call.task_rows ? last - begin : call.task_rows);
+    for (int done = 0; done < count; done += kHeight) {
+      const int left = count - done < kHeight ? count - done : kHeight, row = static_cast<int>(begin) + done;
+      const ProgramTile tile{call, slots, call.partials + task * partial, cell, row, kHeight, left, done == 0};
       for (int i = 0; i < call.code.step_count; ++i) {
         const ProgramStep& step = call.code.steps[i];
         if (step.op == ProgramOp::linear) {
@@ -543,10 +543,15 @@ Cut cut(const Program& program, int64_t n, int64_t k) {
   const Device& device = current_device();
   const size_t most = std::max({table.inputs.size(), static_cast<size_t>(table.parameters), table.outputs.size(),
                                 static_cast<size_t>(table.sum_tensors)});
-  if (most > kProgramMost || table.memories.size() > kProgramMemories) {
+  if (most > kProgramMost) {
     throw std::invalid_argument("grouped_program: a program must have at most " + std::to_string(kProgramMost) +
                                 " inputs, parameters, outputs or sums on CUDA, got " + std::to_string(most) +
                                 "; use backend='reference'");
+  }
+  if (table.memories.size() > kProgramMemories) {
+    throw std::invalid_argument("grouped_program: a program must have at most " + std::to_string(kProgramMemories) +
+                                " look-ups, their gradients and outputs of rays on CUDA, got " +
+                                std::to_string(table.memories.size()) + "; use backend='reference'");
   }
   Cut found{};
   const int64_t columns = Slots(table).columns();

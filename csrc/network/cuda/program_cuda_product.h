@@ -47,8 +47,8 @@ __device__ __forceinline__ float cut_off(float x, float largest) {  // NaN stays
 template <bool kBfloat16>
 struct HalfFragments {
   static __device__ __forceinline__ uint32_t pair(const float (&x)[2], float largest) {
-    if constexpr (kBfloat16) return pack_halves<true, false>(x[0], x[1]);
-    return pack_halves<false, false>(cut_off(x[0], largest), cut_off(x[1], largest));
+    if constexpr (kBfloat16) return pack_halves<true>(x[0], x[1]);
+    return pack_halves<false>(cut_off(x[0], largest), cut_off(x[1], largest));
   }
   // Rows g and g + 8 by four pairs of steps; a column by two.
   template <typename A>

@@ -79,7 +79,7 @@ __device__ __forceinline__ void store_number(void* to, int type, int64_t at, flo
       static_cast<uint16_t*>(to)[at] = static_cast<uint16_t>(pack_halves<true>(x, 0.0f));
       return;
     default:
-      static_cast<uint16_t*>(to)[at] = static_cast<uint16_t>(pack_halves<false, false>(x, 0.0f));
+      static_cast<uint16_t*>(to)[at] = static_cast<uint16_t>(pack_halves<false>(x, 0.0f));
   }
 }
 
@@ -108,7 +108,7 @@ struct Rows {
 struct ProgramTile {
   const CudaProgram& call;
   float *slots, *partial;
-  int64_t cell, begin;
+  int cell, begin;
   int height, rows;  // there are, and have a sample
   bool fill;         // the first tile of a task
 
