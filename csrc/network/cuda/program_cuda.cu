@@ -202,10 +202,14 @@ __device__ __noinline__ void plain_step(const ProgramTile& tile, const ProgramSt
   }
 }
 
-// Keeps a value in memory of the call too: hash grids looked up, and the gradient of that.
+// What becomes of a value beside its slot: the gradient of what was looked up is added to that of its table, and what
+// was looked up is kept in memory of the call.
 __device__ __noinline__ void keep(const ProgramTile& tile, const ProgramStep& step) {
   const CudaProgram& call = tile.call;
-  if (call.memories[step.memory] == nullptr || (call.ready && step.op == ProgramOp::encode)) return;
+  for (int i = 0; i < call.scatter_count; ++i) {
+    if (call.scatters[i].memory == step.memory) return scatter_rows(tile, step, call.scatters[i]);
+  }
+  if (call.memories[step.memory] == nullptr || call.ready) return;
   const int64_t stride = call.memory_strides[step.memory];
   float* const to = call.memories[step.memory] + tile.begin * stride;
   const float* from = tile.slot(step.slot);
@@ -417,40 +421,6 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// Adds to the gradient of a table from memory that holds the gradient of what was looked up; a thread has a level of a
-// row.
-__global__ void __launch_bounds__(kThreads)
-    program_scatter_kernel(const VN_GRID_CONSTANT CudaProgram call, const ProgramScatter scatter) {
-  const CudaRows& rows = call.rows;
-  const HashEncoding& grid = call.grids[scatter.grid];
-  const int64_t low = cell_begin(rows, 0), count = cell_begin(rows, rows.k) - low;
-  const int64_t stride = call.memory_strides[scatter.memory], step = static_cast<int64_t>(gridDim.x) * kThreads;
-  const int64_t own = call.strides[scatter.parameter];  // 0 where all cells share the table
-  hash_with_features(grid.features, [&](auto features) {
-    constexpr int kFeatures = decltype(features)::value;
-#pragma unroll 1
-    for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < count * grid.count; i += step) {
-      const int64_t number = i / count, row = low + i % count, source = source_row(rows, row);
-      const GridLevel& level = grid.levels[number];
-      const HashAxes at =
-          hash_axes(grid, level, [&](int axis) { return load_input(call, scatter.input, 3, source, axis); });
-      const float* from = call.memories[scatter.memory] + row * stride + number * kFeatures;
-      float given[kFeatures];
-#pragma unroll
-      for (int f = 0; f < kFeatures; ++f) given[f] = from[f];
-      const int64_t before = own == 0 ? 0 : last_not_above(rows.offsets, rows.k, row) * own;
-      hash_corners<kFeatures>(at.axes, level, before + level.offset * kFeatures,
-                              [&](int64_t entry, int x, int y, int z) {
-                                const float weight = hash_weight(at.axes, false, nullptr, x, y, z);
-                                float added[kFeatures];
-#pragma unroll
-                                for (int f = 0; f < kFeatures; ++f) added[f] = weight * given[f];
-                                hash_add(call.sums[scatter.sum] + entry, added);
-                              });
-    }
-  });
-}
-
 // Launches -------------------------------------------------------------------------------------------------------
 
 struct Device {
@@ -480,7 +450,7 @@ const Device& current_device() {
 
 // Where the slots of a program are in shared memory, whose rows are longer than the program says: a slot moves by what
 // those before it have grown. A value that a program has in memory alone, the gradient of what was looked up, has a
-// slot here, behind the others.
+// slot here instead, behind the others.
 class Slots {
  public:
   explicit Slots(const ProgramTable& table) : own_(table.memories.size(), -1) {
@@ -512,7 +482,7 @@ class Slots {
 
 // Bytes of the parts of a code, one after another.
 struct CodePlaces {
-  int64_t packs, steps, operands, sums, grids, bytes;
+  int64_t packs, steps, operands, sums, scatters, grids, bytes;
 };
 int64_t aligned(int64_t bytes) { return ceil_div<int64_t>(bytes, 256) * 256; }
 CodePlaces code_places(const ProgramTable& table) {
@@ -523,7 +493,8 @@ CodePlaces code_places(const ProgramTable& table) {
   at.steps = behind(at.packs, table.packs);
   at.operands = behind(at.steps, table.steps);
   at.sums = behind(at.operands, table.operands);
-  at.grids = behind(at.sums, table.sums);
+  at.scatters = behind(at.sums, table.sums);
+  at.grids = behind(at.scatters, table.scatters);
   at.bytes = at.grids + aligned(static_cast<int64_t>(table.grids.size() * sizeof(HashEncoding)));
   return at;
 }
@@ -535,7 +506,6 @@ struct Cut {
   int shared;
   int64_t task_rows, tasks, blocks;
   int64_t partials, slots, bytes;
-  std::vector<int64_t> memories;
 };
 
 Cut cut(const Program& program, int64_t n, int64_t k) {
@@ -571,10 +541,6 @@ Cut cut(const Program& program, int64_t n, int64_t k) {
   found.partials = aligned(4 * (k + 1));
   found.slots = found.partials + aligned(4 * found.tasks * table.partial);
   found.bytes = found.slots + (found.spilled ? aligned(4 * found.blocks * found.height * columns) : 0);
-  for (const ProgramScatter& scatter : table.scatters) {
-    found.memories.push_back(found.bytes);
-    found.bytes += aligned(4 * n * table.memories[static_cast<size_t>(scatter.memory)]);
-  }
   return found;
 }
 
@@ -640,6 +606,7 @@ void program_code_cuda(const Program& program, unsigned char* code) {
   write(at.steps, steps);
   write(at.operands, operands);
   write(at.sums, table.sums);
+  write(at.scatters, table.scatters);
   write(at.grids, grids);
 }
 
@@ -661,6 +628,8 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
   call.code.step_count = static_cast<int32_t>(table.steps.size());
   call.code.sum_count = static_cast<int32_t>(table.sums.size());
   call.code.columns = Slots(table).columns();
+  call.scatters = reinterpret_cast<const ProgramScatter*>(code + at.scatters);
+  call.scatter_count = static_cast<int32_t>(table.scatters.size());
   call.grids = reinterpret_cast<const HashEncoding*>(code + at.grids);
   call.rows = {in.offsets, in.order, in.ray_index, reinterpret_cast<int32_t*>(workspace), in.n, in.r, in.k};
   call.partials = reinterpret_cast<float*>(workspace + found.partials);
@@ -688,11 +657,16 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
   for (size_t i = 0; in.kept != nullptr && i < table.lookups.size(); ++i) {
     call.memories[table.lookups[i].memory] = in.kept[i];
   }
-  for (size_t i = 0; i < table.scatters.size(); ++i) {
-    call.memories[table.scatters[i].memory] = reinterpret_cast<float*>(workspace + found.memories[i]);
-  }
   call.ready = in.ready;
 
+  for (const ProgramScatter& scatter : table.scatters) {
+    const HashGrid& grid = table.grids[static_cast<size_t>(scatter.grid)];
+    const int64_t stride = in.strides[static_cast<size_t>(scatter.parameter)];
+    const int64_t entries = grid.levels.back().offset + grid.levels.back().entries;
+    const int64_t size = stride > 0 ? in.k * stride : entries * grid.features;
+    VN_CUDA_CHECK(cudaMemsetAsync(results.sums[scatter.sum], 0, 4 * static_cast<size_t>(size),
+                                  static_cast<cudaStream_t>(stream)));
+  }
   VN_LAUNCH(program_prepare_kernel, blocks_for(in.n), kThreads, 0, stream, call, found.tasks);
   if (in.n > 0 && in.k > 0) {
     if (current_device().capability < 80 && precision != ProgramPrecision::float16) {
@@ -719,17 +693,6 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
     const dim3 grid(static_cast<unsigned>(in.k),
                     static_cast<unsigned>(std::min(useful, ceil_div<int64_t>(blocks, in.k))));
     VN_LAUNCH(program_reduce_kernel, grid, kThreads, 0, stream, call, table.partial);
-  }
-  for (const ProgramScatter& scatter : table.scatters) {
-    const HashGrid& grid = table.grids[static_cast<size_t>(scatter.grid)];
-    const int64_t stride = in.strides[scatter.parameter];
-    const int64_t entries = grid.levels.back().offset + grid.levels.back().entries;
-    const int64_t size = stride > 0 ? in.k * stride : entries * grid.features;
-    VN_CUDA_CHECK(cudaMemsetAsync(results.sums[scatter.sum], 0, 4 * static_cast<size_t>(size),
-                                  static_cast<cudaStream_t>(stream)));
-    if (in.n == 0 || in.k == 0) continue;
-    const int64_t entries_of_rows = in.n * static_cast<int64_t>(grid.levels.size());
-    VN_LAUNCH(program_scatter_kernel, blocks_for(entries_of_rows), kThreads, 0, stream, call, scatter);
   }
 }
 

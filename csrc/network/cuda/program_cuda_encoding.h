@@ -89,6 +89,34 @@ static __device__ __noinline__ void look_up(const ProgramTile& tile, const Progr
   });
 }
 
+// Adds to the gradient of a table that of what was looked up, a value of a step, by atomic operations.
+static __device__ __noinline__ void scatter_rows(const ProgramTile& tile, const ProgramStep& step,
+                                                 const ProgramScatter& scatter) {
+  const CudaProgram& call = tile.call;
+  const HashEncoding& grid = call.grids[scatter.grid];
+  float* const to = call.sums[scatter.sum] + tile.cell * call.strides[scatter.parameter];
+  hash_with_features(grid.features, [&](auto features) {
+    constexpr int kFeatures = decltype(features)::value;
+#pragma unroll 1
+    for (int i = threadIdx.x; i < tile.height * grid.count; i += kProgramThreads) {
+      const int number = i / tile.height, row = i % tile.height;
+      if (row >= tile.rows) continue;
+      const int64_t source = source_row(call.rows, tile.begin + row);
+      const GridLevel& level = grid.levels[number];
+      const HashAxes at =
+          hash_axes(grid, level, [&](int axis) { return load_input(call, scatter.input, 3, source, axis); });
+      const float* given = tile.slot(step.slot) + row * step.stride + number * kFeatures;
+      hash_corners<kFeatures>(at.axes, level, level.offset * kFeatures, [&](int64_t entry, int x, int y, int z) {
+        const float weight = hash_weight(at.axes, false, nullptr, x, y, z);
+        float added[kFeatures];
+#pragma unroll
+        for (int f = 0; f < kFeatures; ++f) added[f] = weight * given[f];
+        hash_add(to + entry, added);
+      });
+    }
+  });
+}
+
 // Eight lanes share a row and its levels.
 static __device__ __noinline__ void look_up_gradient(const ProgramTile& tile, const ProgramStep& step, const Rows& x,
                                                      const Rows& g, float* to) {

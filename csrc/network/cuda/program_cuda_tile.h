@@ -8,7 +8,7 @@
 #include "common/index_maps.h"
 #include "encoding/hash_encode_math.h"
 #include "network/cuda/program_cuda_product.h"
-#include "network/program_code.h"
+#include "network/program.h"
 
 namespace voronerf {
 
@@ -25,6 +25,7 @@ struct CudaRows {
 struct CudaProgram {
   ProgramCode code;
   const HashEncoding* grids;  // without tables
+  const ProgramScatter* scatters;
   CudaRows rows;
   float *partials, *spilled;  // in the workspace
   int64_t task_rows;
@@ -36,7 +37,7 @@ struct CudaProgram {
   int32_t memory_strides[kProgramMemories], output_widths[kProgramMost];
   uint8_t input_types[kProgramMost], parameter_types[kProgramMost], output_types[kProgramMost];
   bool turned[kProgramMost], rays[kProgramMost];  // inputs
-  int32_t output_count;
+  int32_t output_count, scatter_count;
   bool ready;  // memories of look-ups are filled
 };
 static_assert(sizeof(CudaProgram) <= 4000, "kernel arguments hold 4 KiB");
