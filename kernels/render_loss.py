@@ -68,7 +68,10 @@ def softplus(x: wp.float32) -> wp.float32:
 
 @wp.struct
 class Inputs:
-    """Outputs of networks for the samples of rays, and what the rays are compared with."""
+    """Outputs of networks for the samples of rays, and what the rays are compared with.
+
+    ``activated``: the outputs are colour and density as they are.
+    """
 
     raw: wp.array2d(dtype=wp.float32)
     deltas: wp.array(dtype=wp.float32)
@@ -76,6 +79,7 @@ class Inputs:
     target: wp.array2d(dtype=wp.float32)
     background: wp.array2d(dtype=wp.float32)
     scale: wp.float32
+    activated: wp.bool
     hidden: wp.float32
 
 
@@ -89,6 +93,21 @@ class Found:
     gradient: wp.array2d(dtype=wp.float32)
 
 
+@wp.func
+def _colour_of(given: Inputs, i: wp.int32) -> wp.vec3:
+    raw = wp.vec3(given.raw[i, 0], given.raw[i, 1], given.raw[i, 2])
+    if given.activated:
+        return raw
+    return wp.vec3(sigmoid(raw[0]), sigmoid(raw[1]), sigmoid(raw[2]))
+
+
+@wp.func
+def _density_of(raw: wp.float32, scale: wp.float32, activated: wp.bool) -> wp.float32:
+    if activated:
+        return raw
+    return softplus(raw) * scale
+
+
 @wp.kernel
 def _render_loss_kernel(given: Inputs, found: Found) -> None:
     ray = wp.tid()
@@ -97,12 +116,12 @@ def _render_loss_kernel(given: Inputs, found: Found) -> None:
     front = wp.float64(0.0)
     light = wp.vec3(0.0, 0.0, 0.0)
     for i in range(begin, end):
-        optical = _density(softplus(given.raw[i, 3]) * given.scale) * given.deltas[i]
+        optical = _density(_density_of(given.raw[i, 3], given.scale, given.activated)) * given.deltas[i]
         weight = wp.exp(-wp.float32(front)) * _absorbed(optical)
         found.gradient[i, 3] = wp.float32(front)
         front += wp.float64(optical)
         found.weights[i] = weight
-        light = light + weight * wp.vec3(sigmoid(given.raw[i, 0]), sigmoid(given.raw[i, 1]), sigmoid(given.raw[i, 2]))
+        light = light + weight * _colour_of(given, i)
     left = wp.exp(-wp.float32(front))
     shown = wp.vec3(0.0, 0.0, 0.0)
     if given.background.shape[0] > 0:
@@ -116,16 +135,21 @@ def _render_loss_kernel(given: Inputs, found: Found) -> None:
     behind = left * wp.dot(slopes, shown)
     for reverse in range(end - begin):
         i = end - 1 - reverse
-        density = softplus(given.raw[i, 3]) * given.scale
+        density = _density_of(given.raw[i, 3], given.scale, given.activated)
         optical = _density(density) * given.deltas[i]
         ahead = found.gradient[i, 3]
-        value = wp.vec3(sigmoid(given.raw[i, 0]), sigmoid(given.raw[i, 1]), sigmoid(given.raw[i, 2]))
+        value = _colour_of(given, i)
         to_weight = wp.dot(slopes, value)
         to_optical = to_weight * wp.exp(-(ahead + optical)) - behind
         behind += to_weight * found.weights[i]
         for k in range(3):
-            found.gradient[i, k] = found.weights[i] * slopes[k] * (value[k] * (1.0 - value[k]))
-        slope = sigmoid(given.raw[i, 3]) * given.scale
+            to_colour = found.weights[i] * slopes[k]
+            if not given.activated:
+                to_colour = to_colour * (value[k] * (1.0 - value[k]))
+            found.gradient[i, k] = to_colour
+        slope = wp.float32(1.0)
+        if not given.activated:
+            slope = sigmoid(given.raw[i, 3]) * given.scale
         if density > _OPAQUE:
             slope = wp.float32(0.0)
         found.gradient[i, 3] = to_optical * given.deltas[i] * slope
@@ -135,9 +159,9 @@ def _render_loss_kernel(given: Inputs, found: Found) -> None:
 
 
 @wp.kernel
-def _density_kernel(raw: wp.array2d(dtype=wp.float32), scale: wp.float32, density: wp.array(dtype=wp.float32)) -> None:
+def _density_kernel(given: Inputs, density: wp.array(dtype=wp.float32)) -> None:
     i = wp.tid()
-    density[i] = softplus(raw[i, 3]) * scale
+    density[i] = _density_of(given.raw[i, 3], given.scale, given.activated)
 
 
 def render_loss(raw: Tensor, *others: Any) -> list[Tensor]:
@@ -153,11 +177,12 @@ def _render_loss(given: Any, found: Any) -> None:
     for of_strays in (found.weights, found.gradient):  # samples that belong to no ray
         of_strays.zero_()
     behind = target.new_empty(0, 3) if given.background is None else given.background.expand_as(target)
-    compared = {"target": target, "background": behind, "scale": given.density_scale, "hidden": given.hidden}
-    inputs = filled(Inputs(), raw=raw, deltas=given.deltas, offsets=given.ray_offsets, **compared)
+    compared = {"target": target, "background": behind, "hidden": given.hidden}
+    rule = {"scale": given.density_scale, "activated": given.activated}
+    inputs = filled(Inputs(), raw=raw, deltas=given.deltas, offsets=given.ray_offsets, **compared, **rule)
     outputs = {name: getattr(found, name) for name in ("colour", "weights", "error", "gradient")}
     launch(_render_loss_kernel, r, [inputs, filled(Found(), **outputs)], raw)
-    launch(_density_kernel, m, [array(raw, raw), given.density_scale, array(found.density, raw)], raw)
+    launch(_density_kernel, m, [inputs, array(found.density, raw)], raw)
     found.loss.copy_(found.error.mean(dtype=torch.float64) / 3)
 
 

@@ -29,7 +29,7 @@ struct ProgramOutput {
   // the caller's order, which the caller sums: PyTorch does so without atomics where deterministic algorithms are asked
   // for.
   bool ray;
-  int32_t memory;  // of a ray output: of its rows before they are summed
+  int32_t memory;  // of a ray output: of its rows before they are summed; of another one: itself; -1: none
 };
 
 // A hash grid at the points of an input, looked up to memory [n][stride] of the call.
@@ -108,8 +108,9 @@ enum class ProgramPrecision : int { float32, tf32, bfloat16, float16 };
 int64_t program_code_bytes_cuda(const Program& program);
 void program_code_cuda(const Program& program, unsigned char* code);
 
-// Both throw std::invalid_argument for more than 64 tensors of a kind. Offsets, an order and a ray_index that leave the
-// rows cannot be refused without a host read: they touch nothing outside. Gradients of tables are added up by atomics.
+// Both throw std::invalid_argument for more than 64 tensors of a kind or 16 look-ups. Offsets, an order and a ray_index
+// that leave the rows cannot be refused without a host read: they touch nothing outside. Gradients of tables are added
+// up by atomics.
 int64_t grouped_program_workspace_cuda(const Program& program, int64_t n, int64_t r, int64_t k);
 void grouped_program_cuda(const Program& program, const unsigned char* code, const ProgramInputs& in,
                           const ProgramResults& results, ProgramPrecision precision, unsigned char* workspace,

@@ -5,7 +5,7 @@
 // A tile is some rows of one cell. Each value of it has a slot: rows of `stride` floats, `slot` columns from the start
 // of all slots, so [tile][stride] at tiles + slot * tile. A value may lie in memory of the whole call instead,
 // [n][stride] in the order of the cells, where there is such memory: what hash grids are looked up to, and the gradient
-// of that.
+// of that; and an output itself, where its rows lie as those of the tile.
 #pragma once
 
 #include <cstdint>

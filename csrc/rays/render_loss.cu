@@ -23,24 +23,32 @@ __device__ float4 load_row(const float* raw, int64_t i, bool aligned) {
   return aligned ? *reinterpret_cast<const float4*>(row) : make_float4(row[0], row[1], row[2], row[3]);
 }
 
-// A sample after its activations; of no extent and no colour where a lane has none.
+// A sample after its activations, if it needs any; of no extent and no colour where a lane has none.
 struct Sample {
   float rgb[3] = {};
-  float density = 0.0f, slope = 0.0f, delta = 0.0f, optical = 0.0f;  // slope: of the density to its raw output
+  float density = 0.0f, slope = 0.0f, delta = 0.0f, optical = 0.0f;  // slope: of the density to the number given
 };
 
-__device__ Sample activated(const RenderLossInputs& in, int64_t i, bool active, bool aligned) {
+template <bool Activated>
+__device__ Sample sample_of(const RenderLossInputs& in, int64_t i, bool active, bool aligned) {
   Sample sample;
   if (!active) return sample;
   const float4 raw = load_row(in.raw, i, aligned);
-  sample.rgb[0] = sigmoid(raw.x), sample.rgb[1] = sigmoid(raw.y), sample.rgb[2] = sigmoid(raw.z);
-  sample.density = density_of(raw.w, in.density_scale);
-  sample.slope = sample.density > kOpaque ? 0.0f : sigmoid(raw.w) * in.density_scale;
+  if (Activated) {
+    sample.rgb[0] = raw.x, sample.rgb[1] = raw.y, sample.rgb[2] = raw.z;
+    sample.density = raw.w;
+    sample.slope = sample.density > kOpaque ? 0.0f : 1.0f;
+  } else {
+    sample.rgb[0] = sigmoid(raw.x), sample.rgb[1] = sigmoid(raw.y), sample.rgb[2] = sigmoid(raw.z);
+    sample.density = density_of(raw.w, in.density_scale);
+    sample.slope = sample.density > kOpaque ? 0.0f : sigmoid(raw.w) * in.density_scale;
+  }
   sample.delta = in.deltas[i];
   sample.optical = finite_density(sample.density) * sample.delta;
   return sample;
 }
 
+template <bool Activated>
 __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs in, RenderLossOutputs out) {
   const int lane = threadIdx.x % 32;
   const int64_t ray = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / 32;
@@ -53,7 +61,7 @@ __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs 
   for (int64_t start = range.begin; start < range.end; start += 32) {
     const int64_t i = start + lane;
     const bool active = i < range.end;
-    sample = activated(in, i, active, aligned);
+    sample = sample_of<Activated>(in, i, active, aligned);
     front = depth_in_front(sample.optical, lane, carry);
     const float weight = expf(-front) * -expm1f(-sample.optical);
     for (int k = 0; k < 3; ++k) light[k] = fmaf(weight, sample.rgb[k], light[k]);
@@ -81,14 +89,15 @@ __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs 
     const int64_t i = range.begin + 32 * chunk + lane;
     const bool active = i < range.end;
     if (chunk + 1 < chunks) {  // and full
-      sample = activated(in, i, true, aligned);
+      sample = sample_of<Activated>(in, i, true, aligned);
       front = out.gradient[4 * i + 3];
     }
     const float arriving = expf(-front), weight = arriving * -expm1f(-sample.optical);
     float own = 0.0f, of_raw[3];
     for (int k = 0; k < 3; ++k) {
       own = fmaf(slopes[k], sample.rgb[k], own);
-      of_raw[k] = weight * slopes[k] * (sample.rgb[k] * (1.0f - sample.rgb[k]));
+      of_raw[k] = weight * slopes[k];
+      if (!Activated) of_raw[k] *= sample.rgb[k] * (1.0f - sample.rgb[k]);
     }
     const float taken = share_behind(active ? own * weight : 0.0f, lane, behind);
     const float of_optical = own * (arriving * expf(-sample.optical)) - taken;
@@ -105,7 +114,7 @@ __global__ void __launch_bounds__(kThreads) render_loss_strays(RenderLossInputs 
   for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < in.m; i += step) {
     if (i >= first && i < last) continue;
     out.weights[i] = 0.0f;
-    out.density[i] = density_of(in.raw[4 * i + 3], in.density_scale);
+    out.density[i] = in.activated ? in.raw[4 * i + 3] : density_of(in.raw[4 * i + 3], in.density_scale);
     for (int k = 0; k < 4; ++k) out.gradient[4 * i + k] = 0.0f;
   }
 }
@@ -132,7 +141,11 @@ void render_loss_cuda(const RenderLossInputs& in, const RenderLossOutputs& out, 
   }
   if (in.r > 0) {
     const unsigned blocks = static_cast<unsigned>(ceil_div<int64_t>(in.r, kWarps));
-    VN_LAUNCH(render_loss_kernel, blocks, kThreads, 0, stream, in, out);
+    if (in.activated) {
+      VN_LAUNCH(render_loss_kernel<true>, blocks, kThreads, 0, stream, in, out);
+    } else {
+      VN_LAUNCH(render_loss_kernel<false>, blocks, kThreads, 0, stream, in, out);
+    }
   }
   VN_LAUNCH(render_loss_mean, 1, kThreads, 0, stream, out.error, in.r, out.loss);
 }

@@ -9,14 +9,15 @@
 namespace voronerf {
 
 struct RenderLossInputs {
-  const float* raw;         // [m,4]: colour before its sigmoid, density before its softplus
+  const float* raw;         // [m,4]: colour before its sigmoid, density before its softplus; or both as they are
   const float* deltas;      // [m]
   const int32_t* offsets;   // [r+1]
   const float* target;      // [r,3]
   const float* background;  // [r,3], or [3], or null
   bool background_per_ray;
   float density_scale;
-  float hidden;  // share of the light; samples that no more than it reaches have no gradient
+  bool activated;  // colour and density as they are, without scale
+  float hidden;    // share of the light; samples that no more than it reaches have no gradient
   int64_t r, m;
 };
 

@@ -83,6 +83,26 @@ VN_INLINE void hear(const float* answers, int64_t from, int64_t to, Sums& sums) 
   }
 }
 
+// From the gradients to the colours of rays: those to the colours of samples, which take their place, and what is in
+// those to their optical depths without the samples behind.
+template <bool Activated>
+VN_INLINE void slopes(float hidden, int64_t count, Chunk& chunk) {
+  for (int64_t i = 0; i < count; i += kLanes) {
+    const F32 light = load(chunk.light + i), weight = load(chunk.weights + i);
+    const Bits seen = ~(light <= splat(hidden));  // as is NaN
+    F32 gradient = splat(0.0f);
+    for (int k = 0; k < 3; ++k) {
+      const F32 value = load(chunk.rgb[k] + i), shade = load(chunk.shade[k] + i);
+      gradient = fma(shade, value, gradient);
+      const F32 of_colour = weight * shade;
+      store(chunk.rgb[k] + i, only(seen, Activated ? of_colour : of_colour * (value * (splat(1.0f) - value))));
+    }
+    store(chunk.part + i, gradient * weight);
+    store(chunk.own + i, gradient * (light * transmittance(load(chunk.optical + i))));
+    store(chunk.slope + i, only(seen, load(chunk.slope + i)));
+  }
+}
+
 VN_INLINE void backward(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to,
                         int64_t first, int64_t count, bool together, Chunk& chunk, Sums& sums) {
   if (!together) {
@@ -98,18 +118,10 @@ VN_INLINE void backward(const RenderLossInputs& in, const RenderLossOutputs& out
   for (int k = 0; k < 3; ++k) {
     for (int64_t i = count; i % kLanes != 0; ++i) chunk.shade[k][i] = 0.0f;
   }
-  for (int64_t i = 0; i < count; i += kLanes) {
-    const F32 light = load(chunk.light + i), weight = load(chunk.weights + i);
-    const Bits seen = ~(light <= splat(in.hidden));  // as is NaN
-    F32 gradient = splat(0.0f);
-    for (int k = 0; k < 3; ++k) {
-      const F32 value = load(chunk.rgb[k] + i), shade = load(chunk.shade[k] + i);
-      gradient = fma(shade, value, gradient);
-      store(chunk.rgb[k] + i, only(seen, weight * shade * (value * (splat(1.0f) - value))));
-    }
-    store(chunk.part + i, gradient * weight);
-    store(chunk.own + i, gradient * (light * transmittance(load(chunk.optical + i))));
-    store(chunk.slope + i, only(seen, load(chunk.slope + i)));
+  if (in.activated) {
+    slopes<true>(in.hidden, count, chunk);
+  } else {
+    slopes<false>(in.hidden, count, chunk);
   }
   each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t end) {
     double behind = sums.behind[ray];

@@ -145,11 +145,12 @@ class Pool {
     results_.outputs = outputs;
     call_.rows.forward(in, results_, own_);
     const SeeOutputs& out = call_.out;
-    add_wave(call_.isa,
-             {all.raw.data(), all.depths.data(), all.deltas.data(), offsets_.data(), number_.data(),
-              call_.rule.density_scale, front_.data(), out.heaviest == nullptr ? nullptr : most_.data(), out.colour,
-              out.opacity, out.depth, out.light, out.heaviest},
-             count_);
+    add_wave(
+        call_.isa,
+        {all.raw.data(), all.depths.data(), all.deltas.data(), offsets_.data(), number_.data(),
+         call_.rule.density_scale, call_.rule.activated, front_.data(),
+         out.heaviest == nullptr ? nullptr : most_.data(), out.colour, out.opacity, out.depth, out.light, out.heaviest},
+        count_);
     return true;
   }
 

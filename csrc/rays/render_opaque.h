@@ -21,8 +21,9 @@ struct SeeCells {
 
 struct SeeRule {
   float density_scale;
-  float opaque;  // a ray ends behind a wave after which no more light than this is left
-  int64_t wave;  // samples of a ray that are evaluated at once
+  bool activated;  // the networks put out colour and density as they are
+  float opaque;    // a ray ends behind a wave after which no more light than this is left
+  int64_t wave;    // samples of a ray that are evaluated at once
 };
 
 struct SeeOutputs {

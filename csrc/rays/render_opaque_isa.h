@@ -13,6 +13,7 @@ struct SeenWave {
   const float *depths, *deltas;     // [m]
   const int32_t *offsets, *number;  // [r+1], [r]
   float density_scale;
+  bool activated;
   double* front;                   // [r], the optical depth so far
   float* most;                     // [r], the largest weight so far, or null
   float* colour;                   // of the picture's rays, as in render_opaque.h

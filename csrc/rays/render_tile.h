@@ -1,7 +1,7 @@
 // Samples of several rays at once, from the networks' outputs to their weights: what render_loss and render_opaque
 // share.
 //
-// `In` has raw [m,4], deltas [m], offsets [r+1] and density_scale.
+// `In` has raw [m,4], deltas [m], offsets [r+1], density_scale and activated.
 #pragma once
 
 #include "common/elementwise_math.h"
@@ -17,7 +17,7 @@ constexpr float kOpaque = 1e30f;  // stands for infinite density: as opaque over
 // Samples [first, first + count), in the order of their rays, filled up to whole vectors by samples of no extent.
 struct Chunk {
   alignas(64) float rgb[3][kChunk], shade[3][kChunk];  // shade: the gradient to the colour of the ray
-  alignas(64) float density[kChunk], slope[kChunk];    // slope: of the density to its raw output
+  alignas(64) float density[kChunk], slope[kChunk];    // slope: of the density to the number given for it
   alignas(64) float deltas[kChunk], optical[kChunk], front[kChunk];
   alignas(64) float light[kChunk], weights[kChunk];  // the share of the light that reaches a sample
   alignas(64) float part[kChunk], own[kChunk];
@@ -39,6 +39,14 @@ VN_INLINE void activate(const In& in, int64_t first, int64_t count, Chunk& chunk
     for (int k = 0; k < 3; ++k) chunk.rgb[k][i] = 0.0f;
     chunk.density[i] = chunk.deltas[i] = 0.0f;
   }
+  if (in.activated) {
+    for (int64_t i = 0; i < count; i += kLanes) {
+      const F32 density = load(chunk.density + i);
+      store(chunk.slope + i, density > splat(kOpaque) ? splat(0.0f) : splat(1.0f));
+      store(chunk.optical + i, finite(density) * load(chunk.deltas + i));
+    }
+    return;
+  }
   const F32 scale = splat(in.density_scale);
   for (int64_t i = 0; i < count; i += kLanes) {
     for (int k = 0; k < 3; ++k) store(chunk.rgb[k] + i, sigmoid(load(chunk.rgb[k] + i)));
@@ -49,7 +57,7 @@ VN_INLINE void activate(const In& in, int64_t first, int64_t count, Chunk& chunk
   }
 }
 
-// exp(-x) for x >= 0, 0 where float32 has nothing smaller.
+// exp(-x), 0 where float32 has nothing smaller.
 VN_INLINE F32 transmittance(F32 x) {
   const F32 minus = splat(0.0f) - x;
   return minus < splat(-87.0f) ? splat(0.0f) : exponential(minus);

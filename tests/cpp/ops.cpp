@@ -297,12 +297,16 @@ void loss(Isa isa) {
   }
   const int64_t m = offsets.back();
   const bool per_ray = below(2) == 0;
-  const Array<float> raw = uniform<float>(4 * m), target = uniform<float>(3 * r);
+  const bool activated = below(2) == 0;
+  Array<float> raw = uniform<float>(4 * m);
+  for (int64_t i = 0; activated && i < m; ++i) raw[4 * i + 3] = std::fabs(raw[4 * i + 3]);
+  const Array<float> target = uniform<float>(3 * r);
   const Array<float> background = uniform<float>(below(2) * (per_ray ? 3 * r : 3));
   Array<float> deltas = uniform<float>(m);
   for (float& delta : deltas) delta = std::fabs(delta);
-  const voronerf::RenderLossInputs in{
-      raw.data(), deltas.data(), offsets.data(), target.data(), or_null(background), per_ray, 10.0f, 1e-4f, r, m};
+  const voronerf::RenderLossInputs in{raw.data(), deltas.data(), offsets.data(), target.data(), or_null(background),
+                                      per_ray,    10.0f,         activated,      1e-4f,         r,
+                                      m};
   const int64_t sizes[] = {1, 3 * r, m, m, r, 4 * m};
   Array<float> results[2][6];
   for (int i = 0; i < 2; ++i) {

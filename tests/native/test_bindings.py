@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import zlib
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import torch
 from helpers import refuses
 
 import voronerf
-from voronerf.ops._core.layers import ACTIVATIONS
+from voronerf.ops._core.program import BINARY, ENCODINGS, FUNCTIONS, Builder, Function
 
 pytestmark = pytest.mark.native
 native = pytest.importorskip("voronerf.ops._core.native")
@@ -24,7 +25,9 @@ def test_the_interface_is_the_checksum_of_what_the_build_bound() -> None:
 
 
 def test_enumerations_have_the_names_that_users_write() -> None:
-    assert native.compiled.Activation == ACTIVATIONS
+    assert sorted(native.compiled.ProgramFunction) == sorted(FUNCTIONS)
+    assert sorted(native.compiled.ProgramBinary) == sorted(BINARY)
+    assert sorted(native.compiled.ProgramEncoding) == sorted(ENCODINGS)
     assert set(native.SUPPORTED_ISAS) <= set(native.ISAS) == {"portable", "neon", "avx2", "avx512", "avx512_bf16"}
 
 
@@ -49,3 +52,13 @@ def test_an_instruction_set_that_is_not_there_is_refused() -> None:
         native.using_isa("sse9"),
     ):
         pass
+
+
+def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names cross the border, not numbers: where the sides differ, nothing is computed by another function."""
+    lowering = importlib.import_module("voronerf.ops.grouped_program.lowering")
+    monkeypatch.setitem(FUNCTIONS, "cube", Function(lambda x, a, b: x**3))
+    b = Builder()
+    program = b.program([b.apply("cube", b.input(3))])
+    with pytest.raises(TypeError, match="ProgramStep: function is no ProgramFunction"):
+        lowering.lower(program.text, False)

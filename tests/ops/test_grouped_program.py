@@ -518,10 +518,31 @@ def test_high_derivatives_within_a_custom_op() -> None:
     assert sine is not None
     program = b.program([sine, b.encode("frequency", x, 1, along=[along, along])])
     rows = [torch.rand(5, 3), torch.rand(5, 3)]
-    found = torch.ops.voronerf.grouped_program_native(rows, [], offsets_of([5]), None, None, program.text)
+    how = (program.text, "", "grouped_program", "float32", False, -1)
+    found = torch.ops.voronerf.grouped_program_native(rows, [], offsets_of([5]), None, None, None, *how)
     torch.testing.assert_close(found[0], rows[0].sin())
     second = -rows[1].square() * torch.stack([rows[0].sin(), rows[0].cos()])
     torch.testing.assert_close(found[1], torch.cat([torch.zeros(5, 3), *second], dim=1))
+
+
+@pytest.mark.parametrize("dynamic", [None, True])
+def test_programs_of_rays_compile(dynamic: bool | None) -> None:
+    """One graph, also where integers of the program are taken for sizes."""
+    torch.compiler.reset()
+    program = encoded()
+    parameters = [torch.rand(1, *shape).requires_grad_() for shape in program.parameters]
+
+    def run(inputs: list[Tensor], ray_index: Tensor) -> list[Tensor]:
+        return grouped_program(inputs, parameters, offsets_of([3, 6]), program=program, ray_index=ray_index)
+
+    compiled = torch.compile(run, fullgraph=True, dynamic=dynamic, backend="aot_eager")
+    for rays in (4, 5):
+        inputs = [torch.rand(rays if i in program.rays else 9, w) for i, w in enumerate(program.inputs)]
+        ray_index = torch.arange(9).int() % rays
+        found, expected = compiled(inputs, ray_index), run(inputs, ray_index)
+        slopes = [torch.autograd.grad(sum(t.sum() for t in part), parameters) for part in (found, expected)]
+        for ours, theirs in zip((*found, *slopes[0]), (*expected, *slopes[1]), strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
 def test_refuses_rays_that_do_not_fit() -> None:

@@ -1,7 +1,12 @@
 from __future__ import annotations
 
 import pytest
+import torch
+from op_cases import offsets_of
+from programs import ByPrograms, derivatives
+from test_grouped_mlp import TABLES
 
+from voronerf.ops import grouped_mlp, grouped_program
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 
@@ -114,3 +119,90 @@ def test_errors(layers, outputs, octaves, message):
     with pytest.raises(ValueError) as caught:
         MLP(layers, outputs, octaves)
     assert str(caught.value) == message
+
+
+GRID = HashGrid(levels=3, features=2, log2_entries=10, base=3, finest=12, interpolation="smoothstep")
+HASHED = MLP(TABLES["tangled"].layers, (3, 1), None, 1, "hash", GRID)
+PROGRAMS = {
+    **TABLES,
+    "hashed": HASHED,
+    "hashed, a table for each cell": HASHED,
+    "unread": MLP((Layer((DIRECTIONS,), 4), Layer((POSITIONS, 0), 3, "sigmoid"), Layer((POSITIONS,), 2)), (2,), 2, 1),
+    "relu": MLP((Layer((POSITIONS,), 9, "relu"), Layer((0, POSITIONS), 5, "relu"), Layer((1,), 3)), (2, 1), 3),
+    "no octaves": MLP((Layer((POSITIONS, DIRECTIONS), 9, "sine"), Layer((0,), 5)), (1,), 0, 0),
+}
+
+
+@pytest.mark.parametrize("ray", [False, True], ids=["of samples", "of rays"])
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_program_is_the_network(name, ray):
+    """Values and two orders of gradients against the reference of grouped_mlp; by the program, and its gradients."""
+    table, generator = PROGRAMS[name], torch.Generator().manual_seed(0)
+    counts, rays, p, q = [4, 0, 6], 5, 6 if PROGRAMS[name].integrated else 3, 3
+    n, k, offsets = sum(counts) + 3, len(counts), offsets_of(counts) + 1
+    shapes = table.weight_shapes(p, q if table.uses_directions else 0)
+    biased = tuple(index != 1 for index in range(len(shapes)))
+    program = table.program(p, q if table.uses_directions else 0, None, biased, ray)
+    assert program is table.program(p, q if table.uses_directions else 0, None, biased, ray)
+
+    def normal(*shape):
+        return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    inputs = [torch.rand(n, p, generator=generator, dtype=torch.float64)]
+    if table.uses_directions:
+        inputs.append(torch.nn.functional.normalize(normal(rays if ray else n, q), dim=1))
+    weights = [normal(k, o, i) / i**0.5 for o, i in shapes]
+    biases = [normal(k, o) for (o, _), has in zip(shapes, biased) if has]
+    features = [normal(k if "each" in name else 1, *table.grid.table_shape)] if table.grid else []
+    tensors = [*inputs, *weights, *biases, *features]
+    index = torch.randint(0, rays, (n,), generator=generator, dtype=torch.int32)
+    index = index if ray and table.uses_directions else None
+
+    def by_layers(*leaves):
+        following = iter(leaves)
+        x, directions = next(following), next(following) if table.uses_directions else None
+        own = [next(following) for _ in weights]
+        bent = [next(following) if has else None for has in biased]
+        grid = next(following, None)
+        return [
+            grouped_mlp(
+                x,
+                offsets,
+                own,
+                bent,
+                layers=table,
+                directions=directions,
+                direction_index=index,
+                features=grid if grid is None or len(grid) > 1 else grid[0],
+                backend="reference",
+            )
+        ]
+
+    def by_the_op(*leaves):
+        count = len(inputs)
+        given = leaves[:count], leaves[count:], offsets
+        return grouped_program(*given, program=program, ray_index=index, backend="reference")
+
+    def by_programs(*leaves):
+        return ByPrograms.apply(program.text, offsets, None, index, *leaves)
+
+    expected = derivatives(by_layers, tensors, 2)
+    for run in (by_the_op, by_programs):
+        for found, exact in zip(derivatives(run, tensors, 2), expected, strict=True):
+            torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-9)
+
+
+def test_program_of_other_widths_and_without_what_is_not_read():
+    """Weights may be wider than the table says; inputs and parameters keep their numbers."""
+    table = MLP((Layer((POSITIONS,), 8, "relu"), Layer((0, DIRECTIONS), 4), Layer((0,), 2)), (2,), 2)
+    program = table.program(3, 3, (5, 6, 7), (True, True, False), True)
+    assert program.inputs == (3, 3) and program.rays == (1,)
+    assert program.parameters == ((5, 15), (6, 8), (7, 5), (5,), (6,))
+    assert [step.op for step in program.steps] == ["input", "encode", "linear", "function", "linear"]
+    assert [columns.width for columns in program.outputs] == [7]
+    both = MLP(table.layers, (2, 1, 2), 2).program(3, 3, None, (False, True, True))
+    assert [columns.width for columns in both.outputs] == [8] and both.steps[-1].op == "move" and both.rays == ()
+    grid = MLP((Layer((POSITIONS, DIRECTIONS), 4),), (0,), None, 2, "hash", GRID)
+    hashed = grid.program(3, 3, None, (True,), True)
+    assert hashed.parameters == ((4, 21), (4,), GRID.table_shape)
+    assert hashed.tables == (2,) and hashed.grids == (GRID.text,)

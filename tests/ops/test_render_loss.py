@@ -20,15 +20,21 @@ def rays(counts, dtype=torch.float64, outside=(0, 0)):
     return raw, deltas, offsets, torch.rand(r, 3, dtype=dtype), torch.rand(r, 3, dtype=dtype)
 
 
-def step_by_step(raw, deltas, offsets, target, background):
-    """Activations, composite and loss as three steps."""
-    colour, density = torch.sigmoid(raw[:, :3]), SCALE * torch.nn.functional.softplus(raw[:, 3])
+def step_by_step(raw, deltas, offsets, target, background, activated=False):
+    """Activations, if any, composite and loss as three steps."""
+    colour, density = raw[:, :3], raw[:, 3]
+    if not activated:
+        colour, density = torch.sigmoid(colour), SCALE * torch.nn.functional.softplus(density)
     seen = composite(density, colour, deltas, deltas, ray_offsets=offsets, background=background, backend="reference")
     off = (seen.colour - target).square()
     return RenderLoss(off.mean(), seen.colour, seen.weights, density, off.sum(-1))
 
 
-def evaluate(device, given, dtype, backend, hidden=0.0):
+def rule(activated):
+    return {"activated": True} if activated else {"density_scale": SCALE}
+
+
+def evaluate(device, given, dtype, backend, hidden=0.0, activated=False):
     """All results, and the gradient of three times the loss."""
     raw, deltas, offsets, target, background = (t.to(device) for t in given)
     wide = torch.promote_types(dtype, torch.float32)
@@ -36,9 +42,9 @@ def evaluate(device, given, dtype, backend, hidden=0.0):
     rest = deltas.to(wide), offsets, target.to(wide)
     background = background.to(wide)
     if backend is None:
-        found = step_by_step(leaf, *rest, background)
+        found = step_by_step(leaf, *rest, background, activated)
     else:
-        options = {"density_scale": SCALE, "hidden": hidden, "backend": backend}
+        options = {**rule(activated), "hidden": hidden, "backend": backend}
         found = render_loss(leaf, *rest, background=background, **options)
     (gradient,) = torch.autograd.grad(3 * found.loss, leaf)
     return [*(part.detach() for part in found), gradient]
@@ -48,12 +54,45 @@ def evaluate(device, given, dtype, backend, hidden=0.0):
     "counts", [[0], [1], [3, 0, 17, 1, 0], [15], [16], [33], [127], [128], [129], [300, 0, 1000], [7] * 150]
 )
 @pytest.mark.parametrize("outside", [(0, 0), (3, 2)])
-def test_is_activations_composite_and_squared_error(device, backend, counts, outside):
+@pytest.mark.parametrize("activated", [False, True])
+def test_is_activations_composite_and_squared_error(device, backend, counts, outside, activated):
     given = rays(counts, outside=outside)
-    exact = evaluate(device, given, torch.float64, None)
-    plain = evaluate(device, given, torch.float32, "reference")
-    for found, same, right in zip(evaluate(device, given, torch.float32, backend), plain, exact):
+    if activated:
+        given[0][:, 3].mul_(SCALE).clamp_(min=-0.5)  # a little of it negative, as no activation is
+    of = {"activated": activated}
+    exact = evaluate(device, given, torch.float64, None, **of)
+    plain = evaluate(device, given, torch.float32, "reference", **of)
+    for found, same, right in zip(evaluate(device, given, torch.float32, backend, **of), plain, exact):
         assert_as_exact(found, same, right)
+
+
+@pytest.mark.parametrize("hidden", [0.0, 0.3])
+def test_gradients_to_activated_values(device, backend, hidden):
+    """Weight times the gradient to the colour of the ray; to raw numbers it has the slopes of the activations, too."""
+    raw, *rest = rays([40, 0, 3, 90])
+    values = torch.cat([torch.sigmoid(raw[:, :3]), SCALE * torch.nn.functional.softplus(raw[:, 3:])], 1)
+    slopes = torch.cat([values[:, :3] * (1 - values[:, :3]), SCALE * torch.sigmoid(raw[:, 3:])], 1)
+    *seen, of_values = evaluate(device, (values, *rest), torch.float32, backend, hidden, activated=True)
+    *same, of_raw = evaluate(device, (raw, *rest), torch.float32, backend, hidden)
+    for part, other in zip([*seen, of_values * slopes.to(of_values)], [*same, of_raw]):
+        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-6)
+    ray = torch.repeat_interleave(rest[1].diff().to(device))
+    of_colours = 2 * (seen[1] - rest[2].to(seen[1])) / seen[1].numel() * 3
+    expected = (seen[2][:, None] * of_colours[ray]) * (of_values[:, 3:] != 0)
+    torch.testing.assert_close(of_values[:, :3], expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("hidden", [0.0, 0.3])
+def test_no_density_has_a_gradient_where_light_arrives(device, backend, hidden):
+    """Density 0, as of a relu, weighs nothing, but more of it would."""
+    raw = torch.tensor([[0.9, 0.5, 0.1, 0.0], [0.2, 0.2, 0.2, 20.0], [0.9, 0.5, 0.1, 0.0]], device=device)
+    rest = torch.full((3,), 0.5, device=device), offsets_of([3]).to(device), torch.zeros(1, 3, device=device)
+    leaf = raw.requires_grad_()
+    found = render_loss(leaf, *rest, activated=True, hidden=hidden, backend=backend)
+    found.loss.backward()
+    assert found.weights[[0, 2]].tolist() == [0, 0] and torch.equal(found.density, raw.detach()[:, 3])
+    assert float(leaf.grad[0, 3]) == pytest.approx(0.5 * 2 * 0.2 * (0.7 + 0.3 - 0.1) / 3, rel=1e-3)
+    assert abs(float(leaf.grad[2, 3])) < 1e-4 and (hidden == 0 or not leaf.grad[2].any())
 
 
 def test_backgrounds(device, backend):
@@ -69,10 +108,13 @@ def test_backgrounds(device, backend):
 
 
 @pytest.mark.parametrize("counts", [[40, 0, 3, 90], [300]])
-def test_what_little_light_reaches_has_no_gradient(device, backend, counts):
+@pytest.mark.parametrize("activated", [False, True])
+def test_what_little_light_reaches_has_no_gradient(device, backend, counts, activated):
     given = rays(counts, outside=(1, 2))
-    *plain, whole = evaluate(device, given, torch.float32, backend)
-    *others, found = evaluate(device, given, torch.float32, backend, hidden=0.3)
+    if activated:
+        given[0][:, 3] = SCALE * given[0][:, 3].abs()
+    *plain, whole = evaluate(device, given, torch.float32, backend, activated=activated)
+    *others, found = evaluate(device, given, torch.float32, backend, hidden=0.3, activated=activated)
     assert all(torch.equal(a, b) for a, b in zip(plain, others))
     light = plain[2] / -torch.expm1(-plain[3] * given[1].to(plain[3]))
     seen = (light > 0.3) & (torch.arange(len(light), device=light.device) > 0)
@@ -92,11 +134,12 @@ def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend):
         assert torch.equal(found.colour[ray], clean.colour[ray])
 
 
-def test_infinite_density_is_opaque_and_has_no_gradient(device, backend):
+@pytest.mark.parametrize("activated", [False, True])
+def test_infinite_density_is_opaque_and_has_no_gradient(device, backend, activated):
     raw, deltas, offsets, target, background = (t.to(device) for t in rays([4], torch.float32))
     raw[1, 3] = torch.inf
     leaf = raw.requires_grad_()
-    found = render_loss(leaf, deltas, offsets, target, background=background, density_scale=SCALE, backend=backend)
+    found = render_loss(leaf, deltas, offsets, target, background=background, **rule(activated), backend=backend)
     found.loss.backward()
     assert found.weights[2:].tolist() == [0, 0]
     assert leaf.grad.isfinite().all() and leaf.grad[1:, 3].tolist() == [0, 0, 0]
@@ -110,13 +153,14 @@ def test_only_the_loss_has_gradients(device, backend):
     assert raw.grad is not None and deltas.grad is None and target.grad is None
 
 
-def test_the_gradient_has_a_gradient(device, backend):
+@pytest.mark.parametrize("activated", [False, True])
+def test_the_gradient_has_a_gradient(device, backend, activated):
     given = rays([4, 0, 9])
     exact = None
     for dtype, chosen in ((torch.float64, "reference"), (torch.float32, "reference"), (torch.float32, backend)):
         raw, deltas, target, background = (given[i].to(device, dtype) for i in (0, 1, 3, 4))
         raw.requires_grad_()
-        rest = {"background": background, "density_scale": SCALE, "hidden": 0.2, "backend": chosen}
+        rest = {"background": background, **rule(activated), "hidden": 0.2, "backend": chosen}
         found = render_loss(raw, deltas, given[2].to(device), target, **rest)
         (gradient,) = torch.autograd.grad(found.loss, raw, create_graph=True)
         (second,) = torch.autograd.grad(gradient.square().sum(), raw)
@@ -140,3 +184,7 @@ def test_bad_arguments():
         render_loss(raw, deltas, offsets, target, density_scale=0.0)
     with refused(ValueError, "render_loss: hidden must lie in [0, 1), got 1.0"):
         render_loss(raw, deltas, offsets, target, hidden=1.0, **rest)
+    with refused(ValueError, "render_loss: density_scale must be given unless the values are activated, got None"):
+        render_loss(raw, deltas, offsets, target)
+    with refused(ValueError, "render_loss: density_scale must not be given for activated values, got 1.0"):
+        render_loss(raw, deltas, offsets, target, density_scale=1.0, activated=True)

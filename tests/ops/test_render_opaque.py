@@ -14,17 +14,43 @@ from voronerf.ops.render_opaque.case import CASE
 
 pytestmark = pytest.mark.op("render_opaque")
 MOVED = ("origins", "directions", "near", "far")
-CHOICES = [*itertools.product((0, 1, 33, 700), ("hashed", "as they are"), (1, 3), ("linear", "disparity"))]
+CHOICES = [
+    *itertools.product((0, 1, 33, 700), ("hashed", "as they are"), (1, 3), ("linear", "disparity"), (False, True))
+]
 
 
 @pytest.mark.native
-@pytest.mark.parametrize(("n", "positions", "cells", "spacing"), CHOICES)
-def test_native_sees_what_the_reference_sees(n, positions, cells, spacing):
-    given = CASE.make(Draw(n, positions=positions, cells=cells, spacing=spacing), n)
+@pytest.mark.parametrize(("n", "positions", "cells", "spacing", "activated"), CHOICES)
+def test_native_sees_what_the_reference_sees(n, positions, cells, spacing, activated):
+    pins = {"positions": positions, "cells": cells, "spacing": spacing, "activated": activated}
+    given = CASE.make(Draw(n, **pins), n)
     found, expected = (render_opaque(**given, backend=backend) for backend in ("native", "reference"))
     for name, part, other in zip(found._fields, found, expected, strict=True):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5, msg=name)
     assert n < 33 or 0.1 < float(found.opacity.mean()) < 1.1
+
+
+@pytest.mark.parametrize("backend", ["reference", pytest.param("native", marks=pytest.mark.native)])
+def test_activated_values_are_seen_as_they_are(backend):
+    """Activated by the networks or by the operation; and what an activation would not give."""
+    layers = {last: MLP((Layer(("positions",), 4, last),), outputs=(0,)) for last in ("none", "softplus")}
+    origins, directions = torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]])
+    ray = origins, directions, torch.zeros(1), torch.full((1,), 4.0)
+    box, occupied = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.ones(2, 2, 2, dtype=torch.bool)
+    network = {"weights": [torch.zeros(1, 4, 3)], "biases": [torch.tensor([[3.0, -2, 0.5, -0.25]])]}
+
+    def see(last, **rule):
+        given = {**network, "layers": layers[last]}
+        return render_opaque(*ray, occupied, box, 64, given, opaque=0.0, backend=backend, **rule)
+
+    raw, soft = see("none", density_scale=1.0), see("softplus", activated=True)
+    for name in ("opacity", "depth", "light", "heaviest"):
+        torch.testing.assert_close(getattr(soft, name), getattr(raw, name), msg=name)
+    seen = see("none", activated=True)
+    opacity = -torch.tensor([0.5]).expm1()  # of density -0.25 over 2
+    torch.testing.assert_close(seen.opacity, opacity)
+    torch.testing.assert_close(seen.colour, opacity * torch.tensor([[3.0, -2, 0.5]]))
+    torch.testing.assert_close(seen.light, 1 - opacity)
 
 
 @pytest.mark.native

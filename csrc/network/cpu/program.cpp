@@ -76,6 +76,15 @@ void clear_strays(const ProgramInputs& in, const ProgramResults& results, const 
   }
 }
 
+// What no look-up writes of what is kept: rows of no cell, and columns behind the features.
+void clear_kept(const ProgramInputs& in, int64_t features, int64_t stride, float* kept, int threads) {
+  std::fill(kept, kept + in.offsets[0] * stride, 0.0f);
+  std::fill(kept + in.offsets[in.k] * stride, kept + in.n * stride, 0.0f);
+  constexpr int64_t kRun = 1024;
+  parallel_for(features < stride ? in.n : 0, kRun, threads,
+               [&](int64_t row) { std::fill(kept + row * stride + features, kept + (row + 1) * stride, 0.0f); });
+}
+
 // Rows with a gradient, which alone add to sums; those without are samples that no light reaches, say.
 struct Sifted {
   std::vector<int32_t> rows, order, offsets;  // numbers as sorted, and of the caller; [k+1]. Empty: all rows
@@ -308,6 +317,8 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
       places[m] = take(in.n * table.memories[m]);
     } else {
       memories[m] = kept;
+      const HashEncoding& grid = rows.grids()[static_cast<size_t>(lookup.grid)];
+      if (!in.ready) clear_kept(in, grid.count * grid.features, table.memories[m], kept, threads);
     }
     const bool shared = in.strides[static_cast<size_t>(lookup.parameter)] == 0 || in.k == 1;
     filled[m] = in.ready || shared;
@@ -319,6 +330,13 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
   }
   for (const ProgramOutput& output : table.outputs) {
     if (output.ray) places[static_cast<size_t>(output.memory)] = take(in.n * output.width);
+  }
+  for (size_t o = 0; o < table.outputs.size(); ++o) {
+    const ProgramOutput& output = table.outputs[o];
+    const bool here = !output.ray && in.order == nullptr && results.output_types[o] == TableType::float32;
+    if (here && output.memory >= 0) {
+      memories[static_cast<size_t>(output.memory)] = static_cast<float*>(results.outputs[o]);
+    }
   }
   const Workspace workspace(floats + kSlack);
   float* const memory = workspace.data();

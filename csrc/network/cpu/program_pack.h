@@ -58,8 +58,10 @@ struct Matrix {
   constexpr int64_t kStep = (VN_HALF ? 2 : 1) * kLanes;
   for (int64_t o = 0; o < (m.outputs == 1 ? 1 : 4); ++o) {
     for (int64_t k = 0; k < m.depth; k += kStep, to += kLanes) {
-      float values[kStep];
-      for (int64_t i = 0; i < kStep; ++i) values[i] = o < m.outputs ? m.at(o, k + i) : 0.0f;
+      float turned[kStep] = {};
+      const float* values = turned;
+      if (o < m.outputs && !m.turned) values = m.from + o * m.stride + k;
+      for (int64_t i = 0; o < m.outputs && m.turned && i < kStep; ++i) turned[i] = m.at(o, k + i);
 #if VN_HALF
       store(to, joined(load(values), load(values + kLanes)));
 #else

@@ -183,6 +183,7 @@ struct ProgramTile {
 
   void output(const ProgramStep& step, const ProgramOperand& from) const {
     const Rows x = operand(from);
+    if (x.data == static_cast<float*>(call.outputs[step.number]) + begin * step.width) return;  // made there
     const int64_t width = step.width, all = call.output_widths[step.number];
     float* const summed = step.memory < 0 ? nullptr : call.memories[step.memory];  // of rays
     const bool half = call.output_types[step.number] == TableType::bfloat16;

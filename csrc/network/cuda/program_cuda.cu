@@ -59,6 +59,8 @@ constexpr int64_t kTaskRows = 128, kTasksPerMultiprocessor = 4, kPartialBytes = 
 constexpr int64_t kBlocksPerMultiprocessor = 8;  // of kernels other than the interpreter
 constexpr int kResident = 2;                     // blocks of the interpreter on a multiprocessor
 constexpr int kStripBytes = 4 * kProgramStrip;
+// The memory of a step, in the device's records: the number of a look-up, none, or below that the number of a scatter.
+constexpr int kNoMemory = -1;
 
 // Steps ----------------------------------------------------------------------------------------------------------
 
@@ -184,10 +186,10 @@ __device__ __noinline__ void plain_step(const ProgramTile& tile, const ProgramSt
     case ProgramOp::move:
       return move_step(tile, step, operands);
     case ProgramOp::encode: {
-      const bool there = tile.call.ready && step.order == 0 && step.memory >= 0;
-      if (!there || tile.call.memories[step.memory] == nullptr) return encode_step(tile, given, operands);
-      const int64_t stride = tile.call.memory_strides[step.memory];
-      const float* from = tile.call.memories[step.memory] + tile.begin * stride;
+      const bool there = tile.call.ready && step.memory >= 0 && tile.call.kept[step.memory] != nullptr;
+      if (!there) return encode_step(tile, given, operands);
+      const int64_t stride = tile.call.kept_strides[step.memory];
+      const float* from = tile.call.kept[step.memory] + tile.begin * stride;
       return for_each_entry(tile.rows, step.width,
                             [&](int row, int column) { to[row * step.stride + column] = from[row * stride + column]; });
     }
@@ -202,19 +204,18 @@ __device__ __noinline__ void plain_step(const ProgramTile& tile, const ProgramSt
   }
 }
 
-// What becomes of a value beside its slot: the gradient of what was looked up is added to that of its table, and what
-// was looked up is kept in memory of the call.
+// What becomes of a value beside its slot: what was looked up is kept, and the gradient of that is added to that of the
+// table.
 __device__ __noinline__ void keep(const ProgramTile& tile, const ProgramStep& step) {
   const CudaProgram& call = tile.call;
-  for (int i = 0; i < call.scatter_count; ++i) {
-    if (call.scatters[i].memory == step.memory) return scatter_rows(tile, step, call.scatters[i]);
-  }
-  if (call.memories[step.memory] == nullptr || call.ready) return;
-  const int64_t stride = call.memory_strides[step.memory];
-  float* const to = call.memories[step.memory] + tile.begin * stride;
+  if (step.memory < kNoMemory) return scatter_rows(tile, step, call.scatters[kNoMemory - 1 - step.memory]);
+  if (call.kept[step.memory] == nullptr || call.ready) return;
+  const int64_t stride = call.kept_strides[step.memory];
+  float* const to = call.kept[step.memory] + tile.begin * stride;
   const float* from = tile.slot(step.slot);
-  for_each_entry(tile.rows, step.width,
-                 [&](int row, int column) { to[row * stride + column] = from[row * step.stride + column]; });
+  for_each_entry(tile.rows, static_cast<int>(stride), [&](int row, int column) {
+    to[row * stride + column] = column < step.width ? from[row * step.stride + column] : 0.0f;
+  });
 }
 
 // A product. Rows without a sample get what lies in the slots, and are not stored.
@@ -343,7 +344,7 @@ __global__ void __launch_bounds__(kThreads, kResident)
           plain_step(tile, step);
         }
         __syncthreads();
-        if (step.memory >= 0) {
+        if (step.memory != kNoMemory) {
           keep(tile, step);
           __syncthreads();
         }
@@ -381,7 +382,7 @@ __device__ void number_tasks(const CudaRows& rows, int64_t task_rows, int64_t mo
   if (threadIdx.x == 0) rows.first_task[rows.k] = inside(carry);
 }
 
-// The first block numbers the tasks, and all clear the outputs of rows of no cell.
+// The first block numbers the tasks, and all clear what rows of no cell have: outputs, and what is kept of them.
 __global__ void __launch_bounds__(kThreads)
     program_prepare_kernel(const VN_GRID_CONSTANT CudaProgram call, int64_t most) {
   const CudaRows& rows = call.rows;
@@ -389,10 +390,15 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t low = cell_begin(rows, 0), last = cell_begin(rows, rows.k), high = last < low ? low : last;
   const int64_t step = static_cast<int64_t>(gridDim.x) * kThreads;
   for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < rows.n - (high - low); i += step) {
-    const int64_t row = source_row(rows, i < low ? i : i + high - low);
+    const int64_t stray = i < low ? i : i + high - low, row = source_row(rows, stray);
     for (int o = 0; o < call.output_count; ++o) {
       const int width = call.output_widths[o];
       for (int c = 0; c < width; ++c) store_number(call.outputs[o], call.output_types[o], row * width + c, 0.0f);
+    }
+    for (int l = 0; l < call.lookup_count; ++l) {
+      const int64_t stride = call.kept_strides[l];
+      if (call.kept[l] == nullptr || call.ready) continue;
+      for (int c = 0; c < stride; ++c) call.kept[l][stray * stride + c] = 0.0f;
     }
   }
 }
@@ -518,10 +524,10 @@ Cut cut(const Program& program, int64_t n, int64_t k) {
                                 " inputs, parameters, outputs or sums on CUDA, got " + std::to_string(most) +
                                 "; use backend='reference'");
   }
-  if (table.memories.size() > kProgramMemories) {
-    throw std::invalid_argument("grouped_program: a program must have at most " + std::to_string(kProgramMemories) +
-                                " look-ups, their gradients and outputs of rays on CUDA, got " +
-                                std::to_string(table.memories.size()) + "; use backend='reference'");
+  if (table.lookups.size() > kProgramLookups) {
+    throw std::invalid_argument("grouped_program: a program must have at most " + std::to_string(kProgramLookups) +
+                                " look-ups of hash grids on CUDA, got " + std::to_string(table.lookups.size()) +
+                                "; use backend='reference'");
   }
   Cut found{};
   const int64_t columns = Slots(table).columns();
@@ -584,13 +590,21 @@ void program_code_cuda(const Program& program, unsigned char* code) {
   const Slots slots(table);
   std::vector<ProgramStep> steps = table.steps;
   std::vector<ProgramOperand> operands = table.operands;
+  // Of each memory of the program what kNoMemory says; outputs are written by their steps alone.
+  std::vector<int32_t> memories(table.memories.size(), kNoMemory);
+  for (size_t i = 0; i < table.lookups.size(); ++i) {
+    memories[static_cast<size_t>(table.lookups[i].memory)] = static_cast<int32_t>(i);
+  }
+  for (size_t i = 0; i < table.scatters.size(); ++i) {
+    memories[static_cast<size_t>(table.scatters[i].memory)] = kNoMemory - 1 - static_cast<int32_t>(i);
+  }
   for (ProgramStep& step : steps) {
-    if (!Slots::makes_value(step)) {
-      step.memory = -1;
-      continue;
+    const bool made = Slots::makes_value(step);
+    if (made) {
+      step.slot = slots.at(step.slot, step.memory);
+      step.stride += kProgramSkew;
     }
-    step.slot = slots.at(step.slot, step.memory);
-    step.stride += kProgramSkew;
+    step.memory = made && step.memory >= 0 ? memories[static_cast<size_t>(step.memory)] : kNoMemory;
   }
   for (ProgramOperand& operand : operands) {
     if (operand.parameter) continue;
@@ -629,7 +643,6 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
   call.code.sum_count = static_cast<int32_t>(table.sums.size());
   call.code.columns = Slots(table).columns();
   call.scatters = reinterpret_cast<const ProgramScatter*>(code + at.scatters);
-  call.scatter_count = static_cast<int32_t>(table.scatters.size());
   call.grids = reinterpret_cast<const HashEncoding*>(code + at.grids);
   call.rows = {in.offsets, in.order, in.ray_index, reinterpret_cast<int32_t*>(workspace), in.n, in.r, in.k};
   call.partials = reinterpret_cast<float*>(workspace + found.partials);
@@ -653,10 +666,11 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
   }
   call.output_count = static_cast<int32_t>(table.outputs.size());
   std::copy_n(results.sums, table.sum_tensors, call.sums);
-  std::copy(table.memories.begin(), table.memories.end(), call.memory_strides);
-  for (size_t i = 0; in.kept != nullptr && i < table.lookups.size(); ++i) {
-    call.memories[table.lookups[i].memory] = in.kept[i];
+  for (size_t i = 0; i < table.lookups.size(); ++i) {
+    call.kept[i] = in.kept == nullptr ? nullptr : in.kept[i];
+    call.kept_strides[i] = table.memories[static_cast<size_t>(table.lookups[i].memory)];
   }
+  call.lookup_count = static_cast<int32_t>(table.lookups.size());
   call.ready = in.ready;
 
   for (const ProgramScatter& scatter : table.scatters) {

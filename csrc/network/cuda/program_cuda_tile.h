@@ -12,8 +12,8 @@
 
 namespace voronerf {
 
-constexpr int kProgramMost = 64;      // tensors of a kind: kernel arguments hold 4 KiB
-constexpr int kProgramMemories = 16;  // of a call
+constexpr int kProgramMost = 64;  // tensors of a kind: kernel arguments hold 4 KiB
+constexpr int kProgramLookups = 16;
 
 struct CudaRows {
   const int32_t *offsets, *order, *ray_index;  // order and ray_index may be null
@@ -32,13 +32,13 @@ struct CudaProgram {
   const void *inputs[kProgramMost], *parameters[kProgramMost];
   void* outputs[kProgramMost];
   float* sums[kProgramMost];
-  int64_t strides[kProgramMost];      // of parameters, from cell to cell
-  float* memories[kProgramMemories];  // [n][stride], or null
-  int32_t memory_strides[kProgramMemories], output_widths[kProgramMost];
+  int64_t strides[kProgramMost];  // of parameters, from cell to cell
+  float* kept[kProgramLookups];   // [n][stride] of each look-up, or null
+  int32_t kept_strides[kProgramLookups], output_widths[kProgramMost];
   uint8_t input_types[kProgramMost], parameter_types[kProgramMost], output_types[kProgramMost];
   bool turned[kProgramMost], rays[kProgramMost];  // inputs
-  int32_t output_count, scatter_count;
-  bool ready;  // memories of look-ups are filled
+  int32_t output_count, lookup_count;
+  bool ready;  // what is kept is there
 };
 static_assert(sizeof(CudaProgram) <= 4000, "kernel arguments hold 4 KiB");
 

@@ -191,7 +191,7 @@ class Program:
         parts = [self.inputs, self.parameters, self.steps, self.outputs, self.sums, self.rays, self.by_ray, self.grids]
         object.__setattr__(self, "text", json.dumps(parts))
         object.__setattr__(self, "orders", max(map(_order, self.steps), default=0))
-        read = {int(step.numbers[1]) for step in self.steps if step.op == "scatter" or step.name == "hash"}
+        read = {int(step.numbers[1]) for step in self.steps if _reads_table(step)}
         object.__setattr__(self, "tables", tuple(sorted(read)))
         of_sums = {step.out: int(step.numbers[1]) for step in self.steps if step.op == "scatter"}
         object.__setattr__(self, "sum_tables", tuple(of_sums.get(index) for index in range(len(self.sums))))
@@ -323,6 +323,8 @@ def check(program: Program) -> None:
             if not (count in (1 + extra, 2 + extra) and fits(operands[0], rows=True)):
                 return False
             depth = operands[0].width
+            if not (depth and width):  # the products walk them with loops that test at the end
+                return False
             inside = (depth, start + width) if transposed else (width, start + depth)
             others = all(fits(each, width, rows=each.of == VALUE) for each in operands[1:])
             return inside[0] == o and inside[1] <= i and others and not tables.setdefault(matrix, False)
@@ -520,6 +522,10 @@ def _sums(step: Step) -> bool:
     return step.op in ("outer", "columns", "scatter")
 
 
+def _reads_table(step: Step) -> bool:
+    return step.op == "scatter" or (step.op == "encode" and step.name == "hash")
+
+
 # Gradients ------------------------------------------------------------------------------------------------------------
 
 
@@ -601,7 +607,7 @@ def gradient(
         else:
             depends = any(c.index in (active if c.of == VALUE else wanted) for c in at)
             depends = depends or (step.op == "linear" and int(step.numbers[0]) in wanted)
-            depends = depends or (step.name == "hash" and int(step.numbers[1]) in wanted)
+            depends = depends or (_reads_table(step) and int(step.numbers[1]) in wanted)
         if depends and step.name != "stop":
             active.add(step.out)
     widths = {step.out: step.width for step in b.steps}
@@ -682,9 +688,12 @@ def _of_function(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> Non
         if arriving.wants(x) and order + 1 <= FUNCTIONS[step.name].orders:
             arriving.add(x, b.function(step.name, x, a, c, int(order) + 1, b.binary("mul", g, rest[0])))
     elif arriving.wants(x):
-        # What ReLU returns tells its slope too, and the value before it need not be kept.
-        known = Columns(VALUE, step.out, 0, step.width) if step.name == "relu" and order == 0 else x
-        arriving.add(x, b.function(step.name, known, a, c, int(order) + 1, g))
+        if step.name == "relu" and order == 0:
+            # What ReLU returns tells its slope too, and the value before it need not be kept. It stops any gradient, as
+            # in PyTorch: 0 times an infinite one would be NaN.
+            arriving.add(x, b.binary("gate", g, Columns(VALUE, step.out, 0, step.width)))
+            return
+        arriving.add(x, b.function(step.name, x, a, c, int(order) + 1, g))
 
 
 def _of_binary(b: Builder, arriving: _Arriving, step: Step, g: Columns) -> None:
@@ -760,25 +769,23 @@ def merged(program: Program) -> Program:
     made = {step.out: place for place, step in enumerate(kept) if not _sums(step)}
     dropped = set()
     for place, step in enumerate(kept):
-        if step.op != "function" or step.name != "relu":
+        slope = step.op == "binary" and step.name == "gate"
+        if not slope and (step.op != "function" or step.name != "relu" or step.numbers[0] or len(step.operands) > 1):
             continue
-        slope = step.numbers[0] == 1
-        source = step.operands[-1] if slope and len(step.operands) == 2 else step.operands[0]
-        if source.of != VALUE or source.spread or source.start or uses[source.index] != 1:
+        source, *known = step.operands
+        if any(c.of != VALUE or c.spread or c.start for c in step.operands) or uses[source.index] != 1:
             continue
         before = kept[made[source.index]]
-        plain = before.op == "linear" and not before.name and before.width == source.width
+        if before.op != "linear" or before.name or before.width != source.width:
+            continue
         if slope:
-            known = step.operands[0]
-            first = made.get(known.index, place)
-            plain = plain and len(step.operands) == 2 and known.of == VALUE and first < made[source.index]
-            if not plain or known.spread or known.start or kept[first].width != step.width:
+            first = kept[made[known[0].index]]  # what is not 0 behind a ReLU is where it lets gradients through
+            there = made[known[0].index] < made[source.index] and first.width == step.width
+            if not there or first.name != "relu":
                 continue
             kept[made[source.index]] = before._replace(
-                out=step.out, operands=(*before.operands, known), name="relu_slope"
+                out=step.out, operands=(*before.operands, known[0]), name="relu_slope"
             )
-        elif not plain or step.numbers[0] or len(step.operands) > 1:
-            continue
         else:
             kept[made[source.index]] = before._replace(out=step.out, name="relu")
         made[step.out] = made[source.index]

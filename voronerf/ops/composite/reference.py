@@ -66,7 +66,7 @@ def composite(
     storage = rgb.dtype
     wide = torch.promote_types(storage, torch.float32)
     sigma, rgb, depths, deltas = (tensor.to(wide) for tensor in (sigma, rgb, depths, deltas))
-    optical = sigma.clamp(max=_OPAQUE) * deltas
+    optical = optical_depth(sigma, deltas)
     if ray_offsets is None:
         weights = _in_front(optical) * -torch.expm1(-optical)
         colour = (weights[:, :, None] * rgb).sum(dim=1)  # no product, which autocast would narrow
@@ -75,14 +75,9 @@ def composite(
     else:
         check_ray_offsets("composite", ray_offsets, sigma.shape[0])
         rays = ray_offsets.shape[0] - 1
-        row = torch.arange(sigma.shape[0], device=sigma.device)
-        # One more than the ray of each sample: 0 and rays + 1 are for samples that belong to no ray.
-        ray = torch.searchsorted(ray_offsets.long(), row, right=True)
-        inside = (ray > 0) & (ray <= rays)
-        first = torch.where(inside, ray_offsets[(ray - 1).clamp(0, rays)], row)
-        last = torch.where(inside, ray_offsets[ray.clamp(0, rays)], row + 1)
-        weights = _packed_in_front(optical, first, last) * -torch.expm1(-optical)
-        weights = torch.where(inside, weights, 0)
+        light, ray = packed_light(optical, ray_offsets)
+        weights = light * -torch.expm1(-optical)
+        weights = torch.where((ray > 0) & (ray <= rays), weights, 0)
         # Colour, opacity and depth are one sum, over columns side by side.
         columns = torch.cat([rgb, torch.ones_like(depths)[:, None], depths[:, None]], dim=1) * weights[:, None]
         total = columns.new_zeros(rays + 2, columns.shape[1]).index_add(0, ray, columns)[1:-1]
@@ -90,6 +85,24 @@ def composite(
     if background is not None:
         colour = colour + (1 - opacity)[:, None] * background.to(wide)
     return Composite(colour.to(storage), opacity.to(storage), depth.to(storage), weights.to(storage))
+
+
+def optical_depth(sigma: Tensor, deltas: Tensor) -> Tensor:
+    """Density times length, of infinite density too."""
+    return sigma.clamp(max=_OPAQUE) * deltas
+
+
+def packed_light(optical: Tensor, ray_offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """The share of the light that arrives at each packed sample [m], and one more than its ray, int64 [m].
+
+    0 and r + 1 are the rays of samples that belong to none.
+    """
+    rays, row = ray_offsets.shape[0] - 1, torch.arange(optical.shape[0], device=optical.device)
+    ray = torch.searchsorted(ray_offsets.long(), row, right=True)
+    inside = (ray > 0) & (ray <= rays)
+    first = torch.where(inside, ray_offsets[(ray - 1).clamp(0, rays)], row)
+    last = torch.where(inside, ray_offsets[ray.clamp(0, rays)], row + 1)
+    return _packed_in_front(optical, first, last), ray
 
 
 def _in_front(optical: Tensor) -> Tensor:

@@ -6,15 +6,14 @@ and back on the way out.
 
 from __future__ import annotations
 
-import functools
-
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.layers import MLP, POSITIONS, Layer
-from voronerf.ops._core.program import Program
+from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer
 from voronerf.ops.grouped_program.native import How, Rows, run_program
 
+# Of one layer, whose width is that of its weight.
+_TABLES = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
 _PRODUCTS = {torch.bfloat16: "bfloat16", torch.float16: "float16"}
 
 
@@ -27,12 +26,7 @@ def grouped_linear(
         dtype = torch.get_autocast_dtype(x.device.type)
     stored = dtype if dtype == torch.bfloat16 else torch.float32
     rounded = [p.to(dtype).float() for p in (weight, bias) if p is not None]
-    program = _program(int(weight.shape[2]), int(weight.shape[1]), bias is not None, activation)
-    rows = Rows([x.to(dtype).to(stored)], rounded, offsets, None, None, [])
-    (out,) = run_program(rows, How(program.text, "grouped_linear", _PRODUCTS.get(dtype, "float32")), program)
+    rows = Rows([x.to(dtype).to(stored)], rounded, offsets, None, None, None)
+    how = How(_TABLES[activation], "0" if bias is None else "1", "grouped_linear", _PRODUCTS.get(dtype, "float32"))
+    (out,) = run_program(rows, how)
     return out.to(dtype)
-
-
-@functools.lru_cache(maxsize=256)
-def _program(i: int, o: int, biased: bool, activation: str) -> Program:
-    return MLP((Layer((POSITIONS,), o, activation),), (0,)).program(i, 0, (o,), (biased,), False)

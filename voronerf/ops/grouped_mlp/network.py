@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.layers import MLP
-from voronerf.ops._core.program import Program
 from voronerf.ops.grouped_mlp.reference import encode_directions, encode_positions
 from voronerf.ops.grouped_program.native import How, Rows, run_program
 
@@ -34,35 +33,37 @@ class Given(NamedTuple):
 
 
 class Network(NamedTuple):
-    """A network as a program and its tensors."""
+    """A network as the program op takes it.
+
+    Attributes:
+        inputs: positions, and directions if any layer reads them, in float32.
+        parameters: weights, biases and the table of a hash grid, in float32 but for that.
+        ray_index: int32 [n] where directions have one row for each ray, or None.
+        how: it runs.
+        dtype: of the result: that of the weights, or autocast's where that is on.
+        given: what inputs and parameters were made of, in their order.
+    """
 
     inputs: list[Tensor]
     parameters: list[Tensor]
-    program: Program
     ray_index: Tensor | None
-    dtype: torch.dtype  # of the result: that of the weights, or autocast's where that is on
-    given: list[Tensor]  # what the inputs and parameters were made of, in their order
+    how: How
+    dtype: torch.dtype
+    given: list[Tensor]
 
     def rows(self, offsets: Tensor, order: Tensor | None = None) -> Rows:
         """What the program runs on, for rows of cells by offsets [k + 1] and an order."""
-        return Rows(self.inputs, self.parameters, offsets, order, self.ray_index, [])
+        return Rows(self.inputs, self.parameters, offsets, order, self.ray_index, None)
 
-    def how(self, caller: str) -> How:
-        """How it runs; ``caller``: the op that errors name."""
-        products = {torch.bfloat16: "bfloat16", torch.float16: "float16"}.get(self.dtype, "float32")
-        return How(self.program.text, caller, products)
-
-    def run(self, caller: str, offsets: Tensor, order: Tensor | None = None) -> Tensor:
+    def run(self, offsets: Tensor, order: Tensor | None = None) -> Tensor:
         """The result [n, out]."""
-        (out,) = run_program(self.rows(offsets, order), self.how(caller), self.program)
+        (out,) = run_program(self.rows(offsets, order), self.how)
         return out.to(self.dtype)
 
 
-def as_network(given: Given) -> Network:
-    """The program of a layer table, with its tensors in float32.
-
-    Octaves and harmonics of float64 are computed in float64, beforehand.
-    """
+def as_network(given: Given, caller: str) -> Network:
+    """A layer table with its tensors; ``caller``: the op that errors name. Octaves and harmonics of float64 are
+    computed in float64, beforehand."""
     positions, weights, biases, layers, directions, index, features = given
     kind = positions.device.type
     dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else weights[0].dtype
@@ -85,11 +86,7 @@ def as_network(given: Given) -> Network:
         assert directions is not None
         rows.append(directions)
         inputs.append(directions.float())
-    program = layers.program(
-        positions.shape[1],
-        directions.shape[1] if seen and directions is not None else 0,
-        tuple([int(weight.shape[1]) for weight in weights]),
-        tuple([bias is not None for bias in biases]),
-        index is not None and seen,
-    )
-    return Network(inputs, parameters, program, index if seen else None, dtype, [*rows, *taken])
+    products = {torch.bfloat16: "bfloat16", torch.float16: "float16"}.get(dtype, "float32")
+    biased = "".join(["0" if bias is None else "1" for bias in biases])
+    how = How(layers.text, biased, caller, products)
+    return Network(inputs, parameters, index if seen else None, how, dtype, [*rows, *taken])

@@ -47,13 +47,11 @@ class Lowered:
         program: that of the compiled module.
         lookups: those whose values may be kept, [n, width] each in the order of the cells.
         widths: floats of a row of each.
-        scatters: the parameter of each sum that is the gradient of a table; other sums are not in it.
     """
 
     program: native.compiled.Program
     lookups: tuple[Lookup, ...]
     widths: tuple[int, ...]
-    scatters: dict[int, int]
 
 
 @functools.lru_cache(maxsize=1024)
@@ -123,7 +121,7 @@ class _Lowering:
         self.memories: list[int] = []
         self.lookups: list[tuple[Lookup, int]] = []
         self.scatters: list[tuple[Lookup, int, int]] = []
-        self.outputs: list[Any] = []
+        self.own: dict[int, int] = {}  # the memory of outputs that values may be made in
         self.work = self._in_order()
         self.readers: dict[int, list[tuple[Step, int]]] = {}
         for step in self.work:
@@ -153,9 +151,8 @@ class _Lowering:
         written: list[Step] = []
         for number, c in enumerate(program.outputs):
             step = made.get(c.index) if c.of == VALUE else None
-            if step is None or step.op != "move" or uses[c.index] > 1 or c[2:] != (0, step.width, False):
-                written.append(Step("output", number, c.width, (c,), (number, 0)))
-            elif not _covered(step):
+            alone = step is not None and step.op == "move" and uses[c.index] == 1 and _all_of(c, step.width)
+            if step is None or not alone or not _covered(step):
                 written.append(Step("output", number, c.width, (c,), (number, 0)))
             else:
                 steps.remove(step)
@@ -207,13 +204,10 @@ class _Lowering:
             number = self.pack("vector", c.index, c.start, width, width, self.shape(c.index))
             return self.compiled.ProgramOperand(parameter=True, slot=number, stride=0, **(given | {"start": 0}))
         value = self.values[c.index]
+        given |= {"memory": value.memory, "input": value.input}
         if product:
-            whole = c.start == 0 and c.width == value.width
-            given |= {"input": value.input, "pairs": value.pairs if whole else _NONE}
-        given["memory"] = value.memory
-        return self.compiled.ProgramOperand(
-            parameter=False, slot=max(value.slot, 0), stride=value.stride, **given
-        )
+            given["pairs"] = value.pairs if _all_of(c, value.width) else _NONE
+        return self.compiled.ProgramOperand(parameter=False, slot=max(value.slot, 0), stride=value.stride, **given)
 
     def emit(self, op: str, operands: Iterable[Any] = (), value: _Value | None = None, **given: Any) -> None:
         """One step's record."""
@@ -261,6 +255,8 @@ class _Lowering:
         more, or in a place of its own."""
         value = _Value(step.width, stride or _padded(step.width))
         self.values[step.out] = value
+        if step.op not in ("input", "encode"):
+            value.memory = self._own_output(step)
         scattered = [reader for reader, place in self.readers.get(step.out, []) if reader.op == "scatter" and place]
         if scattered:
             value.memory = self.memory(value.stride)
@@ -270,19 +266,29 @@ class _Lowering:
             if known is None or c.index not in dying or c.spread or c.start or known.stride != value.stride:
                 continue
             others = [other for other in step.operands if other.of == VALUE and other.index == c.index]
-            if known.slot != _NONE and known.memory == _NONE and known.input == _NONE:
-                if all(other.start == 0 and not other.spread for other in others):
-                    value.slot, known.slot = known.slot, _NONE
-                    return value
+            here = known.slot != _NONE and known.memory == _NONE and known.input == _NONE
+            if here and all(other.start == 0 and not other.spread for other in others):
+                value.slot, known.slot = known.slot, _NONE
+                return value
         value.slot = self.slots.take(value.stride)
         return value
+
+    def _own_output(self, step: Step) -> int:
+        """The memory of an output that is a whole value and whose rows end with whole vectors: it can be made there."""
+        for reader, _ in self.readers.get(step.out, []):
+            if reader.op == "output" and step.width % _GRANULE == 0 and _all_of(reader.operands[0], step.width):
+                number, first = map(int, reader.numbers)
+                if number not in self.program.by_ray and self.program.outputs[number].width == step.width and not first:
+                    return self.own.setdefault(number, self.memory(step.width))
+        return _NONE
 
     def _input(self, step: Step, dying: set[int]) -> None:
         number, readers = int(step.numbers[0]), self.readers.get(step.out, [])
         encoded = [reader.op in ("encode", "scatter") and place == 0 for reader, place in readers]
         value = self.make(step, dying, stride=step.width if readers and all(encoded) else 0)
         plain = number not in self.program.rays
-        if plain and readers and all(self._product(reader, place) for reader, place in readers):
+        whole = value.stride == step.width and not all(encoded)  # no vector reads beyond a row
+        if plain and readers and (whole or all(self._product(reader, place) for reader, place in readers)):
             value.input = number
         self.emit("input", value=value, number=number, in_place=value.input != _NONE)
 
@@ -390,7 +396,7 @@ class _Lowering:
     def finished(self) -> Lowered:
         """The compiled program."""
         program, compiled = self.program, self.compiled
-        scattered = {out: lookup.parameter for lookup, _, out in self.scatters}
+        scattered = [out for _, _, out in self.scatters]
         for i, shape in enumerate(program.sums):
             if i not in scattered and not any(record[0] == i for record in self.sums):
                 size = shape[0] * (shape[1] if len(shape) > 1 else 1)
@@ -399,9 +405,14 @@ class _Lowering:
         outputs = []
         for number, c in enumerate(program.outputs):
             ray = number in program.by_ray
-            outputs.append(compiled.ProgramOutput(c.width, ray, self.memory(c.width) if ray else _NONE))
+            outputs.append(
+                compiled.ProgramOutput(c.width, ray, self.memory(c.width) if ray else self.own.get(number, _NONE))
+            )
         steps = [
-            step._replace(memory=outputs[step.number].memory) if step.op == "output" else step for step in self.steps
+            step._replace(memory=outputs[step.number].memory)
+            if step.op == "output" and step.number in program.by_ray
+            else step
+            for step in self.steps
         ]
         whole = any(step.op == "encode" and step.name == "spherical" for step in self.work)
         fewest, most = (_WHOLE if whole else _ROWS[0]), _ROWS[1]
@@ -431,7 +442,6 @@ class _Lowering:
             compiled.make_program(table),
             tuple(lookup for lookup, _ in self.lookups),
             tuple(self.memories[memory] for _, memory in self.lookups),
-            scattered,
         )
 
 

@@ -39,6 +39,9 @@ def grouped_program(
     for i in program.rays:
         assert ray_index is not None
         rays = inputs[i].shape[0]
+        if n and (int(ray_index.min()) < 0 or int(ray_index.max()) >= rays):
+            wrong = int(ray_index.min() if ray_index.min() < 0 else ray_index.max())
+            raise ValueError(f"grouped_program: ray_index must be 0 to {rays - 1}, got {wrong}")
         rows[i] = inputs[i].index_select(0, ray_index)
     run = _Run(program, rows, parameters, offsets, slice(low, high))
     results = [run.columns(columns) for columns in program.outputs]
@@ -187,7 +190,7 @@ def along(encode: Callable[[Tensor], Tensor], directions: Sequence[Tensor]) -> C
 
 
 def _slope(encode: Callable[[Tensor], Tensor], direction: Tensor, x: Tensor) -> Tensor:
-    y, back = torch.func.vjp(encode, x)
+    y, back, *_ = torch.func.vjp(encode, x)
     # The gradient of <direction, back(v)> to v; PyTorch's forward mode compiles TorchScript.
     return torch.func.vjp(lambda v: back(v)[0], torch.zeros_like(y))[1](direction)[0]
 

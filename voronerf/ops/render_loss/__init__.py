@@ -9,7 +9,7 @@ from torch import Tensor
 
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops._core.declare import declare
-from voronerf.ops.render_loss.reference import RenderLoss
+from voronerf.ops.render_loss.reference import RenderLoss, scaled
 
 
 @declare(
@@ -17,6 +17,7 @@ from voronerf.ops.render_loss.reference import RenderLoss
     warp=Implementation(EVERYWHERE, FLOATS),
     smooth=["raw"],
     small=["raw"],
+    prepare=lambda given: scaled("render_loss", given),
 )
 def render_loss(
     raw: Annotated[Tensor, "floating [m, 4]"],
@@ -25,24 +26,29 @@ def render_loss(
     target: Annotated[Tensor, "wide [r, 3]"],
     *,
     background: Annotated[Tensor | None, "wide [3] or [r, 3]"] = None,
-    density_scale: Annotated[float, "positive"],
+    density_scale: Annotated[float | None, "positive"] = None,
+    activated: bool = False,
     hidden: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
 ) -> RenderLoss:
     """The mean squared error of rendered rays, from what the networks put out for their samples.
 
-    The colour of a sample is ``sigmoid(raw[:, :3])``, its density ``density_scale * softplus(raw[:, 3])``. `composite`
-    makes the colours of the rays of them. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020,
-    equations 3 and 6). The native backend computes loss and gradient in one pass over each ray.
+    The colour of a sample is ``sigmoid(raw[:, :3])``, its density ``density_scale * softplus(raw[:, 3])``. With
+    ``activated`` both are ``raw`` as it is, for networks with other activations. `composite` makes the colours of the
+    rays of them. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020, equations 3 and 6). The
+    native backend computes loss and gradient in one pass over each ray.
 
     Args:
-        raw: [m, 4], colour and density before their activations: float16, bfloat16, float32 or float64.
+        raw: [m, 4], colour and density before their activations, or ``activated``: float16, bfloat16, float32 or
+            float64.
         deltas: [m], length of the part of its ray that a sample stands for, at least 0.
         ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none.
             Other samples have weight 0.
         target: [r, 3], the colours to learn.
         background: [3] or [r, 3], added with weight 1 - opacity, or None.
-        density_scale: factor on the density, > 0.
+        density_scale: factor on the density, > 0; None with ``activated``.
+        activated: whether ``raw`` is the colour and the density themselves, as for `composite`: no sigmoid, softplus or
+            scale comes in between, nothing is clamped, and gradients are to them.
         hidden: share of the light, in [0, 1). Samples that no more than it reaches have no gradient; they count as all
             others in those of the samples in front of them.
         backend: "auto", "reference", "native" or "warp".
@@ -54,7 +60,7 @@ def render_loss(
         RenderLoss(loss [], colour [r, 3], weights [m], density [m], error [r]).
 
     Raises:
-        ValueError: on the CPU offsets that fall or exceed m.
+        ValueError: ``density_scale`` with ``activated``, or neither; on the CPU offsets that fall or exceed m.
 
     Examples:
         >>> import torch
@@ -67,6 +73,9 @@ def render_loss(
         >>> result.loss.backward()
         >>> raw.grad[:, :3].round(decimals=4)  # lighter
         tensor([[-0.0833, -0.0833, -0.0833]])
+        >>> values = torch.tensor([[0.5, 0.5, 0.5, 50.0]])  # the same wall, of networks that have activated
+        >>> float(render_loss(values, torch.ones(1), offsets, torch.ones(1, 3), activated=True).loss)
+        0.25
     """
 
 
@@ -76,6 +85,7 @@ def render_loss(
     reference=Implementation(file="render_loss"),
     smooth=["raw"],
     small=["raw"],
+    prepare=lambda given: scaled("render_loss_gradient", given),
 )
 def render_loss_gradient(
     raw: Annotated[Tensor, "floating [m, 4]"],
@@ -84,7 +94,8 @@ def render_loss_gradient(
     target: Annotated[Tensor, "wide [r, 3]"],
     *,
     background: Annotated[Tensor | None, "wide [3] or [r, 3]"] = None,
-    density_scale: Annotated[float, "positive"],
+    density_scale: Annotated[float | None, "positive"] = None,
+    activated: bool = False,
     hidden: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
 ) -> tuple[RenderLoss, Annotated[Tensor, "same [m, 4]"]]:
@@ -96,7 +107,8 @@ def render_loss_gradient(
         ray_offsets: int32 [r + 1], as in `render_loss`.
         target: [r, 3], the colours to learn.
         background: [3] or [r, 3], as in `render_loss`, or None.
-        density_scale: factor on the density, > 0.
+        density_scale: factor on the density, > 0; None with ``activated``.
+        activated: whether ``raw`` is the colour and the density themselves, as in `render_loss`. So is the gradient.
         hidden: share of the light, as in `render_loss`.
         backend: "auto", "reference", "native" or "warp".
 

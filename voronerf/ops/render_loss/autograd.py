@@ -17,8 +17,8 @@ def register(forward: Op) -> None:
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    *tensors, density_scale, hidden = inputs
-    ctx.numbers = density_scale, hidden
+    *tensors, density_scale, activated, hidden = inputs
+    ctx.rule = density_scale, activated, hidden
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(*output[1:])
     ctx.save_for_backward(*tensors, output[-1])
@@ -29,8 +29,8 @@ def _backward(ctx: Any, of_loss: Tensor | None, *_: Tensor | None) -> tuple[Tens
     raw, *others, gradient = ctx.saved_tensors
     found = None
     if of_loss is not None and torch.is_grad_enabled():
-        loss = render_loss(raw, *others, *ctx.numbers).loss
+        loss = render_loss(raw, *others, *ctx.rule).loss
         (found,) = torch.autograd.grad(loss, raw, of_loss, create_graph=True)
     elif of_loss is not None:
         found = of_loss * gradient
-    return found, *[None] * 6
+    return found, *[None] * 7

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from voronerf.ops._core.cases import Arguments, Case, Draw
@@ -11,7 +13,12 @@ def _make(draw: Draw, n: int) -> Arguments:
     r, dtype = draw.among("rays", 9, 0, 1, 2, 33), draw.dtype()
     wide = torch.promote_types(dtype, torch.float32)
     call: Arguments = {"raw": draw.normal(n, 4, dtype=dtype), "deltas": draw.uniform(n, dtype=wide)}
-    call |= {"ray_offsets": draw.offsets(n, r), "target": draw.uniform(r, 3, dtype=wide), "density_scale": 3.0}
+    call |= {"ray_offsets": draw.offsets(n, r), "target": draw.uniform(r, 3, dtype=wide)}
+    if draw.among("activated", False, True):
+        call["activated"] = True
+        call["raw"][:, 3].relu_()
+    else:
+        call["density_scale"] = 3.0
     of_all, of_rays = draw.uniform(3, dtype=wide), draw.uniform(r, 3, dtype=wide)
     return {
         **call,
@@ -21,8 +28,15 @@ def _make(draw: Draw, n: int) -> Arguments:
 
 
 def _make_plain(draw: Draw, n: int) -> Arguments:
-    return _make(Draw(n, dtype=torch.float32), n)
+    return _make(Draw(n, dtype=torch.float32, activated=draw.among("activated", False, True)), n)
 
 
-CASE = Case(_make, differentiable=True, hostile="numbers")
-CASES = {"render_loss": CASE, "render_loss_gradient": Case(_make_plain, traced=False)}
+_BOTH: dict[str, Any] = {
+    "kinds": {"": {}, "activated": {"activated": True}},
+    "refused": {
+        "density_scale must be given unless the values are activated, got None": {"density_scale": None},
+        "density_scale must not be given for activated values, got 3.0": {"activated": True},
+    },
+}
+CASE = Case(_make, differentiable=True, hostile="numbers", **_BOTH)
+CASES = {"render_loss": CASE, "render_loss_gradient": Case(_make_plain, traced=False, **_BOTH)}

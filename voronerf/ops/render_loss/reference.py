@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from voronerf.ops.composite.reference import check_ray_offsets, composite
+from voronerf.ops.composite.reference import check_ray_offsets, composite, optical_depth, packed_light
 
 
 class RenderLoss(NamedTuple):
@@ -44,20 +44,40 @@ def render_loss(
     target: Tensor,
     background: Tensor | None,
     density_scale: float,
+    activated: bool,
     hidden: float,
 ) -> RenderLoss:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
     raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
     check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
     if hidden and raw.requires_grad:
-        found = render_loss(raw.detach(), deltas, ray_offsets, target, background, density_scale, hidden)
-        unseen = found.weights <= hidden * -torch.expm1(-found.density * deltas)
+        _, density = activate(raw.detach(), density_scale, activated)
+        unseen = packed_light(optical_depth(density, deltas), ray_offsets)[0] <= hidden
         raw = torch.where(unseen[:, None], raw.detach(), raw)
-    colours, density = torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
+    colours, density = activate(raw, density_scale, activated)
     seen = composite(density, colours, deltas, deltas, ray_offsets, background)
     error = (seen.colour - target).square().sum(-1)
     rest = (seen.colour, seen.weights, density, error)
     return RenderLoss(error.mean() / 3, *(part.detach() for part in rest))
+
+
+def scaled(op: str, given: Any) -> Any:
+    """The arguments with a scale of 1 for activated values; ValueError unless one is given just where it is used."""
+    scale = given.density_scale
+    if not given.activated:
+        if scale is None:
+            raise ValueError(f"{op}: density_scale must be given unless the values are activated, got None")
+        return given
+    if scale is not None:
+        raise ValueError(f"{op}: density_scale must not be given for activated values, got {scale}")
+    return given._replace(density_scale=1.0)
+
+
+def activate(raw: Tensor, density_scale: float, activated: bool) -> tuple[Tensor, Tensor]:
+    """Colours [m, 3] and densities [m] of what networks put out [m, 4]; as they are where they are activated."""
+    if activated:
+        return raw[:, :3], raw[:, 3]
+    return torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
 
 
 def kept(value: Any) -> Any:

@@ -12,6 +12,7 @@ from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
 from voronerf.ops.grouped_mlp.checks import check_routed
+from voronerf.ops.render_loss.reference import scaled
 from voronerf.ops.render_opaque.reference import RaySums
 
 #: Names of the arguments of `routed_mlp` that a network has; the others are of the samples, or of the backward pass.
@@ -34,7 +35,7 @@ def _prepare(given: Any) -> Any:
     outputs = sum(table["weights"][output].shape[1] for output in table["layers"].outputs)
     if outputs != 4:
         raise ValueError(f"{op}: layers must put out 4 numbers, colour and density, got {outputs}")
-    return *given[:7], table, *given[8:]
+    return scaled(op, given._replace(network=table))
 
 
 @declare(
@@ -50,7 +51,8 @@ def render_opaque(
     samples: Annotated[int, "1..65535"],
     network: Mapping[str, Any],
     *,
-    density_scale: Annotated[float, "positive"],
+    density_scale: Annotated[float | None, "positive"] = None,
+    activated: bool = False,
     wave: Annotated[int, "1..1024"] = 8,
     opaque: Annotated[float, "[0, 1)"] = 0.02,
     spacing: Annotated[str, "linear|disparity"] = "linear",
@@ -60,7 +62,7 @@ def render_opaque(
 ) -> RaySums:
     """Renders rays without gradients and without randomness: each is walked until it is opaque.
 
-    Equivalent to ``march_rays``, ``routed_mlp``, the activations of ``render_loss`` and ``composite`` for a few samples
+    Equivalent to ``march_rays``, ``routed_mlp``, activations as in ``render_loss`` and ``composite`` for a few samples
     of each ray at a time, of all rays that are not opaque yet. So the networks are asked about little more than what
     lies in front of the first surface of each ray.
 
@@ -74,8 +76,10 @@ def render_opaque(
         samples: strata of a ray, s; samples are their middles.
         network: Arguments of `routed_mlp` by name: weights, biases and layers, and where there are any, features,
             centres, child_offsets, child and depth. The networks put out 4 numbers, colour before its sigmoid and
-            density before its softplus.
-        density_scale: factor on the density, > 0.
+            density before its softplus, or ``activated``.
+        density_scale: factor on the density, > 0; None with ``activated``.
+        activated: whether the networks put out the colour and the density themselves, as for `composite`: no sigmoid,
+            softplus or scale comes in between, and nothing is clamped.
         wave: samples of a ray that are evaluated at a time, 1 to 1,024.
         opaque: a ray ends with a wave behind which no more than this share of the light is left, in [0, 1).
         spacing: of the strata, "linear" or "disparity".
@@ -85,6 +89,9 @@ def render_opaque(
 
     Returns:
         RaySums(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]), sums without a background.
+
+    Raises:
+        ValueError: ``density_scale`` with ``activated``, or neither.
 
     Examples:
         >>> import torch

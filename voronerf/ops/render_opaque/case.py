@@ -15,10 +15,13 @@ def _make(draw: Draw, n: int) -> Arguments:
     k, sides = draw.number("cells", 3, 1, 9), [draw.number("side", side, 1, 9) for side in (5, 4, 6)]
     hashed = draw.among("positions", "hashed", "as they are") == "hashed"
     encoding: Arguments = {"position_encoding": "hash", "grid": _GRID} if hashed else {}
-    table = MLP((Layer((POSITIONS,), 6, "relu"), Layer((0, DIRECTIONS), 3), Layer((0,), 1)), (1, 2), **encoding)
+    activated = draw.among("activated", False, True)
+    colour, density = ("sigmoid", "relu") if activated else ("none", "none")
+    ends = Layer((0, DIRECTIONS), 3, colour), Layer((0,), 1, density)
+    table = MLP((Layer((POSITIONS,), 6, "relu"), *ends), (1, 2), **encoding)
     network: Arguments = {"layers": table, "centres": draw.uniform(k, 3) - 0.5}
     network["weights"] = [draw.normal(k, o, i) for o, i in table.weight_shapes(3, 3)]
-    network["biases"] = [draw.normal(k, 6), None, 1 + draw.normal(k, 1)]
+    network["biases"] = [draw.normal(k, 6), None, (4 if activated else 1) + draw.normal(k, 1)]
     if hashed:
         network["features"] = draw.normal(*_GRID.table_shape)
     directions = draw.unit(n)
@@ -26,7 +29,8 @@ def _make(draw: Draw, n: int) -> Arguments:
     call: Arguments = {"origins": origins, "directions": directions, "network": network}
     call |= {"near": 0.01 + draw.uniform(n), "far": 3 + draw.uniform(n), "samples": draw.among("samples", 40, 1, 130)}
     call |= {"occupied": draw.uniform(*sides) < 0.6, "box": torch.tensor([[-1.0] * 3, [1.0] * 3])}
-    call |= {"density_scale": 5.0, "wave": draw.number("wave", 5, 1, 9), "opaque": draw.among("opaque", 0.02, 0.0, 0.5)}
+    call |= {"activated": True} if activated else {"density_scale": 5.0}
+    call |= {"wave": draw.number("wave", 5, 1, 9), "opaque": draw.among("opaque", 0.02, 0.0, 0.5)}
     call["spacing"] = draw.among("spacing", "linear", "disparity")
     sphere = draw.uniform(4) + 0.1
     call["contraction"] = draw.among("contraction", None, sphere, draw.uniform(5, 3) + 0.1)
@@ -35,12 +39,15 @@ def _make(draw: Draw, n: int) -> Arguments:
 
 CASE = Case(
     _make,
+    {"": {}, "activated": {"activated": True}},
     refused={
         "network must hold weights, biases and layers, got 3": {"network": 3},
         "network must hold weights, biases and layers, got features": {"network": {"features": torch.zeros(2, 3)}},
         "wave must be at least 1, got 0": {"wave": 0},
         "opaque must lie in [0, 1), got 1.0": {"opaque": 1.0},
         "density_scale must be positive, got 0": {"density_scale": 0},
+        "density_scale must be given unless the values are activated, got None": {"density_scale": None},
+        "density_scale must not be given for activated values, got 5.0": {"activated": True},
     },
     traced=False,
 )

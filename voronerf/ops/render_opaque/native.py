@@ -15,7 +15,7 @@ from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 from voronerf.ops.grouped_mlp.network import Given, as_network
 from voronerf.ops.grouped_program.lowering import lower
-from voronerf.ops.grouped_program.native import program_inputs
+from voronerf.ops.grouped_program.native import program_inputs, program_of
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.render_opaque import reference
@@ -43,7 +43,8 @@ def render_opaque(*flat: Any) -> RaySums:
         return composed
     ray_index = given.near.new_empty(0, dtype=torch.int32)  # of samples that are not there yet
     samples = Given(given.origins, weights, biases, network["layers"], network["directions"], ray_index, features)
-    taken = as_network(samples)
+    taken = as_network(samples, "render_opaque")
+    rows = taken.rows(_no_offsets(weights[0]))
     child_offsets, child, depth = network["child_offsets"], network["child"], network["depth"]
     if weights[0].shape[0] == 1:
         centres = child_offsets = child = None
@@ -52,8 +53,8 @@ def render_opaque(*flat: Any) -> RaySums:
     found: RaySums = _OP.allocate(given)
     outputs, compiled = _outputs(found), native.compiled
     sound = compiled.render_opaque(
-        lower(taken.program.text, False).program,
-        program_inputs(taken.rows(_no_offsets(weights[0])), 0, 0, caller="render_opaque"),
+        lower(program_of(rows, taken.how).text, False).program,
+        program_inputs(rows, 0, 0, caller="render_opaque"),
         _rays(given),
         compiled.SeeCells(
             centres=centres,

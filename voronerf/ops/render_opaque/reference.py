@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from voronerf.ops._core.declare import declared
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.march_rays import march_rays
+from voronerf.ops.render_loss.reference import activate
 from voronerf.ops.routed_mlp import routed_mlp
 
 
@@ -55,48 +57,33 @@ class Wave(NamedTuple):
 
 
 @torch.no_grad()
-def render_opaque(
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
-    occupied: Tensor,
-    box: Tensor,
-    samples: int,
-    network: Mapping[str, Any],
-    density_scale: float,
-    wave: int,
-    opaque: float,
-    spacing: str,
-    contraction: Tensor | None,
-    heaviest: bool,
-    backend: str = "reference",
-) -> RaySums:
+def render_opaque(*flat: Any, backend: str = "reference") -> RaySums:
     """Every ray up to the first surface; see ``voronerf.ops.render_opaque``.
 
     ``backend`` is that of the operations it is made of.
     """
+    given = declared("render_opaque").Inputs._make(flat)
+    network, wave = given.network, given.wave
     centres, seen_by = network.get("centres"), network.get("directions")
     of_samples = ("positions", "coords", "directions", "direction_index")
-    given = {name: value for name, value in network.items() if name not in of_samples}
-    space: dict[str, Any] = {"spacing": spacing, "most": wave, "contraction": contraction, "backend": backend}
+    fixed = {name: value for name, value in network.items() if name not in of_samples}
+    space: dict[str, Any] = {"spacing": given.spacing, "most": wave, "contraction": given.contraction}
 
     def look(live: Tensor, start: Tensor | None) -> Wave:
-        of_rays = origins[live], directions[live], near[live], far[live]
-        march = march_rays(*of_rays, occupied, box, samples, start=start, **space)
+        of_rays = given.origins[live], given.directions[live], given.near[live], given.far[live]
+        march = march_rays(*of_rays, given.occupied, given.box, given.samples, start=start, **space, backend=backend)
         positions = march.positions.to(network["positions"].dtype)
         coords = None if centres is None else positions.to(centres.dtype)
         seen_from: dict[str, Any] = {"directions": None, "direction_index": None}
         if seen_by is not None:
             seen_from = {"directions": seen_by[live], "direction_index": march.ray_index}
-        raw, _ = routed_mlp(positions=positions, coords=coords, **seen_from, **given, backend=backend)
-        raw = raw.to(near.dtype)
-        density = torch.nn.functional.softplus(raw[:, 3]) * density_scale
+        raw, _ = routed_mlp(positions=positions, coords=coords, **seen_from, **fixed, backend=backend)
+        colours, density = activate(raw.to(given.near.dtype), given.density_scale, given.activated)
         packed: dict[str, Any] = {"ray_offsets": march.ray_offsets, "backend": backend}
-        seen = composite(density, raw[:, :3].sigmoid(), march.depths, march.deltas, **packed)
+        seen = composite(density, colours, march.depths, march.deltas, **packed)
         return Wave(seen, march.ray_index, march.ray_offsets, march.depths, march.stop)
 
-    return walk(look, far, samples, wave, opaque, heaviest)
+    return walk(look, given.far, given.samples, wave, given.opaque, given.heaviest)
 
 
 @torch.no_grad()

@@ -30,7 +30,7 @@ def routed_mlp(
     """Output in the order of the positions, and the cells; see ``voronerf.ops.routed_mlp``."""
     network, where = prepared(positions, weights, biases, **given)
     route = find(positions, where, weights[0].shape[0])
-    out = network.run("routed_mlp", route.offsets, route.order)
+    out = network.run(route.offsets, route.order)
     if where.rows is None or native.on_cuda(out):
         return out, route.cells
     return first_rows(out, route.cells, where.rows)
@@ -51,7 +51,7 @@ def prepared(
     cell."""
     where = Where(**places)
     cells, rows = where.cells, where.rows
-    network = as_network(Given(positions, weights, biases, layers, directions, direction_index, features))
+    network = as_network(Given(positions, weights, biases, layers, directions, direction_index, features), "routed_mlp")
     if rows is not None and cells is not None and native.on_cuda(cells):
         where = where._replace(cells=torch.where(torch.arange(cells.shape[0], device=cells.device) < rows, cells, -1))
     if cells is None and weights[0].shape[0] == 1:
@@ -69,7 +69,8 @@ class Route(NamedTuple):
 
 def find(positions: Tensor, where: Where, k: int) -> Route:
     """The cells of samples, and their order by cell; None where there is one cell."""
-    cells, order, offsets = locate_and_sort(positions, where, k)
+    coords = None if where.coords is None else where.coords.detach()
+    cells, order, offsets = locate_and_sort(positions.detach(), where._replace(coords=coords), k)
     return Route(cells if where.cells is None else where.cells, order if order.numel() else None, offsets)
 
 
@@ -97,3 +98,14 @@ def locate_and_sort(positions: Tensor, where: Where, k: int) -> Iterator[tuple[T
         else:
             locate_cell.find(found, coords, centres, (child_offsets, child, depth), "routed_mlp", rows)
     cell_sort.sort(found if cells is None else cells, order, offsets, "routed_mlp")
+
+
+def _setup(ctx: Any, inputs: Any, output: tuple[Tensor, ...]) -> None:
+    ctx.mark_non_differentiable(*output)
+
+
+def _nothing(ctx: Any, *gradients: None) -> tuple[Any, ...]:
+    return None, Where(*(None,) * len(Where._fields)), None  # type: ignore[arg-type]
+
+
+locate_and_sort.register_autograd(_nothing, setup_context=_setup)  # integers, which torch.func asks for all the same
