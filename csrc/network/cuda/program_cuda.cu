@@ -268,12 +268,12 @@ __device__ __forceinline__ void linear_step(const ProgramTile& tile, float* slot
 #pragma unroll
       for (int turn = 0; turn < kTurns; ++turn) {
         const MapPlace at = place(turn);
-        strip[Products::strip_place(at.column, at.row)] = ahead[turn];
+        Products::store(strip, at.column, at.row, ahead[turn]);
       }
       __syncthreads();
       if (start + kProgramDepth < step.depth) fetch(start + kProgramDepth);
       const ByRows part{x.data + start, x.stride, x.largest};
-      Products::multiply(sums, part, Products::strip(strip, kLargestHalf), deep, columns);
+      Products::multiply(sums, part, Products::strip(strip), deep, columns);
       __syncthreads();  // the strip has been read
     }
 #pragma unroll

@@ -1,12 +1,12 @@
 // Products of a block on CUDA: sums [16 kDown][64] += a [16 kDown][depth] b [64][depth]^T, a thread has 4 kDown of
 // them.
 //
-// Tensor cores: 8 warps, kDown by rows and 8 / kDown by columns; a warp has 16 rows and kDown tiles of 8 columns. What
-// is multiplied lies as float32 in shared memory and is rounded on its way into a fragment, so that one layout serves
-// all precisions. Which of 16 steps of the depth is which in a fragment is free, if it is the same for both sides:
-// lane 4 g + m takes steps m and m + 4 of what lies by rows and 2 m, 2 m + 1 of what lies by columns. With strides of
-// 4 more than a multiple of 16 floats, its 32 lanes are then in 32 different banks. float32: a thread has kDown rows,
-// 16 apart, by four columns.
+// Tensor cores: 8 warps, kDown by rows and 8 / kDown by columns; a warp has 16 rows and kDown tiles of 8 columns.
+// Values lie as float32 in shared memory and are rounded on their way into a fragment, so that one layout serves all
+// precisions; weights are rounded as they come, since four warps read them. Which of 16 steps of the depth is which in
+// a fragment is free, if it is the same for both sides: lane 4 g + m takes steps m and m + 4 of what lies by rows and 2
+// m, 2 m + 1 of what lies by columns. With strides of 4 more than a multiple of 16 floats, its 32 lanes are then in 32
+// different banks. float32: a thread has kDown rows, 16 apart, by four columns.
 #pragma once
 
 #include "common/cuda_wrappers.h"
@@ -43,56 +43,74 @@ __device__ __forceinline__ float cut_off(float x, float largest) {  // NaN stays
   return x > largest ? largest : x < -largest ? -largest : x;
 }
 
-// Pairs of steps as a fragment of 16 bits.
+// What a lane has of 16 steps: pairs of a left row, [row g or g + 8][pair][part], and of a right column, [pair][part].
+// As fragments of 16 bits:
 template <bool kBfloat16>
 struct HalfFragments {
+  using Element = uint16_t;
   static __device__ __forceinline__ uint32_t pair(const float (&x)[2], float largest) {
     if constexpr (kBfloat16) return pack_halves<true>(x[0], x[1]);
     return pack_halves<false>(cut_off(x[0], largest), cut_off(x[1], largest));
   }
-  // Rows g and g + 8 by four pairs of steps; a column by two.
-  template <typename A>
   struct Left {
     uint32_t words[4];
-    __device__ __forceinline__ Left(const float (&x)[2][2][2], const A& a)
-        : words{pair(x[0][0], a.largest), pair(x[1][0], a.largest), pair(x[0][1], a.largest),
-                pair(x[1][1], a.largest)} {}
+    __device__ __forceinline__ Left(const float (&x)[2][2][2], float largest)
+        : words{pair(x[0][0], largest), pair(x[1][0], largest), pair(x[0][1], largest), pair(x[1][1], largest)} {}
   };
-  template <typename A, typename B>
-  static __device__ __forceinline__ void multiply(float (&sums)[4], const Left<A>& left, const float (&y)[2][2],
-                                                  const B& b) {
-    const uint32_t right[2] = {pair(y[0], b.largest), pair(y[1], b.largest)};
-    multiply_halves<kBfloat16>(sums, left.words, right);
+  struct Right {
+    uint32_t words[2];
+    __device__ __forceinline__ Right(const float (&y)[2][2], float largest)
+        : words{pair(y[0], largest), pair(y[1], largest)} {}
+    // From a strip, where the parts of a pair lie side by side.
+    __device__ __forceinline__ Right(const Element* strip, int column, int k, int member) {
+      const auto* from = reinterpret_cast<const uint32_t*>(strip + column * kStride + k) + member;
+      words[0] = from[0], words[1] = from[4];
+    }
+  };
+  static constexpr int kStride = kProgramDepth + 2 * kProgramSkew;
+  static __device__ __forceinline__ void store(Element* strip, int column, int k, float x) {
+    const float both[2] = {x, 0.0f};
+    strip[column * kStride + k / 8 * 8 + k % 4 * 2 + k / 4 % 2] = static_cast<Element>(pair(both, kLargestHalf));
+  }
+  static __device__ __forceinline__ void multiply(float (&sums)[4], const Left& left, const Right& right) {
+    multiply_halves<kBfloat16>(sums, left.words, right.words);
   }
 };
 
-// The same as two fragments of tf32.
+// And as two fragments of tf32.
 struct Tf32Fragments {
+  using Element = uint32_t;
   static __device__ __forceinline__ uint32_t word(float x) {
     const float rounded = round_to_tf32(x);
     uint32_t bits;
     memcpy(&bits, &rounded, sizeof bits);
     return bits;
   }
-  template <typename A>
   struct Left {
     uint32_t words[2][4];
-    __device__ __forceinline__ Left(const float (&x)[2][2][2], const A&) {
+    __device__ __forceinline__ Left(const float (&x)[2][2][2], float) {
 #pragma unroll
-      for (int p = 0; p < 2; ++p) {
-#pragma unroll
-        for (int i = 0; i < 4; ++i) words[p][i] = word(x[i % 2][p][i / 2]);
-      }
+      for (int i = 0; i < 8; ++i) words[i / 4][i % 4] = word(x[i % 2][i / 4][i / 2 % 2]);
     }
   };
-  template <typename A, typename B>
-  static __device__ __forceinline__ void multiply(float (&sums)[4], const Left<A>& left, const float (&y)[2][2],
-                                                  const B&) {
+  struct Right {
+    uint32_t words[2][2];
+    __device__ __forceinline__ Right(const float (&y)[2][2], float) {
 #pragma unroll
-    for (int p = 0; p < 2; ++p) {
-      const uint32_t right[2] = {word(y[p][0]), word(y[p][1])};
-      multiply_tf32(sums, left.words[p], right);
+      for (int i = 0; i < 4; ++i) words[i / 2][i % 2] = word(y[i / 2][i % 2]);
     }
+    __device__ __forceinline__ Right(const Element* strip, int column, int k, int member) {
+#pragma unroll
+      for (int i = 0; i < 4; ++i) words[i / 2][i % 2] = strip[column * kStride + k + 4 * i + member];
+    }
+  };
+  static constexpr int kStride = kProgramDepth + kProgramSkew;
+  static __device__ __forceinline__ void store(Element* strip, int column, int k, float x) {
+    strip[column * kStride + k] = word(x);
+  }
+  static __device__ __forceinline__ void multiply(float (&sums)[4], const Left& left, const Right& right) {
+    multiply_tf32(sums, left.words[0], right.words[0]);
+    multiply_tf32(sums, left.words[1], right.words[1]);
   }
 };
 
@@ -109,12 +127,15 @@ struct TensorProducts {
   }
   static __device__ __forceinline__ float& sum(Sums& sums, int i) { return sums[i / 4][i % 4]; }
 
-  // A strip of weights, [64 outputs][32 inputs].
-  static __device__ __forceinline__ int strip_place(int column, int k) {
-    return column * (kProgramDepth + kProgramSkew) + k;
+  // A strip of weights, [64 outputs][32 inputs], rounded; 0 where there are none.
+  struct Strip {
+    const typename Fragments::Element* data;
+  };
+  static __device__ __forceinline__ void store(float* strip, int column, int k, float x) {
+    Fragments::store(reinterpret_cast<typename Fragments::Element*>(strip), column, k, x);
   }
-  static __device__ __forceinline__ ByRows strip(const float* data, float largest) {
-    return {data, kProgramDepth + kProgramSkew, largest};
+  static __device__ __forceinline__ Strip strip(const float* data) {
+    return {reinterpret_cast<const typename Fragments::Element*>(data)};
   }
 
   // Warps without columns have nothing to do.
@@ -132,23 +153,36 @@ struct TensorProducts {
   static __device__ __forceinline__ void block(Sums& sums, const A& a, const B& b, int k, int depth) {
     const int thread = thread_again(), warp = thread / 32, group = thread % 32 / 4, member = thread % 4;
     const int row = 16 * (warp % kDown) + group, column = 8 * (warp / kDown * kDown) + group;
-    // Step `part` of pair p of this lane.
-    const auto get = [&](const auto& from, int i, int p, int part) {
-      using From = std::decay_t<decltype(from)>;
-      const int step = k + 8 * p + From::kLane * member + From::kPair * part;
-      return kWhole || step < depth ? from.at(i, step) : 0.0f;
-    };
     float x[2][2][2];
 #pragma unroll
-    for (int i = 0; i < 8; ++i) x[i / 4][i / 2 % 2][i % 2] = get(a, row + i / 4 * 8, i / 2 % 2, i % 2);
-    const typename Fragments::template Left<A> left(x, a);
+    for (int i = 0; i < 8; ++i) {
+      x[i / 4][i / 2 % 2][i % 2] = get<kWhole>(a, row + i / 4 * 8, k + i / 2 % 2 * 8, member, i % 2, depth);
+    }
+    const typename Fragments::Left left(x, a.largest);
 #pragma unroll
     for (int t = 0; t < kDown; ++t) {
-      float y[2][2];
-#pragma unroll
-      for (int i = 0; i < 4; ++i) y[i / 2][i % 2] = get(b, column + 8 * t, i / 2, i % 2);
-      Fragments::multiply(sums[t], left, y, b);
+      Fragments::multiply(sums[t], left, right<kWhole>(b, column + 8 * t, k, member, depth));
     }
+  }
+
+  // Part `part` of the pair of this lane in the 8 steps from k on.
+  template <bool kWhole, typename Operand>
+  static __device__ __forceinline__ float get(const Operand& from, int i, int k, int member, int part, int depth) {
+    const int step = k + Operand::kLane * member + Operand::kPair * part;
+    return kWhole || step < depth ? from.at(i, step) : 0.0f;
+  }
+  template <bool kWhole>
+  static __device__ __forceinline__ typename Fragments::Right right(const Strip& b, int column, int k, int member,
+                                                                    int) {
+    return {b.data, column, k, member};
+  }
+  template <bool kWhole>
+  static __device__ __forceinline__ typename Fragments::Right right(const ByColumns& b, int column, int k, int member,
+                                                                    int depth) {
+    float y[2][2];
+#pragma unroll
+    for (int i = 0; i < 4; ++i) y[i / 2][i % 2] = get<kWhole>(b, column, k + i / 2 * 8, member, i % 2, depth);
+    return {y, b.largest};
   }
 };
 
@@ -169,8 +203,10 @@ struct FloatProducts {
     const float* data;
     __device__ float4 four(int i, int k) const { return *reinterpret_cast<const float4*>(data + k * kStripStride + i); }
   };
-  static __device__ __forceinline__ int strip_place(int column, int k) { return k * kStripStride + column; }
-  static __device__ __forceinline__ Strip strip(const float* data, float) { return {data}; }
+  static __device__ __forceinline__ void store(float* strip, int column, int k, float x) {
+    strip[k * kStripStride + column] = x;
+  }
+  static __device__ __forceinline__ Strip strip(const float* data) { return {data}; }
 
   template <typename A, typename B>
   static __device__ __forceinline__ void multiply(Sums& sums, const A& a, const B& b, int depth, int columns) {
