@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,9 @@ LARGEST = 65504.0
 """Of float16."""
 
 
-def tensors_of(program: Program, sizes: list[int], strays: int = 0, rays: int = 5, shared: bool = False) -> list[Tensor]:
+def tensors_of(
+    program: Program, sizes: list[int], strays: int = 0, rays: int = 5, shared: bool = False
+) -> list[Tensor]:
     """Inputs, then parameters; with ``shared`` every other one is of all cells."""
     generator, n, k = torch.Generator().manual_seed(3), sum(sizes) + strays, len(sizes)
     found = [torch.rand(rays if i in program.rays else n, w, generator=generator) for i, w in enumerate(program.inputs)]
@@ -41,15 +44,15 @@ def tensors_of(program: Program, sizes: list[int], strays: int = 0, rays: int = 
     return found
 
 
-def outcome(
-    program: Program, tensors: list[Tensor], offsets: Tensor, products: str = "", **given: Any
-) -> list[Tensor]:
+def outcome(program: Program, tensors: list[Tensor], offsets: Tensor, products: str = "", **given: Any) -> list[Tensor]:
     """Results and gradients; in float64 by the reference unless products are named."""
     count = len(program.inputs)
 
     def run(*leaves: Tensor) -> list[Tensor]:
         if not products:
-            return grouped_program(leaves[:count], leaves[count:], offsets, program=program, backend="reference", **given)
+            return grouped_program(
+                leaves[:count], leaves[count:], offsets, program=program, backend="reference", **given
+            )
         rows = plans.Rows(leaves[:count], leaves[count:], offsets, given.get("order"), given.get("ray_index"), None)
         name = "float32" if products == "tf32" else products
         return plans.run_program(rows, plans.How(program.text, products=name))
@@ -77,7 +80,7 @@ def layers_of(widths: list[int]) -> Program:
     """Layers with a smooth function between them, of any widths, and a second output of four columns."""
     b = Builder()
     x = h = b.input(widths[0])
-    for i, (before, width) in enumerate(zip(widths, widths[1:])):
+    for i, (before, width) in enumerate(itertools.pairwise(widths)):
         bias = Columns(PARAMETER, b.parameter(width), 0, width)
         h = b.apply("sine" if i % 2 else "tanh", b.linear(h, b.parameter(width, before), width, add=bias), 1.0)
     return b.program([h, b.linear(x, b.parameter(4, widths[0]), 4)])
@@ -184,7 +187,9 @@ def test_what_was_looked_up_is_not_looked_up_again() -> None:
         for parameter in (table, torch.full_like(table, torch.nan)):
             call = rows._replace(inputs=[x, torch.ones_like(out)], parameters=[parameter, weight], kept=kept)
             (found,) = plans.run(call, plans.How(own.text))
-            torch.testing.assert_close(found[0], kept.view(70, 16)[:, : e.width].sum(0).expand(5, -1), rtol=1e-5, atol=1e-5)
+            torch.testing.assert_close(
+                found[0], kept.view(70, 16)[:, : e.width].sum(0).expand(5, -1), rtol=1e-5, atol=1e-5
+            )
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])

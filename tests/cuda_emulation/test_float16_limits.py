@@ -1,7 +1,8 @@
 """Networks on CUDA whose values come near float16's largest, and pass it: no NaN where float32 has none.
 
-Every activation, in tiles of 64 rows and with values in the workspace. What a value exceeds is cut off (65,504) where a layer reads it, what a gradient exceeds is
-infinite, for a GradScaler to see; the other samples and cells are as exact as ever.
+Every activation, in tiles of 64 rows and with values in the workspace. What a value exceeds is cut off (65,504) where a
+layer reads it, what a gradient exceeds is infinite, for a GradScaler to see; the other samples and cells are as exact
+as ever.
 """
 
 import pytest

@@ -115,37 +115,43 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
     kept = keeps[0] if keeps else kept
     parts = None if kept is None or not kept.numel() else kept.split([n * width for width in lowered.widths])
     given = program_inputs(rows, n, r, kept=parts, ready=not keeps, gradients=how.gradients, caller=how.caller)
-    results = native.compiled.ProgramResults(outputs=outputs, output_types=_types(outputs), sums=sums)
     if native.on_cuda(first):
-        _run_on_cuda(program, how, given, results)
+        _run_on_cuda(program, rows, how, given, outputs, sums)
         return
+    results = native.compiled.ProgramResults(outputs=outputs, output_types=_types(outputs), sums=sums)
     for result in (*outputs, *sums, *keeps):
         native.on_huge_pages(result)
     native.compiled.grouped_program(lowered.program, given, results, native.cpu())
 
 
 def _run_on_cuda(
-    program: Program, how: How, given: native.compiled.ProgramInputs, results: native.compiled.ProgramResults
+    program: Program,
+    rows: Rows,
+    how: How,
+    given: native.compiled.ProgramInputs,
+    outputs: list[Tensor],
+    sums: list[Tensor],
 ) -> None:
     """The call, and the sums over the samples of each ray, of which the kernels give the rows."""
+    offsets, index = rows.offsets, rows.ray_index
     if any(step.op == "scatter" for step in program.steps):
-        native.refuse_where_deterministic(how.caller, given.offsets)
-    products = how.products
-    if products == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32":
-        products = "tf32"
-    outputs, device, machine = list(results.outputs), given.offsets.device, native.machine(given.offsets)
+        native.refuse_where_deterministic(how.caller, offsets)
+    tf32 = how.products == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32"
+    made = list(outputs)
     for i in program.by_ray:
-        outputs[i] = torch.empty(given.n, outputs[i].shape[1], device=device)
-    to = results._replace(outputs=outputs, output_types=_types(outputs))
-    lowered = lower(program.text, False).program
+        made[i] = torch.empty(given.n, outputs[i].shape[1], device=offsets.device)
+    results = native.compiled.ProgramResults(outputs=made, output_types=_types(made), sums=sums)
+    lowered, code = lower(program.text, False).program, _code(program.text, offsets.device)
+    machine = native.compiled.Cuda(*native.stream(offsets))
     size = native.compiled.grouped_program_workspace(lowered, given.n, given.r, given.k, machine)
-    workspace = torch.empty(size, dtype=torch.uint8, device=device)
-    native.compiled.grouped_program(lowered, _code(program.text, device), given, to, products, workspace, machine)
+    workspace = torch.empty(size, dtype=torch.uint8, device=offsets.device)
+    products = "tf32" if tf32 else how.products
+    native.compiled.grouped_program(lowered, code, given, results, products, workspace, machine)
     for i in program.by_ray:
-        total = torch.zeros(given.r, outputs[i].shape[1], device=device)
-        if given.n and given.r:
-            total.index_add_(0, given.ray_index.clamp(0, given.r - 1), outputs[i])
-        results.outputs[i].copy_(total)
+        total = torch.zeros(given.r, outputs[i].shape[1], device=offsets.device)
+        if index is not None and given.n and given.r:
+            total.index_add_(0, index.clamp(0, given.r - 1), made[i])
+        outputs[i].copy_(total)
 
 
 @functools.lru_cache(maxsize=1024)
