@@ -221,8 +221,8 @@ __device__ __noinline__ void keep(const ProgramTile& tile, const ProgramStep& st
 // A product. Rows without a sample get what lies in the slots, and are not stored.
 //
 // What enters a product of float16 is cut off at its largest number, since infinities in a network soon become NaN,
-// except for gradients: whoever scales a loss looks for the infinite ones. Products with a matrix the other way round
-// are taken for theirs.
+// except for gradients: whoever scales a loss looks for the infinite ones. What a turned matrix multiplies is taken for
+// one.
 template <typename Products>
 __device__ __forceinline__ void linear_step(const ProgramTile& tile, float* slots, float* strip,
                                             const ProgramStep& step) {
