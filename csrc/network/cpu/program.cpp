@@ -183,8 +183,6 @@ ProgramCode code_of(const ProgramTable& table) {
 
 }  // namespace
 
-std::unique_ptr<Program> make_program(const ProgramTable& table) { return std::make_unique<Program>(Program{table}); }
-
 ProgramRows::ProgramRows(const Program& program, const ProgramInputs& in, Isa isa)
     : table_(program.table),
       isa_(isa),

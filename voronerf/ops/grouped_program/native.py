@@ -117,10 +117,52 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
     kept = keeps[0] if keeps else kept
     parts = None if kept is None or not kept.numel() else kept.split([n * width for width in lowered.widths])
     given = program_inputs(rows, n, r, kept=parts, ready=not keeps, gradients=how.gradients, caller=how.caller)
+    if native.on_cuda(first):
+        _run_on_cuda(program, rows, how, given, outputs, sums)
+        return
     results = native.compiled.ProgramResults(outputs=outputs, output_types=_types(outputs), sums=sums)
     for result in (*outputs, *sums, *keeps):
         native.on_huge_pages(result)
     native.compiled.grouped_program(lowered.program, given, results, native.cpu())
+
+
+def _run_on_cuda(
+    program: Program,
+    rows: Rows,
+    how: How,
+    given: native.compiled.ProgramInputs,
+    outputs: list[Tensor],
+    sums: list[Tensor],
+) -> None:
+    """The call, and the sums over the samples of each ray, of which the kernels give the rows."""
+    offsets, index = rows.offsets, rows.ray_index
+    if any(step.op == "scatter" for step in program.steps):
+        native.refuse_where_deterministic(how.caller, offsets)
+    tf32 = how.products == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32"
+    made = list(outputs)
+    for i in program.by_ray:
+        made[i] = torch.empty(given.n, outputs[i].shape[1], device=offsets.device)
+    results = native.compiled.ProgramResults(outputs=made, output_types=_types(made), sums=sums)
+    lowered, code = lower(program.text, False).program, _code(program.text, offsets.device)
+    machine = native.compiled.Cuda(*native.stream(offsets))
+    size = native.compiled.grouped_program_workspace(lowered, given.n, given.r, given.k, machine)
+    workspace = torch.empty(size, dtype=torch.uint8, device=offsets.device)
+    products = "tf32" if tf32 else how.products
+    native.compiled.grouped_program(lowered, code, given, results, products, workspace, machine)
+    for i in program.by_ray:
+        total = torch.zeros(given.r, outputs[i].shape[1], device=offsets.device)
+        if index is not None and given.n and given.r:
+            total.index_add_(0, index.clamp(0, given.r - 1), made[i])
+        outputs[i].copy_(total)
+
+
+@functools.lru_cache(maxsize=1024)
+def _code(text: str, device: torch.device) -> Tensor:
+    """The records of a program on a device, copied there once."""
+    program = lower(text, False).program
+    code = torch.empty(native.compiled.program_code_bytes(program), dtype=torch.uint8)
+    native.compiled.program_code(program, code)
+    return code.to(device)
 
 
 def program_inputs(
