@@ -86,7 +86,7 @@ struct ProgramInputs {
   // Rows that are 0 in all inputs from this one on, float32 and of no rays, add nothing to any sum; -1: there are none
   // such.
   int64_t gradients;
-  const char *caller, *index;  // the operation that errors name, and its name for ray_index
+  const char *caller, *ray_name;  // the operation that errors name, and its name for ray_index
 };
 
 struct ProgramResults {

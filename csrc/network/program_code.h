@@ -70,7 +70,7 @@ struct ProgramStep {
   bool floats;           // linear: whether anything reads its value as floats
   bool in_place;         // input: nothing is copied where it may be read in place
   float a, b;            // of a function
-  int32_t first, count;  // operands
+  int32_t first, taken;  // operands: the first, and how many
 };
 
 // Part of a sum over the rows of a cell, from its place in the partial. `kind` none: nothing is added to that sum.

@@ -97,8 +97,8 @@ struct ProgramTile {
       case ProgramOp::linear:
         return linear(step, operands, to);
       case ProgramOp::function: {
-        const Rows x = operand(operands[0]), times = step.count > 1 ? operand(operands[1]) : x;
-        const Rows* by = step.count > 1 ? &times : nullptr;
+        const Rows x = operand(operands[0]), times = step.taken > 1 ? operand(operands[1]) : x;
+        const Rows* by = step.taken > 1 ? &times : nullptr;
         switch (step.function) {
 #define VN_CASE(NAME, ...)    \
   case ProgramFunction::NAME: \
@@ -204,8 +204,8 @@ struct ProgramTile {
   void linear(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
     const bool slopes = step.finish == ProgramFinish::relu_slope;
     const int32_t count = step.sources;
-    const Rows add = step.count > count + slopes ? operand(operands[count]) : Rows{kZeros, 0, false};
-    const float* slope = slopes ? operand(operands[step.count - 1]).data : nullptr;
+    const Rows add = step.taken > count + slopes ? operand(operands[count]) : Rows{kZeros, 0, false};
+    const float* slope = slopes ? operand(operands[step.taken - 1]).data : nullptr;
     const Finish finish = step.finish == ProgramFinish::none   ? Finish::none
                           : step.finish == ProgramFinish::relu ? Finish::relu
                                                                : Finish::relu_slope;
@@ -273,7 +273,7 @@ struct ProgramTile {
     if (step.order == 0) {  // something is added up, or left out
       for (int64_t i = 0; i < rows * step.stride; i += kLanes) store(to + i, splat(0.0f));
     }
-    for (int32_t i = 0; i < step.count; ++i) {
+    for (int32_t i = 0; i < step.taken; ++i) {
       const Rows x = operand(operands[i]);
       const int64_t width = operands[i].width;
       float* into = to + operands[i].place;

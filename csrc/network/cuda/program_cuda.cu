@@ -81,10 +81,10 @@ __device__ __forceinline__ float derivative(int order, float x, float a, float b
 
 __device__ __noinline__ void function_step(const ProgramTile& tile, const ProgramStep& step,
                                            const ProgramOperand* operands) {
-  const Rows x = tile.operand(operands[0]), times = tile.operand(operands[step.count - 1]);
+  const Rows x = tile.operand(operands[0]), times = tile.operand(operands[step.taken - 1]);
   const float a = step.a, b = step.b;
   const int order = step.order, stride = step.stride;
-  const bool alone = step.count == 1;
+  const bool alone = step.taken == 1;
   float* const to = tile.slot(step.slot);
   switch (step.function) {
 #define VN_CASE(NAME, ...)                                                                                  \
@@ -118,7 +118,7 @@ __device__ __forceinline__ void move_step(const ProgramTile& tile, const Program
   float* const to = tile.slot(step.slot);
   const int stride = step.stride;
   if (step.order == 1) {  // every column has one part
-    for (int i = 0; i < step.count; ++i) {
+    for (int i = 0; i < step.taken; ++i) {
       const Rows x = tile.operand(operands[i]);
       const int place = operands[i].place;
       for_each_entry(tile.rows, operands[i].width,
@@ -128,7 +128,7 @@ __device__ __forceinline__ void move_step(const ProgramTile& tile, const Program
   }
   for_each_entry(tile.rows, step.width, [&](int row, int column) {
     float sum = 0.0f;
-    for (int i = 0; i < step.count; ++i) {
+    for (int i = 0; i < step.taken; ++i) {
       const int within = column - operands[i].place;
       if (within >= 0 && within < operands[i].width) sum += tile.operand(operands[i]).at(row, within);
     }
@@ -230,10 +230,10 @@ __device__ __forceinline__ void linear_step(const ProgramTile& tile, float* slot
   const ProgramOperand* operands = tile.call.code.operands + step.first;
   const ProgramPack pack = tile.call.code.packs[step.number];
   const bool turned = pack.kind == ProgramPackKind::turned || pack.kind == ProgramPackKind::few_turned;
-  const bool sloped = step.finish == ProgramFinish::relu_slope, added = step.count > 1 + sloped;
+  const bool sloped = step.finish == ProgramFinish::relu_slope, added = step.taken > 1 + sloped;
   const float* weights = tile.parameter(pack);
   const Rows add = added ? tile.operand(operands[1]) : Rows{};
-  const Rows slope = sloped ? tile.operand(operands[step.count - 1]) : Rows{};
+  const Rows slope = sloped ? tile.operand(operands[step.taken - 1]) : Rows{};
   const float largest = turned ? __builtin_inff() : kLargestHalf;
   ByRows x{slots + operands[0].slot * tile.height + operands[0].start, operands[0].stride, largest};
   float* const to = slots + step.slot * tile.height;

@@ -65,9 +65,15 @@ def compiled_runs(text: str) -> bool:
 
 
 @functools.lru_cache(maxsize=1024)
-def lower(text: str, half: bool) -> Lowered:
-    """The records of a program, given by its text, for products of float32 or, if ``half``, of pairs of bfloat16."""
-    return _Lowering(merged(Program.parse(text)), half).lowered()
+def lower(text: str, half: bool, cuda: bool = False) -> Lowered:
+    """The records of a program, given by its text.
+
+    Args:
+        text: of the program.
+        half: for products of pairs of bfloat16, instead of float32.
+        cuda: for CUDA, whose products have one source.
+    """
+    return _Lowering(merged(Program.parse(text)), half, joins=not (half or cuda)).lowered()
 
 
 def _padded(width: int, to: int = _GRANULE) -> int:
@@ -111,7 +117,7 @@ class _Value:
 class _Lowering:
     """Records on their way."""
 
-    def __init__(self, program: Program, half: bool) -> None:
+    def __init__(self, program: Program, half: bool, joins: bool) -> None:
         self.program, self.half = program, half
         self.compiled = native.compiled
         self.slots, self.values = _Slots(), dict[int, _Value]()
@@ -124,7 +130,7 @@ class _Lowering:
         self.lookups: list[tuple[Lookup, int]] = []
         self.scatters: list[tuple[Lookup, int, int]] = []
         self.own: dict[int, int] = {}  # the memory of outputs that values may be made in
-        self.work = self._in_order() if half else _joined(self._in_order())
+        self.work = _joined(self._in_order()) if joins else self._in_order()
         self.readers: dict[int, list[tuple[Step, int]]] = {}
         for step in self.work:
             for place, c in enumerate(step.operands):
@@ -152,14 +158,13 @@ class _Lowering:
         made = {step.out: step for step in steps if not _sums(step)}
         written: list[Step] = []
         for number, c in enumerate(program.outputs):
-            step = made.get(c.index) if c.of == VALUE else None
-            alone = step is not None and step.op == "move" and uses[c.index] == 1 and _all_of(c, step.width)
-            if step is None or not alone or not _covered(step):
-                written.append(Step("output", number, c.width, (c,), (number, 0)))
-            else:
-                steps.remove(step)
-                for part, at in zip(step.operands, step.numbers):
-                    written.append(Step("output", number, part.width, (part,), (number, at)))
+            maker = made.get(c.index) if c.of == VALUE else None
+            parts: list[tuple[Columns, float]] = [(c, 0)]
+            alone = maker is not None and uses[c.index] == 1 and _all_of(c, maker.width)
+            if maker is not None and alone and maker.op == "move" and _covered(maker):
+                steps.remove(maker)
+                parts = list(zip(maker.operands, maker.numbers))
+            written += [Step("output", number, part.width, (part,), (number, at)) for part, at in parts]
         return [*steps, *written]
 
     def _whole(self, g: Columns) -> bool:
@@ -229,7 +234,7 @@ class _Lowering:
         if value is not None:
             fields |= {"width": value.width, "slot": max(value.slot, 0), "stride": value.stride}
             fields |= {"memory": value.memory, "pairs": value.pairs, "floats": value.floats}
-        fields |= {"first": len(self.operands), "count": len(operands)}
+        fields |= {"first": len(self.operands), "taken": len(operands)}
         self.steps.append(self.compiled.ProgramStep(op=op, **(fields | given)))
         self.operands += operands
 

@@ -143,7 +143,7 @@ def _run_on_cuda(
     for i in program.by_ray:
         made[i] = torch.empty(given.n, outputs[i].shape[1], device=offsets.device)
     results = native.compiled.ProgramResults(outputs=made, output_types=_types(made), sums=sums)
-    lowered, code = lower(program.text, False).program, _code(program.text, offsets.device)
+    lowered, code = lower(program.text, False, True).program, _code(program.text, offsets.device)
     machine = native.compiled.Cuda(*native.stream(offsets))
     size = native.compiled.grouped_program_workspace(lowered, given.n, given.r, given.k, machine)
     workspace = torch.empty(size, dtype=torch.uint8, device=offsets.device)
@@ -159,7 +159,7 @@ def _run_on_cuda(
 @functools.lru_cache(maxsize=1024)
 def _code(text: str, device: torch.device) -> Tensor:
     """The records of a program on a device, copied there once."""
-    program = lower(text, False).program
+    program = lower(text, False, True).program
     code = torch.empty(native.compiled.program_code_bytes(program), dtype=torch.uint8)
     native.compiled.program_code(program, code)
     return code.to(device)
@@ -207,7 +207,7 @@ def program_inputs(
         ready=ready,
         gradients=gradients,
         caller=caller,
-        index="ray_index" if caller == "grouped_program" else "direction_index",
+        ray_name="ray_index" if caller == "grouped_program" else "direction_index",
     )
 
 
@@ -246,7 +246,8 @@ def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
     found: list[Tensor | None] = [None] * count
     arriving = arriving[:-1] if ctx.how.keep else arriving
     if any(g is not None for g in arriving) and any(wanted):
-        rows = Rows(saved[: ctx.count], saved[ctx.count : count], *saved[count : count + 3], kept)
+        offsets, order, ray_index = saved[count : count + 3]
+        rows = Rows(saved[: ctx.count], saved[ctx.count : count], offsets, order, ray_index, kept)
         results = iter(run_gradient(rows, ctx.how, arriving, wanted))
         found = [next(results) if want else None for want in wanted]
     nothing: Any = (None,) * len(How._fields)
@@ -268,11 +269,11 @@ def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted
     more = [[g for g in part if g is not None] for part in (arriving[:split], arriving[split:])]
     sifts = own.sifts and not more[1] and all(g.dtype == torch.float32 for g in more[0])
     following = How(own.text, "", how.caller, how.products, False, count if sifts else -1)
-    inputs, parameters, *others, kept = rows
-    call = Rows([*inputs, *more[0]], [*parameters, *more[1]], *others, kept if own.keeps else None)
+    inputs, parameters, kept = [*rows.inputs, *more[0]], [*rows.parameters, *more[1]], rows.kept if own.keeps else None
+    call = rows._replace(inputs=inputs, parameters=parameters, kept=kept)
     # Of a pass that is differentiated again, what is looked up may be kept once more.
     found = run_program(call, following) if torch.is_grad_enabled() else run(call, following)
-    results, learning = found[: own.outputs], [p for p, want in zip(parameters, wanted[count:]) if want]
+    results, learning = found[: own.outputs], [p for p, want in zip(rows.parameters, wanted[count:]) if want]
     for total, p in zip(found[own.outputs :], learning, strict=True):
         total = total.sum(0, keepdim=True) if p.shape[0] == 1 and total.shape[0] > 1 else total
         results.append(total if p.dtype == total.dtype else total.to(p.dtype))
