@@ -61,7 +61,9 @@ def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:
     """
     background = torch.zeros(3) if batch.background is None else batch.background
     background = background.to(batch.target)
-    light = output.error.new_zeros(len(batch.rays)).index_add(0, output.samples.ray_index.long(), output.weights.float())
+    light = output.error.new_zeros(len(batch.rays)).index_add(
+        0, output.samples.ray_index.long(), output.weights.float()
+    )
     differs = (batch.target - background).abs().amax(-1) > DIFFERS
     if bool(differs.any()) and not bool(light[differs].mean() >= EMPTY):
         return "all space is empty"
