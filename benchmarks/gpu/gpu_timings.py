@@ -294,6 +294,7 @@ def profile(out: Path, again: Again, device: str = "cuda", steps: int = 10) -> i
     from voronerf.app.scenes import load_scene
     from voronerf.app.train import TrainConfig, build
     from voronerf.app.train import train as steps_of
+    from voronerf.nerf.schedule import WARMUP_STEPS
 
     journal, cuda = Journal(out, "profile", begun=again.start > 0), device == "cuda"
     scene = load_scene("builtin")
@@ -306,7 +307,7 @@ def profile(out: Path, again: Again, device: str = "cuda", steps: int = 10) -> i
             """A second of this clock is a step."""
             steps_of(state, until=state.seconds + count, clock=itertools.count().__next__)
 
-        train_steps(2 * steps)
+        train_steps(WARMUP_STEPS + 2 * steps)  # until the grid learns
         settle()
         with warnings.catch_warnings(record=True) as waits:
             warnings.simplefilter("always")
