@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -49,11 +50,15 @@ class Lowered:
         program: that of the compiled module.
         lookups: those whose values may be kept, [n, width] each in the order of the cells.
         widths: floats of a row of each.
+        sizes: entries of each parameter for one cell.
+        tables: numbers of the parameters that are tables of hash grids.
     """
 
     program: native.compiled.Program
     lookups: tuple[Lookup, ...]
     widths: tuple[int, ...]
+    sizes: tuple[int, ...]
+    tables: tuple[int, ...]
 
 
 @functools.lru_cache(maxsize=1024)
@@ -459,6 +464,8 @@ class _Lowering:
             compiled.make_program(table),
             tuple(lookup for lookup, _ in self.lookups),
             tuple(self.memories[memory] for _, memory in self.lookups),
+            tuple(map(math.prod, program.parameters)),
+            program.tables,
         )
 
 

@@ -45,6 +45,7 @@ def render_opaque(*flat: Any) -> RaySums:
     samples = Given(given.origins, weights, biases, network["layers"], network["directions"], ray_index, features)
     taken = as_network(samples, "render_opaque")
     rows = taken.rows(_no_offsets(weights[0]))
+    lowered = lower(program_of(rows, taken.how).text, False)
     child_offsets, child, depth = network["child_offsets"], network["child"], network["depth"]
     if weights[0].shape[0] == 1:
         centres = child_offsets = child = None
@@ -53,8 +54,8 @@ def render_opaque(*flat: Any) -> RaySums:
     found: RaySums = _OP.allocate(given)
     outputs, compiled = _outputs(found), native.compiled
     sound = compiled.render_opaque(
-        lower(program_of(rows, taken.how).text, False).program,
-        program_inputs(rows, 0, 0, caller="render_opaque"),
+        lowered.program,
+        program_inputs(lowered, rows, 0, 0, caller="render_opaque"),
         _rays(given),
         compiled.SeeCells(
             centres=centres,
