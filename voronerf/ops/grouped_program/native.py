@@ -88,7 +88,9 @@ def program_of(rows: Rows, how: How) -> Program:
         return Program.parse(how.text)
     p, q = int(rows.inputs[0].shape[1]), int(rows.inputs[1].shape[1]) if len(rows.inputs) > 1 else 0
     widths = tuple([int(weight.shape[1]) for weight in rows.parameters[: len(how.biased)]])
-    return MLP.parse(how.text).program(p, q, widths, tuple([bias == "1" for bias in how.biased]), rows.ray_index is not None)
+    return MLP.parse(how.text).program(
+        p, q, widths, tuple([bias == "1" for bias in how.biased]), rows.ray_index is not None
+    )
 
 
 @custom_op("grouped_program_native")
@@ -113,7 +115,8 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
         return
     kept = keeps[0] if keeps else kept
     parts = None if kept is None or not kept.numel() else kept.split([n * width for width in lowered.widths])
-    given = program_inputs(rows, n, r, kept=parts, ready=not keeps, gradients=how.gradients, caller=how.caller)
+    gradients = -1 if keeps else how.gradients  # what is kept is of all rows
+    given = program_inputs(rows, n, r, kept=parts, ready=not keeps, gradients=gradients, caller=how.caller)
     results = native.compiled.ProgramResults(outputs=outputs, output_types=_types(outputs), sums=sums)
     for result in (*outputs, *sums, *keeps):
         native.on_huge_pages(result)
@@ -142,7 +145,8 @@ def program_inputs(
         caller: the op that errors name.
     """
     inputs, parameters, offsets, order, ray_index, _ = rows
-    turned = [int(not x.is_contiguous() and x.dim() == 2 and _columns_lie_together(x, n)) for x in inputs]
+    samples = -1 if ray_index is not None and n == r else n  # which inputs are of samples, none if that is not known
+    turned = [int(not x.is_contiguous() and x.dim() == 2 and _columns_lie_together(x, samples)) for x in inputs]
     return native.compiled.ProgramInputs(
         inputs=[x.t() if turn else x for x, turn in zip(inputs, turned)],
         input_types=_types(inputs),
