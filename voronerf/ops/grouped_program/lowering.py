@@ -150,13 +150,13 @@ class _Lowering:
         made = {step.out: step for step in steps if not _sums(step)}
         written: list[Step] = []
         for number, c in enumerate(program.outputs):
-            step = made.get(c.index) if c.of == VALUE else None
-            alone = step is not None and step.op == "move" and uses[c.index] == 1 and _all_of(c, step.width)
-            if step is None or not alone or not _covered(step):
+            maker = made.get(c.index) if c.of == VALUE else None
+            alone = maker is not None and maker.op == "move" and uses[c.index] == 1 and _all_of(c, maker.width)
+            if maker is None or not alone or not _covered(maker):
                 written.append(Step("output", number, c.width, (c,), (number, 0)))
             else:
-                steps.remove(step)
-                for part, at in zip(step.operands, step.numbers):
+                steps.remove(maker)
+                for part, at in zip(maker.operands, maker.numbers):
                     written.append(Step("output", number, part.width, (part,), (number, at)))
         return [*steps, *written]
 

@@ -203,7 +203,8 @@ def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
     found: list[Tensor | None] = [None] * count
     arriving = arriving[:-1] if ctx.how.keep else arriving
     if any(g is not None for g in arriving) and any(wanted):
-        rows = Rows(saved[: ctx.count], saved[ctx.count : count], *saved[count : count + 3], kept)
+        offsets, order, ray_index, _ = saved[count:]
+        rows = Rows(saved[: ctx.count], saved[ctx.count : count], offsets, order, ray_index, kept)
         results = iter(run_gradient(rows, ctx.how, arriving, wanted))
         found = [next(results) if want else None for want in wanted]
     nothing: Any = (None,) * len(How._fields)
