@@ -119,7 +119,8 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
         return
     kept = keeps[0] if keeps else kept
     parts = None if kept is None or not kept.numel() else kept.split([n * width for width in lowered.widths])
-    given = program_inputs(lowered, rows, n, r, kept=parts, ready=not keeps, gradients=how.gradients, caller=how.caller)
+    gradients = -1 if keeps else how.gradients  # what is kept is of all rows
+    given = program_inputs(lowered, rows, n, r, kept=parts, ready=not keeps, gradients=gradients, caller=how.caller)
     if native.on_cuda(first):
         _run_on_cuda(program, rows, how, given, outputs, sums)
         return
@@ -196,7 +197,8 @@ def program_inputs(
         caller: the op that errors name.
     """
     inputs, parameters, offsets, order, ray_index, _ = rows
-    turned = [0 if x.is_contiguous() else int(_columns_lie_together(x, n)) for x in inputs]
+    samples = -1 if ray_index is not None and n == r else n  # which inputs are of samples, none if that is not known
+    turned = [0 if x.is_contiguous() else int(_columns_lie_together(x, samples)) for x in inputs]
     if any(turned):
         inputs = [x.t() if turn else x for x, turn in zip(inputs, turned)]
     kind, kinds = _NAMES[inputs[0].dtype], ["float32"] * len(parameters)
