@@ -41,6 +41,12 @@ class ParameterEntries:
         self._turned = codes.dim() == 2 and torch.equal(codes.t().flatten(), every)
         self._numbers = numbers.clone()  # which can be saved for a backward pass, also where it is of inference mode
 
+    def own(self, values: Mapping[Any, Any]) -> Tensor:
+        """The parameter itself, where these are all of its entries in its own shape; else as `of_values`."""
+        value: Tensor = values.get(self._of, self._of)
+        whole = self._whole and value.shape[self._of_cells :] == self._shape
+        return value if whole else self.of_values(values)
+
     def of_values(self, values: Mapping[Any, Any]) -> Tensor:
         """Its entries, [k, ...], or [1, ...] where cells share it."""
         value = values.get(self._of, self._of)
@@ -282,6 +288,39 @@ class Fused:
             self._compute(values, grouping, sort)
         found = [values[node] if recorded else values[node].detach() for node in self._outputs]
         return Results(self._result, found, grouping if sort else None)
+
+    def whole(self) -> tuple[Program, tuple[int, ...], tuple[tuple[int, ...], ...]] | str:
+        """The program of all that a call computes, its inputs as numbers of arguments with rows, and shapes of results
+        for one sample; or what else there is."""
+        if self.name != "fused":
+            return self.why
+        (run,) = self._runs.values()
+        layouts = [node.meta["layout"] if node in run.outputs else None for node in self._outputs]
+        moved = self._between or any(node not in self._inputs for node in run.inputs)
+        if moved or any(layout is None or layout[1:] != (0, 1) for layout in layouts):
+            return "arguments or results are rearranged"
+        if len(self._shared) > len(self._places):
+            return "arguments are the same for all samples"
+        outputs = [run.program.outputs[run.outputs.index(node)] for node in self._outputs]
+        reads = tuple(self._inputs.index(node) for node in run.inputs)
+        shapes = tuple(tuple(layout[0]) for layout in layouts if layout is not None)
+        return Builder(run.program).program(outputs), reads, shapes
+
+    def parameters(self, k: int, device: torch.device, backend: str) -> list[Tensor]:
+        """Those of :meth:`whole`, float32: the module's own where they are a parameter as it is, else made of them."""
+        tensors = [self.inputs.tensor(lookup(part, name), device) for part, _, name in self._places]
+        values: dict[Any, Any] = dict(zip(self._shared, tensors, strict=True))
+        for node, place in self._parameters.items():
+            owner, name = self._owned[place]
+            values[node] = owner._parameters[name]
+        if self._weights:  # of parameters alone, so of no samples
+            none = torch.zeros(2, dtype=torch.int32, device=device)
+            grouped = GroupedRun(Grouping(none, 2, k, device, backend), {})
+            for node in self._weights:
+                if node not in values:
+                    _compute(node, values, grouped)
+        (run,) = self._runs.values()
+        return [taken.own(values).to(torch.float32) for taken in run.parameters]
 
     def _with_inputs(self, call: Call, device: torch.device) -> Call:
         """The call with tensors in the place of its numbers that are inputs."""

@@ -88,7 +88,9 @@ def program_of(rows: Rows, how: How) -> Program:
         return Program.parse(how.text)
     p, q = int(rows.inputs[0].shape[1]), int(rows.inputs[1].shape[1]) if len(rows.inputs) > 1 else 0
     widths = tuple([int(weight.shape[1]) for weight in rows.parameters[: len(how.biased)]])
-    return MLP.parse(how.text).program(p, q, widths, tuple([bias == "1" for bias in how.biased]), rows.ray_index is not None)
+    return MLP.parse(how.text).program(
+        p, q, widths, tuple([bias == "1" for bias in how.biased]), rows.ray_index is not None
+    )
 
 
 @custom_op("grouped_program_native")
