@@ -65,7 +65,7 @@ class Radiance(NamedTuple):
         places, rays = self.router.places(inputs), self.networks.program.rays
         if _on_warp(inputs.device, backend):
             seen = {"directions": directions, "direction_index": ray_index} if rays else {}
-            return {"positions": inputs, **cast(Any, self.cells.table), **seen, **places}
+            return {"positions": inputs, **cast(Any, self.cells.table)(), **seen, **places}
         given = {"inputs": [inputs, directions], "ray_index": ray_index} if rays else {"inputs": [inputs]}
         return {"program": self.networks.program, "parameters": self.cells.parameters, **given, **places}
 

@@ -26,6 +26,7 @@ from voronerf.router.layout import Call, Results, map_tensors, tensors_of
 from voronerf.router.lower import Entries, Lowering, NotAStep
 from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiable
 from voronerf.router.watch import Inputs, lookup
+from voronerf.router.waves import with_encodings
 
 _HALF = (torch.bfloat16, torch.float16)  # what a run computes in float32 and rounds at its end
 
@@ -40,6 +41,13 @@ class ParameterEntries:
         self._whole = torch.equal(numbers, every)
         self._turned = codes.dim() == 2 and torch.equal(codes.t().flatten(), every)
         self._numbers = numbers.clone()  # which can be saved for a backward pass, also where it is of inference mode
+
+    def constants(self) -> list[float] | None:
+        """Its entries, if they are numbers."""
+        found: list[float] | None = None
+        if isinstance(self._of, Tensor):
+            found = self._of.detach().flatten().cpu()[self._numbers].tolist()
+        return found
 
     def own(self, values: Mapping[Any, Any]) -> Tensor:
         """The parameter itself, where these are all of its entries in its own shape; else as `of_values`."""
@@ -304,7 +312,9 @@ class Fused:
         outputs = [run.program.outputs[run.outputs.index(node)] for node in self._outputs]
         reads = tuple(self._inputs.index(node) for node in run.inputs)
         shapes = tuple(tuple(layout[0]) for layout in layouts if layout is not None)
-        return Builder(run.program).program(outputs), reads, shapes
+        constants = {i: taken.constants() for i, taken in enumerate(run.parameters)}
+        known = {i: numbers for i, numbers in constants.items() if numbers is not None}
+        return with_encodings(Builder(run.program).program(outputs), known), reads, shapes
 
     def parameters(self, k: int, device: torch.device, backend: str) -> list[Tensor]:
         """Those of :meth:`whole`, float32: the module's own where they are a parameter as it is, else made of them."""
@@ -320,7 +330,8 @@ class Fused:
                 if node not in values:
                     _compute(node, values, grouped)
         (run,) = self._runs.values()
-        return [taken.own(values).to(torch.float32) for taken in run.parameters]
+        found = [taken.own(values) for taken in run.parameters]
+        return [value if value.dtype is torch.float32 else value.float() for value in found]
 
     def _with_inputs(self, call: Call, device: torch.device) -> Call:
         """The call with tensors in the place of its numbers that are inputs."""

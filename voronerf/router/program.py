@@ -34,7 +34,7 @@ class CellProgram(NamedTuple):
         reads: Of each input of the program, the number of the argument of the call whose rows it is.
         shapes: Of each tensor that the call returns, for one sample.
         parameters: [k, ...], or without k where all cells share it: the module's own, or made of them.
-        table: Arguments of `routed_mlp` for the same parameters, of a field with a layer table.
+        table: Gives the arguments of `routed_mlp` for the same parameters, of a field with a layer table.
         after: The steps from what the table puts out, one input, to the results; None without a table.
     """
 
@@ -42,7 +42,7 @@ class CellProgram(NamedTuple):
     reads: tuple[int, ...]
     shapes: tuple[tuple[int, ...], ...]
     parameters: list[Tensor]
-    table: Mapping[str, Any] | None = None
+    table: Callable[[], Mapping[str, Any]] | None = None
     after: Program | None = None
 
 
@@ -103,7 +103,7 @@ def program_of_table(field: LayeredField, k: int, activation: Activation) -> Cel
     biased = tuple(bias is not None for bias in biases)
     program = _activated(layers.text, biased, activation.program.text)
     reads = (0, 1) if layers.uses_directions else (0,)
-    table = parameters_of_table(field, k)
+    table = functools.partial(parameters_of_table, field, k)
     return CellProgram(program, reads, activation.shapes, parameters, table, activation.program)
 
 
