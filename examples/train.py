@@ -37,7 +37,7 @@ while (fraction := (time.perf_counter() - start) / seconds) < 1:
     optimizer.update()
     optimizer.after_step(step)
     strategy.step_post_backward(output)
-    rays = next_rays(rays, len(output.weights), rays=512, samples=samples, growth=8, contracted=contracted)
+    rays = next_rays(rays, len(output.weights), rays=512, samples=sampler.strata, growth=8, contracted=contracted)
     step += 1
 with optimizer.averaged():
     sampler.finish(router, seed=0)

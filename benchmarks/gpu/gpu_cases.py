@@ -8,15 +8,14 @@ from dataclasses import replace
 from typing import Any
 
 STEPS: dict[str, tuple[int, str, bool, int]] = {
-    "fused": (64, "float32", False, 8),
-    "fused, bfloat16": (64, "bfloat16", False, 8),
-    "fused, directions by an index": (64, "float32", True, 8),
-    "by layers": (300, "float32", False, 8),
-    "by layers, bfloat16, directions by an index": (300, "bfloat16", True, 8),
+    "width 64": (64, "float32", False, 8),
+    "width 64, bfloat16": (64, "bfloat16", False, 8),
+    "width 64, directions by an index": (64, "float32", True, 8),
+    "width 700, beyond shared memory": (700, "float32", False, 2),
+    "width 300, bfloat16, directions by an index": (300, "bfloat16", True, 8),
     "many cells, sorted by radix": (16, "float32", False, 1030),
 }
-"""Steps to capture: the width, beyond 256 layer by layer, the type of the weights, whether there are directions, and
-the number of cells."""
+"""Steps to capture: the width, the type of the weights, whether there are directions, and the number of cells."""
 
 
 def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
@@ -46,7 +45,6 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     from voronerf.ops._core.layers import MLP, POSITIONS, Layer
     from voronerf.ops.cell_sort.native import sort as sort_cells
     from voronerf.ops.cell_sort.reference import cell_sort as specified
-    from voronerf.ops.grouped_mlp.network import using_way
 
     where, cases_of_ops = torch.device(device), every_case()
 
@@ -165,12 +163,12 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         overflowing = torch.autograd.grad(out, leaves, torch.full_like(out, 6e4))
         assert not all(gradient.isfinite().all() for gradient in overflowing)
 
-    def network(layers: Any, counts: list[int], d: int, precision: str, way: str = "auto") -> None:
-        with where, using_way(way):
+    def network(layers: Any, counts: list[int], d: int, precision: str) -> None:
+        with where:
             check(layers, counts, d, precision)
 
-    def forward(layers: Any, precision: str, way: str) -> None:
-        with where, using_way(way):
+    def forward(layers: Any, precision: str) -> None:
+        with where:
             check_forward(layers, [37, 0, 60], 3, precision)
 
     networks = {"branched": (BRANCHED, 3), "wide": (WIDE, 7), "gaussians": (GAUSSIANS, 6), "broad": (BROAD, 3)}
@@ -198,28 +196,15 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             for name, (layers, d) in networks.items()
             for precision in ALLOWED
         ),
-        # Chained where nothing else is said: beside it the other ways of the same networks.
         *(
-            (
-                f"grouped_mlp {name} {precision} by {way}",
-                functools.partial(network, networks[name][0], [70, 0, 1, 40], networks[name][1], precision, way),
+            (f"grouped_mlp {name} {precision} forward", functools.partial(forward, layers, precision))
+            for name, layers, precision in (
+                ("skips", SKIPS, "bfloat16"),
+                ("skips", SKIPS, "float16"),
+                ("nerf64", NeRF(width=64).layers, "bfloat16"),
+                ("thick", THICK, "bfloat16"),
+                ("narrow", NARROW, "bfloat16"),
             )
-            for name, way in (
-                *(("branched", "tiles"), ("gaussians", "tiles")),
-                *(("branched", "layers"), ("harmonics", "layers")),
-            )
-            for precision in ("bfloat16", "float16")
-        ),
-        *(
-            (f"grouped_mlp {name} {precision} forward by {way}", functools.partial(forward, layers, precision, way))
-            for name, layers, precision, ways in (
-                ("skips", SKIPS, "bfloat16", ("chain",)),
-                ("skips", SKIPS, "float16", ("chain", "tiles")),
-                ("nerf64", NeRF(width=64).layers, "bfloat16", ("chain",)),
-                ("thick", THICK, "bfloat16", ("chain",)),
-                ("narrow", NARROW, "bfloat16", ("chain",)),
-            )
-            for way in ways
         ),
         ("grouped_mlp dense float32", functools.partial(network, DENSE, [37, 3], 3, "float32")),
         ("grouped_mlp beyond float16", beyond_float16),

@@ -8,7 +8,7 @@ is a Blender scene for the trainings.
     1   machine    versions, and what is missing
         build      the extension for this GPU alone
         small      every operation once against float64, each case for itself and with a time limit of its own
-        large      networks at 2^22 samples: every way against the others and against float64, with gradients
+        large      networks at 2^22 samples against float64, with gradients
         captured   steps of the route in CUDA graphs, fused and layer by layer
         warp       every operation of Warp beside native, where Warp is installed
         memcheck   compute-sanitizer over the small cases, where it is installed
@@ -252,11 +252,7 @@ def highlights(found: dict[str, Any]) -> list[str]:
 
 def ruled(times: dict[str, float]) -> list[str]:
     """What docs/cuda.md says is to be kept or deleted, by seconds of each row."""
-    chain, tiles = (times.get(f"nerf64 k=16 forward{way}") for way in ("", " by tiles"))
     lines = []
-    if chain and tiles:
-        gain = tiles / chain
-        lines.append(f"chain is {gain:.2f} x the tiles: {'keep it' if gain >= 1.5 else 'delete it (below 1.5)'}")
     pairs = [
         (times.get(f"cell_sort k={k} by counting"), times.get(f"cell_sort k={k} by radix")) for k in (16, 256, 1022)
     ]

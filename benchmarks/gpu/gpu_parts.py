@@ -2,7 +2,7 @@
 
     machine    what a build and the tests need, each with what is missing
     small      every operation once, forward and backward, against float64: each case for itself
-    large      networks at full size, each way against the others
+    large      networks at full size
     captured   steps of the route in CUDA graphs
     tests      tests/ops on CUDA, a process for each file
     roofs      the networks, look-ups and sorts at full size, beside the machine's own copy and products

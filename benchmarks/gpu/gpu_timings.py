@@ -114,7 +114,6 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
 
     import voronerf
     from voronerf.ops.cell_sort.native import sort as sort_cells
-    from voronerf.ops.grouped_mlp.network import using_way
 
     rows = Rows(out, "roofs", again, device)
     where, row = rows.device, rows.add
@@ -134,18 +133,20 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         given = itertools.cycle(sets)
         return lambda: sort_cells(next(given), order, offsets, "cell_sort", way)
 
-    def network(name: str, k: int, backward: bool, way: str = "auto") -> Run:
+    def network(name: str, k: int, backward: bool, precision: str = "bfloat16") -> Run:
         if where.type == "cuda":
             torch.cuda.empty_cache()
-        batch = make_batch(NETS[name], n, k, torch.bfloat16, BACKWARD, where)
+        kind = torch.float32 if precision == "tf32" else getattr(torch, precision)
+        batch = make_batch(NETS[name], n, k, kind, BACKWARD, where)
         options = {"layers": batch.net, "directions": batch.directions, "direction_index": batch.direction_index}
         given = batch.positions[0], batch.offsets, batch.weights, batch.biases
 
         def run() -> None:
-            with torch.set_grad_enabled(backward), using_way(way):
+            torch.backends.cuda.matmul.allow_tf32 = precision == "tf32"
+            with torch.set_grad_enabled(backward):
                 result = voronerf.grouped_mlp(*given, **options, backend="native")
                 if backward:
-                    torch.autograd.grad(result, [*batch.weights, *batch.biases], batch.gradients[1])
+                    torch.autograd.grad(result, [*batch.weights, *batch.biases], batch.gradients[1].to(result.dtype))
 
         return run
 
@@ -161,11 +162,14 @@ def roofs(out: Path, again: Again, device: str = "cuda", n: int = N) -> int:
         forward, both = (functools.partial(network, name, k, backward) for backward in (False, True))
         both_work, both_aim = (price.forward + price.backward) * n, 0.25 if name == "nerf64" else None
         row(f"{name} k={k} forward", forward, "bfloat16", price.forward * n, aims.get(name))
-        if name != "nerf256":
-            # Which is faster: values in registers, as above, or in shared memory.
-            other = functools.partial(network, name, k, False, "tiles")
-            row(f"{name} k={k} forward by tiles", other, "bfloat16", price.forward * n)
         row(f"{name} k={k} forward + backward", both, "bfloat16", both_work, both_aim)
+    # The same programs in the other precisions; tensor cores multiply tf32 half as fast as 16 bits.
+    price = cost(NETS["w64d4"])
+    for precision, limit, factor in (("float16", "bfloat16", 1), ("tf32", "bfloat16", 2), ("float32", "float32", 1)):
+        for backward in (False, True):
+            run = functools.partial(network, "w64d4", 16, backward, precision)
+            work = factor * (price.forward + price.backward * backward) * n
+            row(f"w64d4 k=16 {precision} forward{' + backward' * backward}", run, limit, work)
     return rows.measure()
 
 
@@ -290,6 +294,7 @@ def profile(out: Path, again: Again, device: str = "cuda", steps: int = 10) -> i
     from voronerf.app.scenes import load_scene
     from voronerf.app.train import TrainConfig, build
     from voronerf.app.train import train as steps_of
+    from voronerf.nerf.schedule import WARMUP_STEPS
 
     journal, cuda = Journal(out, "profile", begun=again.start > 0), device == "cuda"
     scene = load_scene("builtin")
@@ -302,7 +307,7 @@ def profile(out: Path, again: Again, device: str = "cuda", steps: int = 10) -> i
             """A second of this clock is a step."""
             steps_of(state, until=state.seconds + count, clock=itertools.count().__next__)
 
-        train_steps(2 * steps)
+        train_steps(WARMUP_STEPS + 2 * steps)  # until the grid learns
         settle()
         with warnings.catch_warnings(record=True) as waits:
             warnings.simplefilter("always")

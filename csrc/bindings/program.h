@@ -19,8 +19,8 @@ VN_NAMES(ProgramPrecision, "float32", "tf32", "bfloat16", "float16");
 VN_STRUCT(ProgramPack, kind, parameter, o, i, start, width, at);
 VN_STRUCT(ProgramOperand, parameter, spread, slot, stride, memory, input, pairs, start, width, place);
 VN_STRUCT(ProgramStep, op, function, binary, encoding, finish, order, width, slot, stride, memory, number, depth,
-          parameter, pairs, floats, in_place, a, b, first, count);
-VN_STRUCT(ProgramSum, sum, kind, partial, o, i, start, width, stride, size);
+          sources, parameter, pairs, floats, in_place, a, b, first, taken);
+VN_STRUCT(ProgramSum, sum, kind, adds, partial, o, i, start, width, stride, size);
 VN_STRUCT(ProgramInput, width, ray);
 VN_STRUCT(ProgramOutput, width, ray, memory);
 VN_STRUCT(ProgramLookup, input, parameter, grid, memory);
@@ -28,7 +28,7 @@ VN_STRUCT(ProgramScatter, input, parameter, grid, memory, sum);
 VN_STRUCT(ProgramTable, packs, steps, operands, sums, inputs, outputs, memories, lookups, scatters, grids, sum_tensors,
           parameters, tile, columns, packed, partial, scratch, scratch_width, half);
 VN_STRUCT(ProgramInputs, inputs, input_types, turned, parameters, parameter_types, strides, offsets, order, ray_index,
-          n, r, k, kept, ready, gradients, caller, index);
+          n, r, k, kept, ready, gradients, caller, ray_name);
 VN_STRUCT(ProgramResults, outputs, output_types, sums);
 VN_OPAQUE(Program);
 

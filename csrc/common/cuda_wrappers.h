@@ -4,6 +4,7 @@
 //
 //   VN_LAUNCH((kernel<64>), grid, block, bytes, stream, arguments...)     checked
 //   VN_SHARED(name, float[8][64]);   VN_DYN_SHARED(float4, name);
+//   kernel(const VN_GRID_CONSTANT Struct argument)     which functions may have by reference without a copy
 //
 // Below them are the instructions that CUDA C++ has no function for.
 #pragma once
@@ -12,7 +13,9 @@
 
 #ifdef VN_EMULATE
 #include "emulation.h"
+#define VN_GRID_CONSTANT
 #else
+#define VN_GRID_CONSTANT __grid_constant__
 #include <cuda_bf16.h>
 #include <cuda_fp16.h>
 
@@ -45,40 +48,12 @@ __device__ __forceinline__ int thread_again() {
 #endif
 }
 
-// Largest value of float16: larger values would become infinite, and infinities in a network soon become NaN.
+// Largest number of float16.
 constexpr float kLargestHalf = 65504.0f;
 
-// Two floats, negative ones as zero if kRelu says so, rounded to 16 bits each, the first in the low half. Gradients are
-// not to be saturated: whoever scales a loss looks for the infinite ones. From sm_80 on all of it is one instruction;
-// NaN stays NaN.
-template <bool kBfloat16, bool kSaturated = true, bool kRelu = false>
+// Two floats rounded to 16 bits each, the first in the low half; from sm_80 on one instruction.
+template <bool kBfloat16>
 __device__ __forceinline__ uint32_t pack_halves(float x, float y) {
-#if !defined(VN_EMULATE) && __CUDA_ARCH__ >= 800
-  uint32_t bits;
-  if constexpr (kBfloat16 && kRelu) {
-    asm("cvt.rn.relu.bf16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
-  } else if constexpr (kBfloat16) {
-    asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
-  } else if constexpr (kRelu && kSaturated) {
-    asm("cvt.rn.relu.satfinite.f16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
-  } else if constexpr (kRelu) {
-    asm("cvt.rn.relu.f16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
-  } else if constexpr (kSaturated) {
-    asm("cvt.rn.satfinite.f16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
-  } else {
-    asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(bits) : "f"(y), "f"(x));
-  }
-  return bits;
-#else
-  // Comparisons keep NaN.
-  if constexpr (kRelu) {
-    x = x < 0.0f ? 0.0f : x;
-    y = y < 0.0f ? 0.0f : y;
-  }
-  if constexpr (!kBfloat16 && kSaturated) {
-    x = x > kLargestHalf ? kLargestHalf : x < -kLargestHalf ? -kLargestHalf : x;
-    y = y > kLargestHalf ? kLargestHalf : y < -kLargestHalf ? -kLargestHalf : y;
-  }
 #ifdef VN_EMULATE
   return half_bits(x, kBfloat16) | half_bits(y, kBfloat16) << 16;
 #else
@@ -91,7 +66,6 @@ __device__ __forceinline__ uint32_t pack_halves(float x, float y) {
     memcpy(&bits, &pair, sizeof bits);
   }
   return bits;
-#endif
 #endif
 }
 
@@ -122,77 +96,6 @@ __device__ __forceinline__ float round_to_tf32(float x) {
   return __uint_as_float(bits);
 #else
   return x;
-#endif
-}
-
-// Sine and cosine of -pi..pi to about 5e-7, by the device's own unit.
-__device__ __forceinline__ float fast_sine(float x) {
-#ifdef VN_EMULATE
-  return sinf(x);
-#else
-  return __sinf(x);
-#endif
-}
-__device__ __forceinline__ float fast_cosine(float x) {
-#ifdef VN_EMULATE
-  return cosf(x);
-#else
-  return __cosf(x);
-#endif
-}
-
-// Loads four 8 x 8 matrices of 16-bit elements from shared memory: lane l gives the address of row l % 8 of matrix l /
-// 8 (16 bytes, aligned) and gets elements 2 (l % 4) and the next of row l / 4 of each; transposed, of column l / 4.
-template <bool kTransposed>
-__device__ __forceinline__ void load_matrices(uint32_t (&out)[4], const void* row) {
-#ifdef VN_EMULATE
-  emulated_ldmatrix(out, row, kTransposed);
-#else
-  const uint32_t address = static_cast<uint32_t>(__cvta_generic_to_shared(row));
-  if constexpr (kTransposed) {
-    asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
-                 : "=r"(out[0]), "=r"(out[1]), "=r"(out[2]), "=r"(out[3])
-                 : "r"(address)
-                 : "memory");
-  } else {
-    asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
-                 : "=r"(out[0]), "=r"(out[1]), "=r"(out[2]), "=r"(out[3])
-                 : "r"(address)
-                 : "memory");
-  }
-#endif
-}
-
-// Copies 16 bytes, aligned, from global to shared memory, or clears them there; complete, for this thread, once
-// copy_wait() has waited for its group, and for others after a barrier. Before sm_80 it is complete at once.
-__device__ __forceinline__ void copy_async(void* to, const void* from, bool valid) {
-#ifdef VN_EMULATE
-  emulated_copy_async(to, from, valid);
-#elif __CUDA_ARCH__ >= 800
-  const uint32_t address = static_cast<uint32_t>(__cvta_generic_to_shared(to));
-  const int bytes = valid ? 16 : 0;
-  asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" ::"r"(address), "l"(from), "r"(bytes) : "memory");
-#else
-  *static_cast<float4*>(to) = valid ? *static_cast<const float4*>(from) : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-#endif
-}
-
-// Closes a group of copies.
-__device__ __forceinline__ void copy_commit() {
-#ifdef VN_EMULATE
-  emulated_copy_commit();
-#elif __CUDA_ARCH__ >= 800
-  asm volatile("cp.async.commit_group;" ::: "memory");
-#endif
-}
-
-// Waits until at most kPending groups, the last ones, are under way.
-template <int kPending>
-__device__ __forceinline__ void copy_wait() {
-#ifdef VN_EMULATE
-  emulated_copy_wait(kPending);
-#elif __CUDA_ARCH__ >= 800
-  asm volatile("cp.async.wait_group %0;" ::"n"(kPending) : "memory");
 #endif
 }
 

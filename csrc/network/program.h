@@ -25,7 +25,10 @@ struct ProgramInput {
 };
 struct ProgramOutput {
   int32_t width;
-  bool ray;        // [r, w], the sum over the samples of each ray; of the rows in the order of the cells
+  // [r, w], the sum over the samples of each ray, of the rows in the order of the cells. On CUDA its rows, [n, w] in
+  // the caller's order, which the caller sums: PyTorch does so without atomics where deterministic algorithms are asked
+  // for.
+  bool ray;
   int32_t memory;  // of a ray output: of its rows before they are summed; of another one: itself; -1: none
 };
 
@@ -60,7 +63,9 @@ struct ProgramTable {
 struct Program {
   ProgramTable table;
 };
-std::unique_ptr<Program> make_program(const ProgramTable& table);
+inline std::unique_ptr<Program> make_program(const ProgramTable& table) {
+  return std::make_unique<Program>(Program{table});
+}
 
 // Tensors of a call. Of each input and parameter: its type, and how it lies.
 struct ProgramInputs {
@@ -81,7 +86,7 @@ struct ProgramInputs {
   // Rows that are 0 in all inputs from this one on, float32 and of no rays, add nothing to any sum; -1: there are none
   // such.
   int64_t gradients;
-  const char *caller, *index;  // the operation that errors name, and its name for ray_index
+  const char *caller, *ray_name;  // the operation that errors name, and its name for ray_index
 };
 
 struct ProgramResults {
@@ -103,8 +108,9 @@ enum class ProgramPrecision : int { float32, tf32, bfloat16, float16 };
 int64_t program_code_bytes_cuda(const Program& program);
 void program_code_cuda(const Program& program, unsigned char* code);
 
-// Both throw std::invalid_argument where the values of a few rows do not fit into shared memory. Offsets, an order and
-// a ray_index that leave the rows cannot be refused without a host read: they touch nothing outside.
+// Both throw std::invalid_argument for more than 64 tensors of a kind or 16 look-ups. Offsets, an order and a ray_index
+// that leave the rows cannot be refused without a host read: they touch nothing outside. Gradients of tables are added
+// up by atomics.
 int64_t grouped_program_workspace_cuda(const Program& program, int64_t n, int64_t r, int64_t k);
 void grouped_program_cuda(const Program& program, const unsigned char* code, const ProgramInputs& in,
                           const ProgramResults& results, ProgramPrecision precision, unsigned char* workspace,

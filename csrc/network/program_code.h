@@ -64,12 +64,13 @@ struct ProgramStep {
   // grid. outer, columns: place in the partial.
   int32_t number;
   int32_t depth;         // linear: of the product. output: the first column where it goes. encode: octaves
+  int32_t sources;       // linear: operands that are multiplied, next to each other in the matrix; on CUDA one
   int32_t parameter;     // encode of a hash grid: the table
   int32_t pairs;         // linear with 16-bit products: where its value is stored as pairs too; -1: nowhere
   bool floats;           // linear: whether anything reads its value as floats
   bool in_place;         // input: nothing is copied where it may be read in place
   float a, b;            // of a function
-  int32_t first, count;  // operands
+  int32_t first, taken;  // operands: the first, and how many
 };
 
 // Part of a sum over the rows of a cell, from its place in the partial. `kind` none: nothing is added to that sum.
@@ -77,6 +78,7 @@ enum class ProgramSumKind : int { none, inputs_outputs, outputs_inputs, vector }
 struct ProgramSum {
   int32_t sum;
   ProgramSumKind kind;
+  bool adds;  // to a sum that is 0 before; else the parts of the sum lie side by side, and are written
   int32_t partial, o, i, start, width, stride, size;
 };
 

@@ -7,6 +7,7 @@ and the question whether a tensor is on CUDA is answered with yes.
 from __future__ import annotations
 
 import functools
+import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
@@ -16,6 +17,8 @@ from unittest import mock
 from emulation_build import build, load
 
 from voronerf.ops._core import native as _native
+
+_programs = importlib.import_module("voronerf.ops.grouped_program.native")
 
 
 @functools.cache
@@ -47,9 +50,19 @@ def emulated(
     loaded = module()
     loaded.seed(seed)
     loaded.device(capability, compiled, shared_bytes)
+    _forget()
     with (
         mock.patch.object(_native, "compiled", _Both(loaded, _native.compiled)),
         mock.patch.object(_native, "on_cuda", lambda tensor: True),
         mock.patch.object(_native, "stream", lambda tensor: (loaded.current(), 0)),
     ):
-        yield loaded
+        try:
+            yield loaded
+        finally:
+            _forget()
+
+
+def _forget() -> None:
+    """Programs are objects of the module that made them."""
+    _programs.lower.cache_clear()
+    _programs._code.cache_clear()

@@ -54,7 +54,6 @@ struct Fiber {
   void* fake_stack = nullptr;
   State state = State::ready;
   unsigned index = 0;
-  std::vector<std::vector<Copy>> copies;
 };
 
 struct Warp {
@@ -223,20 +222,12 @@ int lane() {
   return static_cast<int>(launching->current->index % 32);
 }
 
-std::vector<std::vector<Copy>>& copies() {
-  return launching->current->copies;
-}
-
 void fail(const std::string& message) {
   throw std::runtime_error(message);
 }
 
 void require_all(unsigned mask) {
   if (mask != 0xffffffffu) fail("the emulation has no partial warps");
-}
-
-void misaligned(const char* operation) {
-  fail(std::string(operation) + " of an address that is not aligned");
 }
 
 void block_barrier() {

@@ -21,6 +21,7 @@
 #define __device__
 #define __host__
 #define __forceinline__ inline
+#define __noinline__
 #define __launch_bounds__(...)
 
 struct dim3 {
@@ -33,9 +34,6 @@ struct alignas(8) float2 {
 };
 struct alignas(16) float4 {
   float x, y, z, w;
-};
-struct alignas(16) uint4 {
-  unsigned x, y, z, w;
 };
 inline float2 make_float2(float x, float y) {
   return {x, y};
@@ -51,10 +49,6 @@ inline float4 atomicAdd(float4* to, float4 value) {
   return {atomicAdd(&to->x, value.x), atomicAdd(&to->y, value.y), atomicAdd(&to->z, value.z),
           atomicAdd(&to->w, value.w)};
 }
-inline uint4 make_uint4(unsigned x, unsigned y, unsigned z, unsigned w) {
-  return {x, y, z, w};
-}
-
 // The part of the runtime that launchers use.
 using cudaStream_t = void*;
 using cudaError_t = int;
@@ -63,7 +57,6 @@ enum cudaFuncAttribute { cudaFuncAttributeMaxDynamicSharedMemorySize };
 enum cudaDeviceAttr {
   cudaDevAttrMaxSharedMemoryPerBlockOptin,
   cudaDevAttrMultiProcessorCount,
-  cudaDevAttrL2CacheSize,
   cudaDevAttrComputeCapabilityMajor,
   cudaDevAttrComputeCapabilityMinor,
 };
@@ -78,11 +71,6 @@ inline cudaError_t cudaSetDevice(int) {
 }
 inline cudaError_t cudaMemsetAsync(void* to, int value, size_t size, cudaStream_t) {
   std::memset(to, value, size);
-  return cudaSuccess;
-}
-enum cudaMemcpyKind { cudaMemcpyDeviceToDevice };
-inline cudaError_t cudaMemcpyAsync(void* to, const void* from, size_t size, cudaMemcpyKind, cudaStream_t) {
-  std::memcpy(to, from, size);
   return cudaSuccess;
 }
 constexpr cudaError_t cudaErrorInvalidValue = 1;
@@ -137,17 +125,8 @@ T from_lane(const unsigned char* slots, int lane) {
   return value;
 }
 
-// Asynchronous copies of the thread that runs, in groups: those of the last one are not closed yet.
-struct Copy {
-  void* to;
-  const void* from;
-  bool valid;
-};
-std::vector<std::vector<Copy>>& copies();
-
 void require_all(unsigned mask);
 [[noreturn]] void fail(const std::string& message);
-[[noreturn]] void misaligned(const char* operation);
 
 }  // namespace vn_emulation
 
@@ -163,9 +142,6 @@ inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, 
       break;
     case cudaDevAttrMultiProcessorCount:
       *value = settings.multiprocessors;
-      break;
-    case cudaDevAttrL2CacheSize:
-      *value = 64 * 1024;  // little, so that a batch is cut
       break;
     case cudaDevAttrComputeCapabilityMajor:
       *value = settings.capability / 10;
@@ -306,46 +282,5 @@ inline float half_value(unsigned bits, bool bfloat16) {
 enum class Multiplied { bfloat16, float16, tf32 };
 // d [16][8] += a b, of operands of this type; in emulated_products.cpp.
 void emulated_multiply(Multiplied type, float (&d)[4], const uint32_t (&a)[4], const uint32_t (&b)[2]);
-
-// Copies are done when they are waited for, as late as they may be on a GPU.
-inline void emulated_copy_async(void* to, const void* from, bool valid) {
-  if (reinterpret_cast<uintptr_t>(to) % 16 != 0 || reinterpret_cast<uintptr_t>(from) % 16 != 0) {
-    vn_emulation::misaligned("cp.async");
-  }
-  auto& groups = vn_emulation::copies();
-  if (groups.empty()) groups.emplace_back();
-  groups.back().push_back({to, from, valid});
-}
-inline void emulated_copy_commit() {
-  auto& groups = vn_emulation::copies();
-  if (groups.empty()) groups.emplace_back();
-  groups.emplace_back();
-}
-inline void emulated_copy_wait(size_t pending) {
-  auto& groups = vn_emulation::copies();
-  while (groups.size() > pending + 1) {
-    for (const vn_emulation::Copy& copy : groups.front()) {
-      for (int word = 0; word < 4; ++word) {
-        static_cast<uint32_t*>(copy.to)[word] = copy.valid ? static_cast<const uint32_t*>(copy.from)[word] : 0;
-      }
-    }
-    groups.erase(groups.begin());
-  }
-}
-
-// Four 8 x 8 matrices of 16-bit elements; lane l names row l % 8 of matrix l / 8.
-inline void emulated_ldmatrix(uint32_t (&out)[4], const void* row, bool transposed) {
-  if (reinterpret_cast<uintptr_t>(row) % 16 != 0) vn_emulation::misaligned("ldmatrix");
-  const int lane = vn_emulation::lane();
-  const unsigned char* slots = vn_emulation::meet(transposed ? "ldmatrix.trans" : "ldmatrix", &row, sizeof row);
-  for (int matrix = 0; matrix < 4; ++matrix) {
-    uint16_t parts[2];
-    for (int part = 0; part < 2; ++part) {
-      const int i = transposed ? 2 * (lane % 4) + part : lane / 4, j = transposed ? lane / 4 : 2 * (lane % 4) + part;
-      parts[part] = vn_emulation::from_lane<const uint16_t*>(slots, 8 * matrix + i)[j];
-    }
-    out[matrix] = parts[0] | static_cast<uint32_t>(parts[1]) << 16;
-  }
-}
 
 }  // namespace voronerf

@@ -22,16 +22,11 @@ SANITIZERS = {
     "address": ["-fsanitize=address", "--param", "asan-instrumentation-with-call-threshold=0"],
     "thread": ["-fsanitize=thread"],
 }
-PYTHON = {"module.cpp", "index_maps.cpp", "chain_layout.cpp", "plans.cpp"}
+PYTHON = {"module.cpp", "index_maps.cpp"}
 """Files for Python, which are compiled with the bindings of csrc/."""
 PLAIN = {"emulation.cpp", "emulated_products.cpp", "python.cpp"}
 """Files with nothing to watch."""
-SHARED = (
-    "cell_sort_plan.cpp",
-    "grouped_mlp_cuda_plan.cpp",
-    "grouped_mlp_cuda_chain_plan.cpp",
-    "grouped_mlp_cuda_layers_plan.cpp",
-)
+SHARED = ("cell_sort_plan.cpp",)
 """What the launchers need of the C++ beside them."""
 REPLACED = {"radix_sort.cu"}
 """What consists of the CUDA toolkit's headers: a file of the same name in this folder stands in."""

@@ -22,14 +22,9 @@ from voronerf.ops._core import backends
 from voronerf.ops._core import native as _native
 from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops.cell_sort.native import sort as sort_cells
-from voronerf.ops.grouped_mlp.network import using_way
 
-# Values in registers, with weights that stay or pass through; in shared memory, where that is asked for; and what fits
-# no fused network: layer by layer.
-NETWORKS = (
-    *(("float32", 227, "auto"), ("bfloat16", 40, "tiles"), ("bfloat16", 227, "auto"), ("bfloat16", 1, "auto")),
-    ("float16", 30, "auto"),
-)
+# Products, and KiB of shared memory: tiles of 64 rows, of 32, and values in the workspace.
+NETWORKS = (("float32", 227), ("bfloat16", 40), ("float16", 40), ("bfloat16", 12), ("float32", 12))
 
 
 class Recorder:
@@ -105,12 +100,9 @@ def recorded() -> list[tuple[int, str, list[Any]]]:
     for op in backends.ops("native", "cuda"):
         for pins in (*cases()[op].kinds.values(), *cases()[op].on_devices):
             record(op, call_case, op, pins, cases()[op].device_rows)
-    for (precision, shared, way), kind in itertools.product(NETWORKS, ("", "hashed")):
-        if kind and (precision, way) not in (("float32", "auto"), ("bfloat16", "auto")):
-            continue
-        with using_way(way):
-            pins = {**cases()["grouped_mlp"].kinds[kind], "dtype": getattr(torch, precision)}
-            record("grouped_mlp", call_case, "grouped_mlp", pins, 64, shared=shared)
+    for (precision, shared), kind in itertools.product(NETWORKS, ("", "hashed")):
+        pins = {**cases()["grouped_mlp"].kinds[kind], "dtype": getattr(torch, precision)}
+        record("grouped_mlp", call_case, "grouped_mlp", pins, 64, shared=shared)
     # By counting and by radix. Keys of 4 bytes would need 65,535 cells, each a thread: too many for a sanitizer.
     for n, k, way in ((3000, 5, "automatic"), (9000, 2, "counting"), (600, 3, "radix"), (300, 1100, "automatic")):
         cells = torch.randint(-1, k + 1, (n,), dtype=torch.int32)

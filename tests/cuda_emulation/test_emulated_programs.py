@@ -1,37 +1,214 @@
-"""Programs by the CUDA kernel on the CPU, with threads in several orders, against the reference."""
+"""Programs by the CUDA kernels on the CPU, with threads in several orders, against the reference in float64."""
+
+from __future__ import annotations
 
 import importlib
+import itertools
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from emulated import emulated
+from torch import Tensor
 
+from voronerf import HashGrid
 from voronerf.ops import grouped_program
-from voronerf.ops._core.program import Builder, Columns
-from voronerf.ops.grouped_program.case import every_step
+from voronerf.ops._core.program import FUNCTIONS, PARAMETER, Builder, Columns, Program, gradient
+from voronerf.ops.grouped_program.case import GRID, encoded, every_step, smooth
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "ops"))
-from test_grouped_program import NUMBERS, arguments, check, derivatives, random_program
+from test_grouped_program import NUMBERS, arguments, check, derivatives, offsets_of, random_program
 
 plans = importlib.import_module("voronerf.ops.grouped_program.native")
 
+KIB = 1024
+TILES = [227 * KIB, 40 * KIB, 12 * KIB]
+"""Of shared memory: tiles of 64 rows, of 32, and values in the workspace."""
+ALLOWED = {"float32": 2e-5, "tf32": 4e-3, "float16": 4e-3, "bfloat16": 3e-2}
+"""Norm of an error, in norms of what is right."""
+LARGEST = 65504.0
+"""Of float16."""
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("shared_bytes", [227 * 1024, 64 * 1024])
-def test_values_and_derivatives(seed, shared_bytes):
-    """Of second order too; tiles of 32 rows and of 16, cells that are no multiple of either, and an empty one."""
-    order = torch.randperm(70, generator=torch.Generator().manual_seed(seed)).int() if seed == 1 else None
-    with emulated(seed=seed, shared_bytes=shared_bytes):
-        check(every_step() if seed < 2 else random_program(seed), [37, 0, 33], shared=seed == 1, order=order)
+
+def tensors_of(
+    program: Program, sizes: list[int], strays: int = 0, rays: int = 5, shared: bool = False
+) -> list[Tensor]:
+    """Inputs, then parameters; with ``shared`` every other one is of all cells."""
+    generator, n, k = torch.Generator().manual_seed(3), sum(sizes) + strays, len(sizes)
+    found = [torch.rand(rays if i in program.rays else n, w, generator=generator) for i, w in enumerate(program.inputs)]
+    for i, shape in enumerate(program.parameters):
+        few = 1 if shared and i % 2 == 0 else k
+        found.append(torch.randn(few, *shape, generator=generator) / shape[-1] ** 0.5)
+    return found
 
 
-def test_every_function_and_turned_inputs():
+def outcome(program: Program, tensors: list[Tensor], offsets: Tensor, products: str = "", **given: Any) -> list[Tensor]:
+    """Results and gradients; in float64 by the reference unless products are named."""
+    count = len(program.inputs)
+
+    def run(*leaves: Tensor) -> list[Tensor]:
+        if not products:
+            return grouped_program(
+                leaves[:count], leaves[count:], offsets, program=program, backend="reference", **given
+            )
+        rows = plans.Rows(leaves[:count], leaves[count:], offsets, given.get("order"), given.get("ray_index"), None)
+        name = "float32" if products == "tf32" else products
+        return plans.run_program(rows, plans.How(program.text, products=name))
+
+    before, generator = torch.backends.cuda.matmul.fp32_precision, torch.Generator().manual_seed(5)
+    leaves = [(tensor if products else tensor.double()).clone().requires_grad_() for tensor in tensors]
+    try:
+        torch.backends.cuda.matmul.fp32_precision = "tf32" if products == "tf32" else "ieee"
+        results = run(*leaves)
+        weights = [torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t.dtype) for t in results]
+        gradients = torch.autograd.grad(results, leaves, weights, allow_unused=True, materialize_grads=True)
+        return [tensor.detach() for tensor in (*results, *gradients)]
+    finally:
+        torch.backends.cuda.matmul.fp32_precision = before
+
+
+def close(found: list[Tensor], exact: list[Tensor], allowed: float) -> None:
+    for ours, right in zip(found, exact, strict=True):
+        assert ours.shape == right.shape and ours.isfinite().all()
+        distance = float((ours.double() - right).norm())
+        assert distance <= allowed * float(right.norm()) + 1e-6, (list(ours.shape), distance, float(right.norm()))
+
+
+def layers_of(widths: list[int]) -> Program:
+    """Layers with a smooth function between them, of any widths, and a second output of four columns."""
+    b = Builder()
+    x = h = b.input(widths[0])
+    for i, (before, width) in enumerate(itertools.pairwise(widths)):
+        bias = Columns(PARAMETER, b.parameter(width), 0, width)
+        h = b.apply("sine" if i % 2 else "tanh", b.linear(h, b.parameter(width, before), width, add=bias), 1.0)
+    return b.program([h, b.linear(x, b.parameter(4, widths[0]), 4)])
+
+
+def test_values_and_derivatives_of_second_order() -> None:
+    """Tiles of every kind; cells that are no multiple of one, and an empty one."""
+    for seed, shared_bytes in enumerate(TILES):
+        order = torch.randperm(70, generator=torch.Generator().manual_seed(seed)).int() if seed == 1 else None
+        with emulated(seed=seed, shared_bytes=shared_bytes):
+            check(every_step(), [37, 0, 33], shared=seed == 1, order=order)
+            check(random_program(seed + 1), [37, 0, 33])
+
+
+@pytest.mark.parametrize("shared_bytes", TILES)
+@pytest.mark.parametrize("products", ALLOWED)
+@pytest.mark.parametrize("widths", [[3, 5, 1], [17, 70, 33, 66], [64, 64, 64, 4]], ids=str)
+def test_products_of_every_precision(products: str, widths: list[int], shared_bytes: int) -> None:
+    """Widths around those of a block and of a strip."""
+    program, sizes = layers_of(widths), [65, 0, 31, 1]
+    tensors = tensors_of(program, sizes)
+    exact = outcome(program, tensors, offsets_of(sizes))
+    with emulated(shared_bytes=shared_bytes):
+        found = outcome(program, tensors, offsets_of(sizes), products)
+    close(found, exact, ALLOWED[products])
+    rounded = max(float((a.double() - b).norm() / b.norm()) for a, b in zip(found, exact))
+    assert products == "float32" or rounded > 1e-5, "operands are rounded"
+
+
+@pytest.mark.parametrize(("capability", "compiled"), [(75, 120), (90, 75)])
+@pytest.mark.parametrize(("products", "exactly"), [("tf32", True), ("bfloat16", True), ("float16", False)])
+def test_products_before_ampere(products: str, exactly: bool, capability: int, compiled: int) -> None:
+    """Of tf32 and bfloat16 there are none: they are float32's. So it is in code for an older device."""
+    program, sizes = layers_of([17, 70, 33]), [40, 9]
+    tensors = tensors_of(program, sizes)
+    with emulated(capability=capability, compiled=compiled, shared_bytes=64 * KIB):
+        found = outcome(program, tensors, offsets_of(sizes), products)
+        plain = outcome(program, tensors, offsets_of(sizes), "float32")
+    assert all(map(torch.equal, found, plain)) == exactly
+    close(found, outcome(program, tensors, offsets_of(sizes)), ALLOWED[products])
+
+
+@pytest.mark.parametrize("n", [0, 1, 31, 32, 33, 63, 64, 65, 127, 128, 129, 257])
+def test_sizes_around_tiles_and_tasks(n: int) -> None:
+    program, offsets = smooth(), offsets_of([n])
+    tensors = tensors_of(program, [n])
+    for shared_bytes in TILES[:2]:
+        with emulated(shared_bytes=shared_bytes):
+            found = outcome(program, tensors, offsets, "float32")
+        close(found, outcome(program, tensors, offsets), ALLOWED["float32"])
+
+
+@pytest.mark.parametrize("products", ["float32", "bfloat16"])
+@pytest.mark.parametrize("shared", [False, True], ids=["tables of cells", "one table"])
+@pytest.mark.parametrize("ordered", [False, True], ids=["sorted", "in any order"])
+def test_encodings_rays_and_tables(products: str, shared: bool, ordered: bool) -> None:
+    """All encodings, inputs and an output of rays, rows of no cell; gradients to all of them, tables included."""
+    program, sizes = encoded(20), [37, 0, 70]
+    n = sum(sizes) + 5
+    generator = torch.Generator().manual_seed(1)
+    tensors = tensors_of(program, sizes, 5, shared=shared)
+    given = {
+        "order": torch.randperm(n, generator=generator).int() if ordered else None,
+        "ray_index": torch.randint(0, 4, (n,), generator=generator).int(),
+    }
+    offsets = offsets_of(sizes) + 2
+    exact = outcome(program, tensors, offsets, **given)
+    for seed, shared_bytes in enumerate(TILES):
+        with emulated(seed=seed, shared_bytes=shared_bytes):
+            found = outcome(program, tensors, offsets, products, **given)
+        close(found, exact, ALLOWED[products])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("features", [1, 2, 4, 8])
+def test_tables_of_every_kind(features: int, dtype: torch.dtype) -> None:
+    """Values, the gradient to the positions and to the table, which has the table's dtype."""
+    grid = HashGrid(levels=11, features=features, log2_entries=10, base=3, finest=50)
+    b = Builder()
+    e = b.encode("hash", b.input(3), b.grid(grid.text), b.parameter(*grid.table_shape))
+    program, offsets = b.program([e]), offsets_of([33, 7])
+    x, table = torch.rand(40, 3), torch.randn(1, *grid.table_shape).to(dtype)
+    g, found = torch.randn(40, e.width), []
+    for backend, of in (("reference", torch.float64), ("native", torch.float32)):
+        leaves = [x.to(of).requires_grad_(), (table.double() if of == torch.float64 else table).requires_grad_()]
+        with emulated():
+            (out,) = grouped_program(leaves[:1], leaves[1:], offsets, program=program, backend=backend)
+            found.append([out.detach(), *torch.autograd.grad(out, leaves, g.to(of))])
+    assert found[1][2].dtype == dtype
+    close(found[1], found[0], 1e-5 if dtype == torch.float32 else 1e-2)
+
+
+def test_what_was_looked_up_is_not_looked_up_again() -> None:
+    """The gradient program reads what was kept: with another table there, it gives the same but for the positions."""
+    b = Builder()
+    e = b.encode("hash", b.input(3), b.grid(GRID.text), b.parameter(*GRID.table_shape))
+    program = b.program([b.linear(e, b.parameter(5, e.width), 5)])
+    own = gradient(program, (False,), (False, True), (True,), ())
+    x, table, weight = tensors_of(program, [70])
+    rows = plans.Rows([x], [table, weight], offsets_of([70]), None, None, None)
+    with emulated():
+        out, kept = plans.run(rows, plans.How(program.text, keep=True))
+        assert kept.shape == (70 * 16,)
+        for parameter in (table, torch.full_like(table, torch.nan)):
+            call = rows._replace(inputs=[x, torch.ones_like(out)], parameters=[parameter, weight], kept=kept)
+            (found,) = plans.run(call, plans.How(own.text))
+            torch.testing.assert_close(
+                found[0], kept.view(70, 16)[:, : e.width].sum(0).expand(5, -1), rtol=1e-5, atol=1e-5
+            )
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_types_in_memory(dtype: torch.dtype) -> None:
+    """What float32 gives for the rounded arguments, rounded."""
+    program = every_step()
+    rows, parameters, offsets = arguments(program, [40, 9], dtype)
+    inputs = plans.Rows(rows, [p.float() for p in parameters], offsets, None, None, None)
+    with emulated():
+        found = plans.run_program(inputs, plans.How(program.text))
+        exact = plans.run_program(inputs._replace(inputs=[x.float() for x in rows]), plans.How(program.text))
+    assert all(torch.equal(ours, right.to(dtype)) for ours, right in zip(found, exact, strict=True))
+
+
+def test_every_function_and_turned_inputs() -> None:
     """All functions in one program, of an input that lies column by column."""
     b = Builder()
     x = b.input(5)
-    names = [(name, f.orders) for name, f in plans.FUNCTIONS.items() if name != "stop"]
+    names = [(name, f.orders) for name, f in FUNCTIONS.items() if name != "stop"]
     made = [
         b.function(name, x, *NUMBERS.get(name, (0.7, 0.0)), order=order)
         for name, orders in names
@@ -41,51 +218,138 @@ def test_every_function_and_turned_inputs():
     rows = 0.1 + torch.rand(5, 40, generator=torch.Generator().manual_seed(0)).t()
     offsets = torch.tensor([0, 17, 40], dtype=torch.int32)
     (exact,) = grouped_program([rows.double()], [], offsets, program=program, backend="reference")
-    with emulated():
-        (found,) = grouped_program([rows], [], offsets, program=program, backend="native")
-    torch.testing.assert_close(found.double(), exact, rtol=2e-5, atol=2e-5)
+    for shared_bytes in TILES[::2]:
+        with emulated(shared_bytes=shared_bytes):
+            (found,) = grouped_program([rows], [], offsets, program=program, backend="native")
+        torch.testing.assert_close(found.double(), exact, rtol=2e-5, atol=2e-5)
 
 
-def test_results_are_the_same_in_every_order_of_threads():
+@pytest.mark.parametrize("products", ALLOWED)
+def test_results_are_the_same_in_every_order_of_threads(products: str) -> None:
     """Bit for bit, sums over several tasks of a cell included."""
-    program, found = random_program(3), []
-    given = arguments(program, [150, 0, 9], torch.float32)
+    program, sizes, found = random_program(3), [150, 0, 9], []
+    tensors = tensors_of(program, sizes)
     for seed in (0, 1, 2):
         with emulated(seed=seed):
-            found.append(derivatives(program, *given, "native"))
+            found.append(outcome(program, tensors, offsets_of(sizes), products))
     for others in found[1:]:
         assert all(map(torch.equal, found[0], others))
 
 
-def test_a_planted_fault_is_found():
+@pytest.mark.parametrize("shared_bytes", TILES)
+def test_rows_of_no_cell_and_unsound_indices(shared_bytes: int) -> None:
+    """Nothing outside is read or written, and what no cell has is 0."""
+    program = encoded()
+    for offsets, strays in (([3, 20, 30], [*range(3), *range(30, 33)]), ([0, 40, 50], []), ([5, 2, 33], [])):
+        tensors = tensors_of(program, [20, 13])
+        wild = torch.tensor([-(2**31), -1, 33, 2**31 - 1] * 8 + [0], dtype=torch.int32)
+        index = torch.tensor(offsets, dtype=torch.int32)
+        for order in (None, wild):
+            with emulated(shared_bytes=shared_bytes):
+                found = outcome(program, tensors, index, "float32", order=order, ray_index=wild)
+            assert order is not None or not found[0][strays].any()
+
+
+def test_cells_that_overlap_stay_inside_the_workspace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They have more tasks than there are partial sums; what lies behind those is no number, and is not read."""
+    program, n, beyond = smooth(), 600, 1 << 20
+    sizes = []
+    with emulated() as loaded:
+        size_of, run = loaded.grouped_program_workspace, loaded.grouped_program
+
+        def larger(*given: Any) -> int:
+            sizes.append(size_of(*given) + beyond)
+            return sizes[-1]
+
+        def poisoned(*given: Any) -> None:
+            given[-2].fill_(0xFF)
+            run(*given)
+
+        monkeypatch.setattr(loaded, "grouped_program_workspace", larger)
+        monkeypatch.setattr(loaded, "grouped_program", poisoned)
+        offsets = torch.tensor([0, n, 0, n, 0, n], dtype=torch.int32)
+        found = outcome(program, tensors_of(program, [n, 0, 0, 0, 0]), offsets, "float32")
+    assert len(sizes) == 2 and all(part.isfinite().all() for part in found)
+
+
+def test_numbers_that_are_none_stay_in_their_rows() -> None:
+    program = layers_of([17, 70, 5])
+    tensors = tensors_of(program, [70])
+    tensors[0][5, 1], tensors[0][9, 0] = torch.nan, torch.inf
+    for products in ALLOWED:
+        with emulated(), torch.no_grad():
+            rows = plans.Rows(tensors[:1], tensors[1:], offsets_of([70]), None, None, None)
+            _, out = plans.run_program(rows, plans.How(program.text, products=products.replace("tf32", "float32")))
+        assert (~out.isfinite()).any(1).nonzero().flatten().tolist() in ([5, 9], [5]), products
+
+
+def test_float16_cuts_values_off_and_leaves_gradients() -> None:
+    """Values beyond the largest number enter products as that; gradients are infinite, for a GradScaler to see."""
+    b = Builder()
+    h = b.linear(b.input(1), b.parameter(16, 1), 16)
+    program = b.program([b.linear(h, b.parameter(3, 16), 3)])
+    x = torch.tensor([[1.0], [1e6]])
+    given = [x, torch.ones(1, 16, 1), torch.ones(1, 3, 16) / 64]
+    leaves = [leaf.requires_grad_() for leaf in given]
+    rows = plans.Rows(leaves[:1], leaves[1:], offsets_of([2]), None, None, None)
+    with emulated():
+        (out,) = plans.run_program(rows, plans.How(program.text, products="float16"))
+        assert out[:, 0].tolist() == [0.25, LARGEST / 4]
+        for size, finite in ((1.0, True), (1e6, False)):
+            found = torch.autograd.grad(out, leaves, torch.full_like(out, size), retain_graph=True)
+            assert not any(part.isnan().any() for part in found)
+            assert bool(found[0].isfinite().all()) == finite
+
+
+def test_a_planted_fault_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """A layer that writes over what other threads still read."""
     b = Builder()
     x = b.input(70)
     program = b.program([b.linear(x, b.parameter(70, 70), 70)])
     given = arguments(program, [40], torch.float32)
     (exact,) = grouped_program(*given, program=program, backend="reference")
-    plan = plans._plan(program.text)
-    code = plan.on(torch.device("cpu"))[0]
-    at = 7 + 7 + (11 + 0) + 4  # header, one pack, the input; the slot of the layer
-    before = int(code[at])
-    assert before == 80
-    for slot, right in ((before, True), (0, False)):
-        code[at], code[at + 11 + 3 + 7] = slot, slot  # and of what the output reads
-        with emulated():
-            (found,) = grouped_program(*given, program=program)
-        code[at] = before
-        assert torch.allclose(found, exact, atol=1e-5) == right
+    for fault in (False, True):
+        with emulated() as loaded:
+            make = loaded.make_program
+
+            def spoilt(table: Any, make: Any = make, fault: bool = fault) -> Any:
+                over = [s._replace(slot=0) if fault and s.op == "linear" else s for s in table.steps]
+                read = [o._replace(slot=0) if fault else o for o in table.operands]
+                return make(table._replace(steps=over, operands=read))
+
+            monkeypatch.setattr(loaded, "make_program", spoilt)
+            (found,) = grouped_program(*given, program=program, backend="native")
+            monkeypatch.undo()
+        assert torch.allclose(found, exact, atol=1e-5) != fault
 
 
-def test_refuses_what_does_not_fit():
-    """Values of many columns, and more tensors than kernel arguments hold."""
-    b = Builder()
-    x = b.input(2000)
-    wide = b.program([b.binary("add", b.apply("exp", x), b.apply("tanh", x))])
-    with emulated(shared_bytes=64 * 1024), pytest.raises(ValueError, match="must fit into the 65536 bytes of a block"):
-        grouped_program([torch.zeros(3, 2000)], [], torch.tensor([0, 3], dtype=torch.int32), program=wide)
+def test_refuses_more_tensors_than_kernel_arguments_hold() -> None:
     b = Builder()
     columns: list[Columns] = [b.input(1) for _ in range(65)]
     many = b.program([b.move(65, [(c, i) for i, c in enumerate(columns)])])
     with emulated(), pytest.raises(ValueError, match="at most 64 inputs, parameters, outputs or sums on CUDA, got 65"):
         grouped_program([torch.zeros(3, 1)] * 65, [], torch.tensor([0, 3], dtype=torch.int32), program=many)
+
+
+def test_values_of_many_columns() -> None:
+    """Which no multiprocessor holds: they are in the workspace, and blocks take several tasks."""
+    b = Builder()
+    x = b.input(2000)
+    wide = b.program([b.binary("add", b.apply("exp", x), b.apply("tanh", x))])
+    rows = torch.rand(700, 2000)
+    with emulated(shared_bytes=64 * KIB):
+        (found,) = grouped_program([rows], [], offsets_of([700]), program=wide, backend="native")
+    torch.testing.assert_close(found, rows.exp() + rows.tanh())
+
+
+def test_derivatives_again_on_the_device() -> None:
+    """The loop of the other tests, of second order and with deterministic sums, by its own helper."""
+    program = random_program(2)
+    given = arguments(program, [37, 0, 33], torch.float32)
+    with emulated():
+        found = derivatives(program, *given, "native")
+        torch.use_deterministic_algorithms(True)
+        try:
+            assert all(map(torch.equal, found, derivatives(program, *given, "native")))
+        finally:
+            torch.use_deterministic_algorithms(False)

@@ -1,7 +1,8 @@
 """Networks on CUDA whose values come near float16's largest, and pass it: no NaN where float32 has none.
 
-Every activation, fused and layer by layer. What a value exceeds is cut off (65,504), what a gradient exceeds is
-infinite, for a GradScaler to see; the other samples and cells are as exact as ever.
+Every activation, in tiles of 64 rows and with values in the workspace. What a value exceeds is cut off (65,504) where a
+layer reads it, what a gradient exceeds is infinite, for a GradScaler to see; the other samples and cells are as exact
+as ever.
 """
 
 import pytest
@@ -13,7 +14,7 @@ import voronerf
 from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer
 
 LARGEST = 65504.0
-WAYS = pytest.mark.parametrize("shared", [227, 1], ids=["fused", "by-layers"])
+WAYS = pytest.mark.parametrize("shared", [227, 12], ids=["tiles", "workspace"])
 ROWS, CELLS = 40, 2
 
 

@@ -16,7 +16,6 @@ from voronerf.ops.cell_sort.native import WAYS
 from voronerf.ops.cell_sort.native import sort as sort_cells
 from voronerf.ops.draw_pixels import native as draw_pixels
 from voronerf.ops.draw_pixels import reference as draw_pixels_reference
-from voronerf.ops.grouped_mlp.network import Given, as_network, backward
 
 
 @pytest.fixture(params=(0, 1, 2), autouse=True)
@@ -120,16 +119,6 @@ def test_tables_and_gradients_that_are_not_aligned():
             found += [out, *torch.autograd.grad(out, [leaf], arriving)]
     for one, other in zip(found[:4], found[4:], strict=True):
         torch.testing.assert_close(one, other)
-
-
-def test_a_backward_pass_needs_what_the_forward_pass_kept():
-    grid = voronerf.HashGrid(levels=2, features=2, log2_entries=10, finest=20)
-    layers = MLP((Layer((POSITIONS,), 3),), (0,), position_encoding="hash", grid=grid)
-    given = Given(torch.rand(9, 3), [torch.rand(1, 3, 4)], [None], layers, features=torch.rand(grid.table_shape))
-    taken, _ = as_network(given, None, hashed_before=False)
-    offsets = torch.tensor([0, 9], dtype=torch.int32)
-    with pytest.raises(ValueError, match=r"^grouped_mlp: encoded must be what the forward pass kept"):
-        backward(torch.rand(9, 3), taken, offsets, None, torch.empty(0), [True, False, False, True])
 
 
 @pytest.mark.parametrize("op", ["hash_encode", "grouped_mlp"])

@@ -26,6 +26,7 @@ from voronerf.nerf.sampling import (
     stratified_edges,
     union_depths,
 )
+from voronerf.nerf.schedule import WARMUP_STEPS
 from voronerf.nerf.volume import Rendered, Samples, Space
 from voronerf.ops.resample import resample
 
@@ -36,8 +37,9 @@ if TYPE_CHECKING:
 COARSE_SHARE = 0.1
 #: While an occupancy grid settles, a quarter of the strata are used.
 SETTLING_PART = 4
-#: In a contracted sphere, the first steps of a training, in which the grid learns nothing. A young field is thin
-#: everywhere: a grid would take it for empty, and what is emptied no longer learns.
+#: The first steps of a training, in which the grid learns nothing, in a contracted sphere; elsewhere they are as many
+#: as the learning rate may rise for. A young field is thin everywhere: a grid would take it for empty, and what is
+#: emptied no longer learns. The more samples a step has, the fewer steps would empty all.
 SETTLING_STEPS = 400
 #: Steps between evaluations of random voxels of the occupancy grid, the share of all that are evaluated, and how many
 #: at most: as many as a few steps have samples.
@@ -265,6 +267,16 @@ class Occupancy(Sampler):
         self.settling = False
         self._leave_empty()
 
+    @property
+    def settling_steps(self) -> int:
+        """The first steps of a training, in which the grid learns nothing."""
+        return SETTLING_STEPS if isinstance(self.grid.contraction, Contraction) else WARMUP_STEPS
+
+    @property
+    def strata(self) -> int:
+        """Strata of a ray of a training step: `samples`, or a part of them while the grid settles."""
+        return max(1, self.samples // SETTLING_PART) if self.settling else self.samples
+
     def _leave_empty(self) -> None:
         if self.empty is not None:
             self.grid.density.view(-1)[self.empty] = 0
@@ -272,7 +284,7 @@ class Occupancy(Sampler):
 
     def step_pre_backward(self, field: Field, step: int, generator: torch.Generator) -> None:
         """Evaluates random voxels; see :meth:`Sampler.step_pre_backward`."""
-        self.settling = isinstance(self.grid.contraction, Contraction) and step < SETTLING_STEPS
+        self.settling = step < self.settling_steps
         if self.settling or step % REVISIT_EVERY:
             return
         every = self.grid.occupied.numel()
@@ -340,9 +352,7 @@ class Occupancy(Sampler):
             most: Samples of a ray; None for all.
             picture: Whether the strata are those of a picture.
         """
-        samples = self.picture_samples if picture else self.samples
-        if self.settling and not picture:
-            samples = max(1, samples // SETTLING_PART)
+        samples = self.picture_samples if picture else self.strata
         walk: dict[str, Any] = {"seed": seed, "start": start, "most": most, "backend": self.backend}
         if seed is not None and start is None and not near.is_cpu:  # a training step waits for no device
             walk["capacity"] = max(1, len(near) * samples)

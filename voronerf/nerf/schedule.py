@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-#: The most steps that the learning rate rises for. While it is small the densities stay low, and an occupancy grid,
-#: which forgets in some thirty steps, would empty itself for good.
+#: The most steps that the learning rate rises for. While it is small the densities stay low, so that an occupancy grid,
+#: which forgets in eight to thirty steps, would empty itself for good: it learns only afterwards.
 WARMUP_STEPS = 100
 #: The fraction of the training that it rises for, at most.
 WARMUP = 0.02
@@ -17,18 +17,20 @@ FINAL = 0.05
 FILL, FILL_SAMPLES, CONTRACTED_FILL_SAMPLES = 0.25, 64, 128
 
 
-def learning_rate(lr: float, fraction: float, step: int, *, hold: float = 0.0) -> float:
+def learning_rate(lr: float, fraction: float, step: int, *, hold: float = 0.0, began: int = 0) -> float:
     """The learning rate of a step: a linear rise over `WARMUP` of the training, then ``lr``, then exponential decay.
+
+    It rises over `WARMUP_STEPS` at most, and over as many where the training began again from another draw.
 
     Args:
         lr: The highest rate.
         fraction: How much of the training is done, 0..1.
         step: Steps done.
         hold: Fraction of the training after which the rate falls, down to ``lr * FINAL`` at the end.
+        began: The step at which it began again; 0 for never.
     """
-    rise = 1.0
-    if fraction < WARMUP and step < WARMUP_STEPS:
-        rise = 0.01 + 0.99 * max(fraction / WARMUP, step / WARMUP_STEPS)
+    risen = max((step - began) / WARMUP_STEPS, 0.0 if began else fraction / WARMUP)
+    rise = 0.01 + 0.99 * risen if risen < 1 else 1.0
     fallen = max(0.0, fraction - hold) / (1 - hold)
     return lr * rise * math.exp(math.log(FINAL) * fallen)
 
@@ -40,7 +42,7 @@ def next_rays(now: int, found: int, *, rays: int, samples: int, growth: float, c
         now: Rays of the last step.
         found: Samples that it had in occupied space.
         rays: Rays of the first step, and the fewest.
-        samples: Strata of a ray.
+        samples: Strata of a ray of the last step.
         growth: The most rays, as a multiple of ``rays``.
         contracted: Whether space is contracted.
     """

@@ -223,8 +223,13 @@ class SplitStrategy:
             for router in self.routers.values():
                 router.subdivide(split.diagram, split.parents, optimizer=optimizer, inherit=self.inherit)
         self.splits += 1
-        self.reservoir = SampleReservoir(self.reservoir.capacity, self.reservoir.batches, device=points.device)
+        self.forget()
         return SplitDone(split, points, importance)
+
+    def forget(self) -> None:
+        """Drops the samples that were kept for the next split."""
+        kept, device = self.reservoir, self.diagram.centres.device
+        self.reservoir = SampleReservoir(kept.capacity, kept.batches, device=device)
 
     def step_post_backward(self, output: RenderOutput) -> None:
         """Keeps the heaviest samples of a step, until the last split.

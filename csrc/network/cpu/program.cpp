@@ -38,7 +38,7 @@ void check(const ProgramInputs& in) {
   }
   if (in.ray_index != nullptr && leaves(in.ray_index, in.n, in.r)) {
     const auto [low, high] = std::minmax_element(in.ray_index, in.ray_index + in.n);
-    throw std::invalid_argument(op + ": " + in.index + " must be 0 to " + std::to_string(in.r - 1) + ", got " +
+    throw std::invalid_argument(op + ": " + in.ray_name + " must be 0 to " + std::to_string(in.r - 1) + ", got " +
                                 std::to_string(*low < 0 ? *low : *high));
   }
 }
@@ -182,8 +182,6 @@ ProgramCode code_of(const ProgramTable& table) {
 }
 
 }  // namespace
-
-std::unique_ptr<Program> make_program(const ProgramTable& table) { return std::make_unique<Program>(Program{table}); }
 
 ProgramRows::ProgramRows(const Program& program, const ProgramInputs& in, Isa isa)
     : table_(program.table),

@@ -29,27 +29,24 @@ void program_reduce(const ProgramCall& call, int64_t cell, float* partials, int6
     const ProgramSum& sum = code.sums[s];
     float* const to = call.sums[sum.sum] + cell * sum.size;
     const bool first = s == 0 || code.sums[s - 1].sum != sum.sum;
-    const bool alone = first && (s + 1 == code.sum_count || code.sums[s + 1].sum != sum.sum);
-    const bool whole = alone && count > 0 && sum.kind != ProgramSumKind::none &&
-                       sum.width == (sum.kind == ProgramSumKind::vector ? sum.size : sum.i);
-    if (first && !whole) {
+    if (first && (sum.adds || count == 0)) {
       for (int64_t i = 0; i < sum.size; ++i) to[i] = 0.0f;
     }
     if (count == 0 || sum.kind == ProgramSumKind::none) continue;
     const float* from = partials + sum.partial;
     if (sum.kind == ProgramSumKind::vector) {
-      for (int64_t c = 0; c < sum.width; ++c) to[sum.start + c] = from[c] + (whole ? 0.0f : to[sum.start + c]);
+      for (int64_t c = 0; c < sum.width; ++c) to[sum.start + c] = from[c] + (sum.adds ? to[sum.start + c] : 0.0f);
       continue;
     }
     const bool by_outputs = sum.kind == ProgramSumKind::outputs_inputs;
     const int64_t by_o = by_outputs ? sum.stride : 1, by_input = by_outputs ? 1 : sum.stride;
     int64_t done = 0;
-    for (; whole && !by_outputs && done + 4 <= sum.width; done += 4) {
-      transpose_four(from + done * by_input, by_input, sum.o, to + done, sum.i);
+    for (; !sum.adds && !by_outputs && done + 4 <= sum.width; done += 4) {
+      transpose_four(from + done * by_input, by_input, sum.o, to + sum.start + done, sum.i);
     }
     for (int64_t o = 0; o < sum.o; ++o) {
       float* const row = to + o * sum.i + sum.start;
-      for (int64_t c = done; c < sum.width; ++c) row[c] = from[c * by_input + o * by_o] + (whole ? 0.0f : row[c]);
+      for (int64_t c = done; c < sum.width; ++c) row[c] = from[c * by_input + o * by_o] + (sum.adds ? row[c] : 0.0f);
     }
   }
 }

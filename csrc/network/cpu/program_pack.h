@@ -4,6 +4,7 @@
 
 #include "encoding/frequency_encode_tile.h"
 #include "network/cpu/program_isa.h"
+#include "network/cpu/program_rows_tile.h"
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
@@ -151,7 +152,8 @@ struct Matrix {
     const float* from =
         static_cast<const float*>(call.parameters[pack.parameter]) + cell * call.strides[pack.parameter] + pack.start;
     if (pack.kind == ProgramPackKind::vector) {
-      for (int64_t c = 0; c < padded(pack.width); ++c) to[c] = c < pack.width ? from[c] : 0.0f;
+      copy_row(from, pack.width, to);
+      for (int64_t c = pack.width; c < padded(pack.width); ++c) to[c] = 0.0f;
       continue;
     }
     const bool turned = pack.kind == ProgramPackKind::turned || pack.kind == ProgramPackKind::few_turned;

@@ -97,8 +97,8 @@ struct ProgramTile {
       case ProgramOp::linear:
         return linear(step, operands, to);
       case ProgramOp::function: {
-        const Rows x = operand(operands[0]), times = step.count > 1 ? operand(operands[1]) : x;
-        const Rows* by = step.count > 1 ? &times : nullptr;
+        const Rows x = operand(operands[0]), times = step.taken > 1 ? operand(operands[1]) : x;
+        const Rows* by = step.taken > 1 ? &times : nullptr;
         switch (step.function) {
 #define VN_CASE(NAME, ...)    \
   case ProgramFunction::NAME: \
@@ -203,24 +203,29 @@ struct ProgramTile {
 
   void linear(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
     const bool slopes = step.finish == ProgramFinish::relu_slope;
-    const Rows x = operand(operands[0]);
-    const Rows add = step.count > 1 + slopes ? operand(operands[1]) : Rows{kZeros, 0, false};
-    const float* slope = slopes ? operand(operands[step.count - 1]).data : nullptr;
+    const int32_t count = step.sources;
+    const Rows add = step.taken > count + slopes ? operand(operands[count]) : Rows{kZeros, 0, false};
+    const float* slope = slopes ? operand(operands[step.taken - 1]).data : nullptr;
     const Finish finish = step.finish == ProgramFinish::none   ? Finish::none
                           : step.finish == ProgramFinish::relu ? Finish::relu
                                                                : Finish::relu_slope;
     const float* const weights = packed + pack(step.number).at;
     const int64_t depth = steps_of(step.depth);
-    Source source{x.data, x.stride, depth};
+    constexpr int32_t kMostSources = 8;
+    Source sources[kMostSources];
+    for (int32_t i = 0; i < count; ++i) {
+      const Rows x = operand(operands[i]);
+      sources[i] = {x.data, x.stride, steps_of(operands[i].width)};
+    }
     float* pairs = nullptr;
     int64_t pairs_stride = 0;
 #if VN_HALF
-    source.stride = pairs_of(step.depth);
+    sources[0].stride = pairs_of(step.depth);  // of pairs there is one source
     if (operands[0].pairs >= 0) {
-      source.data = slot(operands[0].pairs);
+      sources[0].data = slot(operands[0].pairs);
     } else {
-      narrow_rows(x, step.depth, rows, scratch(0), source.stride);
-      source.data = scratch(0);
+      narrow_rows(operand(operands[0]), step.depth, rows, scratch(0), sources[0].stride);
+      sources[0].data = scratch(0);
     }
     if (step.pairs >= 0) {
       pairs = slot(step.pairs);
@@ -229,14 +234,14 @@ struct ProgramTile {
 #endif
     if (step.order > 0) {
       const auto product = step.order == 1 ? few_outputs<1> : few_outputs<4>;
-      return product(&source, 1, weights, depth, add.data, step.finish == ProgramFinish::relu, rows, to);
+      return product(sources, count, weights, depth, add.data, step.finish == ProgramFinish::relu, rows, to);
     }
     float* const c = pairs == nullptr || step.floats ? to : nullptr;
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       const int64_t columns = smaller(kPanel, step.stride - first);
       const float* start = add.data == kZeros ? kZeros : add.data + first;
-      multiply<false>({&source, 1, weights + first * depth, columns, start, add.stride, c == nullptr ? c : c + first,
-                       step.stride, finish, slope == nullptr ? nullptr : slope + first,
+      multiply<false>({sources, count, weights + first * depth, columns, start, add.stride,
+                       c == nullptr ? c : c + first, step.stride, finish, slope == nullptr ? nullptr : slope + first,
                        pairs == nullptr ? pairs : pairs + first / 2, pairs_stride},
                       rows, columns);
     }
@@ -268,7 +273,7 @@ struct ProgramTile {
     if (step.order == 0) {  // something is added up, or left out
       for (int64_t i = 0; i < rows * step.stride; i += kLanes) store(to + i, splat(0.0f));
     }
-    for (int32_t i = 0; i < step.count; ++i) {
+    for (int32_t i = 0; i < step.taken; ++i) {
       const Rows x = operand(operands[i]);
       const int64_t width = operands[i].width;
       float* into = to + operands[i].place;

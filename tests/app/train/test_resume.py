@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers import refuses, same, trained
+from helpers import read_json, refuses, same, trained
 from tiny_runs import HIERARCHICAL, Each, assert_resumes, scores, small, tensors
 
 import voronerf.app.evaluate.scores as scores_module
@@ -163,11 +163,22 @@ def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
 @pytest.mark.parametrize("contraction", ["none", "sphere"])
 def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch, contraction):
     monkeypatch.setattr("voronerf.nerf.samplers.REVISIT_EVERY", 2)
-    monkeypatch.setattr("voronerf.nerf.samplers.SETTLING_STEPS", 5)
+    for name in ("SETTLING_STEPS", "WARMUP_STEPS"):
+        monkeypatch.setattr(f"voronerf.nerf.samplers.{name}", 5)
     monkeypatch.setattr("voronerf.nerf.schedule.FILL", 1.5)  # other numbers of rays in every step
     settings = {"contraction": contraction, "precision": "fp32" if contraction == "none" else "bf16"}
     found = assert_resumes(tmp_path, scene, 15, occupancy=True, field="hashgrid", depth=1, **settings)
     assert len(found["occupancy.density"].unique()) > 1
+
+
+@pytest.mark.parametrize("stop_at", [4, 7])  # before and after it begins again
+def test_a_start_that_failed_is_begun_again_and_resumed(tmp_path, scene, monkeypatch, stop_at):
+    monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 2)
+    monkeypatch.setattr("voronerf.app.train.start.JUDGED", 3)
+    monkeypatch.setattr("voronerf.app.train.start.why_nothing_is_learnt", lambda batch, output: "planted")
+    assert_resumes(tmp_path, scene, stop_at, occupancy=True, field="hashgrid", depth=1, split_at=(0.9,))
+    stages = read_json(tmp_path / "part" / "summary.json")["stages"]
+    assert [(each["cells"], each["started_at_step"]) for each in stages] == [(1, 0), (1, 5), (1, 10), (1, 15), (4, 22)]
 
 
 def test_averages_are_resumed_and_shown(tmp_path, scene):

@@ -9,6 +9,7 @@ from contextlib import nullcontext
 
 import torch
 
+from voronerf.app.train.start import judge_start
 from voronerf.app.train.state import Stage, State
 from voronerf.nerf.loss import Batch, RenderOutput
 from voronerf.nerf.split import SplitDone
@@ -93,6 +94,7 @@ def train(
         state.count_step(batch)
         if state.device.type == "cpu" or state.step % READ_EVERY == 0:
             state.read_output(output)
+        judge_start(state, batch, output)
         state.add_seconds(clock() - started)
         for callback in callbacks:
             callback.after_step(state)
@@ -108,7 +110,7 @@ def _step(state: State) -> tuple[Batch, RenderOutput]:
     optimizer, sampler = state.optimizer, state.sampler
     autocast = HALVES.get(state.config.precision)
     optimizer.set_learning_rate(state.learning_rate())
-    sampler.step_pre_backward(state.renderer.field, state.step, state.generator)
+    sampler.step_pre_backward(state.renderer.field, state.step - state.began, state.generator)
     if not state.router.training:
         state.renderer.train()
     batch = state.batches.draw(state.rays, state.draws)

@@ -68,7 +68,7 @@ class State:
         rays_done: Of all steps.
         loss: Of the last step that the host has read.
         skipped_in_a_row: Steps that the guard has left out since the last good one.
-        stages: Periods of training, one more than splits.
+        stages: Periods of training: one more than splits, and one for each new start of the coarse stage.
         stopped: Whether somebody asked to end the training.
     """
 
@@ -139,7 +139,12 @@ class State:
     def learning_rate(self) -> float:
         """The learning rate of the next step."""
         hold = self.config.field_type.lr_hold
-        return learning_rate(float(self.config.lr or 0), self.fraction, self.step, hold=hold)
+        return learning_rate(float(self.config.lr or 0), self.fraction, self.step, hold=hold, began=self.began)
+
+    @property
+    def began(self) -> int:
+        """The step at which the coarse stage began, for the last time: see `voronerf.app.train.start`."""
+        return max((stage.started_at_step for stage in self.stages if stage.cells == 1), default=0)
 
     def averaged(self) -> AbstractContextManager[None]:
         """A context in which the networks have their averaged weights, for pictures; not for training."""
@@ -158,7 +163,7 @@ class State:
                 self.rays,
                 samples,
                 rays=int(self.config.rays or 0),
-                samples=self.sampler.samples,
+                samples=self.sampler.strata,
                 growth=self.config.field_type.ray_growth,
                 contracted=self.config.contraction != "none",
             )
@@ -175,6 +180,11 @@ class State:
             for name in ("imbalance_before", "imbalance_after")
         )
         self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
+
+    def begin_again(self) -> None:
+        """Counts a new start of the coarse stage."""
+        self.rays = int(self.config.rays or 0)
+        self.stages.append(Stage(1, self.seconds, self.step, None, None, 0))
 
     def count_step(self, batch: Batch) -> None:
         """Counts a step."""

@@ -6,6 +6,7 @@ Letters: n rows, k cells, w columns of a value.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -28,6 +29,7 @@ _ROWS = (24, 96)  # of a tile, whole blocks of the products (gemm_tile.h)
 _WHOLE = 48  # rows of a tile where harmonics write whole vectors of rows
 _GRANULE = 16
 _FEW = 4  # outputs of a layer that has a product of its own (few_outputs_tile.h)
+_MOST_SOURCES = 8  # of a product (program_tile.h)
 _NONE = -1
 
 
@@ -63,9 +65,15 @@ def compiled_runs(text: str) -> bool:
 
 
 @functools.lru_cache(maxsize=1024)
-def lower(text: str, half: bool) -> Lowered:
-    """The records of a program, given by its text, for products of float32 or, if ``half``, of pairs of bfloat16."""
-    return _Lowering(merged(Program.parse(text)), half).lowered()
+def lower(text: str, half: bool, cuda: bool = False) -> Lowered:
+    """The records of a program, given by its text.
+
+    Args:
+        text: of the program.
+        half: for products of pairs of bfloat16, instead of float32.
+        cuda: for CUDA, whose products have one source.
+    """
+    return _Lowering(merged(Program.parse(text)), half, joins=not (half or cuda)).lowered()
 
 
 def _padded(width: int, to: int = _GRANULE) -> int:
@@ -109,7 +117,7 @@ class _Value:
 class _Lowering:
     """Records on their way."""
 
-    def __init__(self, program: Program, half: bool) -> None:
+    def __init__(self, program: Program, half: bool, joins: bool) -> None:
         self.program, self.half = program, half
         self.compiled = native.compiled
         self.slots, self.values = _Slots(), dict[int, _Value]()
@@ -122,7 +130,7 @@ class _Lowering:
         self.lookups: list[tuple[Lookup, int]] = []
         self.scatters: list[tuple[Lookup, int, int]] = []
         self.own: dict[int, int] = {}  # the memory of outputs that values may be made in
-        self.work = self._in_order()
+        self.work = _joined(self._in_order()) if joins else self._in_order()
         self.readers: dict[int, list[tuple[Step, int]]] = {}
         for step in self.work:
             for place, c in enumerate(step.operands):
@@ -150,14 +158,13 @@ class _Lowering:
         made = {step.out: step for step in steps if not _sums(step)}
         written: list[Step] = []
         for number, c in enumerate(program.outputs):
-            step = made.get(c.index) if c.of == VALUE else None
-            alone = step is not None and step.op == "move" and uses[c.index] == 1 and _all_of(c, step.width)
-            if step is None or not alone or not _covered(step):
-                written.append(Step("output", number, c.width, (c,), (number, 0)))
-            else:
-                steps.remove(step)
-                for part, at in zip(step.operands, step.numbers):
-                    written.append(Step("output", number, part.width, (part,), (number, at)))
+            maker = made.get(c.index) if c.of == VALUE else None
+            parts: list[tuple[Columns, float]] = [(c, 0)]
+            alone = maker is not None and uses[c.index] == 1 and _all_of(c, maker.width)
+            if maker is not None and alone and maker.op == "move" and _covered(maker):
+                steps.remove(maker)
+                parts = list(zip(maker.operands, maker.numbers))
+            written += [Step("output", number, part.width, (part,), (number, at)) for part, at in parts]
         return [*steps, *written]
 
     def _whole(self, g: Columns) -> bool:
@@ -213,12 +220,21 @@ class _Lowering:
         """One step's record."""
         operands = list(operands)
         fields: dict[str, Any] = {"function": "copy", "binary": "add", "encoding": "frequency", "finish": "none"}
-        fields |= {"order": 0, "width": 0, "slot": 0, "stride": 0, "memory": _NONE, "number": 0, "depth": 0}
+        fields |= {
+            "order": 0,
+            "width": 0,
+            "slot": 0,
+            "stride": 0,
+            "memory": _NONE,
+            "number": 0,
+            "depth": 0,
+            "sources": 1,
+        }
         fields |= {"parameter": 0, "pairs": _NONE, "floats": True, "in_place": False, "a": 0.0, "b": 0.0}
         if value is not None:
             fields |= {"width": value.width, "slot": max(value.slot, 0), "stride": value.stride}
             fields |= {"memory": value.memory, "pairs": value.pairs, "floats": value.floats}
-        fields |= {"first": len(self.operands), "count": len(operands)}
+        fields |= {"first": len(self.operands), "taken": len(operands)}
         self.steps.append(self.compiled.ProgramStep(op=op, **(fields | given)))
         self.operands += operands
 
@@ -295,23 +311,24 @@ class _Lowering:
     def _product(self, step: Step, place: int) -> bool:
         """Whether an operand is read no further than its columns: as x of a linear step, or broadcast in a sum."""
         if step.op == "linear":
-            return place == 0
+            return place < _sources(step)
         return step.op == "outer" and not self.half and place == (0 if self._by_outputs(step) else 1)
 
     def _linear(self, step: Step, dying: set[int]) -> None:
-        matrix, start, transposed = map(int, step.numbers)
+        matrix, start, transposed = map(int, step.numbers[:3])
         o, i = self.shape(matrix)
-        x, relu_slope = step.operands[0], step.name == "relu_slope"
-        depth, added = x.width, step.operands[1 : len(step.operands) - relu_slope]
-        unit = 2 * _GRANULE if self.half else _GRANULE
-        few = step.width <= _FEW and depth % unit == 0 and not relu_slope and all(c.of == PARAMETER for c in added)
+        count, relu_slope = _sources(step), step.name == "relu_slope"
+        sources, added = step.operands[:count], step.operands[count : len(step.operands) - relu_slope]
+        depth, unit = sum(c.width for c in sources), 2 * _GRANULE if self.half else _GRANULE
+        few = step.width <= _FEW and not relu_slope and all(c.width % unit == 0 for c in sources)
+        few = few and all(c.of == PARAMETER for c in added)
         order = 0 if not few else 1 if step.width == 1 else _FEW
         kind, width = ("turned", step.width) if transposed else ("matrix", depth)
         kind = f"few{'_turned' * transposed}" if few else kind
         deep = -(-depth // 2) if self.half else depth
         number = self.pack(kind, matrix, start, width, deep * (order or _padded(step.width)), (o, i))
-        records = [self.operand(c, product=not at) for at, c in enumerate(step.operands)]
-        entrywise = [c for c in step.operands[1:] if c[:2] != x[:2]]
+        records = [self.operand(c, product=at < count) for at, c in enumerate(step.operands)]
+        entrywise = [c for c in step.operands[count:] if all(c[:2] != x[:2] for x in sources)]
         value = self.make(step, dying, entrywise)
         readers = self.readers.get(step.out, [])
         as_pairs = [r.op == "linear" and not p and _all_of(r.operands[0], step.width) for r, p in readers]
@@ -319,7 +336,7 @@ class _Lowering:
         if narrow and value.stride % (2 * _GRANULE) == 0 and step.width % 2 == 0 and value.memory == _NONE:
             value.pairs, value.floats = self.slots.take(_padded(step.width, 2 * _GRANULE) // 2), not all(as_pairs)
         finish = step.name or "none"
-        self.emit("linear", records, value, order=order, number=number, depth=depth, finish=finish)
+        self.emit("linear", records, value, order=order, number=number, depth=depth, sources=count, finish=finish)
 
     def _function(self, step: Step, dying: set[int]) -> None:
         records = [self.operand(c) for c in step.operands]
@@ -421,7 +438,7 @@ class _Lowering:
             packs=[compiled.ProgramPack(*key, at) for key, (_, at) in self.packs.items()],
             steps=steps,
             operands=self.operands,
-            sums=[compiled.ProgramSum(*record) for record in self.sums],
+            sums=_sum_records(self.sums),
             inputs=[compiled.ProgramInput(w, i in program.rays) for i, w in enumerate(program.inputs)],
             outputs=outputs,
             memories=self.memories,
@@ -445,6 +462,20 @@ class _Lowering:
         )
 
 
+def _sum_records(parts: list[tuple[int, str, int, int, int, int, int, int, int]]) -> list[Any]:
+    """The records of the parts of sums, in their order; those of a sum that cover it side by side are written."""
+    spans: dict[int, list[tuple[int, int]]] = {}
+    for out, _, _, _, _, start, width, _, _ in parts:
+        spans.setdefault(out, []).append((start, start + width))
+    records = []
+    for part in parts:
+        ends = sorted(spans[part[0]])
+        beside = all(end == start for (_, end), (start, _) in itertools.pairwise(ends))
+        whole = beside and part[1] != "none" and (ends[0][0], ends[-1][1]) == (0, part[4])
+        records.append(native.compiled.ProgramSum(*part[:2], not whole, *part[2:]))
+    return records
+
+
 def _all_of(c: Columns, width: int) -> bool:
     """Whether columns are all those of a value."""
     return c.start == 0 and c.width == width and not c.spread
@@ -452,6 +483,35 @@ def _all_of(c: Columns, width: int) -> bool:
 
 def _sums(step: Step) -> bool:
     return step.op in ("outer", "columns", "scatter")
+
+
+def _sources(step: Step) -> int:
+    """How many operands of a linear step are multiplied, one behind the other."""
+    return int(step.numbers[3]) if len(step.numbers) > 3 else 1
+
+
+def _joined(steps: list[Step]) -> list[Step]:
+    """The steps with layers of several sources, next to each other in the weights, as one product: the number of
+    sources is a fourth number then. The sums stay in registers from one source to the next."""
+    uses = [c.index for step in steps for c in step.operands if c.of == VALUE]
+    makers = {step.out: step for step in steps if not _sums(step) and step.op != "output"}
+    gone: set[int] = set()
+    for place, step in enumerate(steps):
+        add = step.operands[1] if step.op == "linear" and len(step.operands) == 2 else None
+        before = makers.get(add.index) if add is not None and add.of == VALUE else None
+        if add is None or before is None or before.op != "linear" or before.name or uses.count(before.out) > 1:
+            continue
+        (matrix, start, transposed), count = step.numbers[:3], _sources(before)
+        width = sum(c.width for c in before.operands[:count])
+        follows = before.numbers[:3] == (matrix, start - width, transposed) and not transposed
+        if not follows or not _all_of(add, before.width) or count >= _MOST_SOURCES:
+            continue
+        operands = (*before.operands[:count], step.operands[0], *before.operands[count:])
+        steps[place] = makers[step.out] = step._replace(
+            operands=operands, numbers=(matrix, start - width, transposed, count + 1)
+        )
+        gone.add(before.out)
+    return [step for step in steps if _sums(step) or step.op == "output" or step.out not in gone]
 
 
 def _covered(step: Step) -> bool:

@@ -6,6 +6,7 @@ derivatives than the compiled module has runs in PyTorch.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -101,10 +102,10 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
     n = (first if ray_index is None else ray_index).shape[0]
     r = inputs[program.rays[0]].shape[0] if program.rays else 0
     counts = [r if i in program.by_ray else n for i in range(len(program.outputs))]
-    outputs = [first.new_empty(count, columns.width) for count, columns in zip(counts, program.outputs)]
+    outputs = [first.new_empty((count, columns.width)) for count, columns in zip(counts, program.outputs)]
     float32: dict[str, Any] = {"dtype": torch.float32, "device": first.device}
     counts = program.cells_of_sums(parameters, k)
-    sums = [new(count, *shape, **float32) for count, shape in zip(counts, program.sums)]
+    sums = [new((count, *shape), **float32) for count, shape in zip(counts, program.sums)]
     lowered = lower(program.text, _half(how.products, first)) if compiled_runs(program.text) else None
     keeps = [new(n * sum(lowered.widths) if lowered else 0, **float32)] if how.keep else []
     yield [*outputs, *sums, *keeps]
@@ -116,10 +117,52 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
     kept = keeps[0] if keeps else kept
     parts = None if kept is None or not kept.numel() else kept.split([n * width for width in lowered.widths])
     given = program_inputs(rows, n, r, kept=parts, ready=not keeps, gradients=how.gradients, caller=how.caller)
+    if native.on_cuda(first):
+        _run_on_cuda(program, rows, how, given, outputs, sums)
+        return
     results = native.compiled.ProgramResults(outputs=outputs, output_types=_types(outputs), sums=sums)
     for result in (*outputs, *sums, *keeps):
         native.on_huge_pages(result)
     native.compiled.grouped_program(lowered.program, given, results, native.cpu())
+
+
+def _run_on_cuda(
+    program: Program,
+    rows: Rows,
+    how: How,
+    given: native.compiled.ProgramInputs,
+    outputs: list[Tensor],
+    sums: list[Tensor],
+) -> None:
+    """The call, and the sums over the samples of each ray, of which the kernels give the rows."""
+    offsets, index = rows.offsets, rows.ray_index
+    if any(step.op == "scatter" for step in program.steps):
+        native.refuse_where_deterministic(how.caller, offsets)
+    tf32 = how.products == "float32" and torch.backends.cuda.matmul.fp32_precision == "tf32"
+    made = list(outputs)
+    for i in program.by_ray:
+        made[i] = torch.empty(given.n, outputs[i].shape[1], device=offsets.device)
+    results = native.compiled.ProgramResults(outputs=made, output_types=_types(made), sums=sums)
+    lowered, code = lower(program.text, False, True).program, _code(program.text, offsets.device)
+    machine = native.compiled.Cuda(*native.stream(offsets))
+    size = native.compiled.grouped_program_workspace(lowered, given.n, given.r, given.k, machine)
+    workspace = torch.empty(size, dtype=torch.uint8, device=offsets.device)
+    products = "tf32" if tf32 else how.products
+    native.compiled.grouped_program(lowered, code, given, results, products, workspace, machine)
+    for i in program.by_ray:
+        total = torch.zeros(given.r, outputs[i].shape[1], device=offsets.device)
+        if index is not None and given.n and given.r:
+            total.index_add_(0, index.clamp(0, given.r - 1), made[i])
+        outputs[i].copy_(total)
+
+
+@functools.lru_cache(maxsize=1024)
+def _code(text: str, device: torch.device) -> Tensor:
+    """The records of a program on a device, copied there once."""
+    program = lower(text, False, True).program
+    code = torch.empty(native.compiled.program_code_bytes(program), dtype=torch.uint8)
+    native.compiled.program_code(program, code)
+    return code.to(device)
 
 
 def program_inputs(
@@ -144,14 +187,16 @@ def program_inputs(
         caller: the op that errors name.
     """
     inputs, parameters, offsets, order, ray_index, _ = rows
-    turned = [int(not x.is_contiguous() and x.dim() == 2 and _columns_lie_together(x, n)) for x in inputs]
+    turned = [0 if x.is_contiguous() else int(_columns_lie_together(x, n)) for x in inputs]
+    if any(turned):
+        inputs = [x.t() if turn else x for x, turn in zip(inputs, turned)]
     return native.compiled.ProgramInputs(
-        inputs=[x.t() if turn else x for x, turn in zip(inputs, turned)],
+        inputs=inputs,
         input_types=_types(inputs),
         turned=turned,
-        parameters=[native.aligned(p) for p in parameters],
+        parameters=[native.aligned(p) for p in parameters] if native.on_cuda(offsets) else parameters,
         parameter_types=_types(parameters),
-        strides=[p[0].numel() if p.shape[0] > 1 else 0 for p in parameters],
+        strides=[p.shape[1:].numel() if p.shape[0] > 1 else 0 for p in parameters],
         offsets=offsets,
         order=order,
         ray_index=ray_index,
@@ -162,7 +207,7 @@ def program_inputs(
         ready=ready,
         gradients=gradients,
         caller=caller,
-        index="ray_index" if caller == "grouped_program" else "direction_index",
+        ray_name="ray_index" if caller == "grouped_program" else "direction_index",
     )
 
 
@@ -201,7 +246,8 @@ def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
     found: list[Tensor | None] = [None] * count
     arriving = arriving[:-1] if ctx.how.keep else arriving
     if any(g is not None for g in arriving) and any(wanted):
-        rows = Rows(saved[: ctx.count], saved[ctx.count : count], *saved[count : count + 3], kept)
+        offsets, order, ray_index = saved[count : count + 3]
+        rows = Rows(saved[: ctx.count], saved[ctx.count : count], offsets, order, ray_index, kept)
         results = iter(run_gradient(rows, ctx.how, arriving, wanted))
         found = [next(results) if want else None for want in wanted]
     nothing: Any = (None,) * len(How._fields)
@@ -219,27 +265,39 @@ def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted
     """
     program, count = program_of(rows, how), len(rows.inputs)
     split, given = len(program.outputs), tuple([g is not None for g in arriving])
-    own = gradient(program, tuple(wanted[:count]), tuple(wanted[count:]), given[:split], given[split:])
+    own = _gradient(program.text, count, split, tuple(wanted), given)
     more = [[g for g in part if g is not None] for part in (arriving[:split], arriving[split:])]
-    kept = rows.kept if program.grids and compiled_runs(own.text) and _lookups(own) == _lookups(program) else None
-    rays = any(i >= count for i in own.rays)
-    sifts = not own.outputs and not more[1] and not rays and all(g.dtype == torch.float32 for g in more[0])
-    following = how._replace(text=own.text, biased="", keep=False, gradients=count if sifts else -1)
-    call = rows._replace(inputs=[*rows.inputs, *more[0]], parameters=[*rows.parameters, *more[1]], kept=kept)
-    if torch.is_grad_enabled():  # a pass of its own, whose look-ups its gradient may have
-        found = run_program(call, following)
-    else:
-        found = run(call, following)
-    results = found[: len(own.outputs)]
-    learning = [p for p, want in zip(rows.parameters, wanted[count:]) if want]
-    for total, p in zip(found[len(own.outputs) :], learning, strict=True):
+    sifts = own.sifts and not more[1] and all(g.dtype == torch.float32 for g in more[0])
+    following = How(own.text, "", how.caller, how.products, False, count if sifts else -1)
+    inputs, parameters, kept = [*rows.inputs, *more[0]], [*rows.parameters, *more[1]], rows.kept if own.keeps else None
+    call = rows._replace(inputs=inputs, parameters=parameters, kept=kept)
+    # Of a pass that is differentiated again, what is looked up may be kept once more.
+    found = run_program(call, following) if torch.is_grad_enabled() else run(call, following)
+    results, learning = found[: own.outputs], [p for p, want in zip(rows.parameters, wanted[count:]) if want]
+    for total, p in zip(found[own.outputs :], learning, strict=True):
         total = total.sum(0, keepdim=True) if p.shape[0] == 1 and total.shape[0] > 1 else total
-        results.append(total.to(p.dtype))
+        results.append(total if p.dtype == total.dtype else total.to(p.dtype))
     return results
 
 
-def _lookups(program: Program) -> Any:
-    return lower(program.text, False).lookups
+class _Gradient(NamedTuple):
+    """The program of gradients: its text, how many of its results are gradients of inputs, whether it sifts rows (see
+    `How.gradients`), and whether what the program kept is what it looks up."""
+
+    text: str
+    outputs: int
+    sifts: bool
+    keeps: bool
+
+
+@functools.lru_cache(maxsize=1024)
+def _gradient(text: str, count: int, split: int, wanted: tuple[bool, ...], given: tuple[bool, ...]) -> _Gradient:
+    program = Program.parse(text)
+    own = gradient(program, wanted[:count], wanted[count:], given[:split], given[split:])
+    sifts = not own.outputs and all(i < count for i in own.rays)
+    keeps = bool(program.grids) and compiled_runs(own.text) and compiled_runs(text)
+    keeps = keeps and lower(own.text, False).lookups == lower(text, False).lookups
+    return _Gradient(own.text, len(own.outputs), sifts, keeps)
 
 
 run.register_autograd(_gradients, setup_context=_keep)

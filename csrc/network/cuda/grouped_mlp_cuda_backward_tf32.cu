@@ -1,8 +1,0 @@
-#include "network/cuda/grouped_mlp_cuda_backward_kernel.h"
-
-namespace voronerf {
-
-template void mlp_backward_launch<FloatProducts<true>>(const MlpCudaPlan&, const MlpCudaData&, const HashEncoding&,
-                                                       void*);
-
-}  // namespace voronerf

@@ -1,0 +1,58 @@
+"""The first steps of a training: a grid that does not empty all, and another draw where nothing is learnt."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny_runs import small, steps_of
+
+from voronerf.app.evaluate.scores import evaluate, mean_scores
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train import TrainConfig, build
+from voronerf.app.train.start import why_nothing_is_learnt
+from voronerf.nerf import Batch, Rays, RenderOutput
+from voronerf.nerf.volume import Samples
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("seed", [0, 3])
+def test_steps_of_many_rays_do_not_empty_the_grid_before_the_field_is_dense(seed):
+    """Seeds whose trainings stayed without a sample, at 9 dB."""
+    scene = builtin_scene(32, train_views=30, test_views=2)
+    config = TrainConfig(steps=6000, split_at=(0.9,), rays=4096, samples=(128,), seed=seed)
+    state = steps_of(build(config, scene), 115)
+    with state.averaged():
+        assert state.sampler.grid.share < 0.9
+        assert mean_scores(evaluate(state.renderer, scene, views=2))["psnr"] > 20
+
+
+def test_a_start_that_failed_begins_again_and_learns(scene, monkeypatch):
+    monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 20)
+    monkeypatch.setattr("voronerf.app.train.start.JUDGED", 30)
+    said = []
+    state = build(small(field="hashgrid", depth=1, occupancy=True, steps=400, split_at=(0.9,)), scene)
+    state = replace(state, on_event=said.append)
+    with torch.no_grad():
+        state.router.module.density.bias.fill_(-30.0)
+    steps_of(state, 20)
+    state.sampler.grid.occupied.fill_(False)
+    steps_of(state, 30)
+    assert said == ["nothing is learnt by step 50: all space is empty; begins again from another draw, 1 of 3"]
+    assert state.began == 50 and state.sampler.grid.share == 1 and state.rays == 64 and not state.optimizer.state
+    assert len(state.strategy.reservoir) == 0 and state.learning_rate() == pytest.approx(0.01 * state.config.lr)
+    steps_of(state, 100)
+    assert len(said) == 1 and state.sampler.grid.share == 1 and state.loss < 0.03
+
+
+def test_a_start_of_one_colour_has_failed():
+    """Rays of other colours through samples of one; not where all of them should have it."""
+    generator = torch.Generator().manual_seed(0)
+    background, target = torch.rand(2, 50, 3, generator=generator)
+    light = torch.linspace(0, 1, 50)[:, None]
+    for own, wanted, failed in ((0.4, target, True), (0.4, 0.4 + 0 * target, False), (target, target, False)):
+        colour = light * own + (1 - light) * background
+        nothing, places = torch.zeros(50), torch.zeros(50, 3)
+        batch = Batch(Rays(places, places), nothing, nothing, wanted, background)
+        samples = Samples(places, torch.arange(50), torch.arange(51), nothing, nothing)
+        output = RenderOutput(torch.zeros(()), nothing, light[:, 0], nothing, samples, colour)
+        assert why_nothing_is_learnt(batch, output) == ("all has one colour" if failed else None)
