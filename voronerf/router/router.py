@@ -565,6 +565,16 @@ class VoronoiRouter(nn.Module):
         Args:
             *args: Tensors [n, w] of the kinds that ``forward`` gets, of two samples or more.
             trace: Whether a module that was not is traced on these, which are 8 samples or more.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiRouter
+            >>> router = VoronoiRouter(torch.nn.Linear(3, 2), torch.rand(4, 3), coords="first3", fuse=True)
+            >>> router.program(torch.rand(8, 3))
+            'Linear.forward is traced at its first call'
+            >>> known = router.program(torch.rand(8, 3), trace=True)
+            >>> [step.op for step in known.program.steps], known.shapes
+            (['input', 'linear'], ((2,),))
         """
         if callable(self.coords) or isinstance(self.coords, slice):
             return "other positions than those of the samples decide the cells"
@@ -583,8 +593,12 @@ class VoronoiRouter(nn.Module):
             found = dispatch.program(call, grouping, device, k, self._options, self.backend)
         if isinstance(found, str) or k == 1:
             return found
-        of_cells = (p.dim() > len(own) for p, own in zip(found.parameters, found.program.parameters))
-        return found if any(of_cells) else "all cells share all parameters"
+        own = zip(found.parameters, found.program.parameters)
+        return (
+            found
+            if any(p.shape[0] == k and p.dim() > len(shape) for p, shape in own)
+            else "all cells share all parameters"
+        )
 
     def explain(self) -> str:
         """How each method has been carried out, a line for each: fused, grouped or cell by cell, and why.
