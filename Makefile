@@ -61,9 +61,9 @@ cuda-check: $(VENV)/.installed
 warp-check: $(VENV)/.built $(VENV)/.tools
 	@$(BIN)/python .ci/warp_check.py $(CUDA_CHECK_ARCHITECTURES) $(HALF)
 
-# The C++ of the CPU kernels on 64-bit Arm, in qemu, with CASES random networks and calls: needs g++-aarch64-linux-gnu and qemu-user.
+# The C++ of the CPU kernels on 64-bit Arm, in qemu, with CASES random programs of each kind and calls: needs g++-aarch64-linux-gnu and qemu-user.
 CASES ?= 12
-arm-check:
+arm-check: $(VENV)/.built
 	@tests/cpp/arm.sh $(CASES)
 
 # The operations with the instruction sets that this processor would not choose; of graphs these know nothing.

@@ -47,6 +47,7 @@ int64_t encode_workspace(int64_t d, int64_t octaves, int threads) {
 }
 
 void encode_cpu(const Encoding& in, float* out, float* workspace, Isa isa, int threads) {
+  if (in.width == 0) return;
   const int64_t stride = stride_of(in.d, in.octaves);
   over_ranges(in, workspace, threads,
               [&](float* own, int64_t begin, int64_t end) { forward_rows(in, out, own, stride, begin, end, isa); });

@@ -166,8 +166,8 @@ class Pool {
     int32_t *cell = samples_.cell.data(), *order = samples_.order.data();
     if (cells.child == nullptr) {
       nearest_centre_serial(positions, cells.centres, cell, in.n, cells.m, call_.isa);
-    } else if (!locate_cell_cpu(positions, cells.centres, cells.child_offsets, cells.child, cell, descent_.data(),
-                                in.n, cells.m, cells.depth, call_.isa, 1)) {
+    } else if (!locate_cell_cpu(positions, cells.centres, cells.child_offsets, cells.child, cell, descent_.data(), in.n,
+                                cells.m, cells.depth, call_.isa, 1)) {
       return false;
     }
     // A counting sort: offsets are where the next row of each cell goes, and then where the last one went.
@@ -227,8 +227,8 @@ bool render_opaque_cpu(const Program& program, const ProgramInputs& network, con
   const ProgramRows rows(program, network, isa);
   const std::vector<ProgramInput>& inputs = program.table.inputs;
   const Workspace workspace(rows.workspace() * std::max(threads, 1));
-  const Call call{network, rows, march, room, cells, rule, out, inputs.size() > 1 ? inputs[1].width : 0, isa,
-                  std::max(threads, 1)};
+  const Call call{
+      network, rows, march, room, cells, rule, out, inputs.size() > 1 ? inputs[1].width : 0, isa, std::max(threads, 1)};
   Items items(march.r, kRun);
   const int team = static_cast<int>(std::min<int64_t>(threads, ceil_div(march.r, kRun)));
   std::vector<std::unique_ptr<Pool>> pools;  // made here, as nothing may be thrown in a team

@@ -4,8 +4,10 @@
 set -euo pipefail
 build=$(mktemp -d)
 trap 'rm -rf "$build"' EXIT
-CXX=${CXX:-aarch64-linux-gnu-g++} "$(dirname "$0")/build.sh" "$build" -O1 -DVN_STD_THREADS -pthread -static
-for test in ops networks; do
+here=$(dirname "$0")
+"$here/../../.venv/bin/python" "$here/programs.py" "${1:-12}" "$build/drawn"
+CXX=${CXX:-aarch64-linux-gnu-g++} "$here/build.sh" "$build" -O1 -DVN_STD_THREADS -pthread -static
+for test in ops programs; do
   echo -n "$test, aarch64: "
-  qemu-aarch64 "$build/$test" "${1:-12}"
+  qemu-aarch64 "$build/$test" "${1:-12}" "$build/drawn"
 done

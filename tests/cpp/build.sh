@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds the C++ tests of the CPU kernels, ops and networks: build.sh FOLDER FLAGS... by $CXX (g++), for its architecture.
+# Builds the C++ tests of the CPU kernels, ops and programs: build.sh FOLDER FLAGS... by $CXX (g++), for its architecture.
 set -euo pipefail
 folder=$1
 shift
@@ -21,7 +21,7 @@ for source in tests/cpp/*.cpp $(find csrc -name "*.cpp" -not -path "*/bindings/*
   fi
 done | xargs -P "$(nproc)" -L 1 sh -c 'source=$1 object=$2; shift 2; exec '"${cxx[*]} -std=c++17 -ffp-contract=off -Wall \
   -Wextra -Wno-unknown-pragmas -Wno-unused-parameter -Icsrc $*"' "$@" -c "$source" -o "$object"' sh
-for test in ops networks; do
-  read -ra others <<<"$(echo "$folder"/*.o | tr ' ' '\n' | grep -v -e /ops.o -e /networks.o | tr '\n' ' ')"
+for test in ops programs; do
+  read -ra others <<<"$(echo "$folder"/*.o | tr ' ' '\n' | grep -v -e /ops.o -e /programs.o | tr '\n' ' ')"
   "${cxx[@]}" "$@" "$folder/$test.o" "${others[@]}" -o "$folder/$test"
 done

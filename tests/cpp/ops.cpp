@@ -14,7 +14,6 @@
 #include "geometry/cell_sort.h"
 #include "geometry/locate_cell.h"
 #include "geometry/nearest_centre.h"
-#include "network/grouped_linear.h"
 #include "rays/composite.h"
 #include "rays/march_rays.h"
 #include "rays/render_loss.h"
@@ -199,62 +198,6 @@ void harmonics(Isa isa) {
   }
 }
 
-// bfloat16 is bits here: halves of the floats that are there anyway.
-template <typename T>
-Array<T> stored(int64_t size) {
-  const Array<float> values = uniform<float>(size);
-  Array<T> result(size);
-  for (int64_t i = 0; i < size; ++i) {
-    std::memcpy(&result[i], reinterpret_cast<const char*>(&values[i]) + sizeof(float) - sizeof(T), sizeof(T));
-  }
-  return result;
-}
-
-template <typename T>
-void linear(Isa isa) {
-  const int64_t widths[] = {1, 2, 3, 4, 15, 16, 17, 32, 33, 48, 63, 64, 65, 90, 129};
-  const int64_t k = 1 + below(5), i = widths[below(15)], o = widths[below(15)];
-  Array<int32_t> offsets{static_cast<int32_t>(below(3))};
-  for (int64_t c = 0; c < k; ++c) {
-    const int64_t rows = below(3) == 0 ? 0 : below(4) == 0 ? 500 + below(600) : below(200);
-    offsets.push_back(offsets.back() + static_cast<int32_t>(rows));
-  }
-  const int64_t n = offsets.back() + below(3);
-  const Array<T> x = stored<T>(n * i), weight = stored<T>(k * o * i), bias = stored<T>(below(2) * k * o),
-                 gradient = stored<T>(n * o);
-  const voronerf::LinearInputs in{x.data(), offsets.data(), weight.data(), or_null(bias), n, k, i, o,
-                                  static_cast<voronerf::Activation>(below(5)), sizeof(T) == 2};
-  const bool to_x = below(4) > 0, to_weight = below(4) > 0;
-  Array<T> results[2][4];
-  for (int j = 0; j < 2; ++j) {
-    Array<T>* const own = results[j];
-    const int64_t sizes[] = {n * o, to_x ? n * i : 0, to_weight ? k * o * i : 0,
-                             to_weight ? static_cast<int64_t>(bias.size()) : 0};
-    for (int part = 0; part < 4; ++part) {
-      own[part].assign(sizes[part], T());
-      own[part].shrink_to_fit();
-      if (sizes[part] > 0) std::memset(own[part].data(), 0xff, sizes[part] * sizeof(T));  // NaN
-    }
-    voronerf::grouped_linear_cpu(in, own[0].data(), isa, 1 + 2 * j);
-    voronerf::grouped_linear_backward_cpu(
-        in,
-        {gradient.data(), to_x ? own[1].data() : nullptr, to_weight ? own[2].data() : nullptr,
-         to_weight && !bias.empty() ? own[3].data() : nullptr},
-        isa, 1 + 2 * j);
-  }
-  for (int part = 0; part < 4; ++part) {
-    same(results[0][part], results[1][part], "grouped_linear");
-    Array<float> values = poisoned(results[0][part].size());
-    for (size_t i = 0; i < values.size(); ++i) {
-      uint32_t bits = 0;
-      std::memcpy(reinterpret_cast<char*>(&bits) + sizeof(float) - sizeof(T), &results[0][part][i], sizeof(T));
-      std::memcpy(&values[i], &bits, sizeof(float));
-      if (!wild && !std::isfinite(values[i])) fail("grouped_linear: a result is not finite");
-    }
-    like_portable(values, "grouped_linear", sizeof(T) == 2 ? 2e-2 : 1e-5);
-  }
-}
-
 void march(Isa isa) {
   const int64_t r = below(4) == 0 ? 300 : below(9), s = 1 + below(70), x = 1 + below(9), y = 1 + below(9),
                 z = 1 + below(9);
@@ -373,8 +316,6 @@ int main(int count, char** arguments) {
       composite(isa);
       encode(isa);
       harmonics(isa);
-      linear<float>(isa);
-      linear<uint16_t>(isa);
       march(isa);
       loss(isa);
       adam(isa);

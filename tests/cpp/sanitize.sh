@@ -10,11 +10,12 @@ export TSAN_OPTIONS="halt_on_error=1 ${TSAN_OPTIONS:-}"
 
 check() { # name, cases, flags
   "$here/build.sh" "$build/$1" -O1 -g "${@:3}"
-  for test in ops networks; do
+  for test in ops programs; do
     echo -n "$test, $1: "
-    setarch -R "$build/$1/$test" "$2" # gaps between mappings may be too random for ThreadSanitizer's shadow
+    setarch -R "$build/$1/$test" "$2" "$build/drawn" # gaps between mappings may be too random for ThreadSanitizer's shadow
   done
 }
 
+"$here/../../.venv/bin/python" "$here/programs.py" "${1:-40}" "$build/drawn"
 check address-and-undefined "${1:-40}" -fopenmp -fsanitize=address,undefined -fno-sanitize-recover=all
 check thread "$((${1:-40} / 3))" -DVN_STD_THREADS -pthread -fsanitize=thread

@@ -628,3 +628,50 @@ def test_texts_of_programs() -> None:
         assert Program.parse(program.text) == program
         assert Program.parse(program.text).text == program.text
     assert gradient(encoded(), *ALL).rays == (2, 4) and gradient(encoded(), *ALL).by_ray == (2,)
+
+
+def test_rows_without_a_gradient_where_tensors_lie_turned() -> None:
+    """They are left out by what they are, with columns of inputs and gradients [w, n] in memory."""
+    b, n = Builder(), 200
+    x = b.input(5)
+    program = b.program([b.linear(x, b.parameter(4, 5), 4)])
+    generator = torch.Generator().manual_seed(0)
+    rows, weights = torch.randn(5, n, generator=generator), torch.randn(2, 4, 5, generator=generator)
+    gradient_of = torch.randn(4, n, generator=generator)
+    gradient_of[:, 60:] = 0
+    for turned in (rows.t(), rows.t().contiguous()):
+        slopes = []
+        for backend in ("reference", "native"):
+            leaf = weights.clone().requires_grad_()
+            (out,) = grouped_program([turned], [leaf], offsets_of([80, 120]), program=program, backend=backend)
+            (out.t() * gradient_of).sum().backward()
+            slopes.append(leaf.grad)
+        torch.testing.assert_close(*slopes, rtol=1e-5, atol=1e-5)
+
+
+def test_rows_of_rays_that_lie_turned() -> None:
+    """As many rays as samples."""
+    b, n = Builder(), 6
+    program = b.program([b.binary("add", b.input(4), b.input(4, ray=True))])
+    x, rays = torch.rand(n, 4), torch.rand(4, n).t()
+    index = torch.arange(n).flip(0).int()
+    found = grouped_program([x, rays], [], offsets_of([2, 4]), program=program, ray_index=index, backend="native")
+    torch.testing.assert_close(found[0], x + rays.flip(0))
+
+
+def test_second_derivatives_where_rows_have_no_gradient() -> None:
+    """What is kept of a hash grid is of all rows, also those that add nothing to the first one."""
+    b, n = Builder(), 40
+    table = b.parameter(*GRID.table_shape)
+    e = b.encode("hash", b.input(3), b.grid(GRID.text), table)
+    program = b.program([b.apply("sigmoid", b.linear(e, b.parameter(2, e.width), 2))])
+    x, light = torch.rand(n, 3), torch.rand(n, 2)
+    light[5:] = 0
+    given, found = [torch.randn(1, *shape) for shape in program.parameters], []
+    for backend in ("reference", "native"):
+        leaves = [parameter.clone().requires_grad_() for parameter in given]
+        (out,) = grouped_program([x], leaves, offsets_of([10, 30]), program=program, backend=backend)
+        first = torch.autograd.grad((out * light).sum(), leaves, create_graph=True)
+        found.append(torch.autograd.grad(sum((slope**2).sum() for slope in first), leaves))
+    for ours, exact in zip(*found, strict=True):
+        torch.testing.assert_close(ours, exact, rtol=1e-4, atol=1e-5)

@@ -60,7 +60,7 @@ void fetch(const ProgramCall& call, int64_t cell) {
 // Rows of no cell.
 void clear_strays(const ProgramInputs& in, const ProgramResults& results, const ProgramTable& table) {
   for (size_t o = 0; o < table.outputs.size(); ++o) {
-    if (table.outputs[o].ray) continue;
+    if (table.outputs[o].ray || in.n == 0) continue;
     const bool half = results.output_types[o] == TableType::bfloat16;
     const int64_t bytes = table.outputs[o].width * (half ? 2 : 4);
     char* const out = static_cast<char*>(results.outputs[o]);
@@ -105,8 +105,10 @@ Sifted sift(const ProgramTable& table, const ProgramInputs& in, int threads) {
       bool zero = true;
       for (size_t input = static_cast<size_t>(in.gradients); input < table.inputs.size(); ++input) {
         const int64_t width = table.inputs[input].width;
-        const float* from = static_cast<const float*>(in.inputs[input]) + row * width;
-        for (int64_t c = 0; c < width; ++c) zero &= from[c] == 0.0f;
+        const bool turned = in.turned[input] != 0;
+        const int64_t next = turned ? in.n : 1;
+        const float* from = static_cast<const float*>(in.inputs[input]) + row * (turned ? 1 : width);
+        for (int64_t c = 0; c < width; ++c) zero &= from[c * next] == 0.0f;
       }
       to[count] = static_cast<int32_t>(i);
       count += !zero;
@@ -289,6 +291,7 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
   ProgramCall call = rows.call(in, results, in_place.get());
   call.memories = memories.data();
   call.filled = filled.get();
+  call.n = given.n;
   clear_strays(in, results, table);
 
   // The memory of the call: threads, partials, memories of n rows, and points in the order of the cells.

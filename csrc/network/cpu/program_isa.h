@@ -25,8 +25,8 @@ struct ProgramCall {
   const bool* filled;         // of memories: nothing is to be looked up
   const HashEncoding* grids;  // without their tables
   const int32_t *order, *ray_index;
-  int64_t n;
-  int64_t tile;  // rows
+  int64_t n;     // rows of inputs
+  int64_t tile;  // rows, at most
 };
 
 // Makes a cell's parameters ready; `first`: nothing was before. `free`: the thread's slots.

@@ -187,6 +187,12 @@ struct ProgramTile {
     const int64_t width = step.width, all = call.output_widths[step.number];
     float* const summed = step.memory < 0 ? nullptr : call.memories[step.memory];  // of rays
     const bool half = call.output_types[step.number] == TableType::bfloat16;
+    if (summed == nullptr && !half && !x.spread) {
+      float* const out = static_cast<float*>(call.outputs[step.number]) + step.depth;
+      const float* values = x.data;
+      for (int64_t row = 0; row < rows; ++row, values += x.stride) copy_row(values, width, out + place(row) * all);
+      return;
+    }
     for (int64_t row = 0; row < rows; ++row) {
       const float* values = x.data + row * x.stride;
       const int64_t to = (summed == nullptr ? place(row) : begin + row) * all + step.depth;

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -49,11 +50,15 @@ class Lowered:
         program: that of the compiled module.
         lookups: those whose values may be kept, [n, width] each in the order of the cells.
         widths: floats of a row of each.
+        sizes: entries of each parameter for one cell.
+        tables: numbers of the parameters that are tables of hash grids.
     """
 
     program: native.compiled.Program
     lookups: tuple[Lookup, ...]
     widths: tuple[int, ...]
+    sizes: tuple[int, ...]
+    tables: tuple[int, ...]
 
 
 @functools.lru_cache(maxsize=1024)
@@ -292,7 +297,8 @@ class _Lowering:
     def _own_output(self, step: Step) -> int:
         """The memory of an output that is a whole value and whose rows end with whole vectors: it can be made there."""
         for reader, _ in self.readers.get(step.out, []):
-            if reader.op == "output" and step.width % _GRANULE == 0 and _all_of(reader.operands[0], step.width):
+            whole = step.width % _GRANULE == 0 and self._within(step, step.width)
+            if reader.op == "output" and whole and _all_of(reader.operands[0], step.width):
                 number, first = map(int, reader.numbers)
                 if number not in self.program.by_ray and self.program.outputs[number].width == step.width and not first:
                     return self.own.setdefault(number, self.memory(step.width))
@@ -303,10 +309,15 @@ class _Lowering:
         encoded = [reader.op in ("encode", "scatter") and place == 0 for reader, place in readers]
         value = self.make(step, dying, stride=step.width if readers and all(encoded) else 0)
         plain = number not in self.program.rays
-        whole = value.stride == step.width and not all(encoded)  # no vector reads beyond a row
+        whole = value.stride == step.width and not all(encoded) and self._within(step, value.stride)
         if plain and readers and (whole or all(self._product(reader, place) for reader, place in readers)):
             value.input = number
         self.emit("input", value=value, number=number, in_place=value.input != _NONE)
+
+    def _within(self, step: Step, stride: int) -> bool:
+        """Whether no vector that reads a value goes beyond its rows, behind the last of which a tensor may end."""
+        columns = [r.operands[p] for r, p in self.readers.get(step.out, []) if r.op not in ("move", "total", "output")]
+        return all(c.spread or c.start + _padded(c.width) <= stride for c in columns)
 
     def _product(self, step: Step, place: int) -> bool:
         """Whether an operand is read no further than its columns: as x of a linear step, or broadcast in a sum."""
@@ -361,7 +372,7 @@ class _Lowering:
         records = [self.operand(c) for c in step.operands]
         value = self.make(step, dying)
         given: dict[str, Any] = {"encoding": step.name, "order": order, "number": size, "parameter": parameter}
-        if step.name == "hash" and not order:
+        if step.name == "hash" and not order and self._within(step, value.stride):
             value.memory = self.memory(value.stride)
             source = self._input_of(step.operands[0])
             self.lookups.append((Lookup(source, parameter, size), value.memory))
@@ -459,6 +470,8 @@ class _Lowering:
             compiled.make_program(table),
             tuple(lookup for lookup, _ in self.lookups),
             tuple(self.memories[memory] for _, memory in self.lookups),
+            tuple(map(math.prod, program.parameters)),
+            program.tables,
         )
 
 

@@ -18,7 +18,7 @@ from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import asked_for
 from voronerf.ops._core.layers import MLP
 from voronerf.ops._core.program import Program, gradient
-from voronerf.ops.grouped_program.lowering import compiled_runs, lower
+from voronerf.ops.grouped_program.lowering import Lowered, compiled_runs, lower
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
 
 
@@ -79,8 +79,11 @@ def grouped_program(
 def run_program(rows: Rows, how: How) -> list[Tensor]:
     """The outputs and sums of a program, with gradients of every order."""
     learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*rows.inputs, *rows.parameters))
-    found: list[Tensor] = run(rows, how._replace(keep=learning))
-    return found[:-1] if learning else found
+    if not learning:
+        found: list[Tensor] = run(rows, how)
+        return found
+    found = run(rows, how._replace(keep=True))
+    return found[:-1]
 
 
 def program_of(rows: Rows, how: How) -> Program:
@@ -116,11 +119,14 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
         return
     kept = keeps[0] if keeps else kept
     parts = None if kept is None or not kept.numel() else kept.split([n * width for width in lowered.widths])
-    given = program_inputs(rows, n, r, kept=parts, ready=not keeps, gradients=how.gradients, caller=how.caller)
+    gradients = -1 if keeps else how.gradients  # what is kept is of all rows
+    given = program_inputs(lowered, rows, n, r, kept=parts, ready=not keeps, gradients=gradients, caller=how.caller)
     if native.on_cuda(first):
         _run_on_cuda(program, rows, how, given, outputs, sums)
         return
-    results = native.compiled.ProgramResults(outputs=outputs, output_types=_types(outputs), sums=sums)
+    results = native.compiled.ProgramResults(
+        outputs=outputs, output_types=[given.input_types[0]] * len(outputs), sums=sums
+    )
     for result in (*outputs, *sums, *keeps):
         native.on_huge_pages(result)
     native.compiled.grouped_program(lowered.program, given, results, native.cpu())
@@ -142,7 +148,9 @@ def _run_on_cuda(
     made = list(outputs)
     for i in program.by_ray:
         made[i] = torch.empty(given.n, outputs[i].shape[1], device=offsets.device)
-    results = native.compiled.ProgramResults(outputs=made, output_types=_types(made), sums=sums)
+    results = native.compiled.ProgramResults(
+        outputs=made, output_types=[_NAMES[result.dtype] for result in made], sums=sums
+    )
     lowered, code = lower(program.text, False, True).program, _code(program.text, offsets.device)
     machine = native.compiled.Cuda(*native.stream(offsets))
     size = native.compiled.grouped_program_workspace(lowered, given.n, given.r, given.k, machine)
@@ -166,6 +174,7 @@ def _code(text: str, device: torch.device) -> Tensor:
 
 
 def program_inputs(
+    lowered: Lowered,
     rows: Rows,
     n: int,
     r: int,
@@ -178,6 +187,7 @@ def program_inputs(
     """The tensors of a program as the compiled module takes them.
 
     Args:
+        lowered: the program.
         rows: the tensors.
         n: rows.
         r: rays.
@@ -187,16 +197,20 @@ def program_inputs(
         caller: the op that errors name.
     """
     inputs, parameters, offsets, order, ray_index, _ = rows
-    turned = [0 if x.is_contiguous() else int(_columns_lie_together(x, n)) for x in inputs]
+    samples = -1 if ray_index is not None and n == r else n  # which inputs are of samples, none if that is not known
+    turned = [0 if x.is_contiguous() else int(_columns_lie_together(x, samples)) for x in inputs]
     if any(turned):
         inputs = [x.t() if turn else x for x, turn in zip(inputs, turned)]
+    kind, kinds = _NAMES[inputs[0].dtype], ["float32"] * len(parameters)
+    for table in lowered.tables:
+        kinds[table] = _NAMES[parameters[table].dtype]
     return native.compiled.ProgramInputs(
         inputs=inputs,
-        input_types=_types(inputs),
+        input_types=[kind] * len(inputs),
         turned=turned,
         parameters=[native.aligned(p) for p in parameters] if native.on_cuda(offsets) else parameters,
-        parameter_types=_types(parameters),
-        strides=[p.shape[1:].numel() if p.shape[0] > 1 else 0 for p in parameters],
+        parameter_types=kinds,
+        strides=[size if p.shape[0] > 1 else 0 for p, size in zip(parameters, lowered.sizes)],
         offsets=offsets,
         order=order,
         ray_index=ray_index,
@@ -218,10 +232,6 @@ def _columns_lie_together(x: Tensor, n: int) -> bool:
 
 
 _NAMES = {torch.float32: "float32", torch.bfloat16: "bfloat16", torch.float16: "float16"}
-
-
-def _types(tensors: Sequence[Tensor]) -> list[str]:
-    return [_NAMES[tensor.dtype] for tensor in tensors]
 
 
 def _half(products: str, tensor: Tensor) -> bool:

@@ -47,6 +47,7 @@ def render_opaque(*flat: Any) -> RaySums:
         composed: RaySums = partial(reference.render_opaque, backend="native")(*given._replace(network=narrow))
         return composed
     rows = taken.rows(torch.zeros(k + 1, dtype=torch.int32))
+    lowered = lower(program_of(rows, taken.how).text, False)
     child_offsets, child, depth = network["child_offsets"], network["child"], network["depth"]
     if k == 1:
         centres = child_offsets = child = None
@@ -55,8 +56,8 @@ def render_opaque(*flat: Any) -> RaySums:
     found: RaySums = _OP.allocate(given)
     outputs, compiled = _outputs(found), native.compiled
     sound = compiled.render_opaque(
-        lower(program_of(rows, taken.how).text, False).program,
-        program_inputs(rows, 0, 0, caller="render_opaque"),
+        lowered.program,
+        program_inputs(lowered, rows, 0, 0, caller="render_opaque"),
         _rays(given),
         compiled.SeeCells(
             centres=centres,
