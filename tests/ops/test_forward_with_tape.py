@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from op_cases import refused
@@ -41,6 +43,19 @@ def network(device, n=40, k=3):
     }
 
 
+def as_program(given):
+    """The same network, in the form of a program."""
+    names = ("weights", "biases", "layers", "positions", "directions", "direction_index", "features")
+    places = {name: value for name, value in given.items() if name not in names}
+    return {
+        "program": TABLE.program(3, 2, None, (True, False), ray=True),
+        "inputs": [given["positions"], given["directions"]],
+        "parameters": parameters_of(given),
+        "ray_index": given["direction_index"],
+        **places,
+    }
+
+
 def parameters_of(given):
     return [*given["weights"], given["biases"][0], given["features"]]
 
@@ -51,9 +66,9 @@ def squares(out):
     return (factor * out.square()).sum(), 2 * factor * out
 
 
-def learn(given, *, backward=False, backend="auto"):
+def learn(given, *, backward=False, backend="auto", program=False):
     """The loss, with gradients."""
-    tape = forward_with_tape(given, backend=backend)
+    tape = forward_with_tape(as_program(given) if program else given, backend=backend)
     assert not tape.raw.requires_grad
     return tape.backward(*squares(tape.raw), defer=not backward)
 
@@ -66,9 +81,12 @@ def composed(given):
 
 @pytest.mark.parametrize(("n", "k"), [(0, 3), (1, 1), (40, 1), (40, 3)])
 @pytest.mark.parametrize("backward", [False, True])
-def test_equals_its_parts(device, backend, n, k, backward):
+@pytest.mark.parametrize("program", [False, True])
+def test_equals_its_parts(device, backend, n, k, backward, program):
+    if program and backend == "warp":
+        pytest.skip("Warp has no programs")
     given, expected = network(device, n, k), network(device, n, k)
-    loss = learn(given, backward=backward, backend=backend)
+    loss = learn(given, backward=backward, backend=backend, program=program)
     wanted = composed(expected)
     assert loss.requires_grad != backward
     if not backward:
@@ -140,12 +158,51 @@ def test_under_autocast(device, backend):
     assert all(parameter.grad.dtype == torch.float32 for parameter in parameters_of(given))
 
 
+@pytest.mark.native
+@pytest.mark.parametrize("k", [1, 3])
+def test_a_program_gives_the_bits_of_its_layer_table(k):
+    """In float32 and under autocast; frozen cells and the rows that count as well."""
+    more = {"frozen": torch.arange(k) == 1, "rows": torch.tensor([30], dtype=torch.int32)}
+    for autocast in (False, True):
+        found = []
+        for program in (False, True):
+            given = {**network("cpu", k=k), **more}
+            with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+                loss = learn(given, backend="native", program=program)
+            loss.backward()
+            found.append([loss.detach(), *(p.grad for p in parameters_of(given))])
+        assert all(map(torch.equal, *found))
+
+
 def test_is_once_differentiable(device, backend):
     given = network(device)
     loss = learn(given, backend=backend)
     with pytest.raises(RuntimeError):
         gradients = torch.autograd.grad(loss, parameters_of(given), create_graph=True)
         torch.autograd.grad(sum(gradient.square().sum() for gradient in gradients), given["weights"][0])
+
+
+def test_refuses_a_program_that_makes_no_sense(backend):
+    given = as_program(network("cpu"))
+    wrong = {
+        "network must hold program, inputs and parameters, got no inputs": {"inputs": ...},
+        "program must be a Program, got str": {"program": "x"},
+        "unknown arguments layers": {"layers": TABLE},
+        "parameters must be 4 tensors (inputs at least one), got 1": {"parameters": given["parameters"][:1]},
+        "parameters[1] must have shape [k, 3, 10] with k = 3, got [2, 3, 10]": {
+            "parameters": [given["parameters"][0], torch.ones(2, 3, 10), *given["parameters"][2:]]
+        },
+        "ray_index must be given for a program with inputs of rays, got None": {"ray_index": None},
+        "frozen must have shape [k] with k = 3, got [2]": {"frozen": torch.zeros(2, dtype=torch.bool)},
+        "program must have one output [n, w] and inputs[0] [n, w], got others": {
+            "program": replace(given["program"], outputs=2 * given["program"].outputs)
+        },
+    }
+    for message, change in wrong.items():
+        network_ = {name: value for name, value in {**given, **change}.items() if value is not ...}
+        error = TypeError if "must be a" in message or "unknown" in message else ValueError
+        with refused(error, f"forward_with_tape: {message}"):
+            forward_with_tape(network_, backend=backend)
 
 
 def test_refuses_what_makes_no_sense(device, backend):

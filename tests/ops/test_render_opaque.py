@@ -116,7 +116,14 @@ def test_what_is_of_the_samples_is_refused():
     given = CASE.make(Draw(0), 3)
     with refused(TypeError, "render_opaque: network must hold ... alone, got cells"):
         render_opaque(**{**given, "network": {**given["network"], "cells": torch.zeros(3, dtype=torch.int32)}})
+    with refused(TypeError, "render_opaque: network must hold program, parameters, ... alone, got layers"):
+        render_opaque(**{**given, "network": {"program": 3, "layers": None}})
+    with refused(TypeError, "render_opaque: program must be a Program, got int"):
+        render_opaque(**{**given, "network": {"program": 3}})
     layers = MLP((Layer(("positions",), 3),), outputs=(0,))
+    program = {"program": layers.program(3, 0, None, (False,)), "parameters": [torch.zeros(1, 3, 3)]}
+    with refused(ValueError, "render_opaque: program must put out 4 numbers, colour and density, got 3"):
+        render_opaque(**{**given, "network": program})
     network = {"weights": [torch.zeros(1, 3, 3)], "biases": [None], "layers": layers}
     with refused(ValueError, "render_opaque: layers must put out 4 numbers, colour and density, got 3"):
         render_opaque(**{**given, "network": network})

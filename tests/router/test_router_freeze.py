@@ -9,6 +9,7 @@ import torch
 from voronerf import NeRF, VoronoiRouter
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.fields import HashGridField
+from voronerf.nerf.radiance import radiance_of
 from voronerf.ops import forward_with_tape
 
 FROZEN, LEARNING = [1, 3], [0, 2]
@@ -145,7 +146,8 @@ def gradients_of_table(router, points, count):
 def test_forward_with_tape_leaves_frozen_cells_out(backend):
     router, points = make("table"), torch.rand(100, 3)
     router.freeze(FROZEN)
-    network = router.table_arguments(points, torch.ones(100, 3), None)
+    rays = torch.arange(100, dtype=torch.int32)
+    network = radiance_of(router).arguments(points, torch.ones(100, 3), rays, backend)
     tape = forward_with_tape(network, backend=backend)
     tape.backward(tape.raw.square().sum(), 2 * tape.raw)
     for p in router.parameters():

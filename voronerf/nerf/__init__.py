@@ -4,7 +4,7 @@ from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.cameras import Cameras, Rays, focus_point, orbit_cameras, turntable_cameras
 from voronerf.nerf.contraction import Contraction, Perspective
-from voronerf.nerf.field import Field
+from voronerf.nerf.field import DirectionPerSample, Field
 from voronerf.nerf.loss import Batch, RayLoss, RenderOutput
 from voronerf.nerf.marching import RayColours, render_until_opaque
 from voronerf.nerf.occupancy import OccupancyGrid
@@ -21,6 +21,7 @@ __all__ = [
     "Batch",
     "Cameras",
     "Contraction",
+    "DirectionPerSample",
     "Field",
     "Hierarchical",
     "Occupancy",

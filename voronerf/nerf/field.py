@@ -29,6 +29,20 @@ class DirectionPerSample(nn.Module):
     Args:
         network: Called with positions [n, 3], or Gaussians [n, 6], and unit directions [n, 3]; returns a colour [n, 3]
             in 0..1 and a density [n] or [n, 1] >= 0 per scene unit.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import VoronoiRouter
+        >>> from voronerf.nerf import DirectionPerSample
+        >>> class Fog(torch.nn.Module):
+        ...     def __init__(self):
+        ...         super().__init__()
+        ...         self.layer = torch.nn.Linear(6, 4)
+        ...     def forward(self, positions, directions):
+        ...         found = self.layer(torch.cat([positions, directions], dim=-1))
+        ...         return found[:, :3].sigmoid(), found[:, 3].exp()
+        >>> router = VoronoiRouter(Fog(), torch.rand(8, 3), coords="first3", fuse=True)
+        >>> field = DirectionPerSample(router)  # which a Renderer takes
     """
 
     def __init__(self, network: nn.Module) -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from voronerf.nerf.cameras import Rays
-from voronerf.nerf.fields.radiance import activate_radiance
 from voronerf.nerf.occupancy import HIDDEN
+from voronerf.nerf.radiance import Radiance, radiance_of, router_of
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Hierarchical, Occupancy
 from voronerf.nerf.sampling import colour_loss
@@ -20,7 +20,6 @@ from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.ops.render_loss import render_loss_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.sparse_depth_gradient.reference import near_point, sparse_depth_loss
-from voronerf.router import VoronoiRouter
 
 
 @dataclass(frozen=True)
@@ -109,6 +108,7 @@ class RayLoss:
         samples: Stratified, 8 a ray
         loss: networks, colours and loss are separate operations
         not faster: empty space is not skipped
+        field: forward: fused, by the layer table of the field
     """
 
     def __init__(self, renderer: Renderer, *, sparse_depth: float = 0.0) -> None:
@@ -125,38 +125,44 @@ class RayLoss:
             backward: Whether gradients are added to those of the parameters at once, as ``loss.backward()`` does it,
                 in less time; the loss has none then.
         """
-        run = self._fused if self.why_not_fused() is None else self._separate
-        return run(batch, generator, backward)
+        field = self._radiance()
+        if isinstance(field, str) and isinstance(self.renderer.sampler, Occupancy):  # perhaps not traced yet
+            middle = (batch.near + batch.far)[:, None] / 2
+            samples = self.renderer.sampler.space.samples(batch.rays, middle, middle.expand(-1, 2))
+            field = self._radiance((samples.inputs, batch.rays.directions))
+        if isinstance(field, str):
+            return self._separate(batch, generator, backward)
+        return self._fused(field, batch, generator, backward)
 
     def why_not_fused(self) -> str | None:
-        """What keeps networks, colours, loss and gradients from being one operation; None if nothing does."""
-        field = self.renderer.field
-        if not isinstance(self.renderer.sampler, Occupancy):
-            return "empty space is not skipped"
-        if not isinstance(field, VoronoiRouter):
-            return f"the field is a {type(field).__name__}, no router"
-        if getattr(type(field.module), "activate", None) is not activate_radiance:
-            return f"{type(field.module).__name__} does not say what its outputs mean (activate = activate_radiance)"
-        if field.coords not in (None, "first3"):
-            return "other positions than those of the samples decide the cells"
-        return None if field.by_table else f"{type(field.module).__name__} does more than its layer table says"
+        """What keeps networks, colours, loss and gradients from being one operation; None if nothing does.
 
-    def _fused(self, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:
+        What a module with ``fuse=True`` computes is known from its first step on, which traces it.
+        """
+        found = self._radiance()
+        return found if isinstance(found, str) else None
+
+    def _radiance(self, samples: tuple[Tensor, Tensor] | None = None) -> Radiance | str:
+        """What the field computes; or why the operations are separate. Samples are those of `radiance_of`."""
+        renderer = self.renderer
+        if not isinstance(renderer.sampler, Occupancy):
+            return "empty space is not skipped"
+        return radiance_of(renderer.field, samples, inputs=6 if renderer.cones else 3, backend=renderer.backend)
+
+    def _fused(self, field: Radiance, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:
         renderer, depths = self.renderer, batch.sparse_depths if self.sparse_depth else None
-        field = cast(VoronoiRouter, renderer.field)
         samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, jitter=True, generator=generator)
         if depths is not None:
             samples = samples.counted()
-        network = cast(Any, field.table_arguments(samples.inputs, batch.rays.directions, samples.ray_index))
+        network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index, renderer.backend)
         tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
-        scale = float(cast(Any, field.module).density_scale)
         found, gradient = render_loss_gradient(
             tape.raw,
             samples.deltas,
             samples.ray_offsets,
             batch.target,
             background=batch.background,
-            density_scale=scale,
+            **field.rule,
             hidden=HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
             backend=renderer.backend,
         )
@@ -174,8 +180,7 @@ class RayLoss:
                 depths,
                 backend=renderer.backend,
             )
-            # The density is a softplus of the output, whose derivative is 1 - exp(-density / scale) times the scale.
-            gradient[begin:, 3] -= factor * scale * slope * torch.expm1(-density / scale)
+            gradient[begin:, 3] += factor * slope * field.networks.slope(density)
             loss = loss + factor * of_depth
         shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
         if shares is not None:
@@ -211,7 +216,8 @@ class RayLoss:
         if isinstance(sampler, Occupancy):
             lines[0] += f", of which {sampler.grid.share:.0%} of the grid are left"
         obstacle = self.why_not_fused()
-        if obstacle is None:
+        separate = obstacle is not None
+        if not separate:
             device, dtype = renderer.device, torch.float32
             chosen = backends.chosen("forward_with_tape", device, dtype, backend=renderer.backend)
             lines.append(f"loss: networks, colours, loss and gradients in one operation, on the {chosen} backend")
@@ -223,6 +229,6 @@ class RayLoss:
         if obstacle is not None:
             lines.append(f"not faster: {obstacle}")
         for name, field in renderer.fields.items():
-            if isinstance(field, VoronoiRouter) and not field.by_table:
-                lines.append(f"{name}: {field.explain()}")
+            if separate and (router := router_of(field)) is not None:
+                lines.append(f"{name}: {router.explain()}")
         return "\n".join(lines)

@@ -5,20 +5,19 @@ r rays, s strata of a ray. Units as in `voronerf.nerf.volume`.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from voronerf.nerf.cameras import Rays
 from voronerf.nerf.field import Field
-from voronerf.nerf.fields.radiance import activate_radiance
+from voronerf.nerf.radiance import radiance_of, router_of
 from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.volume import normalised
 from voronerf.ops.composite import composite
-from voronerf.ops.render_opaque import NETWORK
+from voronerf.ops.render_opaque import OF_PROGRAM
 from voronerf.ops.render_opaque.reference import Wave, walk
-from voronerf.router import VoronoiRouter
 
 OPAQUE = 0.05  # a ray ends when it lets less than this through: what is behind counts as of the colour before it
 #: Samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain. Pictures of
@@ -125,14 +124,13 @@ def render_until_opaque(
 
 def _network(field: Field, rays: Rays, sampler: Occupancy) -> dict[str, Any] | None:
     """What ``render_opaque`` asks in the place of a field; None if it is more than networks, for Warp and CUDA."""
-    if not isinstance(field, VoronoiRouter) or not rays.origins.is_cpu:
+    router = router_of(field)
+    if router is None or not rays.origins.is_cpu or "warp" in (sampler.backend, router.backend):
         return None
-    if "warp" in (sampler.backend, field.backend):
+    known = radiance_of(field, (rays.origins, rays.directions))
+    if isinstance(known, str):
         return None
-    if getattr(type(field.module), "activate", None) is not activate_radiance:
+    found = known.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32), sampler.backend)
+    if "cells" in found:  # which each sample has of its own
         return None
-    found = field.table_arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32))
-    if found is None or "cells" in found:  # which each sample has of its own
-        return None
-    network = {name: value for name, value in found.items() if name in NETWORK}
-    return {"network": network, "density_scale": float(cast(Any, field.module).density_scale)}
+    return {"network": {name: value for name, value in found.items() if name in OF_PROGRAM}, **known.rule}

@@ -19,13 +19,12 @@ from torch import Tensor
 from voronerf.nerf.cameras import Rays
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
-from voronerf.nerf.fields.radiance import activate_density, activate_radiance
+from voronerf.nerf.radiance import radiance_of
 from voronerf.ops._core.checks import check_range
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.observe_occupancy.reference import cells_of as voxels_of
 from voronerf.ops.render_opaque import RaySums, render_opaque
-from voronerf.router import VoronoiRouter
 
 #: Voxels of a grid along each axis, of a box and of contracted space, which is all the world.
 RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
@@ -385,15 +384,9 @@ def draw_seed(device: torch.device, generator: torch.Generator | None) -> Tensor
 
 def density_of(field: Field, points: Tensor) -> Tensor:
     """Density [n] of a field at points [n, 3], float32, seen along the z axis; NaN becomes infinity."""
-    sigma = _density_alone(field, points) if isinstance(field, VoronoiRouter) else None
+    direction = points.new_tensor(((0.0, 0.0, 1.0),))
+    known = radiance_of(field, (points, direction.expand(len(points), -1)))
+    sigma = None if isinstance(known, str) else known.density(points)
     if sigma is None:
-        direction = points.new_tensor(((0.0, 0.0, 1.0),))
         _, sigma = field(points, direction, torch.zeros(len(points), dtype=torch.int32, device=points.device))
     return sigma.detach().float().nan_to_num(nan=float("inf"), posinf=float("inf"))
-
-
-def _density_alone(field: VoronoiRouter, points: Tensor) -> Tensor | None:
-    """The density without the networks' colour, where they give it as the last of their outputs; else None."""
-    radiance = getattr(type(field.module), "activate", None) is activate_radiance
-    raw = field.last_output(points) if radiance and field.by_table else None
-    return None if raw is None else activate_density(field.module, raw[:, 0].float())

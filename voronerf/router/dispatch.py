@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -31,6 +31,8 @@ from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters, parts_of
 from voronerf.router.layout import Call, Results, map_tensors
 from voronerf.router.probe import Options, Probe, check_rays
+from voronerf.router.program import Activation, CellProgram
+from voronerf.router.table import LayeredField
 from voronerf.router.transforms import aside, recorded
 from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup, same
 
@@ -67,6 +69,7 @@ class CallPlan:
     watch: Watch = field(default_factory=Watch)
     skip: int = 0
     wait: int = 0
+    whole: Any = None  # of `Fused.whole`, once it is asked for
 
     @property
     def fused(self) -> Fused | None:
@@ -105,12 +108,51 @@ class Dispatch:
         self._inner: list[Any] = []  # shapes of one cell's parameters
         self._warned: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
+        self._activation: Activation | None = None
 
     def explain(self, methods: tuple[str, ...]) -> str:
         """How each method has run so far, and why."""
         latest = [(method, self._latest.get(method, {"not called yet": ""})) for method in methods]
         ways = [(method, *way) for method, ways in latest for way in list(ways.items())]
         return "\n".join(f"{method}: {name}{f': {why}' if why else ''}" for method, name, why in ways)
+
+    def program(
+        self, call: Call, grouping: Grouping | None, device: torch.device, k: int, options: Options, backend: str
+    ) -> CellProgram | str:
+        """What a call of this kind computes as one program; or why that is not known.
+
+        Args:
+            call: The call.
+            grouping: Its samples by cell, on which it is traced where no earlier one was; None for no trace.
+            device: Of the samples.
+            k: Cells.
+            options: What the user asked for.
+            backend: Of operations on parameters.
+        """
+        if not options.fuse:
+            return f"{call.name} is not traced without fuse=True"
+        if torch.is_autocast_enabled(device.type):
+            return f"{call.name} rounds as autocast does"
+        self._check_parameters(call, k, options.names)
+        plans, constants = self.plans.get(_kind_of(call, device), []), call.constants()
+        plan = next((plan for plan in plans if not plan.changed(constants)), None)
+        if plan is None and grouping is None:
+            return f"{call.name} is traced at its {'next' if plans else 'first'} call"
+        plan = plan or self._plan(call, cast(Grouping, grouping), options)
+        if plan.fused is None:
+            return f"{call.name} runs {plan.ways[0].name}: {plan.ways[0].why}"
+        if plan.whole is None:
+            plan.whole = plan.fused.whole()
+        if isinstance(plan.whole, str):
+            return f"{call.name} is not one program: {plan.whole}"
+        program, reads, shapes = plan.whole
+        return CellProgram(program, reads, shapes, plan.fused.parameters(k, device, backend))
+
+    def activation(self, field: LayeredField) -> Activation:
+        """The steps of a field behind its layer table."""
+        if self._activation is None or not self._activation.holds(field):
+            self._activation = Activation.of(field)
+        return self._activation
 
     def evaluate(self, call: Call, grouping: Grouping, options: Options, frozen: Tensor | None) -> Results:
         """Runs a call on the samples of all cells, or on two placeholders.

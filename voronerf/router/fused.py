@@ -26,6 +26,7 @@ from voronerf.router.layout import Call, Results, map_tensors, tensors_of
 from voronerf.router.lower import Entries, Lowering, NotAStep
 from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiable
 from voronerf.router.watch import Inputs, lookup
+from voronerf.router.waves import with_encodings
 
 _HALF = (torch.bfloat16, torch.float16)  # what a run computes in float32 and rounds at its end
 
@@ -40,6 +41,19 @@ class ParameterEntries:
         self._whole = torch.equal(numbers, every)
         self._turned = codes.dim() == 2 and torch.equal(codes.t().flatten(), every)
         self._numbers = numbers.clone()  # which can be saved for a backward pass, also where it is of inference mode
+
+    def constants(self) -> list[float] | None:
+        """Its entries, if they are numbers."""
+        found: list[float] | None = None
+        if isinstance(self._of, Tensor):
+            found = self._of.detach().flatten().cpu()[self._numbers].tolist()
+        return found
+
+    def own(self, values: Mapping[Any, Any]) -> Tensor:
+        """The parameter itself, where these are all of its entries in its own shape; else as `of_values`."""
+        value: Tensor = values.get(self._of, self._of)
+        whole = self._whole and value.shape[self._of_cells :] == self._shape
+        return value if whole else self.of_values(values)
 
     def of_values(self, values: Mapping[Any, Any]) -> Tensor:
         """Its entries, [k, ...], or [1, ...] where cells share it."""
@@ -282,6 +296,42 @@ class Fused:
             self._compute(values, grouping, sort)
         found = [values[node] if recorded else values[node].detach() for node in self._outputs]
         return Results(self._result, found, grouping if sort else None)
+
+    def whole(self) -> tuple[Program, tuple[int, ...], tuple[tuple[int, ...], ...]] | str:
+        """The program of all that a call computes, its inputs as numbers of arguments with rows, and shapes of results
+        for one sample; or what else there is."""
+        if self.name != "fused":
+            return self.why
+        (run,) = self._runs.values()
+        layouts = [node.meta["layout"] if node in run.outputs else None for node in self._outputs]
+        moved = self._between or any(node not in self._inputs for node in run.inputs)
+        if moved or any(layout is None or layout[1:] != (0, 1) for layout in layouts):
+            return "arguments or results are rearranged"
+        if len(self._shared) > len(self._places):
+            return "arguments are the same for all samples"
+        outputs = [run.program.outputs[run.outputs.index(node)] for node in self._outputs]
+        reads = tuple(self._inputs.index(node) for node in run.inputs)
+        shapes = tuple(tuple(layout[0]) for layout in layouts if layout is not None)
+        constants = {i: taken.constants() for i, taken in enumerate(run.parameters)}
+        known = {i: numbers for i, numbers in constants.items() if numbers is not None}
+        return with_encodings(Builder(run.program).program(outputs), known), reads, shapes
+
+    def parameters(self, k: int, device: torch.device, backend: str) -> list[Tensor]:
+        """Those of :meth:`whole`, float32: the module's own where they are a parameter as it is, else made of them."""
+        tensors = [self.inputs.tensor(lookup(part, name), device) for part, _, name in self._places]
+        values: dict[Any, Any] = dict(zip(self._shared, tensors, strict=True))
+        for node, place in self._parameters.items():
+            owner, name = self._owned[place]
+            values[node] = owner._parameters[name]
+        if self._weights:  # of parameters alone, so of no samples
+            none = torch.zeros(2, dtype=torch.int32, device=device)
+            grouped = GroupedRun(Grouping(none, 2, k, device, backend), {})
+            for node in self._weights:
+                if node not in values:
+                    _compute(node, values, grouped)
+        (run,) = self._runs.values()
+        found = [taken.own(values) for taken in run.parameters]
+        return [value if value.dtype is torch.float32 else value.float() for value in found]
 
     def _with_inputs(self, call: Call, device: torch.device) -> Call:
         """The call with tensors in the place of its numbers that are inputs."""

@@ -19,9 +19,8 @@ from torch import Tensor, nn
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import finer_diagram
 from voronerf.ops._core.backends import BACKENDS
-from voronerf.ops._core.checks import of_one_dtype, trust
+from voronerf.ops._core.checks import trust
 from voronerf.ops._core.compiler import not_compiled
-from voronerf.ops._core.layers import for_last_output
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.router.cells import (
     apply_to_cells,
@@ -46,6 +45,7 @@ from voronerf.router.optimizers import (
     watch_optimizers,
 )
 from voronerf.router.probe import Options
+from voronerf.router.program import CellProgram, program_of_table
 from voronerf.router.table import LayeredField, described_by_table, each_direction, parameters_of_table
 from voronerf.router.transforms import outside, refuse_transforms, transformed, unwrapped
 
@@ -532,53 +532,73 @@ class VoronoiRouter(nn.Module):
             places = (positions[:, :3] if coords is None else coords).flatten(0, -2)
             cells = self.diagram.locate(places, backend=self.backend)
             self._doubt(None, None, places, cells.bincount(minlength=self.num_cells))
-        given = self._arguments(coords, positions, directions, ray_index)
-        return self.field.activate(routed_mlp(**given, backend=self.backend)[0])
-
-    def _arguments(
-        self, coords: Tensor | None, positions: Tensor, directions: Tensor | None, ray_index: Tensor | None
-    ) -> dict[str, Any]:
-        """Those of ``routed_mlp``; ``coords`` decide the cells, or for None the positions."""
-        given = {"positions": positions, **parameters_of_table(self.field, self.num_cells), "frozen": self.frozen_cells}
+        given = {**parameters_of_table(self.field, self.num_cells), **self.places(positions, coords)}
         if self.field.layers.uses_directions:
             given.update(directions=directions, direction_index=ray_index)
-        diagram = self.diagram
+        return self.field.activate(routed_mlp(positions, **given, backend=self.backend)[0])
+
+    def places(self, positions: Tensor, coords: Tensor | None = None) -> dict[str, Any]:
+        """What tells the cells of samples, and which of them are frozen: arguments of `routed_mlp`.
+
+        Args:
+            positions: [n, 3] in scene units, or [n, 6] Gaussians.
+            coords: [..., d], positions that decide the cells; None for those of the samples.
+        """
+        given: dict[str, Any] = {"frozen": self.frozen_cells}
+        diagram, first = self.diagram, positions[:, : self._d] if positions.shape[1] > self._d else positions
         if self.num_cells > 1 and self.assignment == "stochastic" and self.training:
-            given["cells"] = self.assign((positions[:, :3] if coords is None else coords).detach())
+            given["cells"] = self.assign((first if coords is None else coords).detach())
         elif self.num_cells > 1 and self._d != 3:
-            given["cells"] = self.assign(positions if coords is None else coords)
+            given["cells"] = self.assign(first if coords is None else coords)
         elif self.num_cells > 1:
-            given.update(centres=diagram.centres, coords=coords)
+            given.update(centres=diagram.centres, coords=first if coords is None else coords)
             if diagram.depth > 1:
                 given.update(child_offsets=diagram.child_offsets, child=diagram.child, depth=diagram.depth)
         return given
 
-    def table_arguments(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any] | None:
-        """``routed_mlp`` arguments for what the networks give before ``activate``, or None if unsupported.
+    def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
+        """What ``forward`` computes of samples, as one program; or why that is not known.
 
-        Arguments are those of ``forward``.
-        """
-        if not self.by_table or self._coords_of_table(None, (positions,), {}) is not None:
-            return None
-        given = self._arguments(None, positions, directions, ray_index)
-        if "centres" in given:
-            given["coords"], given["centres"] = of_one_dtype(positions, given["centres"])
-        return given
-
-    def last_output(self, positions: Tensor) -> Tensor | None:
-        """The last output of the layer table, [n, width], without the layers that it does not need.
-
-        None where it needs the view direction, or other positions than the samples' decide the cells.
+        That of a field with a layer table is known at once; that of a module with ``fuse=True`` from a call with such
+        arguments on, which traces it.
 
         Args:
-            positions: [n, 3] in scene units.
+            *args: Tensors [n, w] of the kinds that ``forward`` gets, of two samples or more.
+            trace: Whether a module that was not is traced on these, which are 8 samples or more.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import VoronoiRouter
+            >>> router = VoronoiRouter(torch.nn.Linear(3, 2), torch.rand(4, 3), coords="first3", fuse=True)
+            >>> router.program(torch.rand(8, 3))
+            'Linear.forward is traced at its first call'
+            >>> known = router.program(torch.rand(8, 3), trace=True)
+            >>> [step.op for step in known.program.steps], known.shapes
+            (['input', 'linear'], ((2,),))
         """
-        table, kept = for_last_output(self.field.layers)
-        if table.uses_directions or self._coords_of_table(None, (positions,), {}) is not None:
-            return None
-        given = self._arguments(None, positions, None, None)
-        given.update({name: [given[name][i] for i in kept] for name in ("weights", "biases")}, layers=table)
-        return routed_mlp(**given, backend=self.backend)[0]
+        if callable(self.coords) or isinstance(self.coords, slice):
+            return "other positions than those of the samples decide the cells"
+        k, dispatch = self.num_cells, self._dispatch
+        if self.by_table:
+            found = program_of_table(self.field, k, dispatch.activation(self.field))
+        elif self._layered and not self.fuse:
+            return f"{type(self.module).__name__} does more than its layer table says"
+        else:
+            given = (*args, None) if self._layered else args
+            positions, device, grouping = args[0][:, : self._d], args[0].device, None
+            if trace and self.fuse:
+                cells = None if k == 1 else self.diagram.locate(positions, backend=self.backend)
+                grouping = Grouping(cells, len(positions), k, device, self.backend)
+            call = self._call("forward", positions, given, {})
+            found = dispatch.program(call, grouping, device, k, self._options, self.backend)
+        if isinstance(found, str) or k == 1:
+            return found
+        own = zip(found.parameters, found.program.parameters)
+        return (
+            found
+            if any(p.shape[0] == k and p.dim() > len(shape) for p, shape in own)
+            else "all cells share all parameters"
+        )
 
     def explain(self) -> str:
         """How each method has been carried out, a line for each: fused, grouped or cell by cell, and why.
@@ -637,7 +657,23 @@ class VoronoiRouter(nn.Module):
             kwargs, coords = {**kwargs, "coords": coords}, None
         rule = coords if coords is not None else self.coords
         positions = find_positions("first3" if rule is None and self._layered else rule, args, kwargs, self._d)
-        known = argument_names(called)
+        call = self._call(method, positions, args, kwargs)
+        layout = call.layout
+        grouping = self._group(method, positions)
+        if self._unseen and layout.n >= _LARGE and torch.is_grad_enabled():
+            with outside():
+                source = first_tensor(args, kwargs)
+                source = None if source is None else unwrapped(source)
+                self._doubt(rule, source, unwrapped(positions), grouping.offsets.diff())
+        return self._dispatch.evaluate(call, grouping, self._options, self.frozen_cells).restored(layout)
+
+    @property
+    def _options(self) -> Options:
+        return Options(self.fuse, self.way, bool(self.methods), self._names)
+
+    def _call(self, method: str, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call:
+        """A call of a method for samples at positions [..., d]."""
+        known = argument_names(getattr(self.module, method))
         names = [*known[: len(args)], *map(str, range(len(known), len(args)))]
 
         def named(item: str | int) -> str:
@@ -649,15 +685,7 @@ class VoronoiRouter(nn.Module):
             frozenset(map(named, self.shared)),
             self.layout == "flat",
         )
-        call = Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
-        grouping = self._group(method, positions)
-        if self._unseen and layout.n >= _LARGE and torch.is_grad_enabled():
-            with outside():
-                source = first_tensor(args, kwargs)
-                source = None if source is None else unwrapped(source)
-                self._doubt(rule, source, unwrapped(positions), grouping.offsets.diff())
-        options = Options(self.fuse, self.way, bool(self.methods), self._names)
-        return self._dispatch.evaluate(call, grouping, options, self.frozen_cells).restored(layout)
+        return Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
 
     def _doubt(self, rule: Any, source: Tensor | None, positions: Tensor, counts: Tensor) -> None:
         """Warns, at the first large batch of a training, where positions may be something else."""

@@ -12,7 +12,7 @@ import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,12 +20,12 @@ from torch import Tensor
 from voronerf.nerf.cameras import Rays
 from voronerf.nerf.loss import Batch, RenderOutput
 from voronerf.nerf.occupancy import HIDDEN
+from voronerf.nerf.radiance import radiance_of
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.volume import Samples, gradient_shares
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.ray_runs import OwnSamples, compose_runs, own_samples, run_gradients, run_sums
-from voronerf.router import VoronoiRouter
 from voronerf.town.group import Group, Key
 from voronerf.town.territories import Place
 
@@ -77,10 +77,12 @@ class Pass:
         self.own: OwnSamples = own_samples(known.positions, *along, bent=bent, backend=renderer.backend)
         if not len(self.own.depths):
             return
-        field = cast(VoronoiRouter, renderer.field)
-        self.scale = float(cast(Any, field.module).density_scale)
-        network = field.table_arguments(self.own.positions, rays.directions, self.own.ray_index)
-        self.tape: Tape = forward_with_tape(cast(Any, network), backend=renderer.backend)
+        field = radiance_of(renderer.field, backend=renderer.backend)
+        if isinstance(field, str) or field.networks.density_scale is None:
+            raise ValueError(f"Pass: field must put out what comes before its activations, got {field}")
+        self.scale = field.networks.density_scale
+        network = field.arguments(self.own.positions, rays.directions, self.own.ray_index, renderer.backend)
+        self.tape: Tape = forward_with_tape(network, backend=renderer.backend)
         self.sums, self.density = run_sums(self.tape.raw, self.own, density_scale=self.scale, backend=renderer.backend)
         ray = self.sums[:, -1].long()
         optical = torch.zeros_like(near).index_add_(0, ray, self.sums[:, 3])

@@ -35,6 +35,7 @@ from voronerf.app.train.defaults import resolve
 from voronerf.app.train.resume import snapshot
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Perspective, RenderOutput
+from voronerf.nerf.radiance import Radiance, radiance_of
 from voronerf.ops._core import backends
 from voronerf.town.geometry import Similarity
 from voronerf.town.group import Group, RankLost
@@ -154,7 +155,10 @@ def build_town(
         batches = make_batches(own, scene, territories.views(number))
         place = territories.place(number)
         state = states[number] = build(own, territories.scene(scene, number), batches=batches, on_event=on_event)
-        if (obstacle := state.ray_loss.why_not_fused()) is not None:
+        obstacle, known = state.ray_loss.why_not_fused(), radiance_of(state.renderer.field)
+        if isinstance(known, Radiance) and known.networks.density_scale is None:
+            obstacle = obstacle or "its activations are not a sigmoid and a scaled softplus"
+        if obstacle is not None:
             raise ConfigError(f"--field {config.field} cannot be trained in territories: {obstacle}")
         sampler = sampler_of(state)
         if contraction is None:

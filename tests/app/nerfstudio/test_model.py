@@ -18,7 +18,7 @@ from torch import nn
 
 from voronerf.app.scenes import builtin_scene
 from voronerf.nerf.adam import Adam
-from voronerf.ops.grouped_program import native as programs
+from voronerf.ops import forward_with_tape
 
 pytestmark = pytest.mark.native
 STEPS = 40
@@ -121,8 +121,8 @@ def test_a_step_is_one_operation_and_learns(model_module: Any, monkeypatch: pyte
     model = model_module.VoronerfModel(config, box, len(views), metadata=metadata, device="cpu").train()
     assert "loss: networks, colours, loss and gradients in one operation, on the native" in model.ray_loss.explain()
     calls = []
-    evaluate = programs.run.inside
-    monkeypatch.setattr(programs.run, "inside", lambda *given: calls.append(len(calls)) or evaluate(*given))
+    evaluate, name = forward_with_tape, "voronerf.nerf.loss.forward_with_tape"
+    monkeypatch.setattr(name, lambda *given, **rule: calls.append(len(calls)) or evaluate(*given, **rule))
     groups = model.get_param_groups()
     optimizers = {name: Adam([{"params": p, "sparse": name == "tables"}], lr=0.02) for name, p in groups.items()}
     trainer = types.SimpleNamespace(config=types.SimpleNamespace(max_num_iterations=STEPS))

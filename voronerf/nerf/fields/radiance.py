@@ -21,8 +21,8 @@ INITIAL_DENSITY = 0.1
 def activate_radiance(self: Any, raw: Tensor) -> tuple[Tensor, Tensor]:
     """Turns the network's outputs into what a renderer needs.
 
-    A class with ``activate = activate_radiance`` and a ``density_scale`` declares by it what its outputs mean. Training
-    through an occupancy grid then goes from outputs to the loss in one operation (``voronerf.ops.render_loss``).
+    A training through an occupancy grid reads them off its steps, and goes from outputs to the loss in one operation
+    (``voronerf.ops.render_loss``).
 
     Args:
         self: The field, which has a ``density_scale``.
@@ -35,12 +35,7 @@ def activate_radiance(self: Any, raw: Tensor) -> tuple[Tensor, Tensor]:
     # `split`, because its gradient is one concatenation, and that of two slices two padded arrays and their sum.
     # `contiguous`, because torch vectorises activations for contiguous values only. Together a third of the time.
     colour, density = (part.contiguous() for part in raw.split([3, 1], dim=-1))
-    return torch.sigmoid(colour), activate_density(self, density.squeeze(-1))
-
-
-def activate_density(self: Any, raw: Tensor) -> Tensor:
-    """The density of `activate_radiance` [n], of the last of the network's outputs [n]."""
-    return F.softplus(raw) * self.density_scale
+    return torch.sigmoid(colour), F.softplus(density.squeeze(-1)) * self.density_scale
 
 
 def reset_layers(layers: Sequence[nn.Linear], heads: Sequence[nn.Linear], density_scale: float) -> None:

@@ -26,7 +26,8 @@ the directions [r, 3] of the rays, and with the row of them that belongs to each
 A class with ``layers``, ``linears()`` and ``activate()`` is a layer table, as :class:`voronerf.nerf.fields.NeRF` is: a
 router evaluates the table for all cells in one operation and does not call ``forward``. A module with an encoding of
 its own before its linear layers becomes such a table by ``router_options = {"fuse": True}``, if the encoding has no
-parameters. Any other module runs its own ``forward``.
+parameters. Any other module runs its own ``forward``. Where all of a field is one operation, its colours, the loss and
+the gradients are part of it, whatever its activations (:class:`voronerf.nerf.RayLoss`).
 """
 
 from __future__ import annotations

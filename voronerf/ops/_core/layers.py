@@ -229,19 +229,6 @@ class MLP:
         return _program(self.text, p, q, widths, biased, ray)
 
 
-@functools.lru_cache(maxsize=64)
-def for_last_output(table: MLP) -> tuple[MLP, tuple[int, ...]]:
-    """A table whose only output is the last of another's, and which layers of that it has."""
-    needed = {table.outputs[-1]}
-    for index in range(len(table.layers) - 1, -1, -1):
-        needed.update(s for s in table.layers[index].inputs if isinstance(s, int) and index in needed)
-    kept = tuple(sorted(needed))
-    numbers: dict[int | str, int] = {old: new for new, old in enumerate(kept)}
-    layers = [table.layers[index] for index in kept]
-    layers = [replace(layer, inputs=tuple(numbers.get(s, s) for s in layer.inputs)) for layer in layers]
-    return replace(table, layers=tuple(layers), outputs=(numbers[table.outputs[-1]],)), kept
-
-
 @functools.lru_cache(maxsize=256)
 def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: tuple[bool, ...], ray: bool) -> Program:
     """:meth:`MLP.program` of the table whose text this is."""

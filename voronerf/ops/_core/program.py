@@ -33,7 +33,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -431,6 +431,34 @@ class Builder:
             self.grids.append(text)
         return self.grids.index(text)
 
+    def replay(self, program: Program, inputs: Mapping[int, Columns]) -> list[Columns]:
+        """Adds the steps of a program without sums, and gives its outputs; its parameters become further ones.
+
+        Args:
+            program: whose steps.
+            inputs: what takes the place of its inputs that are read, by their numbers.
+        """
+        first, grids = len(self.parameters), [self.grid(text) for text in program.grids]
+        self.parameters += program.parameters
+        values: dict[int, Columns] = {}
+
+        def own(c: Columns) -> Columns:
+            if c.of == PARAMETER:
+                return c._replace(index=first + c.index)
+            return values[c.index].part(c.start, c.width)._replace(spread=c.spread)
+
+        for step in program.steps:
+            numbers = step.numbers
+            if step.op == "input":
+                values[step.out] = self.rows(inputs[int(numbers[0])])
+                continue
+            if step.op == "linear":
+                numbers = (first + int(numbers[0]), *numbers[1:])
+            elif step.op == "encode" and step.name == "hash":
+                numbers = (grids[int(numbers[0])], first + int(numbers[1]), *numbers[2:])
+            values[step.out] = self.emit(step.op, step.width, [own(c) for c in step.operands], numbers, step.name)
+        return [own(c) for c in program.outputs]
+
     def linear(
         self, x: Columns, matrix: int, width: int, start: int = 0, transposed: bool = False, add: Columns | None = None
     ) -> Columns:
@@ -472,6 +500,20 @@ class Builder:
         if len(parts) == 1 and parts[0][0].width == width and not parts[0][0].spread and parts[0][0].of == VALUE:
             return parts[0][0]
         return self.emit("move", width, [columns for columns, _ in parts], [at for _, at in parts])
+
+    def side_by_side(self, parts: Sequence[Columns]) -> Columns:
+        """Columns next to each other; as they are where they lie so already."""
+        joined, places, at = parts[0], [], 0
+        for each in parts[1:]:
+            following = joined.part(joined.width, each.width)
+            joined = joined._replace(width=joined.width + each.width) if following == each else joined
+        width = sum(each.width for each in parts)
+        if joined.width == width and joined.of == VALUE and not joined.spread:
+            return joined
+        for each in parts:
+            places.append((each, at))
+            at += each.width
+        return self.move(width, places)
 
     def encode(self, name: str, x: Columns, size: int, parameter: int = 0, along: Sequence[Columns] = ()) -> Columns:
         """An encoding F_0(x), or its derivative F_m along m values.

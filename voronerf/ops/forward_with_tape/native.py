@@ -15,27 +15,29 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
-from voronerf.ops.forward_with_tape import reference
-from voronerf.ops.forward_with_tape.reference import Tape, learnt, with_gradients
+from voronerf.ops.forward_with_tape.reference import Graph, Tape, learnt, with_gradients
 from voronerf.ops.grouped_program.native import How, Rows, run, run_gradient
 from voronerf.ops.routed_mlp import native as routed_mlp
 from voronerf.ops.routed_mlp import of_samples
+from voronerf.ops.routed_mlp.program import cells_of
 from voronerf.ops.routed_mlp.reference import first_rows
 
 
 def forward_with_tape(network: Mapping[str, Any]) -> Tape:
     """The outputs and their tape, once differentiable; see ``voronerf.ops.forward_with_tape``."""
-    floats = [network.get(name) for name in ("positions", "directions", "features")]
-    floats += [*network["weights"], *network["biases"]]
-    plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in floats)
-    if not plain or torch.is_autocast_enabled(network["positions"].device.type) or not torch.is_grad_enabled():
-        return reference.forward_with_tape(network, "native")
     given = dict(network)
     frozen = given.pop("frozen", None)
+    prepared = routed_mlp.prepared_program if "program" in network else routed_mlp.prepared
+    taken, where = prepared(**given)
+    first, k = taken.inputs[0], cells_of(taken.parameters)
+    plain = all(tensor.dtype == torch.float32 for tensor in taken.given)
+    if not plain or torch.is_autocast_enabled(first.device.type) or not torch.is_grad_enabled():
+        cells, order, offsets = routed_mlp.find(first, where, k)
+        out, cells = first_rows(taken.run(offsets, order), cells, where.rows)
+        return Graph(out.detach().float(), out, cells, frozen)
     with torch.no_grad():
-        taken, where = routed_mlp.prepared(**given)
         learning = any(tensor.requires_grad for tensor in taken.given)
-        cells, order, offsets = routed_mlp.find(given["positions"], where, network["weights"][0].shape[0])
+        cells, order, offsets = routed_mlp.find(first, where, k)
         rows, how = taken.rows(offsets, order), taken.how
         out, *kept = run.inside(rows, how._replace(keep=learning))
         count = None if native.on_cuda(out) else where.rows  # CUDA has left out the others

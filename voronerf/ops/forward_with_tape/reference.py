@@ -12,6 +12,7 @@ from torch import Tensor
 
 from voronerf.ops._core.checks import check_flag, check_shape, trust
 from voronerf.ops.routed_mlp import of_samples, routed_mlp
+from voronerf.ops.routed_mlp.program import routed_program
 
 
 class Tape(ABC):
@@ -63,12 +64,13 @@ def forward_with_tape(network: Mapping[str, Any], backend: str = "reference") ->
     """The outputs and their tape; see ``voronerf.ops.forward_with_tape``."""
     network = dict(network)
     frozen = network.pop("frozen", None)
-    out, cells = routed_mlp(**network, backend=backend)
-    return _Graph(out.detach().float(), out, cells, frozen)
+    run = routed_program if "program" in network else routed_mlp
+    out, cells = run(**network, backend=backend)
+    return Graph(out.detach().float(), out, cells, frozen)
 
 
 @dataclass(frozen=True)
-class _Graph(Tape):
+class Graph(Tape):
     """That of torch's own autograd."""
 
     raw: Tensor

@@ -25,11 +25,12 @@ from voronerf.ops._core.checks import (
 )
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
 
-_DEFAULTS: dict[str, Any] = {
-    **dict.fromkeys(("centres", "child_offsets", "child", "cells", "coords", "rows")),
-    **dict.fromkeys(("layers", "directions", "direction_index", "features", "frozen")),
+PLACES: dict[str, Any] = {
+    **dict.fromkeys(("centres", "child_offsets", "child", "cells", "coords", "rows", "frozen")),
     "depth": 1,
 }
+"""Of the arguments that tell the cells of samples, and which of them count."""
+_DEFAULTS = {**PLACES, **dict.fromkeys(("layers", "directions", "direction_index", "features"))}
 """Of the arguments of `routed_mlp` that are given by name."""
 
 
@@ -78,7 +79,8 @@ def check_together(
     op: str, weights: Sequence[Tensor], biases: Sequence[Tensor | None], tensors: dict[str, Tensor | None]
 ) -> None:
     """Checks that all are on one device, and that autograd can keep them where it has to."""
-    every, device = (*tensors.values(), *weights, *biases), weights[0].device
+    every = (*tensors.values(), *weights, *biases)
+    device = next(t.device for t in every if t is not None)
     if torch.compiler.is_compiling() or any(t is not None and (t.device != device or t.is_inference()) for t in every):
         for name, parameters in (("weights", weights), ("biases", biases)):  # named for an error alone
             tensors |= {f"{name}[{index}]": parameter for index, parameter in enumerate(parameters)}
@@ -137,25 +139,41 @@ def check_routed(
         raise TypeError(f"{op}: unknown arguments {', '.join(network.keys() - _DEFAULTS.keys())}")
     if not trust.on:
         _check_routed(op, positions, weights, biases, network)
+    return {"positions": positions, "weights": weights, "biases": biases, **with_coords(positions, network)}
+
+
+def with_coords(positions: Tensor, network: dict[str, Any]) -> dict[str, Any]:
+    """The same with the locations of the samples, if centres tell their cells."""
     coords, centres = network["coords"], network["centres"]
     if centres is not None:
         points = positions[:, :3] if coords is None else coords
         network["coords"], network["centres"] = of_one_dtype(points, centres)
-    return {"positions": positions, "weights": weights, "biases": biases, **network}
+    return network
 
 
 def _check_routed(
     op: str, positions: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor | None], network: dict[str, Any]
 ) -> None:
-    tables = {name: network[name] for name in ("centres", "child_offsets", "child", "cells")}
-    frozen = network["frozen"]
     read = {name: network[name] for name in ("directions", "direction_index", "features")}
-    coords, centres = network["coords"], network["centres"]
     sizes: dict[str, int] = {}
     check_shape(op, "positions", positions, ("n", "p"), sizes)
     check_dtype(op, "positions", positions)
     check_count(op, "positions", sizes["n"])
     check_network(op, weights, biases, network["layers"], **read, sizes=sizes)
+    check_places(op, network, {"positions": positions, **read}, sizes, weights, biases)
+
+
+def check_places(
+    op: str,
+    network: dict[str, Any],
+    tensors: dict[str, Tensor | None],
+    sizes: dict[str, int],
+    weights: Sequence[Tensor] = (),
+    biases: Sequence[Tensor | None] = (),
+) -> None:
+    """Checks what tells the cells, and that it is where the other tensors are; ``sizes`` holds n, p and k."""
+    tables = {name: network[name] for name in ("centres", "child_offsets", "child", "cells")}
+    frozen, coords, centres = network["frozen"], network["coords"], network["centres"]
     _check_tables(op, **tables, depth=network["depth"], sizes=sizes)
     if frozen is not None:
         check_shape(op, "frozen", frozen, ("k",), sizes)
@@ -171,8 +189,7 @@ def _check_routed(
         check_dtype(op, "coords", coords)
     elif centres is not None and sizes["p"] < 3:
         raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {sizes['p']}")
-    tensors = {"positions": positions, "coords": coords, "frozen": frozen, **tables, "rows": rows, **read}
-    check_together(op, weights, biases, tensors)
+    check_together(op, weights, biases, {**tensors, "coords": coords, "frozen": frozen, **tables, "rows": rows})
 
 
 def _check_tables(

@@ -61,6 +61,11 @@ class Network(NamedTuple):
         return out.to(self.dtype)
 
 
+def half_products(dtype: torch.dtype) -> str:
+    """What products take for results of a dtype."""
+    return {torch.bfloat16: "bfloat16", torch.float16: "float16"}.get(dtype, "float32")
+
+
 def as_network(given: Given, caller: str) -> Network:
     """A layer table with its tensors; ``caller``: the op that errors name. Octaves and harmonics of float64 are
     computed in float64, beforehand."""
@@ -86,7 +91,6 @@ def as_network(given: Given, caller: str) -> Network:
         assert directions is not None
         rows.append(directions)
         inputs.append(directions.float())
-    products = {torch.bfloat16: "bfloat16", torch.float16: "float16"}.get(dtype, "float32")
     biased = "".join(["0" if bias is None else "1" for bias in biases])
-    how = How(layers.text, biased, caller, products)
+    how = How(layers.text, biased, caller, half_products(dtype))
     return Network(inputs, parameters, index if seen else None, how, dtype, [*rows, *taken])

@@ -122,46 +122,59 @@ def _check(
 ) -> None:
     """Raises ValueError and TypeError as :func:`grouped_program` says."""
     sizes: dict[str, int] = {}
-    if not isinstance(program, Program):
-        raise TypeError(f"{_OP}: program must be a Program, got {type(program).__name__}")
-    for name, given, wanted in (("inputs", inputs, program.inputs), ("parameters", parameters, program.parameters)):
-        if not isinstance(given, Sequence):
-            raise TypeError(f"{_OP}: {name} must be a list, got {type(given).__name__}")
-        if len(given) != len(wanted) or not (wanted or name == "parameters"):
-            raise ValueError(f"{_OP}: {name} must be {len(wanted)} tensors (inputs at least one), got {len(given)}")
     check_shape(_OP, "offsets", offsets, ("k+1",), sizes)
     check_dtype(_OP, "offsets", offsets, INDEX)
     if sizes["k"] < 1:
         raise ValueError(f"{_OP}: offsets must be of at least one cell, got {list(offsets.shape)}")
-    for i, (x, width) in enumerate(zip(inputs, program.inputs)):
-        check_shape(_OP, f"inputs[{i}]", x, ("r" if _among(i, program.rays) else "n", width), sizes)
-        check_dtype(_OP, f"inputs[{i}]", x, backends.COORDINATES if i == 0 else (inputs[0].dtype,))
-    for i, (p, shape) in enumerate(zip(parameters, program.parameters)):
-        check_tensor(_OP, f"parameters[{i}]", p)
-        check_shape(_OP, f"parameters[{i}]", p, (1 if p.shape[:1] == (1,) else "k", *shape), sizes)
-        known = (inputs[0].dtype, *(_TABLES if _among(i, program.tables) else ()))
-        check_dtype(_OP, f"parameters[{i}]", p, tuple(dict.fromkeys(known)))
-    if (ray_index is not None) != bool(program.rays):
-        rule = "given for a program with" if program.rays else "None for a program without"
-        came = "None" if ray_index is None else "an index"
-        raise ValueError(f"{_OP}: ray_index must be {rule} inputs of rays, got {came}")
-    if ray_index is not None:
-        check_shape(_OP, "ray_index", ray_index, ("n",), sizes)
-        check_dtype(_OP, "ray_index", ray_index, INDEX)
-        first = next(i for i in range(len(inputs)) if _among(i, program.rays))
-        if not sizes["r"] and sizes["n"]:
-            found = list(inputs[first].shape)
-            raise ValueError(f"{_OP}: inputs[{first}] must hold a row for the ray_index, got {found}")
-        check_count(_OP, f"inputs[{first}]", sizes["r"])
+    named = check_tensors(_OP, inputs, parameters, program, ray_index, sizes)
     if order is not None:
         check_shape(_OP, "order", order, ("n",), sizes)
         check_dtype(_OP, "order", order, INDEX)
-    check_count(_OP, "inputs[0]", sizes["n"])
-    named: dict[str, Tensor | None] = {f"inputs[{i}]": x for i, x in enumerate(inputs)}
-    named.update(offsets=offsets, order=order, ray_index=ray_index)
-    named.update({f"parameters[{i}]": p for i, p in enumerate(parameters)})
+    named.update(offsets=offsets, order=order)
     check_same_device(_OP, **named)
     check_no_inference(_OP, **named)
+
+
+def check_tensors(
+    op: str,
+    inputs: Sequence[Tensor],
+    parameters: Sequence[Tensor],
+    program: Program,
+    ray_index: Tensor | None,
+    sizes: dict[str, int],
+) -> dict[str, Tensor | None]:
+    """Checks the tensors of a program but for devices, and gives them by name; ``sizes`` holds k where it is known."""
+    if not isinstance(program, Program):
+        raise TypeError(f"{op}: program must be a Program, got {type(program).__name__}")
+    for name, given, wanted in (("inputs", inputs, program.inputs), ("parameters", parameters, program.parameters)):
+        if not isinstance(given, Sequence):
+            raise TypeError(f"{op}: {name} must be a list, got {type(given).__name__}")
+        if len(given) != len(wanted) or not (wanted or name == "parameters"):
+            raise ValueError(f"{op}: {name} must be {len(wanted)} tensors (inputs at least one), got {len(given)}")
+    for i, (x, width) in enumerate(zip(inputs, program.inputs)):
+        check_shape(op, f"inputs[{i}]", x, ("r" if _among(i, program.rays) else "n", width), sizes)
+        check_dtype(op, f"inputs[{i}]", x, backends.COORDINATES if i == 0 else (inputs[0].dtype,))
+    for i, (p, shape) in enumerate(zip(parameters, program.parameters)):
+        check_tensor(op, f"parameters[{i}]", p)
+        check_shape(op, f"parameters[{i}]", p, (1 if p.shape[:1] == (1,) else "k", *shape), sizes)
+        known = (inputs[0].dtype, *(_TABLES if _among(i, program.tables) else ()))
+        check_dtype(op, f"parameters[{i}]", p, tuple(dict.fromkeys(known)))
+    if (ray_index is not None) != bool(program.rays):
+        rule = "given for a program with" if program.rays else "None for a program without"
+        came = "None" if ray_index is None else "an index"
+        raise ValueError(f"{op}: ray_index must be {rule} inputs of rays, got {came}")
+    if ray_index is not None:
+        check_shape(op, "ray_index", ray_index, ("n",), sizes)
+        check_dtype(op, "ray_index", ray_index, INDEX)
+        first = next(i for i in range(len(inputs)) if _among(i, program.rays))
+        if not sizes["r"] and sizes["n"]:
+            found = list(inputs[first].shape)
+            raise ValueError(f"{op}: inputs[{first}] must hold a row for the ray_index, got {found}")
+        check_count(op, f"inputs[{first}]", sizes["r"])
+    check_count(op, "inputs[0]", sizes["n"])
+    named: dict[str, Tensor | None] = {f"inputs[{i}]": x for i, x in enumerate(inputs)}
+    named.update({f"parameters[{i}]": p for i, p in enumerate(parameters)}, ray_index=ray_index)
+    return named
 
 
 def _among(i: int, numbers: Sequence[int]) -> bool:

@@ -14,8 +14,10 @@ from voronerf.ops._core.declare import declare
 from voronerf.ops.grouped_mlp.checks import check_routed
 from voronerf.ops.render_loss.reference import scaled
 from voronerf.ops.render_opaque.reference import RaySums
+from voronerf.ops.routed_mlp.program import check_program
 
 #: Names of the arguments of `routed_mlp` that a network has; the others are of the samples, or of the backward pass.
+OF_PROGRAM = ("program", "parameters", "centres", "child_offsets", "child", "depth")
 NETWORK = ("weights", "biases", "layers", "features", "centres", "child_offsets", "child", "depth")
 
 
@@ -24,6 +26,8 @@ def _prepare(given: Any) -> Any:
     check_count(op, "samples of all rays", given.near.shape[0] * given.samples)
     if occupied.numel() < 1:
         raise ValueError(f"{op}: occupied must have at least one cell, got {list(occupied.shape)}")
+    if isinstance(network, Mapping) and "program" in network:
+        return scaled(op, given._replace(network=_program(op, given, network)))
     if not isinstance(network, Mapping) or not {"weights", "biases", "layers"} <= network.keys():
         got = ", ".join(map(str, network)) or "nothing" if isinstance(network, Mapping) else repr(network)
         raise ValueError(f"{op}: network must hold weights, biases and layers, got {got:.60}")
@@ -36,6 +40,21 @@ def _prepare(given: Any) -> Any:
     if outputs != 4:
         raise ValueError(f"{op}: layers must put out 4 numbers, colour and density, got {outputs}")
     return scaled(op, given._replace(network=table))
+
+
+def _program(op: str, given: Any, network: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of `routed_program` for one sample at the origin of each ray."""
+    if unknown := [name for name in network if name not in OF_PROGRAM]:
+        raise TypeError(f"{op}: network must hold {', '.join(OF_PROGRAM)} alone, got {', '.join(map(str, unknown))}")
+    origins, reads = given.origins, bool(getattr(network["program"], "rays", ()))
+    index = torch.arange(len(origins), dtype=torch.int32, device=origins.device) if reads else None
+    inputs = [origins, given.directions] if reads else [origins]
+    table = check_program(op, **{"parameters": [], **network}, inputs=inputs, ray_index=index)
+    table.pop("frozen")
+    if table["program"].outputs[0].width != 4:
+        got = table["program"].outputs[0].width
+        raise ValueError(f"{op}: program must put out 4 numbers, colour and density, got {got}")
+    return table
 
 
 @declare(
@@ -75,8 +94,10 @@ def render_opaque(
         box: [2, 3].
         samples: strata of a ray, s; samples are their middles.
         network: Arguments of `routed_mlp` by name: weights, biases and layers, and where there are any, features,
-            centres, child_offsets, child and depth. The networks put out 4 numbers, colour before its sigmoid and
-            density before its softplus, or ``activated``.
+            centres, child_offsets, child and depth. Or ``program`` and ``parameters`` as `grouped_program` takes them,
+            in the place of weights, biases, layers and features; its inputs are positions [n, 3] and, if read,
+            directions with one row for each ray. The networks put out 4 numbers, colour before its sigmoid and density
+            before its softplus, or ``activated``.
         density_scale: factor on the density, > 0; None with ``activated``.
         activated: whether the networks put out the colour and the density themselves, as for `composite`: no sigmoid,
             softplus or scale comes in between, and nothing is clamped.

@@ -24,6 +24,11 @@ def _make(draw: Draw, n: int) -> Arguments:
     network["biases"] = [draw.normal(k, 6), None, (4 if activated else 1) + draw.normal(k, 1)]
     if hashed:
         network["features"] = draw.normal(*_GRID.table_shape)
+    if draw.among("network", "table", "program") == "program":
+        biased = tuple(bias is not None for bias in network["biases"])
+        parameters = [*network.pop("weights"), *(bias for bias in network.pop("biases") if bias is not None)]
+        parameters += [network.pop("features")] if hashed else []
+        network |= {"program": network.pop("layers").program(3, 3, None, biased, True), "parameters": parameters}
     directions = draw.unit(n)
     origins = 2 * draw.normal(n, 3) if draw.free else -directions
     call: Arguments = {"origins": origins, "directions": directions, "network": network}
@@ -39,7 +44,7 @@ def _make(draw: Draw, n: int) -> Arguments:
 
 CASE = Case(
     _make,
-    {"": {}, "activated": {"activated": True}},
+    {"": {}, "activated": {"activated": True}, "program": {"network": "program"}},
     refused={
         "network must hold weights, biases and layers, got 3": {"network": 3},
         "network must hold weights, biases and layers, got features": {"network": {"features": torch.zeros(2, 3)}},

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
-from voronerf.ops.grouped_mlp.network import Given, as_network
 from voronerf.ops.grouped_program.lowering import lower
 from voronerf.ops.grouped_program.native import program_inputs, program_of
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.render_opaque import reference
 from voronerf.ops.render_opaque.reference import RaySums
+from voronerf.ops.routed_mlp import native as routed_mlp
+from voronerf.ops.routed_mlp.program import cells_of
 
 _OP = declared("render_opaque")
 _rays = _OP.inputs(
@@ -33,21 +34,22 @@ def render_opaque(*flat: Any) -> RaySums:
     """Every ray up to the first surface, in float32; see ``voronerf.ops.render_opaque``."""
     given = _OP.Inputs._make(flat)
     network = given.network
-    weights, biases, centres, features = network["weights"], network["biases"], network["centres"], network["features"]
-    floats = (*weights, *biases, centres, features, network["directions"])
-    plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in floats)
+    prepared = routed_mlp.prepared_program if "program" in network else routed_mlp.prepared
+    ray_index = given.near.new_empty(0, dtype=torch.int32)  # of samples that are not there yet
+    index = "ray_index" if "program" in network else "direction_index"
+    seen = network.get("directions") is not None or network.get("ray_index") is not None
+    taken, _ = prepared(**network | {index: ray_index if seen else None})
+    centres, k = network["centres"], cells_of(taken.parameters)
+    plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in (*taken.given, centres))
     if not plain or torch.is_autocast_enabled("cpu"):
-        narrow = network | {name: [_narrow(part) for part in network[name]] for name in ("weights", "biases")}
-        narrow["features"] = _narrow(features)
+        narrow = {name: [_narrow(part) for part in network.get(name, ())] for name in ("weights", "biases")}
+        narrow = network | ({} if "program" in network else {**narrow, "features": _narrow(network["features"])})
         composed: RaySums = partial(reference.render_opaque, backend="native")(*given._replace(network=narrow))
         return composed
-    ray_index = given.near.new_empty(0, dtype=torch.int32)  # of samples that are not there yet
-    samples = Given(given.origins, weights, biases, network["layers"], network["directions"], ray_index, features)
-    taken = as_network(samples, "render_opaque")
-    rows = taken.rows(_no_offsets(weights[0]))
+    rows = taken.rows(torch.zeros(k + 1, dtype=torch.int32))
     lowered = lower(program_of(rows, taken.how).text, False)
     child_offsets, child, depth = network["child_offsets"], network["child"], network["depth"]
-    if weights[0].shape[0] == 1:
+    if k == 1:
         centres = child_offsets = child = None
     if child_offsets is not None:
         check_tree(child_offsets, child, len(centres), "render_opaque")
@@ -76,8 +78,3 @@ def render_opaque(*flat: Any) -> RaySums:
 def _narrow(tensor: Tensor | None) -> Tensor | None:
     """Not float64, in which no network of the compiled module is."""
     return tensor.float() if tensor is not None and tensor.dtype == torch.float64 else tensor
-
-
-def _no_offsets(weight: Tensor) -> Tensor:
-    """Of no rows, for as many cells as a weight has."""
-    return torch.zeros(weight.shape[0] + 1, dtype=torch.int32)

@@ -13,6 +13,7 @@ from voronerf.ops.composite import Composite, composite
 from voronerf.ops.march_rays import march_rays
 from voronerf.ops.render_loss.reference import activate
 from voronerf.ops.routed_mlp import routed_mlp
+from voronerf.ops.routed_mlp.program import routed_program
 
 
 class RaySums(NamedTuple):
@@ -64,20 +65,27 @@ def render_opaque(*flat: Any, backend: str = "reference") -> RaySums:
     """
     given = declared("render_opaque").Inputs._make(flat)
     network, wave = given.network, given.wave
-    centres, seen_by = network.get("centres"), network.get("directions")
-    of_samples = ("positions", "coords", "directions", "direction_index")
+    centres, seen_by, by_program = network.get("centres"), network.get("directions"), "program" in network
+    dtype = (network["inputs"][0] if by_program else network["positions"]).dtype
+    of_samples = ("positions", "inputs", "coords", "directions", "direction_index", "ray_index")
     fixed = {name: value for name, value in network.items() if name not in of_samples}
     space: dict[str, Any] = {"spacing": given.spacing, "most": wave, "contraction": given.contraction}
 
     def look(live: Tensor, start: Tensor | None) -> Wave:
         of_rays = given.origins[live], given.directions[live], given.near[live], given.far[live]
         march = march_rays(*of_rays, given.occupied, given.box, given.samples, start=start, **space, backend=backend)
-        positions = march.positions.to(network["positions"].dtype)
+        positions = march.positions.to(dtype)
         coords = None if centres is None else positions.to(centres.dtype)
-        seen_from: dict[str, Any] = {"directions": None, "direction_index": None}
-        if seen_by is not None:
-            seen_from = {"directions": seen_by[live], "direction_index": march.ray_index}
-        raw, _ = routed_mlp(positions=positions, coords=coords, **seen_from, **fixed, backend=backend)
+        taken: dict[str, Any] = {**fixed, "coords": coords, "backend": backend}
+        if by_program:
+            rays = [x[live] for x in network["inputs"][1:]]
+            index = march.ray_index if rays else None
+            raw, _ = routed_program(inputs=[positions, *rays], ray_index=index, **taken)
+        else:
+            seen_from: dict[str, Any] = {"directions": None, "direction_index": None}
+            if seen_by is not None:
+                seen_from = {"directions": seen_by[live], "direction_index": march.ray_index}
+            raw, _ = routed_mlp(positions=positions, **seen_from, **taken)
         colours, density = activate(raw.to(given.near.dtype), given.density_scale, given.activated)
         packed: dict[str, Any] = {"ray_offsets": march.ray_offsets, "backend": backend}
         seen = composite(density, colours, march.depths, march.deltas, **packed)

@@ -17,10 +17,13 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.layers import MLP
+from voronerf.ops._core.program import Program
 from voronerf.ops.cell_sort import native as cell_sort
-from voronerf.ops.grouped_mlp.network import Given, Network, as_network
+from voronerf.ops.grouped_mlp.network import Given, Network, as_network, half_products
+from voronerf.ops.grouped_program.native import How
 from voronerf.ops.locate_cell import native as locate_cell
 from voronerf.ops.nearest_centre import native as nearest_centre
+from voronerf.ops.routed_mlp.program import cells_of, with_cells
 from voronerf.ops.routed_mlp.reference import Where, first_rows
 
 
@@ -50,13 +53,33 @@ def prepared(
     """A network, and what tells the cells; ``places`` are those of `Where`. With neither cells nor centres there is one
     cell."""
     where = Where(**places)
-    cells, rows = where.cells, where.rows
     network = as_network(Given(positions, weights, biases, layers, directions, direction_index, features), "routed_mlp")
+    return network, _of_cells(where, weights[0].shape[0])
+
+
+def _of_cells(where: Where, k: int) -> Where:
+    """The same, without tables for one cell, and on CUDA with -1 for samples that do not count."""
+    cells, rows = where.cells, where.rows
     if rows is not None and cells is not None and native.on_cuda(cells):
-        where = where._replace(cells=torch.where(torch.arange(cells.shape[0], device=cells.device) < rows, cells, -1))
-    if cells is None and weights[0].shape[0] == 1:
-        where = Where(depth=where.depth, rows=rows)
-    return network, where
+        return where._replace(cells=torch.where(torch.arange(cells.shape[0], device=cells.device) < rows, cells, -1))
+    return Where(depth=where.depth, rows=rows) if cells is None and k == 1 else where
+
+
+def prepared_program(
+    program: Program,
+    inputs: Sequence[Tensor],
+    parameters: Sequence[Tensor],
+    *,
+    ray_index: Tensor | None = None,
+    **places: Any,
+) -> tuple[Network, Where]:
+    """The same for a program; see ``routed_program``."""
+    kind = inputs[0].device.type
+    dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else inputs[0].dtype
+    kept = [p if i in program.tables else p.float() for i, p in enumerate(with_cells(program, parameters))]
+    how = How(program.text, products=half_products(dtype))
+    network = Network([x.float() for x in inputs], kept, ray_index, how, dtype, [*inputs, *parameters])
+    return network, _of_cells(Where(**places), cells_of(kept))
 
 
 class Route(NamedTuple):

@@ -50,22 +50,16 @@ def routed_mlp(
 
     ``backend`` is that of the operations it is made of.
     """
-    centres, child_offsets, child, depth, cells, coords, rows = Where(**where)
+    places = Where(**where)
     k, n = weights[0].shape[0], positions.shape[0]
     check_direction_index("routed_mlp", directions, direction_index)
     read: dict[str, Any] = {"layers": layers, "directions": directions, "direction_index": direction_index}
     read |= {"features": features, "backend": backend}
-    if cells is None and k == 1:
+    cells = find_cells(places, k, backend)
+    if cells is None:
         offsets = torch.tensor([0, n], dtype=torch.int32, device=positions.device)
         out = grouped_mlp(positions, offsets, weights, biases, **read)
-        return first_rows(out, torch.zeros(n, dtype=torch.int32, device=positions.device), rows)
-    if cells is None:
-        assert coords is not None and centres is not None
-        if child_offsets is None or child is None:
-            cells = nearest_centre(coords, centres, backend=backend)
-        else:
-            cells = locate_cell(coords, centres, child_offsets, child, depth=depth, backend=backend)
-    check_range("routed_mlp", "cells", cells, k)
+        return first_rows(out, torch.zeros(n, dtype=torch.int32, device=positions.device), places.rows)
     order, offsets = cell_sort(cells, k, backend=backend)
     if direction_index is not None:
         read["direction_index"] = direction_index[order]
@@ -73,7 +67,22 @@ def routed_mlp(
         read["directions"] = directions[order]
     out = grouped_mlp(positions[order], offsets, weights, biases, **read)
     # The backward of index_copy is a gather, where that of an index would be a scatter that adds.
-    return first_rows(torch.zeros_like(out).index_copy(0, order.long(), out), cells, rows)
+    return first_rows(torch.zeros_like(out).index_copy(0, order.long(), out), cells, places.rows)
+
+
+def find_cells(where: Where, k: int, backend: str) -> Tensor | None:
+    """int32 [n], the cells of samples; None where there is one."""
+    centres, child_offsets, child, depth, cells, coords, _ = where
+    if cells is None and k == 1:
+        return None
+    if cells is None:
+        assert coords is not None and centres is not None
+        if child_offsets is None or child is None:
+            cells = nearest_centre(coords, centres, backend=backend)
+        else:
+            cells = locate_cell(coords, centres, child_offsets, child, depth=depth, backend=backend)
+    check_range("routed_mlp", "cells", cells, k)
+    return cells
 
 
 def first_rows(out: Tensor, cells: Tensor, rows: Tensor | None) -> tuple[Tensor, Tensor]:
