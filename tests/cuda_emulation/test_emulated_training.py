@@ -29,7 +29,7 @@ def losses(field, precision, *, on_device):
         lr=0.005, evaluations=1, precision=precision,
     )  # fmt: skip
     kept = Losses()
-    with mock.patch("voronerf.nerf.schedule.WARMUP", 0.0), emulated() if on_device else contextlib.nullcontext():
+    with mock.patch("voronerf.nerf.schedule.WARMUP", 1e-9), emulated() if on_device else contextlib.nullcontext():
         train(state := build(config, builtin_scene(12)), [kept])
     return kept.losses, state
 
