@@ -32,9 +32,11 @@ void members(voronerf::ProgramOperand& o) {
 }
 void members(voronerf::ProgramStep& s) {
   read(s.op, s.function, s.binary, s.encoding, s.finish, s.order, s.width, s.slot, s.stride, s.memory, s.number);
-  read(s.depth, s.parameter, s.pairs, s.floats, s.in_place, s.a, s.b, s.first, s.count);
+  read(s.depth, s.sources, s.parameter, s.pairs, s.floats, s.in_place, s.a, s.b, s.first, s.taken);
 }
-void members(voronerf::ProgramSum& s) { read(s.sum, s.kind, s.partial, s.o, s.i, s.start, s.width, s.stride, s.size); }
+void members(voronerf::ProgramSum& s) {
+  read(s.sum, s.kind, s.adds, s.partial, s.o, s.i, s.start, s.width, s.stride, s.size);
+}
 void members(voronerf::ProgramInput& i) { read(i.width, i.ray); }
 void members(voronerf::ProgramOutput& o) { read(o.width, o.ray, o.memory); }
 void members(voronerf::ProgramLookup& l) { read(l.input, l.parameter, l.grid, l.memory); }
