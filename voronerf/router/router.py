@@ -545,12 +545,14 @@ class VoronoiRouter(nn.Module):
             coords: [..., d], positions that decide the cells; None for those of the samples.
         """
         given: dict[str, Any] = {"frozen": self.frozen_cells}
-        diagram, first = self.diagram, positions[:, : self._d] if positions.shape[1] > self._d else positions
-        if self.num_cells > 1 and self.assignment == "stochastic" and self.training:
+        diagram = self.diagram
+        k, d = diagram.num_cells, diagram.centres.shape[1]
+        first = positions[:, :d] if positions.shape[1] > d else positions
+        if k > 1 and self.assignment == "stochastic" and self.training:
             given["cells"] = self.assign((first if coords is None else coords).detach())
-        elif self.num_cells > 1 and self._d != 3:
+        elif k > 1 and d != 3:
             given["cells"] = self.assign(first if coords is None else coords)
-        elif self.num_cells > 1:
+        elif k > 1:
             given.update(centres=diagram.centres, coords=first if coords is None else coords)
             if diagram.depth > 1:
                 given.update(child_offsets=diagram.child_offsets, child=diagram.child, depth=diagram.depth)

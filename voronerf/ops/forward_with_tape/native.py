@@ -30,7 +30,7 @@ def forward_with_tape(network: Mapping[str, Any]) -> Tape:
     prepared = routed_mlp.prepared_program if "program" in network else routed_mlp.prepared
     taken, where = prepared(**given)
     first, k = taken.inputs[0], cells_of(taken.parameters)
-    plain = all(tensor.dtype == torch.float32 for tensor in taken.given)
+    plain = {tensor.dtype for tensor in taken.given} == {torch.float32}
     if not plain or torch.is_autocast_enabled(first.device.type) or not torch.is_grad_enabled():
         cells, order, offsets = routed_mlp.find(first, where, k)
         out, cells = first_rows(taken.run(offsets, order), cells, where.rows)
@@ -63,7 +63,8 @@ class _Kept(Tape):
         with torch.no_grad():
             found = self._gradients(gradient, wanted)
             learning = [tensor for tensor, want in zip(self.given, wanted) if want]
-            found = [slope.view_as(tensor) for slope, tensor in zip(found, learning, strict=True)]
+            pairs = zip(found, learning, strict=True)
+            found = [slope if slope.shape == tensor.shape else slope.view_as(tensor) for slope, tensor in pairs]
             if not defer and all(map(_takes_gradients, learning)):
                 for parameter, slope in zip(learning, found, strict=True):
                     parameter.grad = slope if parameter.grad is None else parameter.grad.add_(slope)

@@ -76,7 +76,8 @@ def prepared_program(
     """The same for a program; see ``routed_program``."""
     kind = inputs[0].device.type
     dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else inputs[0].dtype
-    kept = [p if i in program.tables else p.float() for i, p in enumerate(with_cells(program, parameters))]
+    shaped, tables = with_cells(program, parameters), program.tables
+    kept = [p if p.dtype == torch.float32 or i in tables else p.float() for i, p in enumerate(shaped)]
     how = How(program.text, products=half_products(dtype))
     network = Network([x.float() for x in inputs], kept, ray_index, how, dtype, [*inputs, *parameters])
     return network, _of_cells(Where(**places), cells_of(kept))

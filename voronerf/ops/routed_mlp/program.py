@@ -39,12 +39,13 @@ def check_program(
 def with_cells(program: Program, parameters: Sequence[Tensor]) -> Sequence[Tensor]:
     """Parameters [1, ...] in the place of those that have no dimension of cells, since all cells share them."""
     shapes = program.parameters
-    return [p[None] if i < len(shapes) and p.dim() == len(shapes[i]) else p for i, p in enumerate(parameters)]
+    shaped = [p[None] if p.dim() == len(shape) else p for p, shape in zip(parameters, shapes)]
+    return [*shaped, *parameters[len(shapes) :]]
 
 
 def cells_of(parameters: Sequence[Tensor]) -> int:
     """k, of parameters [k, ...] and those [1, ...] that all cells share."""
-    return max((parameter.shape[0] for parameter in parameters), default=1)
+    return max([parameter.shape[0] for parameter in parameters], default=1)
 
 
 def routed_program(
