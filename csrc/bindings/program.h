@@ -19,7 +19,7 @@ VN_NAMES(ProgramPrecision, "float32", "tf32", "bfloat16", "float16");
 VN_STRUCT(ProgramPack, kind, parameter, o, i, start, width, at);
 VN_STRUCT(ProgramOperand, parameter, spread, slot, stride, memory, input, pairs, start, width, place);
 VN_STRUCT(ProgramStep, op, function, binary, encoding, finish, order, width, slot, stride, memory, number, depth,
-          sources, parameter, pairs, floats, in_place, a, b, first, taken);
+          sources, parameter, pairs, floats, points, in_place, a, b, first, taken);
 VN_STRUCT(ProgramSum, sum, kind, adds, partial, o, i, start, width, stride, size);
 VN_STRUCT(ProgramInput, width, ray);
 VN_STRUCT(ProgramOutput, width, ray, memory);

@@ -68,6 +68,7 @@ struct ProgramStep {
   int32_t parameter;     // encode of a hash grid: the table
   int32_t pairs;         // linear with 16-bit products: where its value is stored as pairs too; -1: nowhere
   bool floats;           // linear: whether anything reads its value as floats
+  bool points;           // input: hash grids alone read it, and nothing does once they are looked up
   bool in_place;         // input: nothing is copied where it may be read in place
   float a, b;            // of a function
   int32_t first, taken;  // operands: the first, and how many

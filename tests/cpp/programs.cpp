@@ -32,7 +32,7 @@ void members(voronerf::ProgramOperand& o) {
 }
 void members(voronerf::ProgramStep& s) {
   read(s.op, s.function, s.binary, s.encoding, s.finish, s.order, s.width, s.slot, s.stride, s.memory, s.number);
-  read(s.depth, s.sources, s.parameter, s.pairs, s.floats, s.in_place, s.a, s.b, s.first, s.taken);
+  read(s.depth, s.sources, s.parameter, s.pairs, s.floats, s.points, s.in_place, s.a, s.b, s.first, s.taken);
 }
 void members(voronerf::ProgramSum& s) {
   read(s.sum, s.kind, s.adds, s.partial, s.o, s.i, s.start, s.width, s.stride, s.size);

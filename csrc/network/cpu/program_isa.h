@@ -23,6 +23,7 @@ struct ProgramCall {
   float* const* sums;
   float* const* memories;     // of the call, in the order of the cells, or null
   const bool* filled;         // of memories: nothing is to be looked up
+  bool looked_up;             // all memories of hash grids are filled
   const HashEncoding* grids;  // without their tables
   const int32_t *order, *ray_index;
   int64_t n;     // rows of inputs

@@ -142,6 +142,7 @@ struct ProgramTile {
     const int32_t number = step.number;
     const int64_t stride = step.stride, width = step.width;
     if (step.in_place && call.in_place[number]) return;
+    if (step.points && call.looked_up) return;
     if (call.turned[number]) return turn(static_cast<const float*>(call.inputs[number]), step, to);
     const auto row_of = [&](int64_t row) {
       const int64_t sample = place(row);

@@ -235,7 +235,8 @@ class _Lowering:
             "depth": 0,
             "sources": 1,
         }
-        fields |= {"parameter": 0, "pairs": _NONE, "floats": True, "in_place": False, "a": 0.0, "b": 0.0}
+        fields |= {"parameter": 0, "pairs": _NONE, "floats": True, "points": False, "in_place": False}
+        fields |= {"a": 0.0, "b": 0.0}
         if value is not None:
             fields |= {"width": value.width, "slot": max(value.slot, 0), "stride": value.stride}
             fields |= {"memory": value.memory, "pairs": value.pairs, "floats": value.floats}
@@ -312,7 +313,9 @@ class _Lowering:
         whole = value.stride == step.width and not all(encoded) and self._within(step, value.stride)
         if plain and readers and (whole or all(self._product(reader, place) for reader, place in readers)):
             value.input = number
-        self.emit("input", value=value, number=number, in_place=value.input != _NONE)
+        hashed = [reader.op == "scatter" or (reader.name == "hash" and not reader.numbers[2]) for reader, _ in readers]
+        points = bool(readers) and all(hashed)
+        self.emit("input", value=value, number=number, points=points, in_place=value.input != _NONE)
 
     def _within(self, step: Step, stride: int) -> bool:
         """Whether no vector that reads a value goes beyond its rows, behind the last of which a tensor may end."""
