@@ -1,4 +1,4 @@
-// Products of pairs of bfloat16; see grouped_mlp_half_isa.cpp.
+// Products of pairs of bfloat16; see program_half_isa.cpp.
 #include "common/isa.h"
 
 #if VN_ISA == 2 && VN_HAS_HALF
