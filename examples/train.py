@@ -8,7 +8,7 @@ import torch
 from voronerf import HashGridField, OccupancyGrid, VoronoiRouter
 from voronerf.app.evaluate import evaluate, mean_scores
 from voronerf.app.scenes import load_scene
-from voronerf.nerf import Adam, Occupancy, PlannedSplit, RayBatches, RayLoss, Renderer, SplitStrategy
+from voronerf.nerf import Adam, Occupancy, PlannedSplit, RayBatches, RayLoss, Renderer, SplitStrategy, TrainingStep
 from voronerf.nerf.samplers import usual_samples
 from voronerf.nerf.schedule import learning_rate, next_rays
 
@@ -26,18 +26,15 @@ optimizer = Adam.of({"field": router}, lr=0.02, views=len(views), sparse=["featu
 strategy = SplitStrategy({"field": router}, [PlannedSplit(at=0.2, children=16)], generator=generator)
 where = {"near": scene.near, "far": scene.far, "box": scene.box, "background": scene.background_colour()}
 batches = RayBatches(views.cameras, views.images, masks=views.masks, sparse=views.sparse_depth, **where)
+training_step = TrainingStep(batches, loss, optimizer, strategy=strategy, generator=generator)  # recorded and replayed
 rays, step, start = 512, 0, time.perf_counter()
 while (fraction := (time.perf_counter() - start) / seconds) < 1:
     strategy.step_pre_backward(optimizer, fraction, step)  # into 16 cells, each with a copy of the coarse network
     sampler.step_pre_backward(router.train(), step, generator)
     optimizer.set_learning_rate(learning_rate(0.02, fraction, step, hold=0.25))
-    optimizer.zero_grad()
-    output = loss(batches.draw(rays, generator), generator, backward=True)
-    sampler.step_post_backward(output)
-    optimizer.update()
+    made = training_step(rays)
     optimizer.after_step(step)
-    strategy.step_post_backward(output)
-    rays = next_rays(rays, len(output.weights), rays=512, samples=sampler.strata, growth=8, contracted=contracted)
+    rays = next_rays(rays, made.samples, rays=512, samples=sampler.strata, growth=8, contracted=contracted)
     step += 1
 with optimizer.averaged():
     sampler.finish(router, seed=0)

@@ -187,4 +187,4 @@ def _render_loss(given: Any, found: Any) -> None:
 
 
 register(_render_loss)
-render_loss_gradient = _render_loss.inside
+render_loss_gradient = _render_loss

@@ -11,6 +11,7 @@
 #include <stdexcept>
 
 #include "common/cuda_device.h"
+#include "common/parallel.h"
 #include "common/trace.h"
 
 namespace voronerf {
@@ -46,15 +47,35 @@ std::map<std::string, PyObject*>& dtypes() {
   return known;
 }
 
+// A number of rows that lies in memory, and the most that it may be.
+struct Count {
+  const int64_t* memory;
+  int64_t most;
+};
+
+class Recording;
+Recording*& recorded() {  // the one that the calling thread's calls are added to, or null
+  static thread_local Recording* recording = nullptr;
+  return recording;
+}
+const Count* count_of(Recording& recording, int64_t rows);
+
 // What a call has taken from Python, given back when it ends.
 class Frame {
  public:
+  // A number of rows that a recorded call has taken, and where it lies.
+  struct Counted {
+    Rows* rows;
+    const Count* count;
+  };
   Frame() = default;
   Frame(const Frame&) = delete;
   Frame& operator=(const Frame&) = delete;
   ~Frame() {
     for (PyObject* each : kept_) Py_DECREF(each);
   }
+
+  const std::vector<Counted>& counted() const { return counted_; }
 
   // False: not of that type. `place` becomes that of an opaque object itself.
   bool load(const Type& type, PyObject* given, void*& place) {
@@ -69,6 +90,15 @@ class Frame {
             type.is_signed ? PyLong_AsLongLong(given) : static_cast<long long>(PyLong_AsUnsignedLongLong(given));
         if (value == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
         store(place, value, type.size);
+        return true;
+      }
+      case Type::Kind::rows: {
+        if (!PyLong_Check(given)) return false;
+        const int64_t rows = PyLong_AsLongLong(given);
+        if (rows == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
+        *static_cast<Rows*>(place) = rows;
+        if (recorded() != nullptr && rows != 0)
+          counted_.push_back({static_cast<Rows*>(place), count_of(*recorded(), rows)});
         return true;
       }
       case Type::Kind::floating: {
@@ -217,6 +247,7 @@ class Frame {
 
   std::vector<PyObject*> kept_;
   std::deque<std::vector<void*>> arrays_;
+  std::vector<Counted> counted_;
 };
 
 // Values of parameters, made when they are loaded.
@@ -278,6 +309,14 @@ py::object to_python(const Type* type, const Result& result) {
   }
 }
 
+// A call with what it has taken.
+struct Loaded {
+  const Function* function;
+  const Bound* bound;
+  Frame frame;
+  Values values;
+};
+
 // A call that was traced (common/trace.h).
 struct Traced {
   const std::string* name;
@@ -287,7 +326,97 @@ struct Traced {
 bool tracing = false;
 std::vector<Traced> traced_calls;
 
-py::object run(const Function& function, const Bound& bound, Values& values) {
+// Without the GIL.
+void call(const Loaded& loaded, Result& result) {
+  Trace regions;
+  if (tracing) trace = &regions;
+  const double began = tracing ? Trace::now() : 0.0;
+  loaded.bound->call(loaded.bound->function, loaded.values.places(), &result);
+  if (tracing) {
+    trace = nullptr;
+    traced_calls.push_back({&loaded.function->name, Trace::now() - began, regions});
+  }
+}
+
+// Calls of a step in their order, with what they have taken, to be made again on the same memory. A number of rows is
+// read again from where it lies, so the memory must do for the most rows.
+class Recording {
+ public:
+  // Calls of this thread are added from here to `end`, in the place of those from before.
+  void begin() {
+    calls_.clear();
+    counts_.clear();
+    obstacle_.clear();
+    recorded() = this;
+  }
+  void end() { recorded() = nullptr; }
+
+  void count(std::uintptr_t memory, int64_t most) {
+    counts_.push_back({reinterpret_cast<const int64_t*>(memory), most});
+  }
+  const Count* count_of(int64_t rows) {
+    const Count* found = nullptr;
+    for (const Count& count : counts_) {
+      if (*count.memory != rows) continue;
+      if (found != nullptr) return refuse("two numbers of rows are the same, " + std::to_string(rows));
+      found = &count;
+    }
+    return found != nullptr ? found : refuse("a number of rows lies in no memory, " + std::to_string(rows));
+  }
+  void add(std::unique_ptr<Loaded> loaded) {
+    if (loaded->bound->machine != &type_of<Cpu>()) refuse(loaded->function->name + " runs on a device");
+    calls_.push_back(std::move(loaded));
+  }
+
+  // Makes the calls again; false, before the first of them that would exceed its memory. With a trace they have no
+  // team.
+  bool replay(int threads) {
+    const py::gil_scoped_release released;
+    bool fits = true;
+    std::exception_ptr failure;
+    with_team(tracing ? 1 : threads, [&] {
+      try {
+        for (size_t i = 0; i < calls_.size() && fits; ++i) fits = again(*calls_[i]);
+      } catch (...) {
+        failure = std::current_exception();
+      }
+    });
+    if (failure) std::rethrow_exception(failure);
+    return fits;
+  }
+
+  size_t size() const { return calls_.size(); }
+  const std::string& obstacle() const { return obstacle_; }
+
+ private:
+  const Count* refuse(const std::string& why) {
+    if (obstacle_.empty()) obstacle_ = why;
+    return nullptr;
+  }
+  static bool again(const Loaded& loaded) {
+    for (const auto& [rows, count] : loaded.frame.counted()) {
+      if (*count->memory > count->most) return false;
+      *rows = *count->memory;
+    }
+    Result result{};
+    call(loaded, result);
+    const Type* type = loaded.bound->result;
+    if (type != nullptr && type->kind == Type::Kind::boolean && !result.boolean) {
+      throw std::invalid_argument(loaded.function->name + ": indices out of range");
+    }
+    return true;
+  }
+
+  std::vector<std::unique_ptr<Loaded>> calls_;
+  std::deque<Count> counts_;
+  std::string obstacle_;
+};
+
+const Count* count_of(Recording& recording, int64_t rows) { return recording.count_of(rows); }
+
+py::object run(Loaded& loaded) {
+  const Bound& bound = *loaded.bound;
+  Values& values = loaded.values;
   void* stream = nullptr;
   [[maybe_unused]] int device = 0;
   const size_t own = bound.given.size() - (bound.machine != nullptr);
@@ -302,9 +431,6 @@ py::object run(const Function& function, const Bound& bound, Values& values) {
     values.replace(own, &stream);
   }
   Result result{};
-  Trace regions;
-  if (tracing) trace = &regions;
-  const double began = tracing ? Trace::now() : 0.0;
   {
     std::optional<py::gil_scoped_release> released;
     if (bound.machine != nullptr) released.emplace();
@@ -312,26 +438,33 @@ py::object run(const Function& function, const Bound& bound, Values& values) {
     std::optional<CudaDevice> current;
     if (bound.machine == &type_of<Cuda>()) current.emplace(device);
 #endif
-    bound.call(bound.function, values.places(), &result);
-  }
-  if (tracing) {
-    trace = nullptr;
-    traced_calls.push_back({&function.name, Trace::now() - began, regions});
+    call(loaded, result);
   }
   return to_python(bound.result, result);
+}
+
+// Whether all arguments are of the types that a function takes.
+bool load(Loaded& loaded, const py::args& given) {
+  for (size_t i = 0; i < given.size(); ++i) {
+    PyObject* const argument = PyTuple_GET_ITEM(given.ptr(), static_cast<Py_ssize_t>(i));
+    if (!loaded.values.load(loaded.frame, *loaded.bound->given[i], argument)) return false;
+  }
+  return true;
 }
 
 py::object call_any(const Function& function, const py::args& given) {
   for (const Bound& bound : function.overloads) {
     if (bound.function == nullptr || bound.given.size() != given.size()) continue;
-    Frame frame;
-    Values values;
-    size_t i = 0;
-    while (i < given.size() &&
-           values.load(frame, *bound.given[i], PyTuple_GET_ITEM(given.ptr(), static_cast<Py_ssize_t>(i)))) {
-      ++i;
+    if (recorded() == nullptr || bound.machine == nullptr) {
+      Loaded loaded{&function, &bound, {}, {}};
+      if (load(loaded, given)) return run(loaded);
+    } else {
+      auto loaded = std::unique_ptr<Loaded>(new Loaded{&function, &bound, {}, {}});
+      if (!load(*loaded, given)) continue;
+      py::object result = run(*loaded);
+      if (recorded() != nullptr) recorded()->add(std::move(loaded));
+      return result;
     }
-    if (i == given.size()) return run(function, bound, values);
   }
   throw py::type_error(function.name + ": incompatible function arguments");
 }
@@ -365,6 +498,14 @@ constexpr const char* kStub =
     "cuda_outcome: str\n"
     "cuda_architectures: str\n"
     "cuda_major: int\n"
+    "\n"
+    "class Recording:\n"
+    "    obstacle: str\n"
+    "    def __len__(self) -> int: ...\n"
+    "    def begin(self) -> None: ...\n"
+    "    def end(self) -> None: ...\n"
+    "    def count(self, memory: int, most: int) -> None: ...\n"
+    "    def replay(self, threads: int) -> bool: ...\n"
     "\n"
     "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n"
     "def trace(on: bool) -> list[tuple[str, float, int, float, list[float]]]: ...\n";
@@ -473,6 +614,14 @@ void bind_all(PyObject* python) {
     if (!there) continue;
     bound.def(name.c_str(), [one = &function](const py::args& given) { return call_any(*one, given); });
   }
+  py::class_<Recording>(bound, "Recording")
+      .def(py::init())
+      .def("begin", &Recording::begin)
+      .def("end", &Recording::end)
+      .def("count", &Recording::count)
+      .def("replay", &Recording::replay)
+      .def("__len__", &Recording::size)
+      .def_property_readonly("obstacle", &Recording::obstacle);
   // The dtypes of tensors, objects of Python that this module knows by name alone.
   bound.def("name_dtypes", [](const py::dict& names) {
     for (const auto& entry : names) {

@@ -8,7 +8,7 @@ VN_NAMES(CellSortWay, "automatic", "counting", "radix");
 
 VN_BINDINGS(module) {
   module.cpu("cell_sort", VN_CPU(cell_sort_cpu));
-  module.plain("cell_sort_workspace", VN_CPU(cell_sort_workspace));
+  module.cpu("one_cell", VN_CPU(one_cell_cpu));
   module.cuda("cell_sort", VN_CUDA(cell_sort_cuda));
   module.cuda("cell_sort_workspace", VN_CUDA(cell_sort_workspace_cuda));
 }

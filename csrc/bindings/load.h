@@ -9,6 +9,7 @@
 //   enumeration   the name of a value (VN_NAMES)
 //   struct        a named tuple with its members (VN_STRUCT), of a class that the module makes
 //   numbers       int, float and bool
+//   Rows          an int, which a recording reads again (bind.cpp)
 #pragma once
 
 #include <cstddef>
@@ -18,6 +19,8 @@
 #include <string>
 #include <type_traits>
 #include <vector>
+
+#include "common/rows.h"
 
 struct _object;
 struct _typeobject;
@@ -33,7 +36,20 @@ struct Member {
 };
 
 struct Type {
-  enum class Kind { none, boolean, integer, floating, text, enumeration, tensor, tensors, sequence, structure, opaque };
+  enum class Kind {
+    none,
+    boolean,
+    integer,
+    rows,
+    floating,
+    text,
+    enumeration,
+    tensor,
+    tensors,
+    sequence,
+    structure,
+    opaque
+  };
   Kind kind = Kind::none;
   size_t size = 0;
   std::string python, exact;        // in Python's words and in C++'s, for the stub; of what has a name, that
@@ -151,6 +167,8 @@ Type describe() {
   const std::string bits = std::to_string(8 * sizeof(T));
   if constexpr (std::is_same_v<T, bool>) {
     return named_type(Kind::boolean, sizeof(T), "bool", "bool");
+  } else if constexpr (std::is_same_v<T, Rows>) {
+    return named_type(Kind::rows, sizeof(T), "int", "rows");
   } else if constexpr (std::is_same_v<T, const char*>) {
     return named_type(Kind::text, sizeof(T), "str | None", "text");
   } else if constexpr (std::is_integral_v<T>) {

@@ -8,10 +8,6 @@
 
 #include "common/hd.h"
 
-#ifdef _OPENMP
-#include <omp.h>
-#endif
-
 #if defined(__CUDACC__) || defined(VN_EMULATE)
 #ifdef __CUDACC__
 #include <cuda_runtime.h>
@@ -40,15 +36,6 @@ namespace voronerf {
 template <typename T>
 VN_HD constexpr T ceil_div(T a, T b) {
   return (a + b - 1) / b;
-}
-
-// Number of this thread in its team; 0 in a build without OpenMP.
-inline int thread_number() {
-#ifdef _OPENMP
-  return omp_get_thread_num();
-#else
-  return 0;
-#endif
 }
 
 }  // namespace voronerf

@@ -18,6 +18,8 @@
 #include <omp.h>
 #endif
 
+#include "common/team.h"
+
 namespace voronerf {
 
 // body(thread) once for each thread of a team of at most `threads`, numbered from 0; returns when all have. One thread
@@ -30,6 +32,7 @@ void parallel(int threads, const Body& body) {
     if (trace != nullptr) trace->end();
     return;
   }
+  if (Team::current() != nullptr) return Team::current()->run(threads, body);
 #ifdef VN_STD_THREADS
   std::vector<std::thread> others;
   for (int thread = 1; thread < threads; ++thread) others.emplace_back([&body, thread] { body(thread); });
@@ -41,6 +44,15 @@ void parallel(int threads, const Body& body) {
 #else
   body(0);
 #endif
+}
+
+// body() on the calling thread, beside up to `threads` - 1 others that run its regions and wait for the next of them
+// without ending: what would be many teams, each woken anew, is one.
+template <typename Body>
+void with_team(int threads, const Body& body) {
+  if (threads <= 1) return body();
+  Team team;
+  parallel(threads, [&](int thread) { thread == 0 ? team.lead(body) : team.follow(); });
 }
 
 // Items 0 to count - 1 in runs of `run`; each goes to the next thread of a team that is free.

@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <memory>
 
 #include "common/parallel.h"
 
@@ -19,16 +20,17 @@ constexpr int64_t kRun = 16, kRuns = 8;  // of few chunks, so many runs at least
 
 }  // namespace
 
-bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32_t* workspace, int64_t n, int64_t k,
-                   int threads) {
+bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, Rows n, int64_t k, int threads) {
   const int64_t rows = cell_sort_chunk_rows(k), chunks = cell_sort_chunks(n, k);
   const int64_t run = std::clamp<int64_t>(chunks / kRuns, 1, kRun);
+  const std::unique_ptr<int32_t[]> counts(new int32_t[static_cast<size_t>(chunks * k)]);
+  int32_t* const workspace = counts.get();
   std::atomic<bool> valid{true};
   parallel_for(chunks, run, threads, [&](int64_t chunk) {
     int32_t* count = workspace + chunk * k;
     std::fill(count, count + k, 0);
     bool inside = true;
-    for (int64_t i = chunk * rows, end = std::min(n, i + rows); i < end; ++i) {
+    for (int64_t i = chunk * rows, end = std::min<int64_t>(n, i + rows); i < end; ++i) {
       // As unsigned, a negative cell is above k as well.
       if (static_cast<uint32_t>(cells[i]) < static_cast<uint32_t>(k)) {
         ++count[cells[i]];
@@ -63,11 +65,17 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, int32
 
   parallel_for(chunks, run, threads, [&](int64_t chunk) {
     int32_t* place = workspace + chunk * k;
-    for (int64_t i = chunk * rows, end = std::min(n, i + rows); i < end; ++i) {
+    for (int64_t i = chunk * rows, end = std::min<int64_t>(n, i + rows); i < end; ++i) {
       order[place[cells[i]]++] = static_cast<int32_t>(i);
     }
   });
   return true;
+}
+
+void one_cell_cpu(int32_t* cells, int32_t* offsets, Rows n, int /*threads*/) {
+  std::fill(cells, cells + n, 0);
+  offsets[0] = 0;
+  offsets[1] = static_cast<int32_t>(n);
 }
 
 }  // namespace voronerf

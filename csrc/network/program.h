@@ -14,6 +14,7 @@
 #include <vector>
 
 #include "common/isa.h"
+#include "common/rows.h"
 #include "encoding/hash_encode.h"
 #include "network/program_code.h"
 
@@ -78,7 +79,8 @@ struct ProgramInputs {
   const int32_t* offsets;
   const int32_t* order;      // or null
   const int32_t* ray_index;  // [n], or null without inputs and outputs of rays
-  int64_t n, r, k;
+  Rows n, r;
+  int64_t k;
   // For each lookup memory [n][stride] of the caller's, filled by the call unless it is `ready`; null entries, or null:
   // what was looked up is not kept.
   float* const* kept;

@@ -5,6 +5,7 @@
 #include <cstdint>
 
 #include "common/hashed.h"
+#include "common/rows.h"
 
 namespace voronerf {
 
@@ -16,7 +17,7 @@ struct DrawPixelsInputs {
   int64_t n, places;     // entries of ends and shift, and of first
   int64_t bits;
   int64_t below;  // places of all runs
-  int64_t b;
+  Rows b;
 };
 
 // The run of a place: looked for from the first that can hold it, within the tables whatever they say.

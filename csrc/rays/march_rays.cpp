@@ -70,8 +70,8 @@ const uint8_t* march_rooms(const MarchInputs& in, uint8_t* memory, int threads) 
   return other;
 }
 
-void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, Isa isa,
-                          int threads) {
+void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t* total, int64_t capacity,
+                          Isa isa, int threads) {
   std::unique_ptr<uint8_t[]> memory;
   const uint8_t* room = nullptr;
   if (march_leaps(in)) {
@@ -80,15 +80,15 @@ void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offset
   }
   for_each_block(in.r, threads,
                  [&](int64_t begin, int64_t end) { count_block(isa, in, room, mask, offsets + 1, begin, end); });
-  int64_t total = 0;
+  *total = 0;
   offsets[0] = 0;
   for (int64_t i = 1; i <= in.r; ++i) {
-    total = std::min(total + offsets[i], capacity);
-    offsets[i] = static_cast<int32_t>(total);
+    *total = std::min(*total + offsets[i], capacity);
+    offsets[i] = static_cast<int32_t>(*total);
   }
 }
 
-void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int64_t rows,
+void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, Rows rows,
                          int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop, Isa isa,
                          int threads) {
   for_each_block(in.r, threads, [&](int64_t begin, int64_t end) {

@@ -9,6 +9,7 @@
 
 #include "common/hd.h"
 #include "common/isa.h"
+#include "common/rows.h"
 
 namespace voronerf {
 
@@ -26,7 +27,8 @@ struct MarchInputs {
   const float* uniforms;              // [r,s], or null
   const int32_t* seed;                // [1], of hashed uniforms, or null; neither: the middles
   const int32_t* start;               // [r], or null for 0
-  int64_t r, s;
+  Rows r;
+  int64_t s;
   int64_t x, y, z;
   bool disparity;
   int64_t most;  // samples of a ray
@@ -39,12 +41,12 @@ constexpr int64_t kMarchWord = 32;
 VN_HD int64_t march_words(int64_t s) { return (s + kMarchWord - 1) / kMarchWord; }
 
 // mask: [r, march_words(s)], bit i of word w for stratum 32 w + i. offsets: [r+1], none above capacity.
-void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, Isa isa,
-                          int threads);
+void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t* total, int64_t capacity,
+                          Isa isa, int threads);
 void march_rays_count_cuda(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, void* stream);
 
 // rows: length of ray_index, depths, deltas and positions [rows,3], at least offsets[r]; what is beyond that becomes 0.
-void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int64_t rows,
+void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, Rows rows,
                          int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop, Isa isa,
                          int threads);
 void march_rays_fill_cuda(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int64_t rows,

@@ -14,7 +14,7 @@ void observe_occupancy_cpu(const ObservedSamples& in, float* density, uint8_t* o
                            int threads) {
   constexpr int64_t kRun = 1024;
   parallel_for((in.m + kRun - 1) / kRun, 1, threads, [&](int64_t run) {
-    const int64_t begin = run * kRun, end = std::min(in.m, begin + kRun);
+    const int64_t begin = run * kRun, end = std::min<int64_t>(in.m, begin + kRun);
     for (int64_t i = begin; i < end; ++i) {
       const int64_t cell = observed_cell(in, i);
       cells[i] = observes(in, i) ? static_cast<int32_t>(cell) : -1;

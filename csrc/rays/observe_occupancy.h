@@ -4,12 +4,15 @@
 
 #include <cstdint>
 
+#include "common/rows.h"
+
 namespace voronerf {
 
 struct ObservedSamples {
   const float *positions, *sigma, *deltas, *weights;  // [m,3], [m], [m], [m]
   const float* box;                                   // [2,3]
-  int64_t x, y, z, m;
+  int64_t x, y, z;
+  Rows m;
   float decay, threshold, hidden;
 };
 

@@ -20,7 +20,7 @@ bool pixel_rays_cpu(const PixelRaysInputs& in, const PixelRaysOutputs& out, int 
   const int64_t all = in.c * in.h * in.w, blocks = (in.b + kRays - 1) / kRays;
   std::atomic<bool> fine{true};
   parallel_for(blocks, 1, threads, [&](int64_t block) {
-    const int64_t begin = block * kRays, end = std::min(in.b, begin + kRays);
+    const int64_t begin = block * kRays, end = std::min<int64_t>(in.b, begin + kRays);
     for (int64_t i = begin; i < end; ++i) {
       if (in.pixels[i] < 0 || in.pixels[i] >= all) {
         fine.store(false, std::memory_order_relaxed);

@@ -4,6 +4,8 @@
 
 #include <cstdint>
 
+#include "common/rows.h"
+
 namespace voronerf {
 
 struct PixelRaysInputs {
@@ -16,7 +18,9 @@ struct PixelRaysInputs {
   const float* box;         // [2,3], or null for all of space
   const float* background;  // [b,3], or [3], or null
   bool background_per_ray;
-  int64_t c, h, w, channels, b, l;
+  int64_t c, h, w, channels;
+  Rows b;
+  int64_t l;
   float near, far;
 };
 

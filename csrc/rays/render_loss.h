@@ -5,6 +5,7 @@
 #include <cstdint>
 
 #include "common/isa.h"
+#include "common/rows.h"
 
 namespace voronerf {
 
@@ -18,7 +19,7 @@ struct RenderLossInputs {
   float density_scale;
   bool activated;  // colour and density as they are, without scale
   float hidden;    // share of the light; samples that no more than it reaches have no gradient
-  int64_t r, m;
+  Rows r, m;
 };
 
 struct RenderLossOutputs {

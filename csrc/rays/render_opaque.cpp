@@ -230,7 +230,7 @@ bool render_opaque_cpu(const Program& program, const ProgramInputs& network, con
   const Call call{
       network, rows, march, room, cells, rule, out, inputs.size() > 1 ? inputs[1].width : 0, isa, std::max(threads, 1)};
   Items items(march.r, kRun);
-  const int team = static_cast<int>(std::min<int64_t>(threads, ceil_div(march.r, kRun)));
+  const int team = static_cast<int>(std::min<int64_t>(threads, ceil_div<int64_t>(march.r, kRun)));
   std::vector<std::unique_ptr<Pool>> pools;  // made here, as nothing may be thrown in a team
   for (int thread = 0; thread < team; ++thread) {
     pools.push_back(std::make_unique<Pool>(call, workspace.data() + thread * rows.workspace()));

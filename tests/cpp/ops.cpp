@@ -87,9 +87,8 @@ void sort() {
   for (int i = 0; i < 2; ++i) {
     order[i].assign(n, -7);
     offsets[i].assign(k + 1, -7);
-    Array<int32_t> workspace(voronerf::cell_sort_workspace(n, k));
     const bool valid =
-        voronerf::cell_sort_cpu(cells.data(), order[i].data(), offsets[i].data(), workspace.data(), n, k, 1 + 2 * i);
+        voronerf::cell_sort_cpu(cells.data(), order[i].data(), offsets[i].data(), n, k, 1 + 2 * i);
     if (valid == broken) fail("cell_sort: cells out of range not told from those in range");
   }
   if (broken) return;
@@ -216,8 +215,9 @@ void march(Isa isa) {
     const int threads = 1 + 2 * i;
     Array<uint32_t> mask(r * voronerf::march_words(s));
     Array<int32_t> offsets(r + 1, -7);
-    voronerf::march_rays_count_cpu(in, mask.data(), offsets.data(), r * s, isa, threads);
-    const int64_t rows = offsets[r];
+    int64_t rows = -7;
+    voronerf::march_rays_count_cpu(in, mask.data(), offsets.data(), &rows, r * s, isa, threads);
+    if (rows != offsets[r]) fail("march_rays: the total is not the last offset");
     Array<int32_t> ray(rows), stop(r);
     Array<float> deltas = poisoned(rows), positions = poisoned(3 * rows);
     depths[i] = poisoned(rows);

@@ -53,7 +53,7 @@ def outcome(program: Program, tensors: list[Tensor], offsets: Tensor, products: 
             return grouped_program(
                 leaves[:count], leaves[count:], offsets, program=program, backend="reference", **given
             )
-        rows = plans.Rows(leaves[:count], leaves[count:], offsets, given.get("order"), given.get("ray_index"), None)
+        rows = plans.Rows(leaves[:count], leaves[count:], offsets, given.get("order"), given.get("ray_index"))
         name = "float32" if products == "tf32" else products
         return plans.run_program(rows, plans.How(program.text, products=name))
 
@@ -180,7 +180,7 @@ def test_what_was_looked_up_is_not_looked_up_again() -> None:
     program = b.program([b.linear(e, b.parameter(5, e.width), 5)])
     own = gradient(program, (False,), (False, True), (True,), ())
     x, table, weight = tensors_of(program, [70])
-    rows = plans.Rows([x], [table, weight], offsets_of([70]), None, None, None)
+    rows = plans.Rows([x], [table, weight], offsets_of([70]), None, None)
     with emulated():
         out, kept = plans.run(rows, plans.How(program.text, keep=True))
         assert kept.shape == (70 * 16,)
@@ -197,7 +197,7 @@ def test_types_in_memory(dtype: torch.dtype) -> None:
     """What float32 gives for the rounded arguments, rounded."""
     program = every_step()
     rows, parameters, offsets = arguments(program, [40, 9], dtype)
-    inputs = plans.Rows(rows, [p.float() for p in parameters], offsets, None, None, None)
+    inputs = plans.Rows(rows, [p.float() for p in parameters], offsets, None, None)
     with emulated():
         found = plans.run_program(inputs, plans.How(program.text))
         exact = plans.run_program(inputs._replace(inputs=[x.float() for x in rows]), plans.How(program.text))
@@ -278,7 +278,7 @@ def test_numbers_that_are_none_stay_in_their_rows() -> None:
     tensors[0][5, 1], tensors[0][9, 0] = torch.nan, torch.inf
     for products in ALLOWED:
         with emulated(), torch.no_grad():
-            rows = plans.Rows(tensors[:1], tensors[1:], offsets_of([70]), None, None, None)
+            rows = plans.Rows(tensors[:1], tensors[1:], offsets_of([70]), None, None)
             _, out = plans.run_program(rows, plans.How(program.text, products=products.replace("tf32", "float32")))
         assert (~out.isfinite()).any(1).nonzero().flatten().tolist() in ([5, 9], [5]), products
 
@@ -291,7 +291,7 @@ def test_float16_cuts_values_off_and_leaves_gradients() -> None:
     x = torch.tensor([[1.0], [1e6]])
     given = [x, torch.ones(1, 16, 1), torch.ones(1, 3, 16) / 64]
     leaves = [leaf.requires_grad_() for leaf in given]
-    rows = plans.Rows(leaves[:1], leaves[1:], offsets_of([2]), None, None, None)
+    rows = plans.Rows(leaves[:1], leaves[1:], offsets_of([2]), None, None)
     with emulated():
         (out,) = plans.run_program(rows, plans.How(program.text, products="float16"))
         assert out[:, 0].tolist() == [0.25, LARGEST / 4]

@@ -13,6 +13,7 @@ from voronerf.nerf.renderer import RenderedImage, Renderer, render_rays
 from voronerf.nerf.samplers import SAMPLERS, Hierarchical, Occupancy, Sampler, Stratified
 from voronerf.nerf.sampling import stratified_depths
 from voronerf.nerf.split import PlannedSplit, SplitDone, SplitStrategy
+from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.nerf.volume import Rendered, Samples, Space
 
 __all__ = [
@@ -41,7 +42,9 @@ __all__ = [
     "Space",
     "SplitDone",
     "SplitStrategy",
+    "StepOutput",
     "Stratified",
+    "TrainingStep",
     "focus_point",
     "intersect_box",
     "orbit_cameras",

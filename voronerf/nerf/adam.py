@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import functools
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from voronerf.ops._core.recording import varying
 from voronerf.ops.adam import Guard, Rule, adam, average
 from voronerf.router import VoronoiRouter
 from voronerf.router.optimizers import trained_parts
@@ -68,6 +70,7 @@ class Adam(torch.optim.Adam):
 
     # The first call of torch's own imports its compiler, to keep it off them, which takes over a second.
     add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
+    zero_grad = inspect.unwrap(torch.optim.Adam.zero_grad)
     state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
     load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
 
@@ -115,15 +118,6 @@ class Adam(torch.optim.Adam):
         """Sets the learning rate of all groups."""
         for group in self.param_groups:
             group["lr"] = rate
-
-    def zero_grad(self, set_to_none: bool = True) -> None:
-        """Drops the gradients, or fills them with zeros; torch's takes as long as a layer of a small network."""
-        if set_to_none:
-            for group in self.param_groups:
-                for parameter in group["params"]:
-                    parameter.grad = None
-        else:
-            super().zero_grad(set_to_none=False)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -196,6 +190,7 @@ class Adam(torch.optim.Adam):
             loss: [], of the step; with it the guard judges first.
         """
         rules, tensors = [], []
+        rates = {id(group): varying(functools.partial(group.__getitem__, "lr")) for group in self.param_groups}
         held = [(p, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
         for (parameter, group), parts in zip(held, trained_parts([entry[0] for entry in held]), strict=True):
             state = self._state(parameter)
@@ -203,7 +198,7 @@ class Adam(torch.optim.Adam):
             own = parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]
             for number, part in enumerate(parts):
                 counted = step.clone() if number else step  # once for a parameter
-                rules.append(Rule(counted, group["lr"], group["betas"], group["eps"], every))
+                rules.append(Rule(counted, rates[id(group)], group["betas"], group["eps"], every))
                 tensors.append(own if part is ... else tuple(tensor[part] for tensor in own))
         if rules:
             adam(rules, *zip(*tensors, strict=True), guard=guard, loss=loss, backend=self.backend)

@@ -125,11 +125,11 @@ class RayLoss:
             backward: Whether gradients are added to those of the parameters at once, as ``loss.backward()`` does it,
                 in less time; the loss has none then.
         """
-        field = self._radiance()
+        field = self.radiance()
         if isinstance(field, str) and isinstance(self.renderer.sampler, Occupancy):  # perhaps not traced yet
             middle = (batch.near + batch.far)[:, None] / 2
             samples = self.renderer.sampler.space.samples(batch.rays, middle, middle.expand(-1, 2))
-            field = self._radiance((samples.inputs, batch.rays.directions))
+            field = self.radiance((samples.inputs, batch.rays.directions))
         if isinstance(field, str):
             return self._separate(batch, generator, backward)
         return self._fused(field, batch, generator, backward)
@@ -139,10 +139,10 @@ class RayLoss:
 
         What a module with ``fuse=True`` computes is known from its first step on, which traces it.
         """
-        found = self._radiance()
+        found = self.radiance()
         return found if isinstance(found, str) else None
 
-    def _radiance(self, samples: tuple[Tensor, Tensor] | None = None) -> Radiance | str:
+    def radiance(self, samples: tuple[Tensor, Tensor] | None = None) -> Radiance | str:
         """What the field computes; or why the operations are separate. Samples are those of `radiance_of`."""
         renderer = self.renderer
         if not isinstance(renderer.sampler, Occupancy):

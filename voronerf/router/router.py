@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import finer_diagram
 from voronerf.ops._core.backends import BACKENDS
-from voronerf.ops._core.checks import trust
 from voronerf.ops._core.compiler import not_compiled
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.router.cells import (
@@ -504,7 +503,7 @@ class VoronoiRouter(nn.Module):
     def by_table(self) -> bool:
         """Whether a layer table describes all that the module computes."""
         # While it compiles, and while a loop repeats its calls, what was found before holds.
-        if self._layered and not torch.compiler.is_compiling() and not trust.on:
+        if self._layered and not torch.compiler.is_compiling():
             self._by_table = described_by_table(self.module)
         return self._by_table
 

@@ -34,7 +34,7 @@ from voronerf.app.train.checkpoint import (
 from voronerf.app.train.defaults import resolve
 from voronerf.app.train.resume import snapshot
 from voronerf.diagram import VoronoiDiagram
-from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Perspective, RenderOutput
+from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Perspective, RenderOutput, StepOutput
 from voronerf.nerf.radiance import Radiance, radiance_of
 from voronerf.ops._core import backends
 from voronerf.town.geometry import Similarity
@@ -256,8 +256,8 @@ def _learn(state: State, batch: Batch, output: RenderOutput) -> None:
     state.optimizer.update(state.guard, output.loss)
     state.optimizer.after_step(state.step)
     state.strategy.step_post_backward(output)
-    state.count_step(batch)
-    state.read_output(output)
+    state.count_step(len(batch.rays))
+    state.read_output(StepOutput(batch, output))
 
 
 # Files ----------------------------------------------------------------------------------------------------------------

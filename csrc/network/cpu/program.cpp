@@ -82,7 +82,7 @@ void clear_kept(const ProgramInputs& in, int64_t features, int64_t stride, float
   std::fill(kept, kept + in.offsets[0] * stride, 0.0f);
   std::fill(kept + in.offsets[in.k] * stride, kept + in.n * stride, 0.0f);
   constexpr int64_t kRun = 1024;
-  parallel_for(features < stride ? in.n : 0, kRun, threads,
+  parallel_for(features < stride ? in.n.value : 0, kRun, threads,
                [&](int64_t row) { std::fill(kept + row * stride + features, kept + (row + 1) * stride, 0.0f); });
 }
 
@@ -107,7 +107,7 @@ Sifted sift(const ProgramTable& table, const ProgramInputs& in, int threads) {
       for (size_t input = static_cast<size_t>(in.gradients); input < table.inputs.size(); ++input) {
         const int64_t width = table.inputs[input].width;
         const bool turned = in.turned[input] != 0;
-        const int64_t next = turned ? in.n : 1;
+        const int64_t next = turned ? in.n.value : 1;
         const float* from = static_cast<const float*>(in.inputs[input]) + row * (turned ? 1 : width);
         for (int64_t c = 0; c < width; ++c) zero &= from[c * next] == 0.0f;
       }

@@ -1,15 +1,13 @@
 """Steps of training are the same bit for bit on any number of threads."""
 
-import contextlib
-
 import pytest
 import torch
-from helpers import on_any_number_of_threads, same
+from helpers import on_any_number_of_threads
 from tiny_runs import small, steps_of
 
 from voronerf.app.train import build, loop, snapshot
 from voronerf.nerf.samplers import SAMPLERS, Stratified
-from voronerf.ops._core import backends, checks
+from voronerf.ops._core import backends
 
 HASH = {"field": "hashgrid", "width": 16}
 VARIANTS = {
@@ -32,22 +30,6 @@ def test_steps_do_not_depend_on_threads(scene, variant):
         return [tensor for _, tensor in sorted(snapshot(state).tensors.items())]
 
     on_any_number_of_threads(four_steps, (1, 2, 8))
-
-
-def test_steps_trust_what_the_first_of_a_stage_checked(scene, monkeypatch):
-    """Trust ends with each step; without it the bits are the same."""
-    trusted = []
-
-    def trained():
-        state = build(small(steps=6, rays=64, split_at=(3,), **(HASH | {"occupancy": True})), scene)
-        draw = state.batches.draw
-        state.batches.draw = lambda *given: (trusted.append(checks.trust.on), draw(*given))[1]
-        return [tensor for _, tensor in sorted(snapshot(steps_of(state, 6)).tensors.items())]
-
-    found = trained()
-    assert trusted == [False, True, True, False, True, True] and not checks.trust.on
-    monkeypatch.setattr(loop, "trusting", lambda on: contextlib.nullcontext())
-    assert same(found, trained())
 
 
 def test_what_a_sampler_of_the_users_gives_is_checked_in_every_step(scene, monkeypatch):

@@ -32,7 +32,7 @@ from voronerf.app.train.callbacks import CHECKPOINT_EVERY, Checkpoints, Divergen
 from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.defaults import machine_speed, why_no_occupancy
-from voronerf.app.train.loop import HALVES, Callback, run
+from voronerf.app.train.loop import Callback, run
 from voronerf.app.train.resume import load
 from voronerf.app.train.run_directory import (
     check_stored_paths,
@@ -45,7 +45,7 @@ from voronerf.app.train.run_directory import (
     stored_config,
     write_curve,
 )
-from voronerf.app.train.state import State
+from voronerf.app.train.state import HALVES, State
 from voronerf.ops._core import backends
 
 #: Bytes of a picture's name without its end, which most file systems take.

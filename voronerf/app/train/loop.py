@@ -7,20 +7,13 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 
-import torch
-
 from voronerf.app.train.start import judge_start
-from voronerf.app.train.state import Stage, State
-from voronerf.nerf.loss import Batch, RenderOutput
+from voronerf.app.train.state import State
 from voronerf.nerf.split import SplitDone
 from voronerf.ops._core import backends
-from voronerf.ops._core.checks import trusting
-from voronerf.ops.adam.reference import judge
 
 #: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
 READ_EVERY = 50
-#: The dtype of autocast for each precision but float32.
-HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 class TrainingError(RuntimeError):
@@ -71,12 +64,8 @@ def train(
         until: Training seconds.
         clock: Counts seconds.
     """
-    config, strategy, sampler, optimizer = state.config, state.strategy, state.sampler, state.optimizer
+    strategy, sampler, optimizer = state.strategy, state.sampler, state.optimizer
     one_thread, before = state.thread_deterministic, state.step
-    # What a user's own class gives is checked in every step.
-    parts = (state.ray_loss, state.batches, sampler, strategy, *(router.module for router in state.routers.values()))
-    known = all(type(part).__module__.startswith("voronerf.") for part in parts)
-    checked: Stage | None = None
     while state.fraction < 1 and state.seconds < until and not state.stopped:
         started = clock()
         with backends.torch_on_one_thread() if one_thread else nullcontext():
@@ -87,49 +76,24 @@ def train(
                     optimizer.drop_averages()
                 for callback in callbacks:
                     callback.after_split(state, split)
-            # From the second step of a stage on, all tensors have the kinds and shapes that were checked in the first.
-            with trusting(known and checked is state.stages[-1]):
-                batch, output = _step(state)
-            checked = state.stages[-1]
-        state.count_step(batch)
+            optimizer.set_learning_rate(state.learning_rate())
+            sampler.step_pre_backward(state.renderer.field, state.step - state.began, state.generator)
+            if not state.router.training:
+                state.renderer.train()
+            made = state.training_step(state.rays)
+            optimizer.after_step(state.step)
+        state.count_step(made.rays)
         if state.device.type == "cpu" or state.step % READ_EVERY == 0:
-            state.read_output(output)
-        judge_start(state, batch, output)
+            state.read_output(made)
+        judge_start(state, made)
         state.add_seconds(clock() - started)
         for callback in callbacks:
             callback.after_step(state)
     if state.fraction >= 1 and state.step > before:  # once, however often this is called
         started = clock()
         with state.averaged():
-            sampler.finish(state.renderer.field, config.seed)
+            sampler.finish(state.renderer.field, state.config.seed)
         state.add_seconds(clock() - started)
-
-
-def _step(state: State) -> tuple[Batch, RenderOutput]:
-    """A step, but for splits and counters."""
-    optimizer, sampler = state.optimizer, state.sampler
-    autocast = HALVES.get(state.config.precision)
-    optimizer.set_learning_rate(state.learning_rate())
-    sampler.step_pre_backward(state.renderer.field, state.step - state.began, state.generator)
-    if not state.router.training:
-        state.renderer.train()
-    batch = state.batches.draw(state.rays, state.draws)
-    optimizer.zero_grad(set_to_none=True)
-    with nullcontext() if autocast is None else torch.autocast(state.device.type, autocast, cache_enabled=False):
-        output = state.ray_loss(batch, state.draws, backward=autocast is None)
-    if autocast is not None:
-        state.scaler.scale(output.loss).backward()
-    sampler.step_post_backward(output)
-    # The optimiser skips a step that is not finite by a flag on the device, so the host need not wait for it.
-    if state.scaler.is_enabled():
-        judge(state.guard, output.loss.detach(), [])
-        state.scaler.step(optimizer)
-        state.scaler.update()
-    else:
-        optimizer.update(state.guard, output.loss.detach())
-    optimizer.after_step(state.step)
-    state.strategy.step_post_backward(output)
-    return batch, output
 
 
 def run(state: State, callbacks: Sequence[Callback] = (), *, clock: Callable[[], float] = time.perf_counter) -> None:

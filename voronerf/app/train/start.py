@@ -13,6 +13,7 @@ from voronerf.app.train.build import make_grid, make_routers
 from voronerf.app.train.state import State
 from voronerf.nerf.loss import Batch, RenderOutput
 from voronerf.nerf.samplers import Occupancy
+from voronerf.nerf.step import StepOutput
 
 #: Steps after the grid has settled after which a start is judged, and how often a training begins again at most.
 JUDGED, DRAWS = 100, 3
@@ -24,22 +25,21 @@ STRIDE = 1_000_003
 DIFFERS, EMPTY, ONE_COLOUR, COLOURED = 0.1, 0.02, 1e-3, 0.05
 
 
-def judge_start(state: State, batch: Batch, output: RenderOutput) -> None:
+def judge_start(state: State, made: StepOutput) -> None:
     """Begins the coarse stage again if its start has failed, once it is so far; says so.
 
     Only trainings with an occupancy grid are judged, which can empty itself. At most `DRAWS` further draws are tried.
 
     Args:
         state: After a step.
-        batch: Of that step.
-        output: Of that step.
+        made: That step.
     """
     sampler, draw = state.sampler, sum(stage.cells == 1 for stage in state.stages)
     if not isinstance(sampler, Occupancy) or state.router.num_cells > 1 or draw > DRAWS:
         return
     if state.step - state.began != sampler.settling_steps + JUDGED:
         return
-    why = why_nothing_is_learnt(batch, output)
+    why = why_nothing_is_learnt(made.batch, made.output)
     if why is None:
         return
     config = state.config

@@ -14,14 +14,18 @@ from voronerf.app.scenes import Scene
 from voronerf.app.train.config import TrainConfig
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
-from voronerf.nerf.loss import Batch, RayLoss, RenderOutput
+from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy, Sampler
 from voronerf.nerf.schedule import learning_rate, next_rays
 from voronerf.nerf.split import SplitDone, SplitStrategy
+from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.ops import Guard
 from voronerf.ops._core import backends
 from voronerf.router import VoronoiRouter
+
+#: The dtype of autocast for each precision but float32.
+HALVES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,7 @@ class State:
         skipped_in_a_row: Steps that the guard has left out since the last good one.
         stages: Periods of training: one more than splits, and one for each new start of the coarse stage.
         stopped: Whether somebody asked to end the training.
+        training_step: Of these objects.
     """
 
     config: TrainConfig
@@ -95,6 +100,19 @@ class State:
     skipped_in_a_row: int = 0
     stages: list[Stage] = field(default_factory=lambda: [Stage(1, 0.0, 0, None, None, 0)])
     stopped: bool = False
+    training_step: TrainingStep = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.training_step = TrainingStep(
+            self.batches,
+            self.ray_loss,
+            self.optimizer,
+            strategy=self.strategy,
+            guard=self.guard,
+            generator=self.draws,
+            autocast=HALVES.get(self.config.precision),
+            scaler=self.scaler,
+        )
 
     @property
     def device(self) -> torch.device:
@@ -150,18 +168,13 @@ class State:
         """A context in which the networks have their averaged weights, for pictures; not for training."""
         return self.optimizer.averaged()
 
-    def read_output(self, output: RenderOutput) -> None:
+    def read_output(self, made: StepOutput) -> None:
         """Reads loss, guard and number of samples of a step, which waits for the device; finds the rays of the next."""
-        rows = [] if output.samples.rows is None else [output.samples.rows[0].float()]
-        wanted = [output.loss.detach(), self.guard.in_a_row, *rows]
-        on_host = output.loss.is_cpu  # where a copy of all at once, as from a device, takes longer
-        found = [each.item() for each in wanted] if on_host else torch.stack([each.float() for each in wanted]).tolist()
-        self.loss, self.skipped_in_a_row = found[0], int(found[1])
+        self.loss, self.skipped_in_a_row = float(made.loss), int(self.guard.in_a_row)
         if isinstance(self.sampler, Occupancy):
-            samples = int(found[2]) if rows else len(output.weights)
             self.rays = next_rays(
                 self.rays,
-                samples,
+                made.samples,
                 rays=int(self.config.rays or 0),
                 samples=self.sampler.strata,
                 growth=self.config.field_type.ray_growth,
@@ -186,10 +199,10 @@ class State:
         self.rays = int(self.config.rays or 0)
         self.stages.append(Stage(1, self.seconds, self.step, None, None, 0))
 
-    def count_step(self, batch: Batch) -> None:
-        """Counts a step."""
+    def count_step(self, rays: int) -> None:
+        """Counts a step with so many rays."""
         self.step += 1
-        self.rays_done += len(batch.rays)
+        self.rays_done += rays
 
     def add_seconds(self, seconds: float) -> None:
         """Counts seconds of training."""
@@ -197,7 +210,7 @@ class State:
 
     def restore(self, skipped: int, stages: Sequence[Mapping[str, Any]], **counters: float) -> None:
         """Takes the counters of a checkpoint, by their names here."""
-        self.guard = Guard.on(self.device, skipped)
+        self.guard = self.training_step.guard = Guard.on(self.device, skipped)
         self.stages = [Stage(**stage) for stage in stages]
         for name, value in counters.items():
             setattr(self, name, value)

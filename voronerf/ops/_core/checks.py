@@ -15,8 +15,7 @@ import contextlib
 import os
 import re
 import sys
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -30,28 +29,6 @@ MAX_COUNT = 2**31 - 1
 """Rows of one call: index tensors are int32."""
 MAX_GROUPS = 2**27
 """Cells or rays that offsets speak of."""
-
-
-class _Trust(threading.local):
-    on = False
-
-
-trust = _Trust()
-"""Whether operations that the calling thread starts check their arguments in Python; see `trusting`."""
-
-
-@contextlib.contextmanager
-def trusting(on: bool = True) -> Iterator[None]:
-    """Operations take their arguments as they are, as long as the context lasts; not with ``on=False``.
-
-    For a loop that repeats calls whose kinds and shapes were checked in its first round: checks take as long as a
-    network of a few thousand samples. What C++ checks, such as offsets and indices, is checked still.
-    """
-    before, trust.on = trust.on, on
-    try:
-        yield
-    finally:
-        trust.on = before
 
 
 def check_tensor(op: str, name: str, value: object) -> None:

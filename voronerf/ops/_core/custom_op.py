@@ -14,6 +14,8 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.library import CustomOpDef
 
+from voronerf.ops._core.recording import active
+
 # torch has no public names for these questions; without an answer the custom op is called.
 _LISTENERS = [
     getattr(torch._C, "_len_torch_function_stack", lambda: True),
@@ -22,6 +24,11 @@ _LISTENERS = [
     getattr(torch.autograd, "_profiler_enabled", lambda: True),
 ]
 _PLAIN = (Tensor, torch.nn.Parameter)
+
+
+def is_watched() -> bool:
+    """Whether modes, transforms, tracers or profilers of torch are to see what is called."""
+    return any(listens() for listens in _LISTENERS)
 
 
 def custom_op(name: str, *, devices: tuple[str, ...] = ("cpu", "cuda")) -> Callable[[Callable[..., Iterator[Any]]], Op]:
@@ -153,9 +160,6 @@ class Op:
     The dispatcher and the autograd of ``torch.library`` take some 130 us for a forward and a backward pass, as long as
     a layer of width 64 takes for a thousand samples, and more for lists of tensors. Modes, transforms, tracers and
     profilers are given the custom op.
-
-    Attributes:
-        inside: gives what the op does, for a node of autograd that has looked at the arguments itself.
     """
 
     def __init__(
@@ -164,7 +168,7 @@ class Op:
         self._op, self._run, self._on_cuda, self.structs, self._listed = op, run, "cuda" in devices, structs, listed
         self._function: Any = None
         self._setup: Any = None
-        self.__name__, self.inside = "", run
+        self.__name__ = ""
 
     def __call__(self, *arguments: Any) -> Any:
         """What the op gives."""
@@ -173,9 +177,8 @@ class Op:
             return self._op(*flat)
         if forward_ad._current_level >= 0:
             self._refuse_tangents(flat)
-        for listens in _LISTENERS:
-            if listens():
-                return self._listened(flat)
+        if active.recording is None and is_watched():
+            return self._listened(flat)
         tensors = [flat[place] for place in self.structs.tensors]
         for place in self.structs.lists:
             tensors += flat[place]
@@ -188,7 +191,7 @@ class Op:
                 learns = learns or tensor.requires_grad
         if not (learns and torch.is_grad_enabled()):
             return self._run(*arguments)
-        if self._function is None:
+        if self._function is None or active.recording is not None:
             return self._op(*flat)
         entries, lengths = _flattened(flat) if self.structs.lists else (flat, None)
         results = self._function.apply(*entries, lengths)

@@ -248,7 +248,6 @@ class Declaration:
             **{f"{each.name}_kind": each.kind for each in self.arguments},
             **{f"{each.name}_dtypes": each.rule.dtypes for each in self._tensors()},
             "Checked": checks.Checked,
-            "trust": checks.trust,
             "resolve": self._resolve,
             "Inputs": self.Inputs,
             "prepare": self._prepare,
@@ -266,8 +265,6 @@ class Declaration:
         names = ", ".join(each.name for each in self.arguments)
         sizes = {entry for each in self._tensors() for entry in each.rule.shape}
         checked: list[Argument] = []
-        yield "if trust.on:"
-        yield from (f"    {line}" for line in self._run(names))
         yield f"given = Checked('{self.name}')"
         for each in self.arguments:
             if each.kind is Tensor and each.rule.wide and not any(other.rule.wide for other in checked):

@@ -18,7 +18,6 @@ from voronerf.ops._core.checks import (
     check_shape,
     check_tensor,
     check_writable,
-    trust,
 )
 from voronerf.ops.adam.reference import Guard, Rule
 
@@ -74,8 +73,7 @@ def adam(
         >>> (table[0] != 0).tolist()
         [False, True, False]
     """
-    if not trust.on:
-        _check_all(rules, parameters, gradients, means, squares, guard, loss)
+    _check_all(rules, parameters, gradients, means, squares, guard, loss)
     if not rules:
         return
     loss = None if loss is None else loss.detach()

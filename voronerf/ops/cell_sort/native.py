@@ -37,6 +37,5 @@ def sort(cells: Tensor, order: Tensor, offsets: Tensor, caller: str, way: str = 
         workspace = cells.new_empty(compiled.cell_sort_workspace(n, k, way, machine), dtype=torch.uint8)
         compiled.cell_sort(cells, order, offsets, workspace, n, k, way, machine)
         return
-    workspace = cells.new_empty(compiled.cell_sort_workspace(n, k))
-    if not compiled.cell_sort(cells, order, offsets, workspace, n, k, machine):
+    if not compiled.cell_sort(cells, order, offsets, n, k, machine):
         check_range(caller, "cells", cells, k)

@@ -39,11 +39,11 @@ def forward_with_tape(network: Mapping[str, Any]) -> Tape:
         learning = any(tensor.requires_grad for tensor in taken.given)
         cells, order, offsets = routed_mlp.find(first, where, k)
         rows, how = taken.rows(offsets, order), taken.how
-        out, *kept = run.inside(rows, how._replace(keep=learning))
+        out, *kept = run(rows, how._replace(keep=learning))
         count = None if native.on_cuda(out) else where.rows  # CUDA has left out the others
         if count is not None:
             out, cells = first_rows(out, cells, count)
-    return _Kept(out, rows._replace(kept=kept[0] if kept else None), how, taken.given, count, cells, frozen)
+    return _Kept(out, rows._replace(kept=kept), how, taken.given, count, cells, frozen)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.checks import check_flag, check_shape, trust
+from voronerf.ops._core.checks import check_flag, check_shape
 from voronerf.ops.routed_mlp import of_samples, routed_mlp
 from voronerf.ops.routed_mlp.program import routed_program
 
@@ -50,10 +50,9 @@ class Tape(ABC):
         Raises:
             ValueError: a loss or gradient of another shape.
         """
-        if not trust.on:
-            check_shape("forward_with_tape", "loss", loss, ())
-            check_shape("forward_with_tape", "gradient", gradient, self.raw.shape)
-            check_flag("forward_with_tape", "defer", defer)
+        check_shape("forward_with_tape", "loss", loss, ())
+        check_shape("forward_with_tape", "gradient", gradient, self.raw.shape)
+        check_flag("forward_with_tape", "defer", defer)
         return self._backward(loss.detach(), gradient.detach(), defer)
 
     @abstractmethod

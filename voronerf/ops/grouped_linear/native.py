@@ -26,7 +26,7 @@ def grouped_linear(
         dtype = torch.get_autocast_dtype(x.device.type)
     stored = dtype if dtype == torch.bfloat16 else torch.float32
     rounded = [p.to(dtype).float() for p in (weight, bias) if p is not None]
-    rows = Rows([x.to(dtype).to(stored)], rounded, offsets, None, None, None)
+    rows = Rows([x.to(dtype).to(stored)], rounded, offsets, None, None)
     how = How(_TABLES[activation], "0" if bias is None else "1", "grouped_linear", _PRODUCTS.get(dtype, "float32"))
     (out,) = run_program(rows, how)
     return out.to(dtype)

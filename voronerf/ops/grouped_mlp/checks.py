@@ -21,7 +21,6 @@ from voronerf.ops._core.checks import (
     check_shape,
     check_tensor,
     of_one_dtype,
-    trust,
 )
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
 
@@ -137,8 +136,7 @@ def check_routed(
     network = {**_DEFAULTS, **given}
     if network.keys() != _DEFAULTS.keys():
         raise TypeError(f"{op}: unknown arguments {', '.join(network.keys() - _DEFAULTS.keys())}")
-    if not trust.on:
-        _check_routed(op, positions, weights, biases, network)
+    _check_routed(op, positions, weights, biases, network)
     return {"positions": positions, "weights": weights, "biases": biases, **with_coords(positions, network)}
 
 

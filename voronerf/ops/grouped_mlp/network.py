@@ -53,7 +53,7 @@ class Network(NamedTuple):
 
     def rows(self, offsets: Tensor, order: Tensor | None = None) -> Rows:
         """What the program runs on, for rows of cells by offsets [k + 1] and an order."""
-        return Rows(self.inputs, self.parameters, offsets, order, self.ray_index, None)
+        return Rows(self.inputs, self.parameters, offsets, order, self.ray_index)
 
     def run(self, offsets: Tensor, order: Tensor | None = None) -> Tensor:
         """The result [n, out]."""

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
+from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import asked_for
 from voronerf.ops._core.layers import MLP
@@ -31,8 +32,8 @@ class Rows(NamedTuple):
         offsets: int32 [k + 1].
         order: int32 [n], or None for rows that are sorted by cell.
         ray_index: int32 [n], or None without rays.
-        kept: float32, what all hash grids were looked up to before, [n, w] each in the order of the cells, one behind
-            the other; None for a first pass.
+        kept: float32 [n, w], what each hash grid was looked up to before, in the order of the cells; none for a first
+            pass.
     """
 
     inputs: Sequence[Tensor]
@@ -40,7 +41,7 @@ class Rows(NamedTuple):
     offsets: Tensor
     order: Tensor | None
     ray_index: Tensor | None
-    kept: Tensor | None
+    kept: Sequence[Tensor] = ()
 
 
 class How(NamedTuple):
@@ -52,7 +53,7 @@ class How(NamedTuple):
         biased: of a table "1" for each layer that has a bias and "0" for one that has none; empty for a program.
         caller: the op that errors name.
         products: what they take: "float32", "bfloat16" or, on CUDA, "float16".
-        keep: whether what hash grids are looked up to is a last result, as `Rows` has it.
+        keep: whether what hash grids are looked up to are further results, as `Rows` has it.
         gradients: the first of the inputs whose rows, where all of them are 0, add nothing to any sum; -1 for none.
     """
 
@@ -73,17 +74,25 @@ def grouped_program(
     text: str,
 ) -> list[Tensor]:
     """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
-    return run_program(Rows(inputs, parameters, offsets, order, ray_index, None), How(text))
+    return run_program(Rows(inputs, parameters, offsets, order, ray_index), How(text))
 
 
 def run_program(rows: Rows, how: How) -> list[Tensor]:
     """The outputs and sums of a program, with gradients of every order."""
     learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*rows.inputs, *rows.parameters))
-    if not learning:
-        found: list[Tensor] = run(rows, how)
-        return found
-    found = run(rows, how._replace(keep=True))
-    return found[:-1]
+    found: list[Tensor] = run(rows, how._replace(keep=True) if learning else how)
+    return found[: _results(how)]
+
+
+def _results(how: How) -> int:
+    """How many outputs and sums there are; behind them comes what is kept."""
+    return 1 if how.biased else _results_of(how.text)
+
+
+@constant_result
+def _results_of(text: str) -> int:
+    program = Program.parse(text)
+    return len(program.outputs) + len(program.sums)
 
 
 def program_of(rows: Rows, how: How) -> Program:
@@ -110,17 +119,16 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
     counts = program.cells_of_sums(parameters, k)
     sums = [new((count, *shape), **float32) for count, shape in zip(counts, program.sums)]
     lowered = lower(program.text, _half(how.products, first)) if compiled_runs(program.text) else None
-    keeps = [new(n * sum(lowered.widths) if lowered else 0, **float32)] if how.keep else []
+    keeps = [new((n, width), **float32) for width in lowered.widths] if how.keep and lowered else []
     yield [*outputs, *sums, *keeps]
     if lowered is None:
         made = in_torch([x.float() for x in inputs], parameters, offsets, order, ray_index, program.text)
         for to, result in zip((*outputs, *sums), made, strict=True):
             to.copy_(result)
         return
-    kept = keeps[0] if keeps else kept
-    parts = None if kept is None or not kept.numel() else kept.split([n * width for width in lowered.widths])
     gradients = -1 if keeps else how.gradients  # what is kept is of all rows
-    given = program_inputs(lowered, rows, n, r, kept=parts, ready=not keeps, gradients=gradients, caller=how.caller)
+    looked = keeps or kept or None
+    given = program_inputs(lowered, rows, n, r, kept=looked, ready=not keeps, gradients=gradients, caller=how.caller)
     if native.on_cuda(first):
         _run_on_cuda(program, rows, how, given, outputs, sums)
         return
@@ -240,28 +248,27 @@ def _half(products: str, tensor: Tensor) -> bool:
 
 
 def _keep(ctx: Any, inputs: tuple[Rows, How], output: list[Tensor]) -> None:
-    (rows, parameters, offsets, order, ray_index, before), ctx.how = inputs
-    ctx.count, ctx.parameters, kept = len(rows), len(parameters), None
+    rows, ctx.how = inputs
+    ctx.count, ctx.parameters, ctx.results = len(rows.inputs), len(rows.parameters), _results(ctx.how)
     ctx.set_materialize_grads(False)
-    if ctx.how.keep:
-        kept = output[-1]
-        ctx.mark_non_differentiable(kept)
-    ctx.save_for_backward(*rows, *parameters, offsets, order, ray_index, before, kept)
+    ctx.kept, kept = len(rows.kept), output[ctx.results :]
+    ctx.mark_non_differentiable(*kept)
+    ctx.save_for_backward(*rows.inputs, *rows.parameters, rows.offsets, rows.order, rows.ray_index, *kept)
 
 
 def _gradients(ctx: Any, arriving: Sequence[Tensor | None]) -> tuple[Any, ...]:
-    count = ctx.count + ctx.parameters
-    *saved, kept = ctx.saved_tensors
-    wanted = asked_for(ctx, saved)[:count]
+    count, saved = ctx.count + ctx.parameters, ctx.saved_tensors
+    wanted = asked_for(ctx, saved[:count])
     found: list[Tensor | None] = [None] * count
-    arriving = arriving[:-1] if ctx.how.keep else arriving
+    arriving = arriving[: ctx.results]
     if any(g is not None for g in arriving) and any(wanted):
-        offsets, order, ray_index = saved[count : count + 3]
+        offsets, order, ray_index, *kept = saved[count:]
         rows = Rows(saved[: ctx.count], saved[ctx.count : count], offsets, order, ray_index, kept)
         results = iter(run_gradient(rows, ctx.how, arriving, wanted))
         found = [next(results) if want else None for want in wanted]
     nothing: Any = (None,) * len(How._fields)
-    return Rows(found[: ctx.count], found[ctx.count :], *nothing[:4]), How(*nothing)  # type: ignore[arg-type]
+    of_rows: Any = (found[: ctx.count], found[ctx.count :], *nothing[:3], [None] * ctx.kept)
+    return Rows._make(of_rows), How(*nothing)
 
 
 def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted: Sequence[bool]) -> list[Tensor]:
@@ -279,7 +286,7 @@ def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted
     more = [[g for g in part if g is not None] for part in (arriving[:split], arriving[split:])]
     sifts = own.sifts and not more[1] and all(g.dtype == torch.float32 for g in more[0])
     following = How(own.text, "", how.caller, how.products, False, count if sifts else -1)
-    inputs, parameters, kept = [*rows.inputs, *more[0]], [*rows.parameters, *more[1]], rows.kept if own.keeps else None
+    inputs, parameters, kept = [*rows.inputs, *more[0]], [*rows.parameters, *more[1]], rows.kept if own.keeps else ()
     call = rows._replace(inputs=inputs, parameters=parameters, kept=kept)
     # Of a pass that is differentiated again, what is looked up may be kept once more.
     found = run_program(call, following) if torch.is_grad_enabled() else run(call, following)

@@ -13,6 +13,7 @@ import torch
 from voronerf.ops._core import native
 from voronerf.ops._core.checks import MAX_COUNT
 from voronerf.ops._core.declare import declared
+from voronerf.ops._core.recording import read_count
 from voronerf.ops.march_rays.reference import March
 
 
@@ -41,8 +42,13 @@ def _march_rays(*flat: Any) -> March:
     near, capacity, inputs, machine = given.near, given.capacity, inputs_of(given), native.machine(given.near)
     mask = near.new_empty(given.r, -(-given.samples // 32), dtype=torch.int32)
     offsets = near.new_empty(given.r + 1, dtype=torch.int32)
-    native.compiled.march_rays_count(inputs, mask, offsets, MAX_COUNT if capacity is None else capacity, machine)
-    rows = int(offsets[-1]) if capacity is None else capacity
+    most, total = MAX_COUNT if capacity is None else capacity, near.new_empty(1, dtype=torch.int64)
+    if isinstance(machine, native.compiled.Cuda):
+        native.compiled.march_rays_count(inputs, mask, offsets, most, machine)
+        total = offsets[-1:]
+    else:
+        native.compiled.march_rays_count(inputs, mask, offsets, total, most, machine)
+    rows = read_count(total) if capacity is None else capacity
     found = March.memory(near, offsets, rows)
     native.compiled.march_rays_fill(inputs, mask, offsets, rows, *found[1:], machine)
     return found

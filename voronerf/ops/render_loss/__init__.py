@@ -83,7 +83,6 @@ def render_loss(
     native=Implementation(EVERYWHERE, (torch.float32,), file="render_loss"),
     warp=Implementation(EVERYWHERE, (torch.float32,), file="render_loss"),
     reference=Implementation(file="render_loss"),
-    smooth=["raw"],
     small=["raw"],
     prepare=lambda given: scaled("render_loss_gradient", given),
 )

@@ -24,7 +24,7 @@ def _forward(given: Any, found: Any) -> None:
 
 
 register(_forward)
-render_loss_gradient = _forward.inside
+render_loss_gradient = _forward
 
 
 def render_loss(raw: Tensor, *others: Any) -> list[Tensor]:

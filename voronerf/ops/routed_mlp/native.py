@@ -108,7 +108,9 @@ def locate_and_sort(positions: Tensor, where: Where, k: int) -> Iterator[tuple[T
     offsets = positions.new_empty(k + 1, dtype=torch.int32)
     yield found, order, offsets
     if alone:
-        if rows is None or not native.on_cuda(positions):
+        if not native.on_cuda(positions):
+            native.compiled.one_cell(found, offsets, n, native.cpu())
+        elif rows is None:
             found.zero_()
             offsets[0], offsets[1] = 0, n
         else:

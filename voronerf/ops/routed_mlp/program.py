@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.checks import trust
 from voronerf.ops._core.program import Program
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.grouped_mlp.checks import PLACES, check_places, with_coords
@@ -23,16 +22,15 @@ def check_program(
     network = {**PLACES, "ray_index": None, **given}
     if unknown := network.keys() - PLACES.keys() - {"ray_index"}:
         raise TypeError(f"{op}: unknown arguments {', '.join(unknown)}")
-    if not trust.on:
-        sizes: dict[str, int] = {}
-        known = isinstance(program, Program) and isinstance(parameters, Sequence)
-        known = known and all(isinstance(p, Tensor) for p in parameters)
-        shaped = with_cells(program, parameters) if known else parameters  # the others are refused
-        tensors = check_tensors(op, inputs, shaped, program, network["ray_index"], sizes)
-        if len(program.outputs) != 1 or program.sums or program.by_ray or 0 in program.rays:
-            raise ValueError(f"{op}: program must have one output [n, w] and inputs[0] [n, w], got others")
-        sizes.update(k=sizes.get("k", 1), p=program.inputs[0])
-        check_places(op, network, tensors, sizes)
+    sizes: dict[str, int] = {}
+    known = isinstance(program, Program) and isinstance(parameters, Sequence)
+    known = known and all(isinstance(p, Tensor) for p in parameters)
+    shaped = with_cells(program, parameters) if known else parameters  # the others are refused
+    tensors = check_tensors(op, inputs, shaped, program, network["ray_index"], sizes)
+    if len(program.outputs) != 1 or program.sums or program.by_ray or 0 in program.rays:
+        raise ValueError(f"{op}: program must have one output [n, w] and inputs[0] [n, w], got others")
+    sizes.update(k=sizes.get("k", 1), p=program.inputs[0])
+    check_places(op, network, tensors, sizes)
     return {"program": program, "inputs": inputs, "parameters": parameters, **with_coords(inputs[0], network)}
 
 

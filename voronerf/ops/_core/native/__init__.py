@@ -28,6 +28,7 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import BackendUnavailable
+from voronerf.ops._core.recording import active
 
 _REMEDY = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
 
@@ -148,7 +149,7 @@ def aligned(tensor: Tensor) -> Tensor:
 def on_huge_pages(result: Tensor) -> None:
     """Gives a result that has just been allocated, where it is large, huge pages, if the system has them, or the memory
     of an earlier result that is gone."""
-    if result.nbytes < _LARGE or result.device.type != "cpu":
+    if result.nbytes < _LARGE or result.device.type != "cpu" or active.recording is not None:
         return
     if result.nbytes < _REUSED or sys.platform != "linux":
         compiled.advise_huge_pages(result, result.nbytes)

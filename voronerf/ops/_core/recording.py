@@ -1,0 +1,223 @@
+"""Calls of the compiled module that are recorded once and made again by one call, without Python in between.
+
+While a function is recorded, it runs as ever. Each of its calls of the compiled module is kept with what it has loaded
+(csrc/bindings/bind.cpp), and everything that it asks of torch is looked at: new memory is made large enough for later
+runs, random draws are noted and drawn again before each of them, and views change nothing. Whatever else torch computes
+would be missing later, so it keeps the function from being replayed: :attr:`Recording.obstacle` says what it is.
+
+What changes from run to run lies in memory: numbers of rows (:meth:`Recording.count`, :func:`read_count`), other
+numbers (:func:`varying`), and what earlier calls have computed. There is memory for a quarter more rows than the
+recorded run had. A run that would exceed it is not made: :meth:`Recording.replay` says so.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+
+#: Rows that there is memory for, beside those of the recorded run: one for so many, and some.
+SPARE, SOME = 4, 64
+_NEW = ("aten::new_empty", "aten::empty")
+_HARMLESS = ("aten::promote_types", "aten::result_type")
+_PASSED_OVER = (str(Path(torch.__file__).absolute().parent), str(Path(__file__).absolute()))
+
+
+class _Active(threading.local):
+    recording: Recording | None = None
+
+
+active = _Active()
+"""The recording that the calling thread makes."""
+
+
+class Count(NamedTuple):
+    """A number of rows.
+
+    Attributes:
+        memory: int64 [1], where it lies.
+        rows: What it was when it was recorded.
+        most: What there is memory for.
+        given: What gives it before each run; None for one that a call computes.
+    """
+
+    memory: Tensor
+    rows: int
+    most: int
+    given: Callable[[], int] | None
+
+
+class Recording(TorchDispatchMode):
+    """The compiled calls of a function; a context around the function, to be entered once.
+
+    Attributes:
+        obstacle: Why they cannot be made again; None if they can.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import nearest_centre
+        >>> from voronerf.ops._core.recording import Recording
+        >>> points, centres = torch.rand(5, 3), torch.rand(4, 3)
+        >>> with Recording() as recording:
+        ...     rows = recording.count(lambda: 5)
+        ...     cells = nearest_centre(points, centres)
+        >>> _ = points.copy_(torch.rand(5, 3))
+        >>> recording.obstacle, recording.replay(threads=1)
+        (None, True)
+        >>> bool((cells == nearest_centre(points, centres)).all())
+        True
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        from voronerf.ops._core import native
+
+        self._compiled, self._calls = native.compiled, native.compiled.Recording()
+        self._counts = list[Count]()
+        self._numbers = list[tuple[Tensor, Callable[[], float]]]()
+        self._draws = list[tuple[Tensor, Callable[[], Tensor]]]()
+        self._generators: dict[int, torch.Generator] = {}  # of the draws, by identity
+        self._memory: dict[int, Tensor] = {}  # of rows, by address
+        self.obstacle: str | None = None
+
+    def __enter__(self) -> Recording:
+        self._calls.begin()
+        active.recording = self
+        super().__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        active.recording = None
+        self._calls.end()
+        self._refuse(self._calls.obstacle)
+
+    def __len__(self) -> int:
+        """How many calls are made again."""
+        return len(self._calls)
+
+    def count(self, given: Callable[[], int]) -> int:
+        """A number of rows that is known before each run; that of this one."""
+        rows = given()
+        with _disable_current_modes():
+            self._add(torch.tensor([rows]), rows, given)
+        return rows
+
+    def _add(self, memory: Tensor, rows: int, given: Callable[[], int] | None) -> None:
+        most = rows + rows // SPARE + SOME
+        self._calls.count(memory.data_ptr(), most)
+        self._counts.append(Count(memory, rows, most, given))
+        self._refuse("there are no rows" if rows == 0 else "")
+
+    def _refuse(self, why: str) -> None:
+        self.obstacle = self.obstacle or why or None
+
+    def replay(self, threads: int) -> bool:
+        """Makes the calls again; False, with the generators as they were, where there is no memory for the rows.
+
+        Args:
+            threads: Of the calls.
+
+        Raises:
+            ValueError: As of the calls, for what they find in their arguments.
+        """
+        for count in self._counts:
+            if count.given is not None:
+                rows = count.given()
+                if not 0 < rows <= count.most:
+                    return False
+                count.memory[0] = rows
+        before = [generator.get_state() for generator in self._generators.values()]
+        for drawn, draw in self._draws:
+            drawn.copy_(draw())
+        for number, value in self._numbers:
+            number.fill_(value())
+        made: bool = self._calls.replay(threads)
+        for generator, state in zip(self._generators.values(), () if made else before):
+            generator.set_state(state)
+        return made
+
+    def rows(self, place: int) -> int:
+        """A number of rows of the last run; they are numbered in the order of the recorded one."""
+        return int(self._counts[place].memory)
+
+    def now(self, tensor: Tensor) -> Tensor:
+        """A tensor of the recorded run, with as many rows as the last run has filled."""
+        for memory, rows, _, _ in self._counts if self._is_counted(tensor) else ():
+            for more in (0, 1):
+                if tensor.shape[:1] == (rows + more,):
+                    shape = (int(memory) + more, *tensor.shape[1:])
+                    return tensor.as_strided(shape, tensor.stride(), tensor.storage_offset())
+        return tensor
+
+    def _is_counted(self, tensor: Tensor) -> bool:
+        return tensor.untyped_storage().data_ptr() in self._memory
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """What torch is asked while a function is recorded."""
+        name, kwargs = func._schema.name, kwargs or {}
+        if name in _NEW:
+            return self._new(func, [*args], kwargs, args[0] if name == "aten::empty" else args[1])
+        result = func(*args, **kwargs)
+        if func.is_view:
+            moved = isinstance(result, Tensor) and result.storage_offset() != args[0].storage_offset()
+            if moved and self._is_counted(result):
+                self._refuse(f"a part of the rows of a step is read{_line()}")
+        elif torch.Tag.nondeterministic_seeded in func.tags and not any(isinstance(each, Tensor) for each in args):
+            generator = kwargs.get("generator") or torch.default_generator
+            self._generators[id(generator)] = generator
+            self._draws.append((result, lambda: func(*args, **kwargs)))
+        elif name not in _HARMLESS and not name.startswith("profiler::"):
+            self._refuse(f"torch computes {name.split('::')[-1]}{_line()}")
+        return result
+
+    def _new(self, func: Any, args: list[Any], kwargs: Any, size: Any) -> Tensor:
+        """New memory; that of rows does for the most of them."""
+        for _, rows, most, _ in self._counts:
+            for more in (0, 1):
+                if len(size) and size[0] == rows + more:
+                    args[args.index(size)] = [most + more, *size[1:]]
+                    memory: Tensor = func(*args, **kwargs)
+                    self._compiled.advise_huge_pages(memory, memory.nbytes)
+                    self._memory[memory.untyped_storage().data_ptr()] = memory
+                    return memory[: rows + more]
+        found: Tensor = func(*args, **kwargs)
+        return found
+
+
+def read_count(memory: Tensor) -> int:
+    """A number of rows that a call has computed, int64 [1]. Replays read it again from there."""
+    recording = active.recording
+    if recording is None:
+        return int(memory)
+    with _disable_current_modes():
+        rows = int(memory)
+    recording._add(memory, rows, None)
+    return rows
+
+
+def varying(value: Callable[[], float]) -> float | Tensor:
+    """A number that changes from run to run, rounded to float32. While it is recorded it is a tensor [] for replays."""
+    recording = active.recording
+    if recording is None:
+        return ctypes.c_float(value()).value
+    with _disable_current_modes():
+        number = torch.tensor(value(), dtype=torch.float32)
+    recording._numbers.append((number, value))
+    return number
+
+
+def _line() -> str:
+    """Where the package, or its caller, is."""
+    for frame, line in traceback.walk_stack(None):
+        file = frame.f_code.co_filename
+        if not file.startswith(_PASSED_OVER):
+            return f", in {Path(file).name}:{line}"
+    return ""
