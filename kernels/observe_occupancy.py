@@ -24,6 +24,25 @@ def _place(x: wp.float32, low: wp.float32, high: wp.float32, size: wp.int32) -> 
     return wp.int32(inside)
 
 
+@wp.func
+def _stretch(x: wp.float32, y: wp.float32, z: wp.float32, space: wp.array2d(dtype=wp.float32)) -> wp.float32:
+    # World length of a unit of the space: `space` has a row for the centre and the radius of a sphere, five for a
+    # perspective.
+    if space.shape[0] == 1:
+        offset = wp.vec3(x - space[0, 0], y - space[0, 1], z - space[0, 2])
+        left = wp.float32(2.0) - wp.length(offset) / space[0, 3]
+        inside = wp.float32(1.0e-3)
+        if left > 1.0e-3:  # NaN is not
+            inside = wp.min(left, wp.float32(1.0))
+        return wp.float32(1.0) / (inside * inside)
+    if space.shape[0] == 5:
+        ahead = wp.float32(1.0e-3)
+        if 1.0 - z > 1.0e-3:
+            ahead = wp.float32(1.0) - z
+        return wp.float32(2.0) * space[4, 0] / (ahead * ahead)
+    return wp.float32(1.0)
+
+
 @wp.kernel
 def _find_kernel(
     positions: wp.array2d(dtype=wp.float32),
@@ -63,6 +82,8 @@ def _raise_kernel(
     sigma: wp.array(dtype=wp.float32),
     deltas: wp.array(dtype=wp.float32),
     weights: wp.array(dtype=wp.float32),
+    positions: wp.array2d(dtype=wp.float32),
+    space: wp.array2d(dtype=wp.float32),
     hidden: wp.float32,
     density: wp.array(dtype=wp.float32),
 ) -> None:
@@ -78,6 +99,7 @@ def _raise_kernel(
     if thickness < 0.01:
         absorbed = thickness * (1.0 - 0.5 * thickness * (1.0 - thickness / 3.0))
     if weights[i] > hidden * absorbed:
+        found *= _stretch(positions[i, 0], positions[i, 1], positions[i, 2], space)
         wp.atomic_max(density, cells[i], found)
 
 
@@ -102,7 +124,10 @@ def observe_occupancy(given: Any) -> None:
     flat, rows, faded = (array(tensor, density) for tensor in (density.view(-1), cells, before))
     samples = [array(tensor, density) for tensor in (given.sigma, given.deltas, given.weights)]
     grid = [array(given.box, density), array(density, density)]
-    launch(_find_kernel, m, [array(given.positions, density), samples[1], *grid, rows, faded], density)
+    positions, contraction = array(given.positions, density), given.contraction
+    space = density.new_empty(0, 0) if contraction is None else contraction.view(-1, contraction.shape[-1])
+    seen = [*samples, positions, array(space, density)]
+    launch(_find_kernel, m, [positions, samples[1], *grid, rows, faded], density)
     launch(_fade_kernel, m, [rows, faded, given.decay, flat], density)
-    launch(_raise_kernel, m, [rows, *samples, given.hidden, flat], density)
+    launch(_raise_kernel, m, [rows, *seen, given.hidden, flat], density)
     launch(_compare_kernel, m, [rows, flat, given.threshold, array(given.occupied.view(-1), density)], density)

@@ -4,11 +4,14 @@
 
 #include <cstdint>
 
+#include "rays/march_rays.h"
+
 namespace voronerf {
 
 struct ObservedSamples {
   const float *positions, *sigma, *deltas, *weights;  // [m,3], [m], [m], [m]
   const float* box;                                   // [2,3]
+  MarchSpace space;  // that of positions, box and grid; sigma and deltas are the world's
   int64_t x, y, z, m;
   float decay, threshold, hidden;
 };

@@ -280,11 +280,9 @@ class OccupancyGrid:
 
     def _enter(self, positions: Tensor, density: Tensor, deltas: Tensor, weights: Tensor, **rule: Any) -> None:
         """Samples, in the units of the world, on their way into the grid; ``rule`` as for `observe_occupancy`."""
-        if self.contraction is not None:
-            stretch = self.contraction.stretch(positions)
-            density, deltas = density * stretch, deltas / stretch
         samples = positions, density.float(), deltas.float(), weights.float()
-        observe_occupancy(self.density, self.occupied, self.box, *samples, threshold=self.threshold, **rule)
+        rule |= {"threshold": self.threshold, "contraction": self._numbers}
+        observe_occupancy(self.density, self.occupied, self.box, *samples, **rule)
 
     def voxels(self, points: Tensor) -> Tensor:
         """Flat numbers int32 [n] of the voxels that points [n, 3] lie in; outside the box the nearest at its border."""

@@ -38,6 +38,7 @@ def observe_occupancy(
     decay: Annotated[float, "0 to 1"],
     threshold: float,
     hidden: float,
+    contraction: Annotated[Tensor | None, "same [4] or [5, 3]"] = None,
     backend: str = "auto",
 ) -> None:
     """Updates the cells of an occupancy grid that rendered samples lie in, in place.
@@ -45,6 +46,9 @@ def observe_occupancy(
     A cell with samples gets the largest of their densities and ``decay`` times its old density (Mueller et al. 2022,
     appendix C). A sample that receives less than the share ``hidden`` of the light counts as density 0:
     ``weights <= hidden * (1 - exp(-sigma * deltas))``. The other cells keep theirs. Not differentiable.
+
+    With a ``contraction`` the grid, its box and the positions are of the contracted space, ``sigma`` and ``deltas`` of
+    the world. A cell then gets densities per unit of contracted length along rays from the centre.
 
     Args:
         density: float32 [x, y, z], >= 0, contiguous.
@@ -57,6 +61,7 @@ def observe_occupancy(
         decay: 0 to 1.
         threshold: density from which a cell counts as occupied.
         hidden: share of the light, 0 to 1.
+        contraction: float32 [4], a sphere, or [5, 3], normalised device coordinates, as for ``march_rays``; or None.
         backend: "auto", "reference", "native" or "warp".
 
     Raises:

@@ -8,9 +8,10 @@ import torch
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
+from voronerf.ops.march_rays.native import space_of
 
 _OP = declared("observe_occupancy")
-_samples = _OP.inputs(native.compiled.ObservedSamples)
+_samples = _OP.inputs(native.compiled.ObservedSamples, space=space_of)
 
 
 @_OP.plain
