@@ -23,6 +23,7 @@ from voronerf.ops.grouped_mlp import grouped_mlp
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.hash_encode import hash_encode
 from voronerf.ops.integrated_encode import integrated_encode
+from voronerf.ops.keep_heaviest import keep_heaviest
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
@@ -64,6 +65,7 @@ __all__ = [
     "grouped_program",
     "hash_encode",
     "integrated_encode",
+    "keep_heaviest",
     "locate_cell",
     "march_rays",
     "nearest_centre",
