@@ -4,7 +4,7 @@
 
 namespace voronerf {
 
-VN_STRUCT(ObservedSamples, positions, sigma, deltas, weights, box, space, x, y, z, m, decay, threshold, hidden);
+VN_STRUCT(ObservedSamples, positions, sigma, deltas, weights, box, fixed, space, x, y, z, m, decay, threshold, hidden);
 
 VN_BINDINGS(module) {
   module.cpu("observe_occupancy", VN_CPU(observe_occupancy_cpu));

@@ -9,9 +9,6 @@
 
 namespace voronerf {
 
-// Whether a sample says anything: not if it stands for no part of its ray.
-VN_HD bool observes(const ObservedSamples& in, int64_t i) { return in.deltas[i] != 0.0f; }
-
 // The cell of a sample; NaN is in the first of its axis.
 VN_HD int64_t observed_cell(const ObservedSamples& in, int64_t i) {
   const int64_t size[3] = {in.x, in.y, in.z};
@@ -23,6 +20,11 @@ VN_HD int64_t observed_cell(const ObservedSamples& in, int64_t i) {
     cell = cell * size[axis] + static_cast<int64_t>(inside);
   }
   return cell;
+}
+
+// Whether a sample says anything of its cell: not if it stands for no part of its ray, or if the cell stays as it is.
+VN_HD bool observes(const ObservedSamples& in, int64_t i, int64_t cell) {
+  return (in.deltas == nullptr || in.deltas[i] != 0.0f) && (in.fixed == nullptr || in.fixed[cell] == 0);
 }
 
 // World length of a unit of length of the space, at a sample; see voronerf/nerf/contraction.py.
@@ -45,6 +47,7 @@ VN_HD float observed_stretch(const ObservedSamples& in, int64_t i) {
 // What a sample says of its cell: its density, or 0 if less than the share `hidden` of the light reaches it.
 VN_HD float observed_density(const ObservedSamples& in, int64_t i) {
   const float density = in.sigma[i] == in.sigma[i] ? in.sigma[i] : INFINITY;
+  if (in.weights == nullptr) return density * observed_stretch(in, i);
   const float thickness = density * in.deltas[i];
   // 1 - exp(-t) <= min(t, 1), which spares most samples the function.
   const bool seen = in.weights[i] > in.hidden * (thickness < 1.0f ? thickness : 1.0f) ||

@@ -68,12 +68,31 @@ def test_equals_a_slow_loop(device, backend, shape, m, decay, space):
         torch.testing.assert_close(after, before, rtol=0, atol=0, equal_nan=True)
 
 
+def test_samples_without_rays_are_seen_and_fixed_cells_stay(device, backend):
+    density = 2 * torch.rand(5, 6, 7)
+    positions, sigma = BOX[0] + (BOX[1] - BOX[0]) * torch.rand(500, 3), 3 * torch.rand(500)
+    sigma[::50] = torch.nan
+    fixed = torch.rand(5, 6, 7) < 0.3
+    given = positions, sigma, torch.ones(500), torch.ones(500), torch.ones(500)
+    for kept in (fixed, None):
+        expected = slow(density, *given[:4], 0.5, 0.0, given[4])
+        expected = expected if kept is None else torch.where(kept, density, expected)
+        found, occupied = density.to(device, copy=True), (density >= 0.9).to(device)
+        rule = {"decay": 0.5, "threshold": 0.9, "hidden": 0.0, "backend": backend}
+        samples = (strided(tensor.to(device)) for tensor in given[:2])
+        there = None if kept is None else strided(kept.to(device))
+        observe_occupancy(found, occupied, BOX.to(device), *samples, **rule, fixed=there)
+        assert torch.equal(found.cpu(), expected)
+        assert torch.equal(occupied.cpu(), expected >= 0.9)
+
+
 def test_refuses_what_makes_no_sense():
     density, occupied = torch.rand(2, 3, 4), torch.ones(2, 3, 4, dtype=torch.bool)
     samples = {"positions": torch.rand(5, 3), "sigma": torch.rand(5), "deltas": torch.rand(5), "weights": torch.rand(5)}
     numbers = {"decay": 0.5, "threshold": 1.0, "hidden": 0.01}
     refuses = refusals(observe_occupancy, density=density, occupied=occupied, box=BOX, **samples, **numbers)
     refuses("density must be contiguous, got strides (1, 2, 6)", density=torch.rand(4, 3, 2).permute(2, 1, 0))
+    refuses("deltas and weights must be given together, got no weights", weights=None)
     refuses("decay must lie in 0 to 1, got -1", decay=-1)
     none = {"density": torch.rand(0, 3, 4), "occupied": torch.ones(0, 3, 4, dtype=torch.bool)}
     refuses("density must have at least one cell, got [0, 3, 4]", **none)

@@ -16,6 +16,7 @@ from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_pixels import draw_pixels
 from voronerf.ops.draw_pixels.reference import Runs
+from voronerf.ops.draw_points import draw_points
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
@@ -58,6 +59,7 @@ __all__ = [
     "compose_runs",
     "composite",
     "draw_pixels",
+    "draw_points",
     "forward_with_tape",
     "frequency_encode",
     "grouped_linear",

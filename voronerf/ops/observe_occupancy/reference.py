@@ -11,19 +11,24 @@ from torch import Tensor
 @torch.no_grad()
 def observe_occupancy(*given: Any) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
-    density, occupied, box, positions, sigma, deltas, weights, decay, threshold, hidden, contraction = given
+    density, occupied, box, positions, sigma, deltas, weights, decay, threshold, hidden, contraction, fixed = given
     found = sigma.nan_to_num(nan=float("inf"), posinf=float("inf"))
-    # weight = light that arrives * share of it that is taken
-    seen = weights > hidden * -torch.expm1(-found * deltas)
     rows = cells_of(positions, box, density.shape).long()
     count = density.numel()
-    rows = torch.where(deltas != 0, rows, count)  # one cell more, for samples that say nothing
+    # One cell more, for samples that say nothing.
+    if fixed is not None:
+        rows = torch.where(fixed.reshape(-1)[rows], count, rows)
+    if deltas is not None:
+        # weight = light that arrives * share of it that is taken
+        seen = weights > hidden * -torch.expm1(-found * deltas)
+        rows = torch.where(deltas != 0, rows, count)
+        found = torch.where(seen, found, 0)
     faded, marked = (torch.nn.functional.pad(table.view(-1), (0, 1)) for table in (density, occupied))
     # A cell decays once, however often it occurs.
     faded = faded.scatter(0, rows, faded[rows] * decay)
     if contraction is not None:
         found = found * stretch(positions, contraction)
-    raised = faded.scatter_reduce(0, rows, torch.where(seen, found, 0), "amax")
+    raised = faded.scatter_reduce(0, rows, found, "amax")
     marked[rows] = raised[rows] >= threshold
     density.view(-1).copy_(raised[:count])
     occupied.view(-1).copy_(marked[:count])
