@@ -306,37 +306,10 @@ class OccupancyGrid:
         """Flat numbers int32 [n] of the voxels that points [n, 3] lie in; outside the box the nearest at its border."""
         return voxels_of(points, self.box, self.occupied.shape)
 
-    def march(
-        self,
-        rays: Rays,
-        near: Tensor,
-        far: Tensor,
-        samples: int,
-        *,
-        seed: Tensor | None = None,
-        spacing: str = "linear",
-        start: Tensor | None = None,
-        most: int | None = None,
-        capacity: int | None = None,
-        backend: str = "auto",
-    ) -> March:
-        """The samples of rays that lie in occupied voxels; see `voronerf.ops.march_rays`."""
-        return march_rays(
-            rays.origins,
-            rays.directions,
-            near,
-            far,
-            self.occupied,
-            self.box,
-            samples,
-            seed=seed,
-            spacing=spacing,
-            start=start,
-            most=most,
-            capacity=capacity,
-            contraction=self._numbers,
-            backend=backend,
-        )
+    def march(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> March:
+        """The samples of rays that lie in occupied voxels; other arguments are those of `voronerf.ops.march_rays`."""
+        given = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
+        return march_rays(*given, contraction=self._numbers, **rule)
 
     def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaySums:
         """What rays see of networks in occupied voxels; other arguments are those of `voronerf.ops.render_opaque`."""

@@ -15,7 +15,7 @@ from voronerf.ops.balance_centres import balance_centres
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_pixels import draw_pixels
-from voronerf.ops.draw_pixels.reference import Runs
+from voronerf.ops.draw_pixels.reference import Known, Runs
 from voronerf.ops.draw_points import draw_points
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.frequency_encode import frequency_encode
@@ -44,6 +44,7 @@ __all__ = [
     "Composite",
     "Guard",
     "HashGrid",
+    "Known",
     "Layer",
     "March",
     "OwnSamples",
