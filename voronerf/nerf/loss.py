@@ -14,10 +14,11 @@ from voronerf.nerf.radiance import Radiance, radiance_of, router_of
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Hierarchical, Occupancy
 from voronerf.nerf.sampling import colour_loss
-from voronerf.nerf.volume import Samples, gradient_shares
+from voronerf.nerf.volume import Samples
 from voronerf.ops._core import backends
 from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.ops.render_loss import render_loss_gradient
+from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.sparse_depth_gradient.reference import near_point, sparse_depth_loss
 
@@ -178,9 +179,8 @@ class RayLoss:
                 **field.rule,
                 backend=renderer.backend,
             )
-        shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
-        if shares is not None:
-            gradient = gradient * shares[:, None]
+        if (full := renderer.sampler.space.full_gradient) is not None:
+            scale_gradient(gradient, samples.depths, full, backend=renderer.backend)
         loss = tape.backward(found.loss, gradient, defer=not backward)
         return RenderOutput(loss, found.error, found.weights, found.density, samples, found.colour)
 

@@ -36,6 +36,7 @@ from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradie
 from voronerf.ops.render_opaque import RaySums, render_opaque
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
+from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.spherical_harmonics import spherical_harmonics
 
@@ -82,6 +83,7 @@ __all__ = [
     "routed_mlp",
     "run_gradients",
     "run_sums",
+    "scale_gradient",
     "sparse_depth_gradient",
     "spherical_harmonics",
 ]
