@@ -23,6 +23,7 @@ from voronerf.nerf import (
     render_until_opaque,
 )
 from voronerf.nerf.loss import RenderOutput
+from voronerf.nerf.radiance import radiance_of
 from voronerf.nerf.samplers import REVISIT_EVERY
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -126,6 +127,9 @@ def test_the_density_of_a_router_is_found_without_its_colour(field):
         torch.nn.init.normal_(parameter, generator=torch.Generator().manual_seed(1))
     router = VoronoiRouter(field, torch.rand(5, 3), share=[n for n, _ in field.named_parameters() if n == "features"])
     box = torch.tensor([[0.0, 0, 0], [1.0, 1, 1]])
+    networks = radiance_of(router).networks
+    every, alone = (sum(step.op == "linear" for step in part.steps) for part in (networks.program, networks.density))
+    assert alone < every and not networks.density.rays
     grids = [OccupancyGrid(box, 6, threshold=1e-6) for _ in range(2)]
     for grid, asked in zip(grids, (router, lambda *given: router(*given))):
         grid.update(asked, generator=torch.Generator().manual_seed(2))
