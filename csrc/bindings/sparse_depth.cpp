@@ -4,7 +4,8 @@
 
 namespace voronerf {
 
-VN_STRUCT(SparseDepth, density, depths, deltas, weights, offsets, distances, nearby, s, m);
+VN_STRUCT(SparseDepth, density, depths, deltas, weights, offsets, distances, nearby, factor, density_scale, activated,
+          s, r, m);
 
 VN_BINDINGS(module) { module.cpu("sparse_depth_gradient", VN_CPU(sparse_depth_gradient_cpu)); }
 

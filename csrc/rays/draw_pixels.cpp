@@ -13,22 +13,29 @@ constexpr int64_t kPixels = 64;  // of a task
 
 }  // namespace
 
-void draw_pixels_cpu(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, int threads) {
+void draw_pixels_cpu(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, float* distances, int threads) {
   parallel_for((in.b + kPixels - 1) / kPixels, 1, threads, [&](int64_t block) {
     const int64_t begin = block * kPixels, end = std::min<int64_t>(in.b, begin + kPixels);
     for (int64_t i = begin; i < end; ++i) {
       const uint32_t key = hash_key(*in.seed, i);
-      pixels[i] = draw_place(key, in.below);
+      if (i < in.several) {
+        const int64_t place = draw_place(key, in.p);
+        pixels[i] = in.known[place];
+        distances[i] = in.distances[place];
+      } else {
+        pixels[i] = draw_place(key, in.below);
+      }
       for (int channel = 0; channel < 3; ++channel) uniforms[3 * i + channel] = hashed(key, 2 + channel);
     }
     if (in.ends == nullptr) return;
     int64_t run[kPixels];
-    for (int64_t i = begin; i < end; ++i) {
+    const int64_t first = std::min(std::max<int64_t>(begin, in.several), end);
+    for (int64_t i = first; i < end; ++i) {
       run[i - begin] = first_run(in, pixels[i]);
       __builtin_prefetch(in.ends + run[i - begin]);
       __builtin_prefetch(in.shift + run[i - begin]);
     }
-    for (int64_t i = begin; i < end; ++i) pixels[i] += in.shift[run_of(in, run[i - begin], pixels[i])];
+    for (int64_t i = first; i < end; ++i) pixels[i] += in.shift[run_of(in, run[i - begin], pixels[i])];
   });
 }
 

@@ -1,5 +1,5 @@
-// The pixels of a training step, drawn from runs of pixels: n runs, b pixels. What it computes is said in
-// voronerf/ops/draw_pixels/reference.py.
+// The pixels of a training step, drawn from runs of pixels: n runs, p known pixels, b pixels. What it computes is said
+// in voronerf/ops/draw_pixels/reference.py.
 #pragma once
 
 #include <cstdint>
@@ -18,6 +18,10 @@ struct DrawPixelsInputs {
   int64_t bits;
   int64_t below;  // places of all runs
   Rows b;
+  const int64_t* known;    // [p], which the first of all pixels are drawn from; or null
+  const float* distances;  // [p], of these
+  int64_t p;
+  Rows several;  // as many as are drawn from them
 };
 
 // The run of a place: looked for from the first that can hold it, within the tables whatever they say.
@@ -36,8 +40,8 @@ VN_HD int64_t draw_place(uint32_t key, int64_t below) {
   return static_cast<int64_t>(fraction * static_cast<double>(below));
 }
 
-// pixels: [b]. uniforms: [b,3], in [0, 1).
-void draw_pixels_cpu(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, int threads);
-void draw_pixels_cuda(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, void* stream);
+// pixels: [b]. uniforms: [b,3], in [0, 1). distances: [several].
+void draw_pixels_cpu(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, float* distances, int threads);
+void draw_pixels_cuda(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, float* distances, void* stream);
 
 }  // namespace voronerf

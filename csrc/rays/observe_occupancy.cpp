@@ -17,7 +17,7 @@ void observe_occupancy_cpu(const ObservedSamples& in, float* density, uint8_t* o
     const int64_t begin = run * kRun, end = std::min<int64_t>(in.m, begin + kRun);
     for (int64_t i = begin; i < end; ++i) {
       const int64_t cell = observed_cell(in, i);
-      cells[i] = observes(in, i) ? static_cast<int32_t>(cell) : -1;
+      cells[i] = observes(in, i, cell) ? static_cast<int32_t>(cell) : -1;
       __builtin_prefetch(density + cell, 1);
       __builtin_prefetch(occupied + cell, 1);
     }

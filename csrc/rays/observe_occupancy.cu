@@ -14,16 +14,17 @@ constexpr unsigned kSign = 0x80000000u;
 
 __device__ __forceinline__ int64_t this_sample() { return static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; }
 
-// before: the density of the cell that a sample speaks for, -1 for the others.
+// cells: -1 for samples that say nothing. before: the density of the cell that one speaks for, -1 for the others.
 __global__ void __launch_bounds__(kThreads)
     claim_kernel(ObservedSamples in, unsigned* density, int32_t* __restrict__ cells, float* __restrict__ before) {
   const int64_t i = this_sample();
-  if (i >= in.m || !observes(in, i)) return;
+  if (i >= in.m) return;
   const int64_t cell = observed_cell(in, i);
+  cells[i] = observes(in, i, cell) ? static_cast<int32_t>(cell) : -1;
+  if (cells[i] < 0) return;
   const unsigned bits = atomicOr(density + cell, kSign);
   float kept;
   memcpy(&kept, &bits, sizeof kept);
-  cells[i] = static_cast<int32_t>(cell);
   before[i] = (bits & kSign) != 0 ? -1.0f : kept;
 }
 
@@ -31,7 +32,7 @@ __global__ void __launch_bounds__(kThreads)
     fade_kernel(ObservedSamples in, const int32_t* __restrict__ cells, const float* __restrict__ before,
                 float* __restrict__ density, uint8_t* __restrict__ occupied) {
   const int64_t i = this_sample();
-  if (i >= in.m || !observes(in, i) || before[i] < 0.0f) return;
+  if (i >= in.m || cells[i] < 0 || before[i] < 0.0f) return;
   const float faded = before[i] * in.decay;
   density[cells[i]] = faded;
   occupied[cells[i]] = faded >= in.threshold;
@@ -40,7 +41,7 @@ __global__ void __launch_bounds__(kThreads)
 __global__ void __launch_bounds__(kThreads)
     raise_kernel(ObservedSamples in, const int32_t* __restrict__ cells, int* density, uint8_t* __restrict__ occupied) {
   const int64_t i = this_sample();
-  if (i >= in.m || !observes(in, i)) return;
+  if (i >= in.m || cells[i] < 0) return;
   const float seen = observed_density(in, i);
   int bits;
   memcpy(&bits, &seen, sizeof bits);

@@ -5,12 +5,16 @@
 #include <cstdint>
 
 #include "common/rows.h"
+#include "rays/march_rays.h"
 
 namespace voronerf {
 
 struct ObservedSamples {
-  const float *positions, *sigma, *deltas, *weights;  // [m,3], [m], [m], [m]
-  const float* box;                                   // [2,3]
+  const float *positions, *sigma;  // [m,3], [m]
+  const float *deltas, *weights;   // [m], or both null where all light reaches every sample
+  const float* box;                // [2,3]
+  const uint8_t* fixed;            // [x,y,z], not 0 for cells that stay as they are; or null
+  MarchSpace space;                // that of positions, box and grid; sigma and deltas are the world's
   int64_t x, y, z;
   Rows m;
   float decay, threshold, hidden;

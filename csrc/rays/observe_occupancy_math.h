@@ -9,9 +9,6 @@
 
 namespace voronerf {
 
-// Whether a sample says anything: not if it stands for no part of its ray.
-VN_HD bool observes(const ObservedSamples& in, int64_t i) { return in.deltas[i] != 0.0f; }
-
 // The cell of a sample; NaN is in the first of its axis.
 VN_HD int64_t observed_cell(const ObservedSamples& in, int64_t i) {
   const int64_t size[3] = {in.x, in.y, in.z};
@@ -25,13 +22,37 @@ VN_HD int64_t observed_cell(const ObservedSamples& in, int64_t i) {
   return cell;
 }
 
+// Whether a sample says anything of its cell: not if it stands for no part of its ray, or if the cell stays as it is.
+VN_HD bool observes(const ObservedSamples& in, int64_t i, int64_t cell) {
+  return (in.deltas == nullptr || in.deltas[i] != 0.0f) && (in.fixed == nullptr || in.fixed[cell] == 0);
+}
+
+// World length of a unit of length of the space, at a sample; see voronerf/nerf/contraction.py.
+VN_HD float observed_stretch(const ObservedSamples& in, int64_t i) {
+  const float* point = in.positions + 3 * i;
+  if (in.space.sphere != nullptr) {
+    const float *centre = in.space.sphere, radius = in.space.sphere[3];
+    const float x = point[0] - centre[0], y = point[1] - centre[1], z = point[2] - centre[2];
+    const float left = 2.0f - sqrtf(x * x + y * y + z * z) / radius;
+    const float inside = left > 1e-3f ? (left < 1.0f ? left : 1.0f) : 1e-3f;
+    return 1.0f / (inside * inside);
+  }
+  if (in.space.perspective != nullptr) {
+    const float ahead = 1.0f - point[2], left = ahead > 1e-3f ? ahead : 1e-3f;
+    return 2.0f * in.space.perspective[12] / (left * left);
+  }
+  return 1.0f;
+}
+
 // What a sample says of its cell: its density, or 0 if less than the share `hidden` of the light reaches it.
 VN_HD float observed_density(const ObservedSamples& in, int64_t i) {
   const float density = in.sigma[i] == in.sigma[i] ? in.sigma[i] : INFINITY;
+  if (in.weights == nullptr) return density * observed_stretch(in, i);
   const float thickness = density * in.deltas[i];
   // 1 - exp(-t) <= min(t, 1), which spares most samples the function.
-  if (in.weights[i] > in.hidden * (thickness < 1.0f ? thickness : 1.0f)) return density;
-  return in.weights[i] > in.hidden * -expm1f(-thickness) ? density : 0.0f;
+  const bool seen = in.weights[i] > in.hidden * (thickness < 1.0f ? thickness : 1.0f) ||
+                    in.weights[i] > in.hidden * -expm1f(-thickness);
+  return seen ? density * observed_stretch(in, i) : 0.0f;
 }
 
 }  // namespace voronerf

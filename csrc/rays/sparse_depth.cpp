@@ -18,43 +18,47 @@ bool near_point(const SparseDepth& in, int64_t i, float distance) {
   return std::fabs(in.depths[i] - distance) <= in.nearby * distance + in.deltas[i];
 }
 
+// The derivative of the density to the last of the outputs: of a softplus, 1 - exp(-density / scale) times the scale.
+float slope(const SparseDepth& in, int64_t i) {
+  return in.activated ? 1.0f : -in.density_scale * std::expm1(-in.density[i] / in.density_scale);
+}
+
 float learn_ray(const SparseDepth& in, int64_t begin, int64_t end, float distance, float* gradient) {
   double sum = 0.0;
   for (int64_t i = begin; i < end; ++i) sum += near_point(in, i, distance) ? static_cast<double>(in.weights[i]) : 0.0;
   const float total = static_cast<float>(sum);
-  if (!(total > kLeast)) {
-    std::fill(gradient + begin, gradient + end, 0.0f);
-    return total == total ? -std::log(kLeast) : total;
-  }
+  if (!(total > kLeast)) return total == total ? -std::log(kLeast) : total;
   double optical = 0.0, light = 0.0;
   for (int64_t i = begin; i < end; ++i) {
     const bool there = near_point(in, i, distance);
     optical += static_cast<double>(in.density[i] * in.deltas[i]);
     light += there ? static_cast<double>(in.weights[i]) : 0.0;
     const float through = there ? std::exp(-static_cast<float>(optical)) : 0.0f;
-    gradient[i] = -in.deltas[i] / total * (through - (total - static_cast<float>(light)));
+    const float to_density = -in.deltas[i] / total * (through - (total - static_cast<float>(light)));
+    gradient[4 * i + 3] += in.factor * to_density * slope(in, i);
   }
   return -std::log(std::min(total, 1.0f));
 }
 
 }  // namespace
 
-void sparse_depth_gradient_cpu(const SparseDepth& in, float* loss, float* of_rays, float* gradient, int threads) {
+void sparse_depth_gradient_cpu(const SparseDepth& in, float* loss, float* gradient, float* of_rays, int threads) {
   constexpr int64_t kRays = 64;  // of a task
-  bool rising = true;
-  for (int64_t i = 0; i < in.s; ++i) rising &= in.offsets[i] <= in.offsets[i + 1];
-  const int64_t first = in.offsets[0];
-  if (!rising || in.offsets[in.s] - first != in.m) {
-    throw std::invalid_argument("sparse_depth_gradient: ray_offsets must rise, by the number of samples, " +
-                                std::to_string(in.m) + ", got offsets from " + std::to_string(first) + " to " +
-                                std::to_string(in.offsets[in.s]));
+  int64_t before = 0;
+  for (int64_t i = 0; i <= in.r; ++i) {
+    if (in.offsets[i] < before || in.offsets[i] > in.m) {
+      throw std::invalid_argument(
+          "sparse_depth_gradient: ray_offsets must rise from 0 or more to at most the number of samples, " +
+          std::to_string(in.m) + ", got " + std::to_string(in.offsets[i]) + " for ray " + std::to_string(i));
+    }
+    before = in.offsets[i];
   }
   parallel_for(in.s, kRays, threads, [&](int64_t i) {
-    of_rays[i] = learn_ray(in, in.offsets[i] - first, in.offsets[i + 1] - first, in.distances[i], gradient);
+    of_rays[i] = learn_ray(in, in.offsets[i], in.offsets[i + 1], in.distances[i], gradient);
   });
   double sum = 0.0;
   for (int64_t i = 0; i < in.s; ++i) sum += static_cast<double>(of_rays[i]);
-  *loss = static_cast<float>(sum);
+  *loss += in.factor * static_cast<float>(sum);
 }
 
 }  // namespace voronerf

@@ -22,6 +22,9 @@ from voronerf.nerf import (
     render_rays,
     render_until_opaque,
 )
+from voronerf.nerf.loss import RenderOutput
+from voronerf.nerf.radiance import radiance_of
+from voronerf.nerf.samplers import REVISIT_EVERY
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 WHITE = torch.ones(3)
@@ -84,6 +87,38 @@ def test_cells_that_are_looked_at_fade_and_the_others_stay():
     assert bool((density[1::2] == 8).all())
 
 
+def test_a_visit_raises_what_it_meets_and_leaves_the_rest():
+    grid = OccupancyGrid(BOX, 4, threshold=0.1, remembered=1.0)
+    fixed = torch.rand(4, 4, 4, generator=seeded(0)) < 0.5
+    seed, ball = torch.tensor([5], dtype=torch.int32), Ball(8.0)
+    grid.revisit(ball, 2000, seed, fixed=fixed)
+    assert ball.asked == 2000
+    near = grid.points(torch.arange(64)).norm(dim=1).view(4, 4, 4) < 0.5
+    assert grid.density[near & ~fixed].tolist() == [8.0] * int((near & ~fixed).sum())
+    assert bool((grid.density[fixed | (grid.density != 8)] == 0.1).all()) and bool((near & fixed).any())
+    other = OccupancyGrid(BOX, 4, threshold=0.1, remembered=1.0)
+    other.revisit(ball, 2000, seed, fixed=fixed)
+    assert torch.equal(grid.density, other.density)
+    # What is not a number counts as dense.
+    grid.revisit(lambda p, d, i: (p, torch.full((len(p),), torch.nan)), 2000, seed)
+    assert bool((grid.density == torch.inf).all())
+
+
+def test_voxels_of_a_sampler_stay_empty():
+    empty = torch.rand(8, 8, 8, generator=seeded(1)) < 0.5
+    sampler = Occupancy(OccupancyGrid(BOX, 8, threshold=0.1), 16, empty=empty.flatten())
+    sampler.grid = OccupancyGrid(BOX, 8, threshold=0.1)
+    ball, random = Ball(), seeded(0)
+    rays = Rays(torch.tensor([[0.0, 0, -3]]).expand(50, 3), torch.tensor([[0.0, 0, 1]]).expand(50, 3))
+    for step in range(sampler.settling_steps, sampler.settling_steps + REVISIT_EVERY):
+        sampler.step_pre_backward(ball, step, random)
+        found = render_rays(ball, rays, 0.0, 6.0, samples=sampler, jitter=True, generator=random)
+        none = torch.zeros(())
+        sampler.step_post_backward(RenderOutput(none, none, found.weights, found.density, found.samples, none))
+        assert not bool(sampler.grid.occupied[empty].any()) and not bool(sampler.grid.density[empty].any())
+    assert ball.asked > 64 and bool(sampler.grid.occupied[~empty].any())
+
+
 @pytest.mark.parametrize(
     "field", [HashGridField(width=8, log2_entries=10), NeRF(width=8, depth=2), NeRF(width=8, view_directions=False)]
 )
@@ -92,6 +127,9 @@ def test_the_density_of_a_router_is_found_without_its_colour(field):
         torch.nn.init.normal_(parameter, generator=torch.Generator().manual_seed(1))
     router = VoronoiRouter(field, torch.rand(5, 3), share=[n for n, _ in field.named_parameters() if n == "features"])
     box = torch.tensor([[0.0, 0, 0], [1.0, 1, 1]])
+    networks = radiance_of(router).networks
+    every, alone = (sum(step.op == "linear" for step in part.steps) for part in (networks.program, networks.density))
+    assert alone < every and not networks.density.rays
     grids = [OccupancyGrid(box, 6, threshold=1e-6) for _ in range(2)]
     for grid, asked in zip(grids, (router, lambda *given: router(*given))):
         grid.update(asked, generator=torch.Generator().manual_seed(2))

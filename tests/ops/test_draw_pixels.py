@@ -5,7 +5,7 @@ import torch
 from helpers import refuses
 
 from voronerf.ops import draw_pixels as draw
-from voronerf.ops.draw_pixels.reference import Runs, draw_pixels
+from voronerf.ops.draw_pixels.reference import Known, Runs, draw_pixels
 
 SEED = torch.tensor([-7], dtype=torch.int32)
 # The first pixels and the lengths of runs: one pixel, many runs of the same length, and some that are much longer.
@@ -24,7 +24,7 @@ def runs_of(start, length):
 def test_every_pixel_of_the_runs_is_drawn_as_often(name):
     runs = runs_of(*map(list, RUNS[name]))
     there = torch.cat([torch.arange(first, first + count) for first, count in zip(*RUNS[name])])
-    pixels, uniforms = draw_pixels(SEED, 100 * len(there), len(there), runs)
+    pixels, uniforms, _ = draw_pixels(SEED, 100 * len(there), len(there), runs, None)
     drawn, counts = pixels.unique(return_counts=True)
     assert torch.equal(drawn, there) and bool(((counts - 100).abs() < 50).all())  # five standard deviations
     assert uniforms.shape == (100 * len(there), 3) and bool(((uniforms >= 0) & (uniforms < 1)).all())
@@ -41,8 +41,11 @@ def test_native_draws_are_those_of_the_reference(name, count):
     before = torch.get_num_threads()
     for threads in (1, 3):
         torch.set_num_threads(threads)
-        for found, expected in zip(drawn(SEED, count, below, runs), draw_pixels(SEED, count, below, runs), strict=True):
-            assert torch.equal(found, expected)
+        for several in (None, 0, count // 3, count):
+            known = None if several is None else Known(torch.arange(70, 80), torch.rand(10), several)
+            given = SEED, count, below, runs, known
+            for found, expected in zip(drawn(*given), draw_pixels(*given), strict=True):
+                assert torch.equal(found, expected)
     torch.set_num_threads(before)
 
 
@@ -56,8 +59,31 @@ def test_tables_of_runs_that_do_not_fit_each_other_stay_in_bounds(backend):
         {"first": runs.first[:1], "bits": 0},
         {"bits": 48},
     ):
-        pixels, _ = draw(SEED, 1000, 110, runs=runs._replace(**change), backend=backend)
+        pixels, *_ = draw(SEED, 1000, 110, runs=runs._replace(**change), backend=backend)
         assert set((pixels - draw(SEED, 1000, 110, backend=backend)[0]).tolist()) <= set(runs.shift.tolist())
+
+
+@pytest.mark.parametrize("backend", ["reference", "native"])
+def test_known_pixels_come_first_with_their_distances(backend):
+    known = Known(torch.tensor([1000, 3000, 2000]), torch.tensor([1.0, 3.0, 2.0]), 300)
+    pixels, uniforms, distances = draw(SEED, 1000, 50, known=known, backend=backend)
+    assert torch.equal(pixels[:300].float(), 1000 * distances) and len(distances) == 300
+    assert bool(((distances.unique(return_counts=True)[1] - 100).abs() < 45).all())  # five standard deviations
+    others = draw(SEED, 1000, 50, backend=backend)
+    assert torch.equal(pixels[300:], others[0][300:]) and torch.equal(uniforms, others[1]) and not len(others[2])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pixels": torch.zeros(2, dtype=torch.int64)}, "distances must have shape [p] with p = 2, got [3]"),
+        ({"pixels": torch.zeros(0, dtype=torch.int64), "distances": torch.zeros(0)}, "known must hold at least one"),
+        ({"several": 4}, "several must be at most 3, got 4"),
+    ],
+)
+def test_known_pixels_are_checked(change, message):
+    known = Known(torch.tensor([1, 2, 3]), torch.rand(3), 2)._replace(**change)
+    refuses(f"draw_pixels: {message}", draw, SEED, 3, 5, known=known)
 
 
 @pytest.mark.parametrize(

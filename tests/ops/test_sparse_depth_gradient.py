@@ -13,20 +13,35 @@ from voronerf.ops.sparse_depth_gradient.reference import NEARBY
 pytestmark = pytest.mark.op("sparse_depth_gradient")
 
 
-def case(counts, dtype=torch.float32, first=0):
-    """Rays with so many samples, whose densities make some of them opaque; points are among the samples."""
+def case(counts, dtype=torch.float32, others=(), skipped=0):
+    """Rays with so many samples, whose densities make some of them opaque; points are among the samples.
+
+    Others follow, without points; some samples before belong to no ray.
+    """
+    counts = [*counts, *others]
     m = sum(counts)
     offsets = torch.tensor([0, *counts]).cumsum(0).to(torch.int32)
     deltas = 0.02 + 0.1 * torch.rand(m, dtype=dtype)
     depths = torch.cat([2 + part.cumsum(0) for part in deltas.split(counts)]) if counts else deltas
     density = 20 * torch.rand(m, dtype=dtype)
-    distances = 2 + torch.rand(len(counts), dtype=dtype)
+    distances = 2 + torch.rand(len(counts) - len(others), dtype=dtype)
     if m:
         given = density, torch.zeros(m, 3, dtype=dtype), depths, deltas
         weights = composite(*given, ray_offsets=offsets, backend="reference").weights
     else:
         weights = density
-    return density, depths, deltas, weights, offsets + first, distances
+    loose = torch.rand(4, skipped, dtype=dtype)
+    samples = (torch.cat(both) for both in zip(loose, (density, depths, deltas, weights)))
+    return *samples, offsets + skipped, distances
+
+
+def learnt(given, device="cpu", **rule):
+    """The loss and the gradient that are added to 2 and to a table of ones."""
+    given = [tensor.to(device) for tensor in given]
+    loss, gradient = torch.full_like(given[-1].sum(), 2), given[0].new_ones(len(given[0]), 4)
+    sparse_depth_gradient(loss, gradient, *given, **rule)
+    assert bool((gradient[:, :3] == 1).all())
+    return loss.cpu() - 2, gradient[:, 3].cpu() - 1
 
 
 def slow(density, depths, deltas, offsets, distances):
@@ -34,7 +49,7 @@ def slow(density, depths, deltas, offsets, distances):
     total = density.new_zeros(())
     for ray, distance in enumerate(distances):
         light, there = density.new_ones(()), density.new_zeros(())
-        for i in range(int(offsets[ray] - offsets[0]), int(offsets[ray + 1] - offsets[0])):
+        for i in range(int(offsets[ray]), int(offsets[ray + 1])):
             through = torch.exp(-density[i] * deltas[i])
             if abs(depths[i] - distance) <= NEARBY * distance + deltas[i]:
                 there = there + light * (1 - through)
@@ -43,17 +58,22 @@ def slow(density, depths, deltas, offsets, distances):
     return total
 
 
-@pytest.mark.parametrize("first", [0, 7])
-def test_equals_autograd_through_a_slow_loop(device, backend, first):
+@pytest.mark.parametrize("scale", [None, 2.5])
+@pytest.mark.parametrize(("others", "skipped"), [((), 0), ((7, 0, 40), 0), ((3,), 5)])
+def test_equals_autograd_through_a_slow_loop(device, backend, others, skipped, scale):
     need("sparse_depth_gradient", backend, device, torch.float32)
-    given = case((5, 0, 1, 12, 33, 2), first=first)
-    loss, gradient = sparse_depth_gradient(*(tensor.to(device) for tensor in given), backend=backend)
+    given = case((5, 0, 1, 12, 33, 2), others=others, skipped=skipped)
+    rule = {"activated": True} if scale is None else {"density_scale": scale}
+    loss, gradient = learnt(given, device, factor=0.25, backend=backend, **rule)
     density, depths, deltas, _, offsets, distances = given
     exact = density.double().requires_grad_()
-    expected = slow(exact, depths.double(), deltas.double(), offsets, distances.double())
+    if scale is not None:  # before the softplus
+        exact = (scale * torch.expm1(exact.detach() / scale).log() / scale).requires_grad_()
+    of_density = exact if scale is None else scale * torch.nn.functional.softplus(exact)
+    expected = 0.25 * slow(of_density, depths.double(), deltas.double(), offsets, distances.double())
     expected.backward()
-    torch.testing.assert_close(loss.cpu().double(), expected.detach(), rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(gradient.cpu().double(), exact.grad, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(loss.double(), expected.detach(), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(gradient.double(), exact.grad, rtol=1e-4, atol=1e-5)
     assert bool(gradient.any())
 
 
@@ -63,17 +83,18 @@ def test_a_ray_whose_point_gets_no_light_has_no_gradient(device, backend):
     weights[6:12] = 0
     distances[2] = torch.nan
     given = density, depths, deltas, weights, offsets, distances
-    loss, gradient = sparse_depth_gradient(*(tensor.to(device) for tensor in given), backend=backend)
+    loss, gradient = learnt(given, device, factor=1.0, activated=True, backend=backend)
     assert bool(loss.isfinite()) and bool(gradient[:6].any()) and not bool(gradient[6:].any())
 
 
-def test_no_rays(device, backend):
+@pytest.mark.parametrize("others", [(), (4,)])
+def test_no_points(device, backend, others):
     need("sparse_depth_gradient", backend, device, torch.float32)
-    loss, gradient = sparse_depth_gradient(*(tensor.to(device) for tensor in case(())), backend=backend)
-    assert float(loss) == 0 and gradient.shape == (0,)
+    loss, gradient = learnt(case((), others=others), device, factor=1.0, activated=True, backend=backend)
+    assert float(loss) == 0 and gradient.shape == (sum(others),) and not bool(gradient.any())
 
 
 def test_does_not_depend_on_the_number_of_threads():
     need("sparse_depth_gradient", "native", torch.device("cpu"), torch.float32)
     given = case((9,) * 700)
-    on_any_number_of_threads(lambda: sparse_depth_gradient(*given, backend="native"))
+    on_any_number_of_threads(lambda: learnt(given, factor=1.0, density_scale=2.0, backend="native"))

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from voronerf.ops.keep_heaviest import keep_heaviest
+
 
 class SampleReservoir:
     """The heaviest samples of the last `batches` batches.
@@ -54,15 +56,27 @@ class SampleReservoir:
         self.quota = -(-capacity // batches)
         self._points = torch.zeros(batches, self.quota, d, device=device)
         self._importance = torch.zeros(batches, self.quota, device=device)
-        self._added = 0
+        self._added = torch.zeros(1, dtype=torch.int64, device=device)  # which the op reads, and no host
 
     @torch.no_grad()
-    def add(self, points: Tensor, importance: Tensor) -> None:
-        """Keeps the heaviest samples of one batch.
+    def add(
+        self,
+        points: Tensor,
+        importance: Tensor,
+        *,
+        error: Tensor | None = None,
+        ray_index: Tensor | None = None,
+        backend: str = "auto",
+    ) -> None:
+        """Keeps the heaviest samples of one batch; of equal ones the first.
 
         Args:
             points: floating [..., d], scene units.
-            importance: floating [...]; any scale, since only ratios count.
+            importance: floating [...]; any scale, since only ratios count. With ``error`` the weights w, which are
+                multiplied by it.
+            error: floating [r], E of the rays; None for 1.
+            ray_index: int32 [m], the ray of each of m samples; given with ``error``.
+            backend: of the op.
 
         Raises:
             ValueError: shapes that do not match.
@@ -76,20 +90,16 @@ class SampleReservoir:
         device = self._points.device
         points = points.reshape(-1, d).to(device, torch.float32)
         importance = importance.reshape(-1).to(device, torch.float32)
-        counted = importance.nan_to_num(0.0, 0.0, 0.0)
-        kept, index = counted.topk(min(self.quota, importance.shape[0]))
-        points = points[index]
-        usable = (kept > 0) & points.isfinite().all(1)
-        slot = self._added % self.batches
-        self._importance[slot] = 0
-        self._importance[slot, : kept.shape[0]] = torch.where(usable, kept, 0)
-        self._points[slot, : kept.shape[0]] = torch.where(usable[:, None], points, 0)
-        self._added += 1
+        error = None if error is None else error.to(device, torch.float32)
+        index = None if ray_index is None else ray_index.to(device)
+        kept = self._points, self._importance, self._added
+        keep_heaviest(*kept, points, importance, error=error, ray_index=index, backend=backend)
 
     def samples(self) -> tuple[Tensor, Tensor]:
         """The kept samples, oldest batch first: points float32 [m, d] and importance float32 [m], all > 0; m = 0 before
         the first batch."""
-        start = self._added % self.batches if self._added > self.batches else 0
+        added = int(self._added)
+        start = added % self.batches if added > self.batches else 0
         importance = self._importance.roll(-start, 0).reshape(-1)
         kept = importance > 0
         return self._points.roll(-start, 0).flatten(0, 1)[kept], importance[kept]
@@ -102,7 +112,7 @@ class SampleReservoir:
         return {
             "points": self._points.clone(),
             "importance": self._importance.clone(),
-            "added": torch.tensor(self._added, dtype=torch.int64),
+            "added": self._added[0].clone(),
         }
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -124,4 +134,4 @@ class SampleReservoir:
                 )
         self._points.copy_(state["points"])
         self._importance.copy_(state["importance"])
-        self._added = int(state["added"])
+        self._added.fill_(int(state["added"]))

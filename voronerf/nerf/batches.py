@@ -11,7 +11,8 @@ from torch import Tensor
 from voronerf.nerf.cameras import Cameras, Rays
 from voronerf.nerf.loss import Batch
 from voronerf.nerf.occupancy import draw_seed
-from voronerf.ops.draw_pixels import Runs, draw_pixels
+from voronerf.ops._core.recording import following_count
+from voronerf.ops.draw_pixels import Known, Runs, draw_pixels
 
 #: Share of the rays that are drawn through points of a sparse model, where these are learnt from.
 SPARSE = 0.25
@@ -115,16 +116,15 @@ class RayBatches:
         return self._pixels if self.useful is None else self.useful.total
 
     def draw(self, count: int, generator: torch.Generator) -> Batch:
-        """A batch of ``count`` rays, drawn with replacement; the last ones through points of the sparse model."""
+        """A batch of ``count`` rays, drawn with replacement; the first ones through points of the sparse model."""
         seed = draw_seed(self.place, generator)
-        index, uniforms = draw_pixels(seed, count, len(self), runs=self.useful, backend=self.backend)
-        depths = None
-        if self.sparse is not None and (several := int(SPARSE * count)):
-            pixels, distances = self.sparse
-            seed = draw_seed(self.place, generator)
-            chosen, _ = draw_pixels(seed, several, len(pixels), backend=self.backend)
-            index[count - several :] = pixels[chosen]
-            depths = distances[chosen].to(self.device)
+        known = None
+        if self.sparse is not None and (several := following_count(count, lambda rays: int(SPARSE * rays))):
+            known = Known(*self.sparse, several)
+        index, uniforms, distances = draw_pixels(
+            seed, count, len(self), runs=self.useful, known=known, backend=self.backend
+        )
+        depths = None if known is None else distances.to(self.device)
         if self.fetch is not None:
             self.fetch(index)
         background = uniforms if self.random_background else self.background

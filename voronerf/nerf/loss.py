@@ -14,10 +14,11 @@ from voronerf.nerf.radiance import Radiance, radiance_of, router_of
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Hierarchical, Occupancy
 from voronerf.nerf.sampling import colour_loss
-from voronerf.nerf.volume import Samples, gradient_shares
+from voronerf.nerf.volume import Samples
 from voronerf.ops._core import backends
 from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.ops.render_loss import render_loss_gradient
+from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.sparse_depth_gradient.reference import near_point, sparse_depth_loss
 
@@ -32,7 +33,7 @@ class Batch:
         far: [r], the depth at which it leaves the scene.
         target: [r, 3], the colour of each ray's pixel over the background.
         background: [3], or [r, 3] where it was drawn; None for black.
-        sparse_depths: [s], the distances of the points of a sparse model that the last s rays end at, or None.
+        sparse_depths: [s], the distances of the points of a sparse model that the first s rays end at, or None.
 
     Examples:
         >>> import torch
@@ -152,8 +153,6 @@ class RayLoss:
     def _fused(self, field: Radiance, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:
         renderer, depths = self.renderer, batch.sparse_depths if self.sparse_depth else None
         samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, jitter=True, generator=generator)
-        if depths is not None:
-            samples = samples.counted()
         network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index, renderer.backend)
         tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
         found, gradient = render_loss_gradient(
@@ -166,26 +165,23 @@ class RayLoss:
             hidden=HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
             backend=renderer.backend,
         )
-        loss = found.loss
         if depths is not None:
-            first = len(batch.rays) - len(depths)
-            begin, factor = int(samples.ray_offsets[first]), self.sparse_depth / len(depths)
-            density = found.density[begin:]
-            of_depth, slope = sparse_depth_gradient(
-                density,
-                samples.depths[begin:],
-                samples.deltas[begin:],
-                found.weights[begin:],
-                samples.ray_offsets[first:],
+            sparse_depth_gradient(
+                found.loss,
+                gradient,
+                found.density,
+                samples.depths,
+                samples.deltas,
+                found.weights,
+                samples.ray_offsets,
                 depths,
+                factor=self.sparse_depth / len(depths),
+                **field.rule,
                 backend=renderer.backend,
             )
-            gradient[begin:, 3] += factor * slope * field.networks.slope(density)
-            loss = loss + factor * of_depth
-        shares = gradient_shares(renderer.sampler.space.full_gradient, samples.depths)
-        if shares is not None:
-            gradient = gradient * shares[:, None]
-        loss = tape.backward(loss, gradient, defer=not backward)
+        if (full := renderer.sampler.space.full_gradient) is not None:
+            scale_gradient(gradient, samples.depths, full, backend=renderer.backend)
+        loss = tape.backward(found.loss, gradient, defer=not backward)
         return RenderOutput(loss, found.error, found.weights, found.density, samples, found.colour)
 
     def _separate(self, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:
@@ -193,13 +189,12 @@ class RayLoss:
         *before, last = self.renderer.render(batch.rays, batch.near, batch.far, **given)
         loss, samples = colour_loss(last.colour, batch.target), last.samples
         if self.sparse_depth and batch.sparse_depths is not None:
-            others = len(batch.rays) - len(batch.sparse_depths)
-            begin, end = (int(samples.ray_offsets[ray]) for ray in (others, -1))
-            depths, deltas, weights = (values[begin:end] for values in (samples.depths, samples.deltas, last.weights))
-            ray = samples.ray_index[begin:end].long() - others
-            there = weights * near_point(depths, deltas, batch.sparse_depths[ray])
-            light = torch.zeros_like(batch.sparse_depths).index_add(0, ray, there)
-            loss = loss + self.sparse_depth * sparse_depth_loss(light).mean()
+            several = len(batch.sparse_depths)
+            known = torch.nn.functional.pad(batch.sparse_depths, (0, len(batch.rays) - several), value=torch.nan)
+            ray = samples.ray_index.long()
+            there = last.weights * near_point(samples.depths, samples.deltas, known[ray])
+            light = torch.zeros_like(known).index_add(0, ray, there)
+            loss = loss + self.sparse_depth * sparse_depth_loss(light[:several]).mean()
         for first in before:
             loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
         error = (last.colour.detach() - batch.target).square().sum(-1)

@@ -9,6 +9,7 @@ which decays). Learning it from the samples of a batch, and emptying what is hid
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,6 +22,7 @@ from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
 from voronerf.nerf.radiance import radiance_of
 from voronerf.ops._core.checks import check_range
+from voronerf.ops.draw_points import draw_points
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.observe_occupancy.reference import cells_of as voxels_of
@@ -213,11 +215,25 @@ class OccupancyGrid:
             self.points(part, torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device))
             for part in voxels.split(CHUNK)
         ]
-        found = [density_of(field, part) for part in points]
+        found = [_density_of(field, part) for part in points]
         if found:
-            positions, density = torch.cat(points), torch.cat(found)
-            seen = torch.ones_like(density)
-            self._enter(positions, density, seen, seen, decay=decay, hidden=0.0, backend=backend)
+            self._enter(torch.cat(points), torch.cat(found), decay=decay, hidden=0.0, backend=backend)
+
+    @torch.no_grad()
+    def revisit(
+        self, field: Field, count: int, seed: Tensor, *, fixed: Tensor | None = None, backend: str = "auto"
+    ) -> None:
+        """Evaluates a field at random points of random voxels, which keep the larger of new and old density.
+
+        Args:
+            field: called without gradients.
+            count: of the points, at least 1.
+            seed: int32 [1], of the points, as from `draw_seed`.
+            fixed: bool [x, y, z], voxels that stay as they are; None for none.
+            backend: of the ops.
+        """
+        points = draw_points(seed, count, self.box, backend=backend)
+        self._enter(points, _density_of(field, points), decay=1.0, hidden=0.0, fixed=fixed, backend=backend)
 
     @torch.no_grad()
     def observe(
@@ -228,6 +244,7 @@ class OccupancyGrid:
         weights: Tensor,
         *,
         decay: float,
+        fixed: Tensor | None = None,
         backend: str = "auto",
     ) -> None:
         """Updates voxels, in place, from samples that were rendered anyway.
@@ -242,6 +259,7 @@ class OccupancyGrid:
             deltas: [m], lengths of the strata of the samples.
             weights: [m], contributions of the samples to their rays, from `composite`.
             decay: factor on the old densities of the voxels of these samples, 0..1.
+            fixed: bool [x, y, z], voxels that stay as they are; None for none.
             backend: "auto", "reference", "native" or "warp".
 
         Raises:
@@ -249,7 +267,8 @@ class OccupancyGrid:
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.observe: decay must lie in 0..1, got {decay}")
-        self._enter(positions, density, deltas, weights, decay=decay, hidden=HIDDEN, backend=backend)
+        rule: dict[str, Any] = {"decay": decay, "hidden": HIDDEN, "fixed": fixed, "backend": backend}
+        self._enter(positions, density.float(), deltas.float(), weights.float(), **rule)
 
     @torch.no_grad()
     def fill_holes(self, field: Field, *, generator: torch.Generator | None = None) -> None:
@@ -278,49 +297,19 @@ class OccupancyGrid:
         self.density.view(-1)[holes] = least
         self.occupied.view(-1)[holes] = True
 
-    def _enter(self, positions: Tensor, density: Tensor, deltas: Tensor, weights: Tensor, **rule: Any) -> None:
-        """Samples, in the units of the world, on their way into the grid; ``rule`` as for `observe_occupancy`."""
-        if self.contraction is not None:
-            stretch = self.contraction.stretch(positions)
-            density, deltas = density * stretch, deltas / stretch
-        samples = positions, density.float(), deltas.float(), weights.float()
-        observe_occupancy(self.density, self.occupied, self.box, *samples, threshold=self.threshold, **rule)
+    def _enter(self, *samples: Tensor, **rule: Any) -> None:
+        """Samples, in the units of the world, on their way into the grid; arguments as for `observe_occupancy`."""
+        rule |= {"threshold": self.threshold, "contraction": self._numbers}
+        observe_occupancy(self.density, self.occupied, self.box, *samples, **rule)
 
     def voxels(self, points: Tensor) -> Tensor:
         """Flat numbers int32 [n] of the voxels that points [n, 3] lie in; outside the box the nearest at its border."""
         return voxels_of(points, self.box, self.occupied.shape)
 
-    def march(
-        self,
-        rays: Rays,
-        near: Tensor,
-        far: Tensor,
-        samples: int,
-        *,
-        seed: Tensor | None = None,
-        spacing: str = "linear",
-        start: Tensor | None = None,
-        most: int | None = None,
-        capacity: int | None = None,
-        backend: str = "auto",
-    ) -> March:
-        """The samples of rays that lie in occupied voxels; see `voronerf.ops.march_rays`."""
-        return march_rays(
-            rays.origins,
-            rays.directions,
-            near,
-            far,
-            self.occupied,
-            self.box,
-            samples,
-            seed=seed,
-            spacing=spacing,
-            start=start,
-            most=most,
-            capacity=capacity,
-            contraction=self._numbers,
-            backend=backend,
-        )
+    def march(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> March:
+        """The samples of rays that lie in occupied voxels; other arguments are those of `voronerf.ops.march_rays`."""
+        given = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
+        return march_rays(*given, contraction=self._numbers, **rule)
 
     def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaySums:
         """What rays see of networks in occupied voxels; other arguments are those of `voronerf.ops.render_opaque`."""
@@ -384,9 +373,20 @@ def draw_seed(device: torch.device, generator: torch.Generator | None) -> Tensor
 
 def density_of(field: Field, points: Tensor) -> Tensor:
     """Density [n] of a field at points [n, 3], float32, seen along the z axis; NaN becomes infinity."""
-    direction = points.new_tensor(((0.0, 0.0, 1.0),))
+    return _density_of(field, points).nan_to_num(nan=float("inf"), posinf=float("inf"))
+
+
+def _density_of(field: Field, points: Tensor) -> Tensor:
+    """The same, with NaN as it is."""
+    direction = _along_z(points.device)
     known = radiance_of(field, (points, direction.expand(len(points), -1)))
     sigma = None if isinstance(known, str) else known.density(points)
     if sigma is None:
         _, sigma = field(points, direction, torch.zeros(len(points), dtype=torch.int32, device=points.device))
-    return sigma.detach().float().nan_to_num(nan=float("inf"), posinf=float("inf"))
+    return sigma.detach().float()
+
+
+@functools.lru_cache(maxsize=8)
+def _along_z(device: torch.device) -> Tensor:
+    """A direction [1, 3]."""
+    return torch.tensor(((0.0, 0.0, 1.0),), device=device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -33,12 +34,6 @@ class Networks(NamedTuple):
     program: Program
     density_scale: float | None
     density: Program | None
-
-    def slope(self, density: Tensor) -> Tensor | float:
-        """The derivative of densities [n] to the last of the outputs."""
-        scale = self.density_scale
-        # Of a softplus, 1 - exp(-density / scale) times the scale.
-        return 1.0 if scale is None else -scale * torch.expm1(-density / scale)
 
 
 class Radiance(NamedTuple):
@@ -140,8 +135,24 @@ def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], 
     colour, density = program.outputs
     raw = _raw(program.steps, colour, density)
     before, scale = raw if raw is not None else ([colour, density], None)
-    alone = _of_fields(program, [density], reads, inputs)
+    apart = _past_moves(program)
+    alone = _of_fields(apart, [apart.outputs[1]], reads, inputs)
     return Networks(_of_fields(program, before, reads, inputs), scale, None if alone.rays else alone)
+
+
+def _past_moves(program: Program) -> Program:
+    """The same, reading what was put side by side where it comes from: the density without the colour beside it."""
+    moves = {step.out: step for step in program.steps if step.op == "move"}
+
+    def source(columns: Columns) -> Columns:
+        step = moves.get(columns.index) if columns.of == VALUE and not columns.spread else None
+        for at, part in zip(step.numbers, step.operands) if step is not None else ():
+            if not part.spread and at <= columns.start and columns.start + columns.width <= at + part.width:
+                return source(part.part(columns.start - int(at), columns.width))
+        return columns
+
+    steps = [step._replace(operands=tuple(map(source, step.operands))) for step in program.steps]
+    return replace(program, steps=tuple(steps), outputs=tuple(map(source, program.outputs)))
 
 
 def _of_fields(program: Program, outputs: Sequence[Columns], reads: tuple[int, ...], width: int) -> Program:

@@ -262,9 +262,19 @@ class Occupancy(Sampler):
         super().__init__(samples, space=space, backend=backend)
         if self.space.cones or (grid.contraction is None) != (self.space.contraction is None):
             raise ValueError("Occupancy: grid must be of points, and in the space of the contraction")
-        self.grid, self.empty = grid, empty
+        self.empty = None if empty is None else empty.view(grid.occupied.shape)
+        self.grid = grid
         self.picture_samples = picture_samples or max(min(PICTURE_SAMPLES * samples, MOST_PICTURE_SAMPLES), samples)
         self.settling = False
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """Which space is empty."""
+        return self._grid
+
+    @grid.setter
+    def grid(self, grid: OccupancyGrid) -> None:
+        self._grid = grid
         self._leave_empty()
 
     @property
@@ -279,8 +289,8 @@ class Occupancy(Sampler):
 
     def _leave_empty(self) -> None:
         if self.empty is not None:
-            self.grid.density.view(-1)[self.empty] = 0
-            self.grid.occupied.view(-1)[self.empty] = False
+            self.grid.density[self.empty] = 0
+            self.grid.occupied[self.empty] = False
 
     def step_pre_backward(self, field: Field, step: int, generator: torch.Generator) -> None:
         """Evaluates random voxels; see :meth:`Sampler.step_pre_backward`."""
@@ -289,18 +299,16 @@ class Occupancy(Sampler):
             return
         every = self.grid.occupied.numel()
         count = min(max(1, int(every * REVISITED)), MOST_REVISITED)
-        voxels = torch.randint(every, (count,), generator=generator, device=generator.device)
+        seed = draw_seed(self.grid.box.device, generator)
         with evaluating(field):
-            voxels = voxels.to(self.grid.occupied.device)
-            self.grid.update(field, voxels, decay=1.0, generator=generator, backend=self.backend)
-        self._leave_empty()
+            self.grid.revisit(field, count, seed, fixed=self.empty, backend=self.backend)
 
     def step_post_backward(self, output: RenderOutput) -> None:
         """Teaches the grid what the samples of a step found; see :meth:`Sampler.step_post_backward`."""
         if not self.settling:
             samples = output.samples
             found = samples.positions, output.density, samples.deltas, output.weights
-            self.grid.observe(*found, decay=DECAY, backend=self.backend)
+            self.grid.observe(*found, decay=DECAY, fixed=self.empty, backend=self.backend)
 
     def finish(self, field: Field, seed: int) -> None:
         """Occupies voxels that were emptied in the middle of surfaces; see `OccupancyGrid`.

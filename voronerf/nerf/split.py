@@ -238,7 +238,14 @@ class SplitStrategy:
             output: What :class:`voronerf.nerf.RayLoss` gave.
         """
         if self.planned is not None:
-            self.reservoir.add(output.samples.positions, output.importance())
+            samples = output.samples
+            self.reservoir.add(
+                samples.positions,
+                output.weights,
+                error=output.error,
+                ray_index=samples.ray_index,
+                backend="auto" if self.backend == "native" else self.backend,  # which has no CUDA kernel for it
+            )
 
     def state_dict(self) -> dict[str, Tensor]:
         """The tensors from which `load_state_dict` restores the kept samples and the number of splits, bit for bit."""

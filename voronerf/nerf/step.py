@@ -52,10 +52,8 @@ class StepOutput:
     @property
     def samples(self) -> int:
         """How many the rays had; waits for the device."""
-        if self._recording is not None:
-            return self._recording.rows(1)
         rows = self._output.samples.rows
-        return len(self._output.weights) if rows is None else int(rows)
+        return len(self._now(self._output.weights)) if rows is None else int(rows)
 
     @property
     def batch(self) -> Batch:

@@ -18,6 +18,7 @@ from voronerf.nerf.cones import frustum_gaussians
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
 from voronerf.ops.composite import composite
+from voronerf.ops.scale_gradient.reference import shares_of
 
 
 class Samples(NamedTuple):
@@ -87,7 +88,8 @@ class Space:
         contraction: Of the space that the field works in; None for that of the world.
         spacing: Of the strata of a ray, "linear" or "disparity".
         cones: Whether the field is asked about Gaussians [m, 6], the frustums of cones, in place of points [m, 3].
-        full_gradient: Distance from which the gradients of samples are whole, see `gradient_shares`; None for any.
+        full_gradient: Distance from which the gradients of samples are whole, see `voronerf.ops.scale_gradient`; None
+            for any.
 
     Examples:
         >>> from voronerf.nerf import Space, Stratified
@@ -153,8 +155,8 @@ def ask(field: Field, rays: Rays, samples: Samples, space: Space) -> tuple[Tenso
     """
     found = field(samples.inputs, rays.directions, samples.ray_index)
     rgb, density = (values.to(samples.depths.dtype) for values in found)
-    share = gradient_shares(space.full_gradient, samples.depths)
-    if share is not None:
+    if space.full_gradient is not None:
+        share = shares_of(samples.depths, space.full_gradient)
         for values, scale in ((rgb, share[:, None]), (density, share)):
             if values.requires_grad:
                 values.register_hook(functools.partial(torch.mul, scale))
@@ -194,23 +196,6 @@ def normalised(depth: Tensor, opacity: Tensor, far: Tensor) -> Tensor:
     """Sums of weight times depth [r] divided by opacities [r]; the far end [r] where these are 0."""
     seen = opacity > 0
     return torch.where(seen, depth / torch.where(seen, opacity, 1), far)
-
-
-def gradient_shares(full: float | None, depths: Tensor) -> Tensor | None:
-    """Factors on the gradients of what a field says of samples: the square of the distance, up to 1.
-
-    A camera sees the space before it with more rays, and more samples, than others do: without this, fog that only one
-    view shows is learnt there first. Source: Philip and Deschaintre 2023, "Floaters No More: Radiance Field Gradient
-    Scaling for Improved Near-Camera Training".
-
-    Args:
-        full: The distance from which gradients are whole; None for any.
-        depths: [m], of the samples.
-
-    Returns:
-        [m]; None if all are whole.
-    """
-    return None if full is None else (depths / full).square().clamp(max=1)
 
 
 def per_ray(distance: Tensor | float, rays: Rays) -> Tensor:

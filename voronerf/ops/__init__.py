@@ -15,7 +15,8 @@ from voronerf.ops.balance_centres import balance_centres
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.composite import Composite, composite
 from voronerf.ops.draw_pixels import draw_pixels
-from voronerf.ops.draw_pixels.reference import Runs
+from voronerf.ops.draw_pixels.reference import Known, Runs
+from voronerf.ops.draw_points import draw_points
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.frequency_encode import frequency_encode
 from voronerf.ops.grouped_linear import grouped_linear
@@ -23,6 +24,7 @@ from voronerf.ops.grouped_mlp import grouped_mlp
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.hash_encode import hash_encode
 from voronerf.ops.integrated_encode import integrated_encode
+from voronerf.ops.keep_heaviest import keep_heaviest
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.nearest_centre import nearest_centre
@@ -34,6 +36,7 @@ from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradie
 from voronerf.ops.render_opaque import RaySums, render_opaque
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
+from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.spherical_harmonics import spherical_harmonics
 
@@ -42,6 +45,7 @@ __all__ = [
     "Composite",
     "Guard",
     "HashGrid",
+    "Known",
     "Layer",
     "March",
     "OwnSamples",
@@ -57,6 +61,7 @@ __all__ = [
     "compose_runs",
     "composite",
     "draw_pixels",
+    "draw_points",
     "forward_with_tape",
     "frequency_encode",
     "grouped_linear",
@@ -64,6 +69,7 @@ __all__ = [
     "grouped_program",
     "hash_encode",
     "integrated_encode",
+    "keep_heaviest",
     "locate_cell",
     "march_rays",
     "nearest_centre",
@@ -77,6 +83,7 @@ __all__ = [
     "routed_mlp",
     "run_gradients",
     "run_sums",
+    "scale_gradient",
     "sparse_depth_gradient",
     "spherical_harmonics",
 ]

@@ -124,8 +124,8 @@ def watch_former(module: nn.Module, former: Sequence[nn.Parameter]) -> None:
 
 # Frozen cells ---------------------------------------------------------------------------------------------------------
 
-#: The frozen cells, bool [k], of every routed module that has some.
-_FROZEN: weakref.WeakKeyDictionary[nn.Module, Tensor] = weakref.WeakKeyDictionary()
+#: The frozen cells, bool [k], of every routed module that has some, and the runs of the others.
+_FROZEN: weakref.WeakKeyDictionary[nn.Module, tuple[Tensor, list[slice]]] = weakref.WeakKeyDictionary()
 #: What a step must leave as it is: tensors, their frozen cells, and the values of those before the step.
 _HELD: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = {}
 
@@ -140,7 +140,9 @@ def freeze_cells(module: nn.Module, frozen: Tensor | None) -> None:
     if frozen is None:
         _FROZEN.pop(module, None)
         return
-    _FROZEN[module] = frozen
+    edges = torch.nn.functional.pad((~frozen).int(), (1, 1)).diff()
+    pairs = zip((edges > 0).nonzero()[:, 0].tolist(), (edges < 0).nonzero()[:, 0].tolist(), strict=True)
+    _FROZEN[module] = frozen, [slice(*pair) for pair in pairs]
     _watch_steps()
 
 
@@ -151,7 +153,7 @@ def _watch_steps() -> None:
 
 
 def _frozen_parameters(optimizer: torch.optim.Optimizer) -> list[tuple[Tensor, Tensor]]:
-    frozen = {id(p): mask for module, mask in _FROZEN.items() for p in cell_parameters(module)}
+    frozen = {id(p): mask for module, (mask, _) in _FROZEN.items() for p in cell_parameters(module)}
     every = (p for group in optimizer.param_groups for p in group["params"]) if frozen else ()
     return [(p, frozen[id(p)]) for p in every if id(p) in frozen]
 
@@ -189,9 +191,6 @@ def _after_step(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> Non
 def trained_parts(parameters: Sequence[Tensor]) -> list[list[Any]]:
     """For each parameter the parts of its first dimension that an optimiser may change: those of cells not frozen."""
     parts: dict[int, list[Any]] = {}
-    for module, frozen in _FROZEN.items() if _FROZEN else ():
-        edges = torch.nn.functional.pad((~frozen).int(), (1, 1)).diff()
-        pairs = zip((edges > 0).nonzero()[:, 0].tolist(), (edges < 0).nonzero()[:, 0].tolist(), strict=True)
-        own = [slice(*pair) for pair in pairs]
+    for module, (_, own) in _FROZEN.items() if _FROZEN else ():
         parts.update((id(parameter), own) for parameter in cell_parameters(module))
     return [parts.get(id(parameter), [...]) for parameter in parameters]

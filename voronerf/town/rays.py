@@ -23,9 +23,10 @@ from voronerf.nerf.occupancy import HIDDEN
 from voronerf.nerf.radiance import radiance_of
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import Renderer
-from voronerf.nerf.volume import Samples, gradient_shares
+from voronerf.nerf.volume import Samples
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.ray_runs import OwnSamples, compose_runs, own_samples, run_gradients, run_sums
+from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.town.group import Group, Key
 from voronerf.town.territories import Place
 
@@ -102,8 +103,8 @@ class Pass:
             return None
         rule: dict[str, Any] = {"density_scale": self.scale, "hidden": HIDDEN, "backend": self.renderer.backend}
         gradient, weights = run_gradients(self.tape.raw, self.own, answers, **rule)
-        shares = gradient_shares(self.renderer.sampler.space.full_gradient, self.own.depths)
-        gradient = gradient if shares is None else gradient * shares[:, None]
+        if (full := self.renderer.sampler.space.full_gradient) is not None:
+            scale_gradient(gradient, self.own.depths, full, backend=self.renderer.backend)
         error = weights.new_zeros(len(self.ids))
         error[self.sums[:, -1].long()] = answers[:, -1]
         own = self.own

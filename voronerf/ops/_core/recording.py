@@ -105,8 +105,8 @@ class Recording(TorchDispatchMode):
 
     def count(self, given: Callable[[], int]) -> int:
         """A number of rows that is known before each run; that of this one."""
-        rows = given()
         with _disable_current_modes():
+            rows = given()
             self._add(torch.tensor([rows]), rows, given)
         return rows
 
@@ -201,6 +201,16 @@ def read_count(memory: Tensor) -> int:
         rows = int(memory)
     recording._add(memory, rows, None)
     return rows
+
+
+def following_count(rows: int, follows: Callable[[int], int]) -> int:
+    """A number of rows that follows from another one. Replays find it again."""
+    recording = active.recording
+    if recording is not None:
+        of = next((count for count in recording._counts if count.rows == rows), None)
+        if of is not None:
+            return recording.count(lambda: follows(int(of.memory)))
+    return follows(rows)
 
 
 def varying(value: Callable[[], float]) -> float | Tensor:

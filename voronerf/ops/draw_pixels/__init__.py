@@ -1,4 +1,4 @@
-"""The pixels of a training step, drawn with replacement. n runs of pixels, b pixels."""
+"""The pixels of a training step, drawn with replacement. n runs of pixels, p known pixels, b pixels."""
 
 from __future__ import annotations
 
@@ -10,11 +10,19 @@ from torch import Tensor
 from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
 from voronerf.ops._core.checks import INDEX, Checked, check_integer
 from voronerf.ops._core.declare import declare
-from voronerf.ops.draw_pixels.reference import Runs
+from voronerf.ops.draw_pixels.reference import Known, Runs
 
 
 def _prepare(given: Any) -> Any:
-    runs, below = given.runs, given.below
+    runs, below, known = given.runs, given.below, given.known
+    if known is not None:
+        checked = Checked("draw_pixels")
+        checked.tensor("seed", given.seed, INDEX, 1)
+        checked.tensor("pixels", known.pixels, (torch.int64,), "p")
+        checked.tensor("distances", known.distances, (torch.float32,), "p")
+        if not checked.sizes["p"]:
+            raise ValueError("draw_pixels: known must hold at least one pixel, got none")
+        check_integer("draw_pixels", "several", known.several, 0, given.count)
     if runs is not None:
         checked = Checked("draw_pixels")
         checked.tensor("seed", given.seed, INDEX, 1)
@@ -36,8 +44,13 @@ def draw_pixels(
     below: Annotated[int, "1..281474976710656"],
     *,
     runs: Runs | None = None,
+    known: Known | None = None,
     backend: str = "auto",
-) -> tuple[Annotated[Tensor, "int64 [count]"], Annotated[Tensor, "float32 [count, 3]"]]:
+) -> tuple[
+    Annotated[Tensor, "int64 [count]"],
+    Annotated[Tensor, "float32 [count, 3]"],
+    Annotated[Tensor, "float32 [known.several if known else 0]"],
+]:
     """Pixels, and three uniform numbers for each; all are hashes of the seed and of the number in the batch.
 
     The same on every backend and on any number of threads. Not differentiable.
@@ -47,15 +60,16 @@ def draw_pixels(
         count: Of pixels, b, 1 to 2**27.
         below: Pixels to draw from, 1 to 2**48; with runs as many as they have.
         runs: The pixels to draw from; None for 0 to ``below`` - 1.
+        known: Others, of known distances, that the first of the batch are drawn from; None for none.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
-        int64 [b], and float32 [b, 3] in [0, 1).
+        int64 [b], float32 [b, 3] in [0, 1), and float32 [several], the distances of the first; [0] without ``known``.
 
     Examples:
         >>> import torch
         >>> from voronerf.ops import draw_pixels
-        >>> pixels, uniforms = draw_pixels(torch.tensor([7], dtype=torch.int32), 1000, 50)
+        >>> pixels, uniforms, _ = draw_pixels(torch.tensor([7], dtype=torch.int32), 1000, 50)
         >>> int(pixels.min()), int(pixels.max()), uniforms.shape
         (0, 49, torch.Size([1000, 3]))
     """

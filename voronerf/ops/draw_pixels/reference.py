@@ -1,4 +1,4 @@
-"""The pixels of a training step, drawn with replacement. n runs of pixels, b pixels."""
+"""The pixels of a training step, drawn with replacement. n runs of pixels, p known pixels, b pixels."""
 
 from __future__ import annotations
 
@@ -44,11 +44,41 @@ class Runs(NamedTuple):
         return Runs(ends, start - (ends - length), first, bits, total)
 
 
-def draw_pixels(seed: Tensor, count: int, below: int, runs: Runs | None) -> tuple[Tensor, Tensor]:
-    """Pixels, and three uniform numbers for each; see ``voronerf.ops.draw_pixels``."""
+class Known(NamedTuple):
+    """Pixels that show what lies at a known distance, and how many of a batch are drawn from them.
+
+    Attributes:
+        pixels: int64 [p], p >= 1.
+        distances: float32 [p].
+        several: the first so many of a batch.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import Known, draw_pixels
+        >>> known = Known(torch.tensor([60, 70]), torch.tensor([1.5, 2.5]), several=3)
+        >>> pixels, _, distances = draw_pixels(torch.tensor([7], dtype=torch.int32), 5, 50, known=known)
+        >>> bool((pixels[:3] >= 60).all()), bool((pixels[3:] < 50).all()), distances.shape
+        (True, True, torch.Size([3]))
+    """
+
+    pixels: Tensor
+    distances: Tensor
+    several: int
+
+
+def draw_pixels(
+    seed: Tensor, count: int, below: int, runs: Runs | None, known: Known | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels, three uniform numbers for each, and distances of the first; see ``voronerf.ops.draw_pixels``."""
     numbers = hashed_uniforms(seed, count, 5)
-    place = ((numbers[:, 0].double() + numbers[:, 1].double() / 2**24) * below).long()
+    fraction = numbers[:, 0].double() + numbers[:, 1].double() / 2**24
+    place = (fraction * below).long()
     if runs is not None:
         run = torch.searchsorted(runs.ends, place, right=True).clamp(max=len(runs.ends) - 1)
         place = place + runs.shift[run]
-    return place, numbers[:, 2:].contiguous()
+    distances = numbers.new_empty(0)
+    if known is not None:
+        chosen = (fraction[: known.several] * len(known.pixels)).long()
+        place = torch.cat((known.pixels[chosen], place[known.several :]))
+        distances = known.distances[chosen]
+    return place, numbers[:, 2:].contiguous(), distances

@@ -17,7 +17,8 @@ from voronerf.ops._core.recording import read_count
 from voronerf.ops.march_rays.reference import March
 
 
-def _space(given: Any) -> native.compiled.MarchSpace:
+def space_of(given: Any) -> native.compiled.MarchSpace:
+    """The space of a grid, from the ``contraction`` of an op."""
     contracted = 0 if given.contraction is None else given.contraction.dim()
     return native.compiled.MarchSpace(
         sphere=given.contraction if contracted == 1 else None,
@@ -31,7 +32,7 @@ INPUTS: dict[str, Any] = {
     "s": "samples",
     "disparity": "spacing == 'disparity'",
     "most": "samples if most is None else most",
-    "space": _space,
+    "space": space_of,
 }
 """Members of the struct that are no arguments."""
 inputs_of = _OP.inputs(native.compiled.MarchInputs, **INPUTS)

@@ -17,6 +17,9 @@ def _prepare(given: Any) -> Any:
     check_writable("observe_occupancy", "occupied", given.occupied)
     if given.density.numel() < 1:
         raise ValueError(f"observe_occupancy: density must have at least one cell, got {list(given.density.shape)}")
+    if (given.deltas is None) != (given.weights is None):
+        missing = "deltas" if given.deltas is None else "weights"
+        raise ValueError(f"observe_occupancy: deltas and weights must be given together, got no {missing}")
     return given
 
 
@@ -32,12 +35,14 @@ def observe_occupancy(
     box: Annotated[Tensor, "same [2, 3]"],
     positions: Annotated[Tensor, "same [m, 3]"],
     sigma: Annotated[Tensor, "same [m]"],
-    deltas: Annotated[Tensor, "same [m]"],
-    weights: Annotated[Tensor, "same [m]"],
+    deltas: Annotated[Tensor | None, "same [m]"] = None,
+    weights: Annotated[Tensor | None, "same [m]"] = None,
     *,
     decay: Annotated[float, "0 to 1"],
     threshold: float,
     hidden: float,
+    contraction: Annotated[Tensor | None, "same [4] or [5, 3]"] = None,
+    fixed: Annotated[Tensor | None, "bool [x, y, z]"] = None,
     backend: str = "auto",
 ) -> None:
     """Updates the cells of an occupancy grid that rendered samples lie in, in place.
@@ -46,21 +51,27 @@ def observe_occupancy(
     appendix C). A sample that receives less than the share ``hidden`` of the light counts as density 0:
     ``weights <= hidden * (1 - exp(-sigma * deltas))``. The other cells keep theirs. Not differentiable.
 
+    With a ``contraction`` the grid, its box and the positions are of the contracted space, ``sigma`` and ``deltas`` of
+    the world. A cell then gets densities per unit of contracted length along rays from the centre.
+
     Args:
         density: float32 [x, y, z], >= 0, contiguous.
         occupied: bool [x, y, z], contiguous: density >= threshold.
         box: float32 [2, 3], lowest and highest corner.
         positions: float32 [m, 3]; a position outside the box counts for the nearest cell at its border.
         sigma: float32 [m], densities of the samples; NaN counts as infinite.
-        deltas: float32 [m], lengths of their strata; a sample of length 0 says nothing.
-        weights: float32 [m], their contributions to their rays.
+        deltas: float32 [m], lengths of their strata; a sample of length 0 says nothing. None where all light reaches
+            every sample.
+        weights: float32 [m], their contributions to their rays; None where ``deltas`` is.
         decay: 0 to 1.
         threshold: density from which a cell counts as occupied.
         hidden: share of the light, 0 to 1.
+        contraction: float32 [4], a sphere, or [5, 3], normalised device coordinates, as for ``march_rays``; or None.
+        fixed: bool [x, y, z], cells that stay as they are; None for none.
         backend: "auto", "reference", "native" or "warp".
 
     Raises:
-        ValueError: a grid that is not contiguous.
+        ValueError: a grid that is not contiguous; one of ``deltas`` and ``weights`` alone.
 
     Examples:
         >>> import torch

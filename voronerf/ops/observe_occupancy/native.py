@@ -8,9 +8,12 @@ import torch
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
+from voronerf.ops.march_rays.native import space_of
 
 _OP = declared("observe_occupancy")
-_samples = _OP.inputs(native.compiled.ObservedSamples)
+_samples = _OP.inputs(
+    native.compiled.ObservedSamples, fixed="None if fixed is None else fixed.view(torch.uint8)", space=space_of
+)
 
 
 @_OP.plain

@@ -1,50 +1,68 @@
-"""How little of a ray's light comes from near a known point, with its gradient. s rays, m samples (packed)."""
+"""How little of a ray's light comes from near a known point, with its gradient. s of r rays, m samples (packed)."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import PLAIN, Implementation
+from voronerf.ops._core.checks import check_writable
 from voronerf.ops._core.declare import declare
+from voronerf.ops.render_loss.reference import scaled
 
 
-@declare(native=Implementation(("cpu",), (torch.float32,)), warp=PLAIN)
+def _prepare(given: Any) -> Any:
+    check_writable("sparse_depth_gradient", "loss", given.loss)
+    check_writable("sparse_depth_gradient", "gradient", given.gradient)
+    if given.s > given.r:
+        raise ValueError(f"sparse_depth_gradient: distances must be of at most the {given.r} rays, got {given.s}")
+    return scaled("sparse_depth_gradient", given)
+
+
+@declare(native=Implementation(("cpu",), (torch.float32,)), warp=PLAIN, small=["gradient"], prepare=_prepare)
 def sparse_depth_gradient(
-    density: Annotated[Tensor, "float32|float64 [m]"],
+    loss: Annotated[Tensor, "float32|float64 []"],
+    gradient: Annotated[Tensor, "same [m, 4]"],
+    density: Annotated[Tensor, "same [m]"],
     depths: Annotated[Tensor, "same [m]"],
     deltas: Annotated[Tensor, "same [m]"],
     weights: Annotated[Tensor, "same [m]"],
-    ray_offsets: Annotated[Tensor, "int32 [s+1]"],
+    ray_offsets: Annotated[Tensor, "int32 [r+1]"],
     distances: Annotated[Tensor, "same [s]"],
     *,
+    factor: float,
+    density_scale: Annotated[float | None, "positive"] = None,
+    activated: bool = False,
     backend: str = "auto",
-) -> tuple[Annotated[Tensor, "same []"], Annotated[Tensor, "same [m]"]]:
-    """The sum of the loss of rays that end at known points, and its gradient to the densities of their samples.
+) -> None:
+    """Adds the loss of rays that end at known points, and its gradient, to those of ``render_loss_gradient``, in place.
 
     A sample is near the point if it lies within 0.03 of the distance of the point and its own length of it. The loss of
     a ray is ``-log`` of the sum of the weights of these samples, from 0.001 to 1: the likelihood of Deng et al. 2022,
     "Depth-supervised NeRF", with a box in the place of their Gaussian. Fog before the point takes from them. With the
     transmittance T behind a sample and the light S from points that lie behind it, the derivative of the sum by its
-    density is ``delta (T near - S)``. Nothing is differentiable further.
+    density is ``delta (T near - S)``. What is added is ``factor`` times the sum of the losses, and to the last column
+    of the gradient that of it. Nothing is differentiable further.
 
     Args:
-        density: float32 or float64 [m], of the samples.
-        depths: [m], their distances along the rays; of the type of ``density``, like the next two.
+        loss: float32 or float64 [].
+        gradient: [m, 4], contiguous, of the type of ``loss`` like all that follows; to the outputs of the networks.
+        density: [m], of the samples.
+        depths: [m], their distances along the rays.
         deltas: [m], their lengths.
         weights: [m], their contributions to the rays.
-        ray_offsets: int32 [s + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, counted from the
-            first of all, which may be beyond 0; together all m.
-        distances: [s], of the point that each ray ends at; NaN for none.
+        ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
+        distances: [s], of the point that each of the first s rays ends at, s <= r; NaN for none.
+        factor: on the loss of each ray.
+        density_scale: factor on the density behind its softplus, as for `render_loss`; None with ``activated``.
+        activated: whether the gradient is to the density itself.
         backend: "auto", "reference", "native" or "warp".
 
-    Returns:
-        (loss [], gradient [m]).
-
     Raises:
-        ValueError: on the CPU offsets that fall, or of more or fewer samples than m.
+        ValueError: a gradient that is not contiguous; more distances than rays; ``density_scale`` with ``activated``,
+            or neither; on the CPU offsets that fall or exceed m.
 
     Examples:
         >>> import torch
@@ -52,7 +70,8 @@ def sparse_depth_gradient(
         >>> depths, deltas = torch.tensor([1.0, 2.0]), torch.full((2,), 0.1)  # fog, and a wall with a point
         >>> weights, offsets = torch.tensor([0.5, 0.5]), torch.tensor([0, 2], dtype=torch.int32)
         >>> given = torch.tensor([6.93, 1e3]), depths, deltas, weights, offsets, torch.tensor([2.0])
-        >>> loss, gradient = sparse_depth_gradient(*given)
-        >>> loss, gradient.abs().round(decimals=3)  # less fog is better
+        >>> loss, gradient = torch.tensor(0.0), torch.zeros(2, 4)
+        >>> sparse_depth_gradient(loss, gradient, *given, factor=1.0, activated=True)
+        >>> loss, gradient[:, 3].abs().round(decimals=3)  # less fog is better
         (tensor(0.6931), tensor([0.1000, 0.0000]))
     """

@@ -8,20 +8,23 @@ from voronerf.ops._core.cases import Arguments, Case, Draw
 
 
 def _make(draw: Draw, n: int) -> Arguments:
-    """n samples on three rays, the last of which has no point."""
+    """n samples on five rays, the first three with points, one of which is nowhere."""
     call: Arguments = {name: draw.uniform(n) for name in ("density", "depths", "deltas", "weights")}
-    cuts = sorted(min(int(cut), n) for cut in draw.integers(0, n + 1, 2))
-    first = draw.among("first", 0, 5)
-    offsets = torch.tensor([0, *cuts, n], dtype=torch.int32) + first
-    return {**call, "ray_offsets": offsets, "distances": torch.tensor([0.4, 0.9, torch.nan])}
+    call |= {"loss": torch.tensor(0.5), "gradient": draw.normal(n, 4).contiguous(), "ray_offsets": draw.offsets(n, 5)}
+    rule = {"activated": True} if draw.among("activated", False, True) else {"density_scale": 3.0}
+    return {**call, "distances": torch.tensor([0.4, 0.9, torch.nan]), "factor": 0.5, **rule}
 
 
 CASE = Case(
     _make,
+    {"": {}, "activated": {"activated": True}},
     refused={
-        "ray_offsets must rise, by the number of samples, 6, got offsets from 0 to 5": {
-            "ray_offsets": torch.tensor([0, 2, 4, 5], dtype=torch.int32)
-        }
+        "ray_offsets must rise from 0 or more to at most the number of samples, 6, got 1 for ray 2": {
+            "ray_offsets": torch.tensor([0, 2, 1, 5], dtype=torch.int32)
+        },
+        "distances must be of at most the 2 rays, got 3": {"ray_offsets": torch.tensor([0, 2, 4], dtype=torch.int32)},
+        "density_scale must be given unless the values are activated, got None": {"density_scale": None},
     },
+    in_place=True,
     traced=False,
 )

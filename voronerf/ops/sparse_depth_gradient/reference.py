@@ -1,9 +1,13 @@
-"""How little of a ray's light comes from near a known point, with its gradient. s rays, m samples (packed)."""
+"""How little of a ray's light comes from near a known point, with its gradient. s of r rays, m samples (packed)."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+
+from voronerf.ops.composite.reference import check_ray_offsets
 
 #: How far from a surface a point of a sparse model may lie, as a share of its distance from the camera.
 NEARBY = 0.03
@@ -26,29 +30,30 @@ def sparse_depth_loss(light: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def sparse_depth_gradient(
-    density: Tensor, depths: Tensor, deltas: Tensor, weights: Tensor, ray_offsets: Tensor, distances: Tensor
-) -> tuple[Tensor, Tensor]:
-    """The sum of the `sparse_depth_loss`, and its gradient; see ``voronerf.ops.sparse_depth_gradient``."""
-    counts = ray_offsets.diff()
-    if density.is_cpu and len(counts) and (int(counts.min()) < 0 or int(counts.sum()) != len(density)):
-        last, first = int(ray_offsets[-1]), int(ray_offsets[0])
-        raise ValueError(
-            f"sparse_depth_gradient: ray_offsets must rise, by the number of samples, {len(density)}, got offsets from "
-            f"{first} to {last}"
-        )
-    ray = torch.repeat_interleave(counts)
-    near = near_point(depths, deltas, distances[ray])
+def sparse_depth_gradient(*given: Any) -> None:
+    """Adds the sum of the `sparse_depth_loss`, and its gradient; see ``voronerf.ops.sparse_depth_gradient``."""
+    loss, gradient, density, depths, deltas, weights, ray_offsets, distances, factor, density_scale, activated = given
+    s = len(distances)
+    check_ray_offsets("sparse_depth_gradient", ray_offsets, len(density))
+    # Samples of other rays, or of none, are those of one more, which has no point: no host reads where they begin.
+    offsets, sample = ray_offsets[: s + 1].long(), torch.arange(len(density), device=density.device)
+    ray = torch.searchsorted(offsets, sample, right=True) - 1
+    own = (ray >= 0) & (ray < s)
+    ray = torch.where(own, ray, s)
+    near = near_point(depths, deltas, torch.nn.functional.pad(distances, (0, 1), value=torch.nan)[ray])
     there = weights * near
     # Sums along each ray are differences of sums along all of them, which float32 would round too much.
-    optical, light = (_sums_along(values, ray, counts) for values in (density * deltas, there))
-    total = torch.zeros_like(distances).index_add(0, ray, there)
+    optical, light = (_sums_along(values, ray, offsets) for values in (density * deltas, there))
+    total = distances.new_zeros(s + 1).index_add(0, ray, there)
     known = torch.where(total > 1e-3, -1 / total, 0)
-    return sparse_depth_loss(total).sum(), known[ray] * deltas * (torch.exp(-optical) * near - (total[ray] - light))
+    slope = known[ray] * deltas * (torch.exp(-optical) * near - (total[ray] - light))
+    if not activated:
+        slope = slope * -density_scale * torch.expm1(-density / density_scale)  # of a softplus
+    loss += factor * sparse_depth_loss(total[:s]).sum()
+    gradient[:, 3] += torch.where(own, factor * slope, 0)
 
 
-def _sums_along(values: Tensor, ray: Tensor, counts: Tensor) -> Tensor:
+def _sums_along(values: Tensor, ray: Tensor, offsets: Tensor) -> Tensor:
     """Running sums [m] of values [m] along each ray."""
-    sums = values.double().cumsum(0)
-    before = torch.nn.functional.pad(sums, (1, 0))[counts.cumsum(0) - counts]
-    return (sums - before[ray]).to(values.dtype)
+    before = torch.nn.functional.pad(values.double().cumsum(0), (1, 0))
+    return (before[1:] - before[offsets][ray]).to(values.dtype)

@@ -1,0 +1,12 @@
+// Random points in a box: n points. What it computes is said in voronerf/ops/draw_points.
+#pragma once
+
+#include <cstdint>
+
+namespace voronerf {
+
+// seed: [1]. box: [2,3]. points: [n,3].
+void draw_points_cpu(const int32_t* seed, const float* box, int64_t n, float* points, int threads);
+void draw_points_cuda(const int32_t* seed, const float* box, int64_t n, float* points, void* stream);
+
+}  // namespace voronerf

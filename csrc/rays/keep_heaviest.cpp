@@ -1,0 +1,124 @@
+// A sample is one number: the bits of its importance, which have the order of positive floats, above those of its
+// place, negated. So no two are equal, the larger is the one to keep, and which are kept does not depend on who
+// compares them. Parts of the samples collect what is above the least that is to be kept; when one has 2 q, the smaller
+// half goes, and the least of the rest is a bound for all parts, since q are no smaller. Few samples get there: of n in
+// random order about q (1 + ln(n / q)).
+#include "rays/keep_heaviest.h"
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <cstring>
+#include <functional>
+#include <limits>
+#include <stdexcept>
+#include <string>
+
+#include "common/parallel.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int64_t kParts = 8, kRun = 64;  // of a call; samples that are weighed before they are compared
+
+uint64_t entry_of(float importance, int64_t i) {
+  uint32_t bits;
+  std::memcpy(&bits, &importance, sizeof bits);
+  return static_cast<uint64_t>(bits) << 32 | ~static_cast<uint32_t>(i);
+}
+
+float importance_of(uint64_t entry) {
+  const uint32_t bits = static_cast<uint32_t>(entry >> 32);
+  float importance;
+  std::memcpy(&importance, &bits, sizeof importance);
+  return importance;
+}
+
+int64_t place_of(uint64_t entry) { return ~static_cast<uint32_t>(entry); }
+
+// Importances of samples [begin, end); whether all of their rays are there.
+bool weigh(const WeighedSamples& in, int64_t begin, int64_t end, float* importance) {
+  if (in.error == nullptr) {
+    std::copy(in.weights + begin, in.weights + end, importance);
+    return true;
+  }
+  bool there = true;
+  for (int64_t i = begin; i < end; ++i) {
+    const bool known = in.ray_index[i] >= 0 && in.ray_index[i] < in.r;
+    importance[i - begin] = known ? in.weights[i] * in.error[in.ray_index[i]] : 0.0f;
+    there &= known;
+  }
+  return there;
+}
+
+// Those of samples [begin, end) that may be among the q heaviest, at most 2 q, in any order; the count. -1 if one has a
+// ray that is not there. Any `least` has q entries of all samples that are no smaller.
+int64_t find_heaviest(const WeighedSamples& in, int64_t begin, int64_t end, int64_t q, std::atomic<uint64_t>& least,
+                      uint64_t* found) {
+  float importance[kRun];
+  int64_t count = 0;
+  for (int64_t first = begin; first < end; first += kRun) {
+    const int64_t run = std::min(kRun, end - first);
+    if (!weigh(in, first, first + run, importance)) return -1;
+    uint64_t bound = least.load(std::memory_order_relaxed);
+    const float lowest = importance_of(bound);
+    bool some = false;
+    for (int64_t i = 0; i < run; ++i) some |= importance[i] >= lowest;  // NaN is not
+    if (!some) continue;
+    for (int64_t i = 0; i < run; ++i) {
+      if (!(importance[i] >= lowest) || importance[i] > std::numeric_limits<float>::max()) continue;
+      const uint64_t entry = entry_of(importance[i], first + i);
+      if (entry < bound) continue;
+      found[count++] = entry;
+      if (count < 2 * q) continue;
+      std::nth_element(found, found + q - 1, found + count, std::greater<>());
+      count = q;
+      uint64_t known = least.load(std::memory_order_relaxed);
+      while (known < found[q - 1] && !least.compare_exchange_weak(known, found[q - 1], std::memory_order_relaxed)) {
+      }
+      bound = std::max(known, found[q - 1]);
+    }
+  }
+  return count;
+}
+
+}  // namespace
+
+int64_t keep_heaviest_workspace(int64_t q) { return kParts * 2 * q; }
+
+void keep_heaviest_cpu(const WeighedSamples& in, const KeptSamples& kept, int64_t* found, int threads) {
+  auto* const entries = reinterpret_cast<uint64_t*>(found);
+  int64_t counts[kParts], q = kept.q;
+  std::atomic<uint64_t> least{entry_of(std::numeric_limits<float>::denorm_min(), in.m)};  // above 0 at least
+  parallel_for(kParts, 1, threads, [&](int64_t part) {
+    counts[part] =
+        find_heaviest(in, part * in.m / kParts, (part + 1) * in.m / kParts, q, least, entries + 2 * q * part);
+  });
+  int64_t count = 0;
+  for (int64_t part = 0; part < kParts; ++part) {
+    if (counts[part] < 0) {
+      const auto [low, high] = std::minmax_element(in.ray_index, in.ray_index + in.m);
+      throw std::invalid_argument("keep_heaviest: ray_index must lie in 0 to " + std::to_string(in.r - 1) +
+                                  ", got values from " + std::to_string(*low) + " to " + std::to_string(*high));
+    }
+    std::copy_n(entries + 2 * q * part, counts[part], entries + count);
+    count += counts[part];
+  }
+  const int64_t most = std::min(count, q);
+  std::partial_sort(entries, entries + most, entries + count, std::greater<>());
+
+  const int64_t slot = (*kept.added % kept.b + kept.b) % kept.b;
+  float *const importance = kept.importance + slot * q, *const points = kept.points + slot * q * in.d;
+  std::fill_n(importance, q, 0.0f);
+  std::fill_n(points, q * in.d, 0.0f);
+  for (int64_t i = 0; i < most; ++i) {
+    const float* const point = in.points + place_of(entries[i]) * in.d;
+    if (!std::all_of(point, point + in.d, [](float value) { return std::isfinite(value); })) continue;
+    importance[i] = importance_of(entries[i]);
+    std::copy_n(point, in.d, points + i * in.d);
+  }
+  ++*kept.added;
+}
+
+}  // namespace voronerf
