@@ -65,7 +65,7 @@ class Frame {
  public:
   // A number of rows that a recorded call has taken, and where it lies.
   struct Counted {
-    Rows* rows;
+    RowCount* rows;
     const Count* count;
   };
   Frame() = default;
@@ -96,9 +96,9 @@ class Frame {
         if (!PyLong_Check(given)) return false;
         const int64_t rows = PyLong_AsLongLong(given);
         if (rows == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
-        *static_cast<Rows*>(place) = rows;
+        *static_cast<RowCount*>(place) = rows;
         if (recorded() != nullptr && rows != 0)
-          counted_.push_back({static_cast<Rows*>(place), count_of(*recorded(), rows)});
+          counted_.push_back({static_cast<RowCount*>(place), count_of(*recorded(), rows)});
         return true;
       }
       case Type::Kind::floating: {

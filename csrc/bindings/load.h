@@ -9,7 +9,7 @@
 //   enumeration   the name of a value (VN_NAMES)
 //   struct        a named tuple with its members (VN_STRUCT), of a class that the module makes
 //   numbers       int, float and bool
-//   Rows          an int, which a recording reads again (bind.cpp)
+//   RowCount          an int, which a recording reads again (bind.cpp)
 #pragma once
 
 #include <cstddef>
@@ -20,7 +20,7 @@
 #include <type_traits>
 #include <vector>
 
-#include "common/rows.h"
+#include "common/row_count.h"
 
 struct _object;
 struct _typeobject;
@@ -167,7 +167,7 @@ Type describe() {
   const std::string bits = std::to_string(8 * sizeof(T));
   if constexpr (std::is_same_v<T, bool>) {
     return named_type(Kind::boolean, sizeof(T), "bool", "bool");
-  } else if constexpr (std::is_same_v<T, Rows>) {
+  } else if constexpr (std::is_same_v<T, RowCount>) {
     return named_type(Kind::rows, sizeof(T), "int", "rows");
   } else if constexpr (std::is_same_v<T, const char*>) {
     return named_type(Kind::text, sizeof(T), "str | None", "text");

@@ -20,7 +20,7 @@ constexpr int64_t kRun = 16, kRuns = 8;  // of few chunks, so many runs at least
 
 }  // namespace
 
-bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, Rows n, int64_t k, int threads) {
+bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, RowCount n, int64_t k, int threads) {
   const int64_t rows = cell_sort_chunk_rows(k), chunks = cell_sort_chunks(n, k);
   const int64_t run = std::clamp<int64_t>(chunks / kRuns, 1, kRun);
   const std::unique_ptr<int32_t[]> counts(new int32_t[static_cast<size_t>(chunks * k)]);
@@ -72,7 +72,7 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, Rows 
   return true;
 }
 
-void one_cell_cpu(int32_t* cells, int32_t* offsets, Rows n, int /*threads*/) {
+void one_cell_cpu(int32_t* cells, int32_t* offsets, RowCount n, int /*threads*/) {
   std::fill(cells, cells + n, 0);
   offsets[0] = 0;
   offsets[1] = static_cast<int32_t>(n);

@@ -7,7 +7,7 @@
 #include <cstdint>
 
 #include "common/common.h"
-#include "common/rows.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
@@ -15,10 +15,10 @@ inline int64_t cell_sort_chunk_rows(int64_t k) { return 4 * k < 2048 ? 2048 : 4 
 inline int64_t cell_sort_chunks(int64_t n, int64_t k) { return ceil_div(n, cell_sort_chunk_rows(k)); }
 
 // False if a cell lies outside 0..k-1; `order` and `offsets` are then undefined.
-bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, Rows n, int64_t k, int threads);
+bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, RowCount n, int64_t k, int threads);
 
 // All samples in one cell: cells 0, offsets 0 and n.
-void one_cell_cpu(int32_t* cells, int32_t* offsets, Rows n, int threads);
+void one_cell_cpu(int32_t* cells, int32_t* offsets, RowCount n, int threads);
 
 // How CUDA sorts: by counting where a warp's counters fit shared memory, which by counting bytes is the better way as
 // long as it is possible (docs/cuda.md), else by the toolkit's radix sort. It has two buckets more than there are

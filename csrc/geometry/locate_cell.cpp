@@ -22,7 +22,7 @@ int64_t locate_cell_workspace(int64_t m, int threads) { return threads * descent
 
 template <typename T>
 bool locate_cell_cpu(const T* points, const T* centres, const int32_t* child_offsets, const int32_t* child,
-                     int32_t* leaves, int32_t* workspace, Rows n, int64_t m, int depth, Isa isa, int threads) {
+                     int32_t* leaves, int32_t* workspace, RowCount n, int64_t m, int depth, Isa isa, int threads) {
   const auto find = [&](const T* at, const int32_t*, int32_t count, int32_t first, int32_t size, int, int32_t* found,
                         int64_t, int) {
     nearest_centre_serial(at, centres + 3 * static_cast<int64_t>(first), found, count, size, isa);
@@ -30,9 +30,9 @@ bool locate_cell_cpu(const T* points, const T* centres, const int32_t* child_off
   return descend({child_offsets, child, depth}, points, leaves, workspace, n, m, threads, find);
 }
 
-template bool locate_cell_cpu(const float*, const float*, const int32_t*, const int32_t*, int32_t*, int32_t*, Rows,
+template bool locate_cell_cpu(const float*, const float*, const int32_t*, const int32_t*, int32_t*, int32_t*, RowCount,
                               int64_t, int, Isa, int);
-template bool locate_cell_cpu(const double*, const double*, const int32_t*, const int32_t*, int32_t*, int32_t*, Rows,
-                              int64_t, int, Isa, int);
+template bool locate_cell_cpu(const double*, const double*, const int32_t*, const int32_t*, int32_t*, int32_t*,
+                              RowCount, int64_t, int, Isa, int);
 
 }  // namespace voronerf

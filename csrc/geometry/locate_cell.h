@@ -8,7 +8,7 @@
 #include <cstdint>
 
 #include "common/isa.h"
-#include "common/rows.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
@@ -21,7 +21,7 @@ int64_t locate_cell_workspace(int64_t m, int threads);
 // The tables are sound (locate_cell_fault). False if a point is not at a leaf after `depth` levels.
 template <typename T>
 bool locate_cell_cpu(const T* points, const T* centres, const int32_t* child_offsets, const int32_t* child,
-                     int32_t* leaves, int32_t* workspace, Rows n, int64_t m, int depth, Isa isa, int threads);
+                     int32_t* leaves, int32_t* workspace, RowCount n, int64_t m, int depth, Isa isa, int threads);
 
 // g diagrams. Unsound tables (locate_cell_fault) cannot be refused without a host read: a walk ends where they lead out
 // of them, nothing outside is read, and a point that has reached no leaf by then, or in `depth` levels, gets a negative

@@ -22,15 +22,16 @@ void nearest_centre_serial(const T* points, const T* centres, int32_t* cells, in
 }
 
 template <typename T>
-void nearest_centre_cpu(const T* points, const T* centres, int32_t* cells, Rows n, int64_t k, Isa isa, int threads) {
+void nearest_centre_cpu(const T* points, const T* centres, int32_t* cells, RowCount n, int64_t k, Isa isa,
+                        int threads) {
   parallel_for(ceil_div<int64_t>(n, kBlock), 1, threads, [&](int64_t b) {
     const int64_t start = b * kBlock;
     nearest_centre_serial(points + 3 * start, centres, cells + start, std::min(kBlock, n - start), k, isa);
   });
 }
 
-template void nearest_centre_cpu(const float*, const float*, int32_t*, Rows, int64_t, Isa, int);
-template void nearest_centre_cpu(const double*, const double*, int32_t*, Rows, int64_t, Isa, int);
+template void nearest_centre_cpu(const float*, const float*, int32_t*, RowCount, int64_t, Isa, int);
+template void nearest_centre_cpu(const double*, const double*, int32_t*, RowCount, int64_t, Isa, int);
 template void nearest_centre_serial(const float*, const float*, int32_t*, int64_t, int64_t, Isa);
 template void nearest_centre_serial(const double*, const double*, int32_t*, int64_t, int64_t, Isa);
 

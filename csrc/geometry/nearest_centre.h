@@ -5,12 +5,12 @@
 #include <cstdint>
 
 #include "common/isa.h"
-#include "common/rows.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
 template <typename T>
-void nearest_centre_cpu(const T* points, const T* centres, int32_t* cells, Rows n, int64_t k, Isa isa, int threads);
+void nearest_centre_cpu(const T* points, const T* centres, int32_t* cells, RowCount n, int64_t k, Isa isa, int threads);
 // rows: [1], how many points count, the others get -1; null for all.
 template <typename T>
 void nearest_centre_cuda(const T* points, const T* centres, const int32_t* rows, int32_t* cells, int64_t n, int64_t k,

@@ -14,7 +14,7 @@
 #include <vector>
 
 #include "common/isa.h"
-#include "common/rows.h"
+#include "common/row_count.h"
 #include "encoding/hash_encode.h"
 #include "network/program_code.h"
 
@@ -79,14 +79,14 @@ struct ProgramInputs {
   const int32_t* offsets;
   const int32_t* order;      // or null
   const int32_t* ray_index;  // [n], or null without inputs and outputs of rays
-  Rows n, r;
+  RowCount n, r;
   int64_t k;
   // For each lookup memory [n][stride] of the caller's, filled by the call unless it is `ready`; null entries, or null:
   // what was looked up is not kept.
   float* const* kept;
   bool ready;
-  // Rows that are 0 in all inputs from this one on, float32 and of no rays, add nothing to any sum; -1: there are none
-  // such.
+  // RowCount that are 0 in all inputs from this one on, float32 and of no rays, add nothing to any sum; -1: there are
+  // none such.
   int64_t gradients;
   const char *caller, *ray_name;  // the operation that errors name, and its name for ray_index
 };

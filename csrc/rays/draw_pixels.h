@@ -5,7 +5,7 @@
 #include <cstdint>
 
 #include "common/hashed.h"
-#include "common/rows.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
@@ -17,11 +17,11 @@ struct DrawPixelsInputs {
   int64_t n, places;     // entries of ends and shift, and of first
   int64_t bits;
   int64_t below;  // places of all runs
-  Rows b;
+  RowCount b;
   const int64_t* known;    // [p], which the first of all pixels are drawn from; or null
   const float* distances;  // [p], of these
   int64_t p;
-  Rows several;  // as many as are drawn from them
+  RowCount several;  // as many as are drawn from them
 };
 
 // The run of a place: looked for from the first that can hold it, within the tables whatever they say.

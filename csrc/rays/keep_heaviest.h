@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#include "common/rows.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
@@ -13,7 +13,7 @@ struct WeighedSamples {
   const float* weights;      // [m]
   const float* error;        // [r], or null for weights as they are
   const int32_t* ray_index;  // [m], or null with error
-  Rows m, r;
+  RowCount m, r;
   int64_t d;
 };
 

@@ -88,7 +88,7 @@ void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offset
   }
 }
 
-void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, Rows rows,
+void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, RowCount rows,
                          int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop, Isa isa,
                          int threads) {
   for_each_block(in.r, threads, [&](int64_t begin, int64_t end) {

@@ -9,7 +9,7 @@
 
 #include "common/hd.h"
 #include "common/isa.h"
-#include "common/rows.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
@@ -27,7 +27,7 @@ struct MarchInputs {
   const float* uniforms;              // [r,s], or null
   const int32_t* seed;                // [1], of hashed uniforms, or null; neither: the middles
   const int32_t* start;               // [r], or null for 0
-  Rows r;
+  RowCount r;
   int64_t s;
   int64_t x, y, z;
   bool disparity;
@@ -46,7 +46,7 @@ void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offset
 void march_rays_count_cuda(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t capacity, void* stream);
 
 // rows: length of ray_index, depths, deltas and positions [rows,3], at least offsets[r]; what is beyond that becomes 0.
-void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, Rows rows,
+void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, RowCount rows,
                          int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop, Isa isa,
                          int threads);
 void march_rays_fill_cuda(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int64_t rows,

@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#include "common/rows.h"
+#include "common/row_count.h"
 #include "rays/march_rays.h"
 
 namespace voronerf {
@@ -16,7 +16,7 @@ struct ObservedSamples {
   const uint8_t* fixed;            // [x,y,z], not 0 for cells that stay as they are; or null
   MarchSpace space;                // that of positions, box and grid; sigma and deltas are the world's
   int64_t x, y, z;
-  Rows m;
+  RowCount m;
   float decay, threshold, hidden;
 };
 

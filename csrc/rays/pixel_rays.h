@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#include "common/rows.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
@@ -19,7 +19,7 @@ struct PixelRaysInputs {
   const float* background;  // [b,3], or [3], or null
   bool background_per_ray;
   int64_t c, h, w, channels;
-  Rows b;
+  RowCount b;
   int64_t l;
   float near, far;
 };

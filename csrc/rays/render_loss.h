@@ -5,7 +5,7 @@
 #include <cstdint>
 
 #include "common/isa.h"
-#include "common/rows.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
@@ -19,7 +19,7 @@ struct RenderLossInputs {
   float density_scale;
   bool activated;  // colour and density as they are, without scale
   float hidden;    // share of the light; samples that no more than it reaches have no gradient
-  Rows r, m;
+  RowCount r, m;
 };
 
 struct RenderLossOutputs {

@@ -7,7 +7,7 @@
 
 namespace voronerf {
 
-void scale_gradient_cpu(const float* depths, float full, Rows m, int64_t c, float* gradient, int threads) {
+void scale_gradient_cpu(const float* depths, float full, RowCount m, int64_t c, float* gradient, int threads) {
   constexpr int64_t kSamples = 1024;  // of a task
   parallel_for((m + kSamples - 1) / kSamples, 1, threads, [&](int64_t block) {
     const int64_t end = std::min<int64_t>(m, (block + 1) * kSamples);

@@ -5,7 +5,7 @@
 #include <cstdint>
 
 #include "common/hd.h"
-#include "common/rows.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
@@ -16,7 +16,7 @@ VN_HD float gradient_share(float depth, float full) {
 }
 
 // depths: [m]. gradient: [m,c].
-void scale_gradient_cpu(const float* depths, float full, Rows m, int64_t c, float* gradient, int threads);
+void scale_gradient_cpu(const float* depths, float full, RowCount m, int64_t c, float* gradient, int threads);
 void scale_gradient_cuda(const float* depths, float full, int64_t m, int64_t c, float* gradient, void* stream);
 
 }  // namespace voronerf

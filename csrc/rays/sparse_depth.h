@@ -4,7 +4,7 @@
 
 #include <cstdint>
 
-#include "common/rows.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
@@ -15,7 +15,7 @@ struct SparseDepth {
   float nearby, factor;
   float density_scale;
   bool activated;  // the gradient is to the density itself, else to what comes before its softplus
-  Rows s, r, m;
+  RowCount s, r, m;
 };
 
 // Adds to loss: [1] and to the last column of gradient: [m,4]. of_rays: [s], working memory. Throws

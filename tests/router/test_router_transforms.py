@@ -193,8 +193,7 @@ def test_a_table_of_layers_and_an_op_refuse_tangents(generator: torch.Generator)
 # Compilers ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("way", ["fused", "grouped"])
-@pytest.mark.parametrize("cold", [True, False])
+@pytest.mark.parametrize(("way", "cold"), [("fused", True), ("grouped", True), ("grouped", False)])
 def test_fullgraph_says_the_routers_text(way: str, cold: bool, generator: torch.Generator) -> None:
     router, x = router_of(net(), generator, **WAYS[way]), torch.rand(64, 3, generator=generator)
     if not cold:

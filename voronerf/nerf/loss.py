@@ -109,7 +109,7 @@ class RayLoss:
         samples: Stratified, 8 a ray
         loss: networks, colours and loss are separate operations
         not faster: empty space is not skipped
-        field: forward: fused, by the layer table of the field
+        field: forward: fused
     """
 
     def __init__(self, renderer: Renderer, *, sparse_depth: float = 0.0) -> None:

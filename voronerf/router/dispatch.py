@@ -15,7 +15,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -29,11 +29,12 @@ from voronerf.router.double import Double
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters, parts_of
+from voronerf.router.known import Known
 from voronerf.router.layout import Call, Results, map_tensors
 from voronerf.router.probe import Options, Probe, check_rays
 from voronerf.router.program import Activation, CellProgram
 from voronerf.router.table import LayeredField
-from voronerf.router.transforms import aside, recorded
+from voronerf.router.transforms import aside, is_watched, recorded
 from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup, same
 
 _OP = "VoronoiRouter"
@@ -69,12 +70,23 @@ class CallPlan:
     watch: Watch = field(default_factory=Watch)
     skip: int = 0
     wait: int = 0
-    whole: Any = None  # of `Fused.whole`, once it is asked for
 
     @property
     def fused(self) -> Fused | None:
         """The way that a call takes as it was traced."""
         return self.ways[0] if isinstance(self.ways[0], Fused) else None
+
+    def takes_first(self, n: int, k: int) -> bool:
+        """Whether n samples in k cells are known to go the first way."""
+        if self.skip:
+            return False
+        if not self.measured or len(self.ways) == 1 or n < _FEWEST:
+            return True
+        return self.chosen.get(self.size(n, k), (1, ""))[0] == 0
+
+    def size(self, n: int, k: int) -> tuple[int, int]:
+        """The key of ``chosen``: batches of up to four times as many samples."""
+        return min(n, measured_samples(self.ways)).bit_length() // 2, k
 
     def changed(self, constants: dict[str, Any]) -> list[Source]:
         """What is not as it was when the module was traced: arguments, attributes and buffers."""
@@ -104,15 +116,17 @@ class Dispatch:
         """Drops all plans, after a change of dtype, device or parameters' names."""
         self.plans: dict[Any, list[CallPlan]] = {}  # the latest first; several where they are traced with other values
         self._fixed: dict[Any, tuple[set[Source], str]] = {}  # what cannot be an input of a trace, and why
+        self.known: dict[Any, Known] = {}  # by `kind_of`
         self._known, self._trees = list[Any](), list[Any]()  # parameters, and parts of the module, at the last call
+        self._k = 0  # cells, then
         self._inner: list[Any] = []  # shapes of one cell's parameters
         self._warned: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
         self._activation: Activation | None = None
 
-    def explain(self, methods: tuple[str, ...]) -> str:
-        """How each method has run so far, and why."""
-        latest = [(method, self._latest.get(method, {"not called yet": ""})) for method in methods]
+    def explain(self, methods: tuple[str, ...], known: Mapping[str, str]) -> str:
+        """How each method has run so far, and why; of some it is known beforehand."""
+        latest = [(m, self._latest.get(m, {known.get(m, "not called yet"): ""})) for m in methods]
         ways = [(method, *way) for method, ways in latest for way in list(ways.items())]
         return "\n".join(f"{method}: {name}{f': {why}' if why else ''}" for method, name, why in ways)
 
@@ -141,12 +155,11 @@ class Dispatch:
         plan = plan or self._plan(call, cast(Grouping, grouping), options)
         if plan.fused is None:
             return f"{call.name} runs {plan.ways[0].name}: {plan.ways[0].why}"
-        if plan.whole is None:
-            plan.whole = plan.fused.whole()
-        if isinstance(plan.whole, str):
-            return f"{call.name} is not one program: {plan.whole}"
-        program, reads, shapes = plan.whole
-        return CellProgram(program, reads, shapes, plan.fused.parameters(k, device, backend))
+        whole = plan.fused.whole
+        if isinstance(whole, str):
+            return f"{call.name} is not one program: {whole}"
+        shapes, encoded = tuple(shape for shape, _ in whole.results), plan.fused.encoded
+        return CellProgram(encoded, whole.reads, shapes, plan.fused.parameters(k, device, backend))
 
     def activation(self, field: LayeredField) -> Activation:
         """The steps of a field behind its layer table."""
@@ -168,22 +181,41 @@ class Dispatch:
         self._check_parameters(call, grouping.k, options.names)
         plan = self._plan(call, grouping, options)
         if frozen is None or not torch.is_grad_enabled() or not call.layout.n:
-            return self._run(plan, call, grouping)
-        return self._run_apart(plan, call, grouping, frozen)
+            results = self._run(plan, call, grouping)
+        else:
+            results = self._run_apart(plan, call, grouping, frozen)
+        if call.like is not None and (known := Known.of(plan, call, grouping)):
+            if len(self.known) >= _PLANS:
+                self.known = {}
+            self.known[call.like] = known
+        return results
+
+    def find(self, kind: Any, k: int) -> Known | None:
+        """What is known of calls of a kind, if the module is as it was; while it compiles it is taken for that."""
+        found = self.known.get(kind)
+        if found is None or torch.compiler.is_compiling():
+            return found
+        return None if is_watched() or not self._same_parameters(k) or found.plan.watch.changed() else found
+
+    def _same_parameters(self, k: int) -> bool:
+        """Whether the module has the parameters and parts of the last call."""
+        if k != self._k:
+            return False
+        for own, name, shape, dtype, device in self._known:
+            p = own.get(name)
+            if p is None or p.shape != shape or p.dtype is not dtype or p.get_device() != device:
+                return False
+        for own, was in self._trees:
+            if len(own) != len(was) or not all(map(operator.is_, own.values(), was)):
+                return False
+        return True
 
     def _check_parameters(self, call: Call, k: int, names: Collection[str]) -> None:
         """Raises TypeError or ValueError where the module has not the parameters of k cells that it was wrapped with.
 
         A parametrisation, or memory of another shape, would send kernels to memory that is not theirs.
         """
-        if (
-            self._known
-            and all(
-                (p := own.get(name)) is not None and p.shape == shape and p.dtype is dtype
-                for own, name, shape, dtype in self._known
-            )
-            and all(len(own) == len(was) and all(map(operator.is_, own.values(), was)) for own, was in self._trees)
-        ):
+        if self._known and self._same_parameters(k):
             return
         now = dict(call.module.named_parameters())
         if gone := [name for name in names if name not in now]:
@@ -201,8 +233,8 @@ class Dispatch:
         inner = [(name, p.shape[id(p) in cells :], p.dtype) for name, p in now.items()]
         if inner != self._inner:
             self.forget()
-        self._inner = inner
-        self._known = [(own._parameters, name, p.shape, p.dtype) for own, name, p in owned_parameters(call.module)]
+        self._inner, self._k, owned = inner, k, owned_parameters(call.module)
+        self._known = [(own._parameters, name, p.shape, p.dtype, p.get_device()) for own, name, p in owned]
         trees = [own._modules for own in parts_of(call.module).values()]
         self._trees = [(own, tuple(own.values())) for own in trees if own]
 
@@ -232,13 +264,15 @@ class Dispatch:
             options = replace(options, several=options.several or bool(plans))
             ways, is_open = probe.find_ways(options, self.warn_once, inputs, over)
         if len(self.plans) >= _PLANS:
-            self.plans.clear()
+            self.plans, self.known = {}, {}
         made = CallPlan(ways, options.way == "fastest", is_open, constants=constants)
         if made.fused is not None:
             made.watch = Watch.of(call.module, made.fused.reads, made.fused.inputs)
         if probe.refused and made.fused is not None:
             fixed = self._fixed.setdefault(key, (set(), probe.refused))[0]
             fixed.update(*(own.sources - made.fused.inputs.sources for own in inputs))
+        before = set(map(id, plans))
+        self.known = {like: own for like, own in self.known.items() if id(own.plan) not in before}
         if plans and [way.name for way in plans[0].ways] == [way.name for way in ways]:
             made.chosen = plans[0].chosen
         self.plans[key] = [made] if made.fused is None else [made, *(own for own in plans if own is not plan)]
@@ -282,8 +316,7 @@ class Dispatch:
             ways = ways[-1:]
         if not plan.measured or len(ways) == 1 or n < _FEWEST:
             return ways[0], ways[0].why
-        n = min(n, measured_samples(ways))
-        size = n.bit_length() // 2, k  # batches of up to four times as many samples
+        size, n = plan.size(n, k), min(n, measured_samples(ways))
         if size not in plan.chosen:
             with self._lock, aside(call) as beside:
                 times = measure(ways, beside, grouping)

@@ -10,9 +10,10 @@ Letters: n samples, k cells, w columns.
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, fx
@@ -28,14 +29,14 @@ from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiab
 from voronerf.router.watch import Inputs, lookup
 from voronerf.router.waves import with_encodings
 
-_HALF = (torch.bfloat16, torch.float16)  # what a run computes in float32 and rounds at its end
+HALF = (torch.bfloat16, torch.float16)  # what a run computes in float32 and rounds at its end
 
 
 class ParameterEntries:
     """A parameter of a program: numbered entries of a parameter, [o, i] or [w], which is a tensor or a node's value."""
 
     def __init__(self, of: Any, codes: Tensor) -> None:
-        self._of, self._shape, numbers = of, codes.shape, codes.flatten()
+        self.of, self._shape, numbers = of, codes.shape, codes.flatten()
         self._of_cells = isinstance(of, fx.Node) and of.meta["on"] == CELLS
         every = torch.arange((of.meta["value"] if isinstance(of, fx.Node) else of).numel())
         self._whole = torch.equal(numbers, every)
@@ -45,19 +46,19 @@ class ParameterEntries:
     def constants(self) -> list[float] | None:
         """Its entries, if they are numbers."""
         found: list[float] | None = None
-        if isinstance(self._of, Tensor):
-            found = self._of.detach().flatten().cpu()[self._numbers].tolist()
+        if isinstance(self.of, Tensor):
+            found = self.of.detach().flatten().cpu()[self._numbers].tolist()
         return found
 
     def own(self, values: Mapping[Any, Any]) -> Tensor:
         """The parameter itself, where these are all of its entries in its own shape; else as `of_values`."""
-        value: Tensor = values.get(self._of, self._of)
+        value: Tensor = values.get(self.of, self.of)
         whole = self._whole and value.shape[self._of_cells :] == self._shape
         return value if whole else self.of_values(values)
 
     def of_values(self, values: Mapping[Any, Any]) -> Tensor:
         """Its entries, [k, ...], or [1, ...] where cells share it."""
-        value = values.get(self._of, self._of)
+        value = values.get(self.of, self.of)
         flat = value.reshape(value.shape[0] if self._of_cells else 1, -1)
         if self._whole:
             return flat.reshape(-1, *self._shape)
@@ -76,6 +77,14 @@ class Run:
     outputs: list[Any] = field(default_factory=list)
 
 
+class Whole(NamedTuple):
+    """One program of some arguments: their numbers, and shape and dtype of each result for one sample."""
+
+    program: Program
+    reads: tuple[int, ...]
+    results: tuple[tuple[tuple[int, ...], torch.dtype], ...]
+
+
 class Fused:
     """A call of the routed module as runs of programs, and the functions between them.
 
@@ -88,12 +97,12 @@ class Fused:
     """
 
     def __init__(self, call: Call, given: list[Tensor], inputs: Inputs) -> None:
-        self._module, self.inputs = call.module, inputs
+        self.module, self.inputs = call.module, inputs
         trace = Trace(self._with_inputs(call, given[0].device), given, inputs)
         parts, self.reads = list(parts_of(call.module).values()), trace.reads
         self._places = [(parts[i], i, name) for i, name in trace.places]
         self._n, self._inputs, self._shared, self._parameters = trace.n, trace.inputs, trace.shared, trace.parameters
-        self._result, self._outputs = trace.result, trace.outputs
+        self.result, self._outputs = trace.result, trace.outputs
         self._owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
         if not all(isinstance(value, fx.Node) and value.meta["on"] == SAMPLES for value in self._outputs):
             raise Unfusable("a result depends on no sample")
@@ -281,7 +290,7 @@ class Fused:
         call = self._with_inputs(call, grouping.device)
         rows, shared = call.arranged(grouping if sort else None), call.shared()
         owned, places = self._owned, self._places
-        if call.module is not self._module:  # a copy of the module, with parameters of its own
+        if call.module is not self.module:  # a copy of the module, with parameters of its own
             owned = [(owner, name) for owner, name, _ in owned_parameters(call.module)]
             parts = list(parts_of(call.module).values())
             places = [(parts[i], i, name) for _, i, name in places]
@@ -295,11 +304,11 @@ class Fused:
         with torch.set_grad_enabled(recorded or self._differentiates):
             self._compute(values, grouping, sort)
         found = [values[node] if recorded else values[node].detach() for node in self._outputs]
-        return Results(self._result, found, grouping if sort else None)
+        return Results(self.result, found, grouping if sort else None)
 
-    def whole(self) -> tuple[Program, tuple[int, ...], tuple[tuple[int, ...], ...]] | str:
-        """The program of all that a call computes, its inputs as numbers of arguments with rows, and shapes of results
-        for one sample; or what else there is."""
+    @functools.cached_property
+    def whole(self) -> Whole | str:
+        """What a call computes, where that is one program on its arguments as they are; or what else there is."""
         if self.name != "fused":
             return self.why
         (run,) = self._runs.values()
@@ -311,27 +320,55 @@ class Fused:
             return "arguments are the same for all samples"
         outputs = [run.program.outputs[run.outputs.index(node)] for node in self._outputs]
         reads = tuple(self._inputs.index(node) for node in run.inputs)
-        shapes = tuple(tuple(layout[0]) for layout in layouts if layout is not None)
+        results = tuple((tuple(node.meta["layout"][0]), node.meta["dtype"]) for node in self._outputs)
+        return Whole(Builder(run.program).program(outputs), reads, results)
+
+    @functools.cached_property
+    def encoded(self) -> Program:
+        """The program of :attr:`whole` with encodings as steps."""
+        (run,), whole = self._runs.values(), cast(Whole, self.whole)
         constants = {i: taken.constants() for i, taken in enumerate(run.parameters)}
-        known = {i: numbers for i, numbers in constants.items() if numbers is not None}
-        return with_encodings(Builder(run.program).program(outputs), known), reads, shapes
+        return with_encodings(whole.program, {i: numbers for i, numbers in constants.items() if numbers is not None})
+
+    @property
+    def computes(self) -> bool:
+        """Whether functions of the module make parameters of :attr:`whole`, or numbers are looked up."""
+        return bool(self._weights or self._places)
+
+    @functools.cached_property
+    def _sources(self) -> list[tuple[dict[str, Any], str, ParameterEntries | None]]:
+        """Where the parameters of :attr:`whole` are, and their entries that it takes; None for a parameter as it is."""
+        (run,) = self._runs.values()
+        found = list[tuple[dict[str, Any], str, ParameterEntries | None]]()
+        for taken in run.parameters:
+            if isinstance(taken.of, Tensor):
+                found.append(({"": taken.own({}).float()}, "", None))
+                continue
+            owner, name = self._owned[self._parameters[taken.of]]
+            own = cast(Tensor, owner._parameters[name])
+            as_it_is = own.dtype is torch.float32 and taken.own({taken.of: own}) is own
+            found.append((owner._parameters, name, None if as_it_is else taken))
+        return found
 
     def parameters(self, k: int, device: torch.device, backend: str) -> list[Tensor]:
-        """Those of :meth:`whole`, float32: the module's own where they are a parameter as it is, else made of them."""
+        """Those of :attr:`whole`, float32: the module's own where they are a parameter as it is, else made of them."""
+        if not self.computes:
+            return [
+                own[name] if taken is None else taken.own({taken.of: own[name]}).float()
+                for own, name, taken in self._sources
+            ]
         tensors = [self.inputs.tensor(lookup(part, name), device) for part, _, name in self._places]
         values: dict[Any, Any] = dict(zip(self._shared, tensors, strict=True))
         for node, place in self._parameters.items():
             owner, name = self._owned[place]
             values[node] = owner._parameters[name]
-        if self._weights:  # of parameters alone, so of no samples
-            none = torch.zeros(2, dtype=torch.int32, device=device)
-            grouped = GroupedRun(Grouping(none, 2, k, device, backend), {})
-            for node in self._weights:
-                if node not in values:
-                    _compute(node, values, grouped)
+        none = torch.zeros(2, dtype=torch.int32, device=device)  # weights are of parameters alone, so of no samples
+        grouped = GroupedRun(Grouping(none, 2, k, device, backend), {})
+        for node in self._weights:
+            if node not in values:
+                _compute(node, values, grouped)
         (run,) = self._runs.values()
-        found = [taken.own(values) for taken in run.parameters]
-        return [value if value.dtype is torch.float32 else value.float() for value in found]
+        return [taken.own(values).float() for taken in run.parameters]
 
     def _with_inputs(self, call: Call, device: torch.device) -> Call:
         """The call with tensors in the place of its numbers that are inputs."""
@@ -340,9 +377,6 @@ class Fused:
 
     def _compute(self, values: dict[Any, Any], grouping: Grouping, sort: bool) -> None:
         order = None if sort else grouping.source
-        if len(self._runs) == 1 and not self._weights and not self._between:
-            self._compute_run(self._runs[0], values, grouping, order)
-            return
         grouped = GroupedRun(grouping, {})
         for node in self._weights:
             if node not in values:
@@ -359,7 +393,7 @@ class Fused:
         n = values[self._n]
         rows = [_flat(values[source], n) for source in run.inputs]
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
-        half = torch.is_autocast_enabled(grouping.device.type) or any(x.dtype in _HALF for x in rows)
+        half = torch.is_autocast_enabled(grouping.device.type) or any(x.dtype in HALF for x in rows)
         parameters = [taken.of_values(values).to(dtype) for taken in run.parameters]
         found = grouped_program(
             [x.to(dtype) for x in rows],
@@ -373,7 +407,7 @@ class Fused:
             if isinstance(of, fx.Node):
                 shape, at, m = of.meta["layout"]
                 tensor = tensor.reshape(n * m, *shape).movedim(0, at) if at else tensor.reshape(n * m, *shape)
-                tensor = tensor.to(of.meta["dtype"]) if half and of.meta["dtype"] in _HALF else tensor
+                tensor = tensor.to(of.meta["dtype"]) if half and of.meta["dtype"] in HALF else tensor
             values[of] = tensor
 
 

@@ -214,6 +214,7 @@ class Call:
     args: tuple[Any, ...]
     kwargs: dict[str, Any]
     kinds: dict[str, str] = dataclasses.field(default_factory=dict)  # what each tensor has an entry for, by name
+    like: Any = None  # of `kind_of`
 
     @property
     def name(self) -> str:
@@ -365,7 +366,10 @@ class Results:
 
 def first_tensor(args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor | None:
     """The first tensor among the arguments of a call."""
-    return next((value for value in (*args, *kwargs.values()) if isinstance(value, Tensor) and value.dim()), None)
+    for value in (*args, *kwargs.values()) if kwargs else args:
+        if isinstance(value, Tensor) and value.dim():
+            return value
+    return None
 
 
 def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: int = 3) -> Tensor:
@@ -376,10 +380,11 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: in
             f"coords='first{d}', a slice of the features or a function of the arguments to the router, or "
             f"coords=positions [..., {d}] to this call"
         )
+    source = None
     if isinstance(rule, Tensor):
-        positions, what = rule, "coords"
+        positions = rule
     elif callable(rule):
-        positions, what = rule(*args, **kwargs), "what coords returns"
+        positions = rule(*args, **kwargs)
     else:
         source = first_tensor(args, kwargs)
         if source is None:
@@ -387,15 +392,18 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: in
             raise ValueError(
                 f"{_OP}: coords={rule!r} must find a tensor among the arguments, got {got}; pass a function"
             )
-        positions = source[..., : int(rule[5:])] if isinstance(rule, str) else source[..., rule]
+        whole = isinstance(rule, str) and source.shape[-1] == d == int(rule[5:])
+        positions = source if whole else source[..., : int(rule[5:])] if isinstance(rule, str) else source[..., rule]
+    if isinstance(positions, Tensor) and positions.shape[-1:] == (d,) and positions.is_floating_point():
+        return positions
+    what = "coords" if isinstance(rule, Tensor) else "what coords returns"
+    if source is not None:
         what = f"what coords={rule!r} takes from the first tensor, {list(source.shape)},"
     if not isinstance(positions, Tensor):
         raise TypeError(f"{_OP}: {what} must be a tensor, got {type(positions).__name__}")
     if positions.shape[-1:] != (d,):
         raise ValueError(f"{_OP}: {what} must have shape [..., {d}], got {list(positions.shape)}")
-    if not positions.is_floating_point():
-        raise TypeError(f"{_OP}: {what} must be floating-point, got {positions.dtype}")
-    return positions
+    raise TypeError(f"{_OP}: {what} must be floating-point, got {positions.dtype}")
 
 
 _MANY = 4  # cells, of which one that has nearly all samples is suspicious

@@ -20,7 +20,6 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.subdivision import finer_diagram
 from voronerf.ops._core.backends import BACKENDS
 from voronerf.ops._core.compiler import not_compiled
-from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.router.cells import (
     apply_to_cells,
     check_module,
@@ -34,6 +33,7 @@ from voronerf.router.cells import (
 )
 from voronerf.router.dispatch import Dispatch
 from voronerf.router.grouping import Assigned, Grouping
+from voronerf.router.known import Known, kind_of
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, doubt_of, find_positions, first_tensor
 from voronerf.router.optimizers import (
     check_optimizer,
@@ -45,10 +45,14 @@ from voronerf.router.optimizers import (
 )
 from voronerf.router.probe import Options
 from voronerf.router.program import CellProgram, program_of_table
-from voronerf.router.table import LayeredField, described_by_table, each_direction, parameters_of_table
+from voronerf.router.table import LayeredField, Table, each_direction
 from voronerf.router.transforms import outside, refuse_transforms, transformed, unwrapped
 
-_NO_GRAPH = "VoronoiRouter: a routed module runs as it is, between two graphs of torch.compile; omit fullgraph=True"
+_NO_GRAPH = (
+    "VoronoiRouter: a routed module runs as it is, between two graphs of torch.compile; omit fullgraph=True, or call a "
+    "router with fuse=True once beforehand, with gradients on or off as in the graph"
+)
+_READ = ("backend", "coords", "layout", "methods", "per_ray", "shared", "way")  # for what is known of calls
 _LARGE = 512  # samples of a batch that shows whether centres and positions fit
 Assignment = Literal["nearest", "stochastic"]
 Coordinates = Literal["first1", "first2", "first3", "first4"] | slice | Callable[..., Tensor]
@@ -161,16 +165,17 @@ class VoronoiRouter(nn.Module):
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
         self._watch: Any = None  # of optimisers that hold the state of other cells
         self.assignment, self.temperature = assignment, temperature
+        if coords is None and isinstance(module, LayeredField):
+            coords = cast(Coordinates, f"first{own.centres.shape[1]}")
         self.backend, self.coords, self.fuse, self.way, self.layout = backend, coords, fuse, way, layout
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
-        self._layered = isinstance(module, LayeredField)
         self._names = tuple(name for name, _ in self.module.named_parameters())
         self._dispatch = Dispatch()
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
         self._unseen = True  # no large batch has shown whether the centres fit the positions
         self.register_buffer("frozen_cells", None, persistent=False)
-        self._by_table = self._layered and described_by_table(self.module)
+        self._table = Table(self.module) if isinstance(module, LayeredField) else None
 
     @classmethod
     def from_modules(
@@ -225,7 +230,9 @@ class VoronoiRouter(nn.Module):
     @property
     def num_cells(self) -> int:
         """Cells of the diagram, networks of the router."""
-        return self.diagram.num_cells
+        diagram: Any = self._modules["diagram"]  # as an attribute it takes six times as long
+        count: int = diagram.num_cells
+        return count
 
     def cell(self, index: int) -> nn.Module:
         """A plain copy of one cell's module, with parameters of its own.
@@ -493,48 +500,35 @@ class VoronoiRouter(nn.Module):
                 nor per ray or could be both, or missing directions.
             TypeError: For a module that mixes samples.
         """
-        if self.by_table:
-            return self._evaluate_table(self._coords_of_table(coords, args, kwargs), *args, **kwargs)
-        if self._layered:
-            args, kwargs = each_direction(args, kwargs)
-        return self._route("forward", *args, coords=coords, **kwargs)
-
-    @property
-    def by_table(self) -> bool:
-        """Whether a layer table describes all that the module computes."""
-        # While it compiles, and while a loop repeats its calls, what was found before holds.
-        if self._layered and not torch.compiler.is_compiling():
-            self._by_table = described_by_table(self.module)
-        return self._by_table
-
-    def _coords_of_table(self, coords: Tensor | None, args: Any, kwargs: Any) -> Tensor | None:
-        """The positions that decide the cells; None for those of the samples."""
-        rule = self.coords if coords is None else coords
-        return None if rule is None or isinstance(rule, str) else find_positions(rule, args, kwargs, self._d)
+        return self._route("forward", args, kwargs, coords)
 
     @property
     def _d(self) -> int:
-        return self.diagram.centres.shape[1]
+        diagram: Any = self._modules["diagram"]
+        d: int = diagram._buffers["centres"].shape[1]
+        return d
 
-    def _evaluate_table(
-        self,
-        coords: Tensor | None,
-        positions: Tensor,
-        directions: Tensor | None = None,
-        ray_index: Tensor | None = None,
-    ) -> Any:
-        features = 6 if self.field.layers.integrated else 3
-        if positions.ndim != 2 or positions.shape[1] != features:
-            raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
-        large = not torch.compiler.is_compiling() and self.num_cells > 1 and len(positions) >= _LARGE
-        if large and self._unseen and torch.is_grad_enabled():
-            places = (positions[:, :3] if coords is None else coords).flatten(0, -2)
-            cells = self.diagram.locate(places, backend=self.backend)
-            self._doubt(None, None, places, cells.bincount(minlength=self.num_cells))
-        given = {**parameters_of_table(self.field, self.num_cells), **self.places(positions, coords)}
-        if self.field.layers.uses_directions:
-            given.update(directions=directions, direction_index=ray_index)
-        return self.field.activate(routed_mlp(positions, **given, backend=self.backend)[0])
+    def _positions(self, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Tensor:
+        """Those that decide the cells of a call, [..., d]; coords are those that it was given."""
+        found = find_positions(self.coords if coords is None else coords, args, kwargs, self._d)
+        if self._unseen:
+            self._look_at(found, args, kwargs, coords)
+        return found
+
+    def _look_at(self, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> None:
+        """Warns, at the first large batch of a training, where positions may be something else."""
+        few = positions.numel() < _LARGE * positions.shape[-1]
+        if few or not torch.is_grad_enabled() or torch.compiler.is_compiling():
+            return
+        self._unseen = False
+        with outside():
+            flat = unwrapped(positions).detach().reshape(-1, self._d)
+            counts = self.diagram.locate(flat, backend=self.backend).bincount(minlength=self.num_cells)
+            source = first_tensor(args, kwargs)
+            source = None if source is None else unwrapped(source)
+            doubt = doubt_of(self.coords if coords is None else coords, source, flat, counts, self.diagram.centres)
+        if doubt:
+            self._dispatch.warn_once("positions", doubt)
 
     def places(self, positions: Tensor, coords: Tensor | None = None) -> dict[str, Any]:
         """What tells the cells of samples, and which of them are frozen: arguments of `routed_mlp`.
@@ -543,19 +537,25 @@ class VoronoiRouter(nn.Module):
             positions: [n, 3] in scene units, or [n, 6] Gaussians.
             coords: [..., d], positions that decide the cells; None for those of the samples.
         """
-        given: dict[str, Any] = {"frozen": self.frozen_cells}
-        diagram = self.diagram
-        k, d = diagram.num_cells, diagram.centres.shape[1]
-        first = positions[:, :d] if positions.shape[1] > d else positions
-        if k > 1 and self.assignment == "stochastic" and self.training:
-            given["cells"] = self.assign((first if coords is None else coords).detach())
-        elif k > 1 and d != 3:
-            given["cells"] = self.assign(first if coords is None else coords)
-        elif k > 1:
-            given.update(centres=diagram.centres, coords=first if coords is None else coords)
-            if diagram.depth > 1:
-                given.update(child_offsets=diagram.child_offsets, child=diagram.child, depth=diagram.depth)
-        return given
+        diagram: Any = self._modules["diagram"]
+        k, centres, frozen = diagram.num_cells, diagram._buffers["centres"], self._buffers["frozen_cells"]
+        if k == 1:
+            return {"frozen": frozen}
+        d, drawn = centres.shape[1], self.assignment == "stochastic" and self.training
+        if coords is None:
+            coords = positions[:, :d] if positions.shape[1] > d else positions
+        if drawn or d != 3:
+            return {"frozen": frozen, "cells": self.assign(coords.detach() if drawn else coords)}
+        if diagram.depth == 1:
+            return {"frozen": frozen, "centres": centres, "coords": coords}
+        tables = {"child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
+        return {"frozen": frozen, "centres": centres, "coords": coords, **tables}
+
+    def _places_of(self, method: str, positions: Tensor) -> dict[str, Any]:
+        """The same for a call of a method at positions [..., d]; methods that share positions share their cells."""
+        if self.methods:
+            return {"frozen": self.frozen_cells, "cells": self._group(method, positions).cells}
+        return self.places(positions if positions.dim() == 2 else positions.flatten(0, -2))
 
     def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
         """What ``forward`` computes of samples, as one program; or why that is not known.
@@ -580,12 +580,12 @@ class VoronoiRouter(nn.Module):
         if callable(self.coords) or isinstance(self.coords, slice):
             return "other positions than those of the samples decide the cells"
         k, dispatch = self.num_cells, self._dispatch
-        if self.by_table:
+        if self._given is not None:
             found = program_of_table(self.field, k, dispatch.activation(self.field))
-        elif self._layered and not self.fuse:
+        elif self._table is not None and not self.fuse:
             return f"{type(self.module).__name__} does more than its layer table says"
         else:
-            given = (*args, None) if self._layered else args
+            given = args if self._table is None else (*args, None)
             positions, device, grouping = args[0][:, : self._d], args[0].device, None
             if trace and self.fuse:
                 cells = None if k == 1 else self.diagram.locate(positions, backend=self.backend)
@@ -611,25 +611,29 @@ class VoronoiRouter(nn.Module):
             >>> router.explain()
             'forward: not called yet'
         """
-        if self._by_table:
-            return "forward: fused, by the layer table of the field"
-        return self._dispatch.explain(("forward", *self.methods))
+        given = {"forward": self._given.name} if self._given is not None else {}
+        return self._dispatch.explain(("forward", *self.methods), given)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuses attributes of the module, which would have no effect here."""
         own = self.__dict__
         known = hasattr(type(self), name) or any(name in names for names in (own, self._modules, self._buffers))
-        if "_by_table" in own and not known and hasattr(self.module, name):
+        if "_table" in own and not known and hasattr(self.module, name):
             raise AttributeError(
                 f"VoronoiRouter: {name} belongs to {type(self.module).__name__}; set router.module.{name}"
             )
+        if name in _READ and "_dispatch" in own:
+            self._dispatch.known = {}
         super().__setattr__(name, value)
 
     def __getattr__(self, name: str) -> Any:
         """The routed methods, beside what a module has."""
+        for registry in ("_modules", "_buffers"):  # without the calls of ``super``, which each call would wait for
+            if name in (own := self.__dict__.get(registry, ())):
+                return own[name]
         methods = self.__dict__.get("methods", ())
         if name in methods:
-            return functools.partial(self._route, name)
+            return functools.partial(self._routed, name)
         try:
             return super().__getattr__(name)
         except AttributeError:
@@ -644,29 +648,41 @@ class VoronoiRouter(nn.Module):
                 f"call {there}"
             ) from None
 
-    def _route(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
-        """One call of a method of the module, which breaks a graph of ``torch.compile``."""
+    def _routed(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
+        return self._route(method, args, kwargs, coords)
+
+    def _route(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
+        """One call of a method of the module; one that is not known breaks a graph of ``torch.compile``."""
+        known: Table | Known | None = self._given if method == "forward" else None
+        if known is None and self.fuse:
+            module: Any = self._modules["module"]
+            kind = kind_of(method, module.training, args, kwargs, coords)
+            known = None if kind is None else self._dispatch.find(kind, self.num_cells)
+        if known is not None and (results := known.run(self, args, kwargs, coords)) is not None:
+            return results
         compiling = torch.compiler.is_compiling() or "torch._dynamo" in sys.modules
         run = self._route_uncompiled if compiling else self._route_as_it_is
         return run(method, *args, coords=coords, **kwargs)
 
+    @property
+    def _given(self) -> Table | None:
+        """The program of ``forward``, where it is given and need not be traced."""
+        return self._table if self._table is not None and self._table.holds(self.module) else None
+
     def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
         refuse_transforms()
-        called = getattr(self.module, method)
+        called, like = getattr(self.module, method), kind_of(method, self.module.training, args, kwargs, coords)
+        layered = method == "forward" and self._table is not None
+        if layered and (each := each_direction(args, kwargs)) is not None:
+            (args, kwargs), like = each, None
         if coords is not None and "coords" in (accepted_names([called]) or ()):  # the method's own argument
-            kwargs, coords = {**kwargs, "coords": coords}, None
-        rule = coords if coords is not None else self.coords
-        positions = find_positions("first3" if rule is None and self._layered else rule, args, kwargs, self._d)
+            kwargs, coords, like = {**kwargs, "coords": coords}, None, None
+        positions = self._positions(args, kwargs, coords)
         call = self._call(method, positions, args, kwargs)
-        layout = call.layout
+        call.like = like
         grouping = self._group(method, positions)
-        if self._unseen and layout.n >= _LARGE and torch.is_grad_enabled():
-            with outside():
-                source = first_tensor(args, kwargs)
-                source = None if source is None else unwrapped(source)
-                self._doubt(rule, source, unwrapped(positions), grouping.offsets.diff())
-        return self._dispatch.evaluate(call, grouping, self._options, self.frozen_cells).restored(layout)
+        return self._dispatch.evaluate(call, grouping, self._options, self.frozen_cells).restored(call.layout)
 
     @property
     def _options(self) -> Options:
@@ -687,13 +703,6 @@ class VoronoiRouter(nn.Module):
             self.layout == "flat",
         )
         return Call(self.module, method, layout, [*names, *kwargs], args, kwargs)
-
-    def _doubt(self, rule: Any, source: Tensor | None, positions: Tensor, counts: Tensor) -> None:
-        """Warns, at the first large batch of a training, where positions may be something else."""
-        self._unseen = False
-        doubt = doubt_of(rule, source, positions, counts, self.diagram.centres)
-        if doubt:
-            self._dispatch.warn_once("positions", doubt)
 
     _route_uncompiled = not_compiled(_route_as_it_is, _NO_GRAPH)
 

@@ -8,9 +8,11 @@ from __future__ import annotations
 import functools
 from typing import Any, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor, nn
 
 from voronerf.ops._core.layers import MLP
+from voronerf.ops.routed_mlp import routed_mlp
 
 
 @runtime_checkable
@@ -73,11 +75,44 @@ def parameters_of_table(field: LayeredField, k: int) -> dict[str, Any]:
     return {"layers": field.layers, "weights": weights, "biases": biases, "features": features}
 
 
-def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """The arguments for a field's own ``forward``: a direction for each sample, in the place of one for each ray."""
+class Table:
+    """The calls of a field whose program is given: all that its layer table describes."""
+
+    name = "fused"
+
+    def __init__(self, field: nn.Module) -> None:
+        self._holds = described_by_table(field)
+
+    def holds(self, field: nn.Module) -> bool:
+        """Whether it describes all that a field computes."""
+        if not torch.compiler.is_compiling():  # while it compiles, what was found before holds
+            self._holds = described_by_table(field)
+        return self._holds
+
+    def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
+        """The results of a call; coords [..., d] are those that it was given."""
+        given = _arguments(*args, **kwargs)
+        field, positions = router.module, given.pop("positions")
+        features = 6 if field.layers.integrated else 3
+        if positions.ndim != 2 or positions.shape[1] != features:
+            raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
+        given = given if field.layers.uses_directions else {}
+        given |= parameters_of_table(field, router.num_cells)
+        given |= router.places(positions, router._positions(args, kwargs, coords))
+        return field.activate(routed_mlp(positions, **given, backend=router.backend)[0])
+
+
+def _arguments(positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> dict[str, Any]:
+    """Those of a field's ``forward`` as `routed_mlp` takes them."""
+    return {"positions": positions, "directions": directions, "direction_index": ray_index}
+
+
+def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
+    """The arguments for a field's own ``forward``, with a direction for each sample in the place of one for each ray;
+    None where they are as they should be."""
     names = ("positions", "directions", "ray_index")
     positions, directions, index = ((dict(zip(names, args)) | kwargs).get(name) for name in names)
     if directions is None or index is None:
-        return args, kwargs
+        return None
     others = {name: value for name, value in kwargs.items() if name not in names}
     return (positions, directions.index_select(0, index), None, *args[3:]), others

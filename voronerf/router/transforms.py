@@ -15,12 +15,14 @@ from voronerf.router.grouping import owned_parameters
 from voronerf.router.layout import Call, map_tensors
 
 _OP = "VoronoiRouter"
+_transforms = torch._C._are_functorch_transforms_active
+_hooks = torch._C._autograd._top_saved_tensors_default_hooks
 _ALONE = "router.cell(i) is a plain module of one cell"
 
 
 def transformed() -> bool:
     """Whether the call is within a function that ``torch.func`` transforms."""
-    return torch._C._are_functorch_transforms_active()
+    return _transforms()
 
 
 def refuse_transforms() -> None:
@@ -86,7 +88,12 @@ def aside(call: Call) -> Iterator[Call]:
 
 def recorded() -> bool:
     """Whether hooks see what is saved for a backward pass. The call may then run again, and must go the same way."""
-    return torch._C._autograd._top_saved_tensors_default_hooks(False) is not None
+    return _hooks(False) is not None
+
+
+def is_watched() -> bool:
+    """Whether transforms, tracers or hooks on saved tensors see what a call does."""
+    return _transforms() or _hooks(False) is not None or forward_ad._current_level >= 0 or torch._C._is_tracing()
 
 
 def _same(tensor: Tensor) -> Tensor:

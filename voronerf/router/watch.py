@@ -134,6 +134,8 @@ class Watch:
             found += [source for source, tensor, version in pairs if tensor._version != version]
         for source, value, held in self._holders:
             items = _held(value) or ()
+            if len(items) == len(held) and all(map(operator.is_, items, held)):
+                continue
             if len(items) != len(held) or not all(map(same, items, held)):
                 found.append(source)
         if [*map(len, self._hooks)] != self._counts:

@@ -10,13 +10,15 @@ from typing import Any, ClassVar
 import pytest
 import torch
 import torch.nn.functional as F
-from helpers import refuses, trained
+from helpers import on_any_number_of_threads, refuses, trained
+from tiny_runs import steps_of
 from torch import Tensor, nn
 
 from voronerf import MLP, Layer
 from voronerf.app import open_run
 from voronerf.app.cli import main
 from voronerf.app.scenes import Scene, builtin_scene
+from voronerf.app.train import snapshot
 from voronerf.app.train.build import build, count_parameters
 from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
@@ -154,6 +156,22 @@ def test_every_kind_of_field_is_trained_split_resumed_and_scored(tmp_path: Path,
     del FIELDS[name]
     with pytest.raises(ConfigError, match=f"register_field adds others, got '{name}'"):
         open_run(tmp_path / "whole", scene=scene)
+
+
+def test_steps_of_what_is_one_program_do_not_depend_on_threads(scene: Scene) -> None:
+    states = {name: build(small(Path("run"), field=name, **KINDS[name][1]), scene) for name in KINDS}
+    alone = {name for name, state in states.items() if state.thread_deterministic}
+    assert alone == {"table", "fourier", "balls"}, "given, or traced for the question"
+    states["fourier"].router.way = "fastest"  # timings may decide for another way
+    assert not states["fourier"].thread_deterministic
+
+    def four_steps() -> list[Tensor]:
+        # Torch shares work on 32,768 elements and more among threads, here in parts of odd sizes.
+        config = replace(small(Path("run"), field="fourier"), steps=4, rays=521, samples=(67,), split_at=(0.5,))
+        state = steps_of(build(config, scene), 4)
+        return [tensor for _, tensor in sorted(snapshot(state).tensors.items())]
+
+    on_any_number_of_threads(four_steps, (1, 2, 8))
 
 
 def test_options_reach_the_field(scene: Scene) -> None:

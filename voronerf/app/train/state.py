@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -9,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from voronerf.app.scenes import Scene
 from voronerf.app.train.config import TrainConfig
@@ -152,7 +154,13 @@ class State:
         """Whether native ops compute all networks: then steps are the same bits on any number of threads."""
         chosen = backends.chosen("routed_mlp", self.device, torch.float32, backend=self.config.backend)
         native = self.device.type == "cpu" and chosen == "native"
-        return native and all(router.by_table for router in self.routers.values())
+        return native and all(map(self._is_one_program, self.routers.values()))
+
+    def _is_one_program(self, router: VoronoiRouter) -> bool:
+        """Whether all that a router computes is one program, whatever its timings."""
+        if router.fuse and router.way != "fused":  # timings may decide for another way
+            return False
+        return not isinstance(router.program(*_samples(6 if self.renderer.cones else 3), trace=True), str)
 
     def learning_rate(self) -> float:
         """The learning rate of the next step."""
@@ -227,3 +235,10 @@ class State:
         """Calls ``on_event``, if set."""
         if self.on_event is not None:
             self.on_event(line)
+
+
+@functools.cache
+def _samples(columns: int) -> tuple[Tensor, Tensor]:
+    """Some on which networks can be traced: positions or Gaussians [16, columns], and directions."""
+    points = torch.linspace(-1, 1, 16 * columns).reshape(16, columns)
+    return points, torch.nn.functional.normalize(points[:, :3], dim=-1)

@@ -15,14 +15,16 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
+from voronerf.ops._core.checks import check_same_device, of_one_dtype
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.layers import MLP
 from voronerf.ops._core.program import Program
 from voronerf.ops.cell_sort import native as cell_sort
 from voronerf.ops.grouped_mlp.network import Given, Network, as_network, half_products
-from voronerf.ops.grouped_program.native import How
+from voronerf.ops.grouped_program.native import How, Rows, run_program
 from voronerf.ops.locate_cell import native as locate_cell
 from voronerf.ops.nearest_centre import native as nearest_centre
+from voronerf.ops.routed_mlp import hold, of_samples
 from voronerf.ops.routed_mlp.program import cells_of, with_cells
 from voronerf.ops.routed_mlp.reference import Where, first_rows
 
@@ -83,6 +85,31 @@ def prepared_program(
     return network, _of_cells(Where(**places), cells_of(kept))
 
 
+def run_routed(
+    how: How, inputs: Sequence[Tensor], parameters: Sequence[Tensor], k: int, *, frozen: Tensor | None, **places: Any
+) -> list[Tensor]:
+    """A program of any number of outputs, [n, w] each, on samples in any order; arguments are not checked.
+
+    Args:
+        how: it runs.
+        inputs: [n, w] each, float32.
+        parameters: [k, ...], or [1, ...] where all cells share it, float32.
+        k: cells.
+        frozen: see ``voronerf.ops.routed_mlp``.
+        **places: `Where`, with coords beside centres.
+    """
+    if (centres := places.get("centres")) is not None:
+        if centres.device != inputs[0].device:
+            check_same_device("VoronoiRouter", samples=inputs[0], centres=centres)
+        places["coords"], places["centres"] = of_one_dtype(places["coords"], centres)
+    cells, order, offsets = find(inputs[0], Where(**places), k)
+    found = run_program(Rows(inputs, parameters, offsets, order, None), how)
+    if frozen is not None:
+        rows = of_samples(frozen, cells)
+        found = [hold(out, rows) for out in found]
+    return found
+
+
 class Route(NamedTuple):
     """Where samples are: cells int32 [n], the order int32 [n] that sorts them or None, and offsets int32 [k + 1]."""
 
@@ -93,8 +120,9 @@ class Route(NamedTuple):
 
 def find(positions: Tensor, where: Where, k: int) -> Route:
     """The cells of samples, and their order by cell; None where there is one cell."""
-    coords = None if where.coords is None else where.coords.detach()
-    cells, order, offsets = locate_and_sort(positions.detach(), where._replace(coords=coords), k)
+    if where.coords is not None and where.coords.requires_grad:
+        where = where._replace(coords=where.coords.detach())
+    cells, order, offsets = locate_and_sort(positions.detach() if positions.requires_grad else positions, where, k)
     return Route(cells if where.cells is None else where.cells, order if order.numel() else None, offsets)
 
 

@@ -1,5 +1,5 @@
 // A number of rows, such as samples or rays of a step: what a recorded call reads again from memory each time that it
-// is replayed (bindings/recording.h).
+// is replayed (bindings/bind.cpp).
 #pragma once
 
 #include <cstdint>
@@ -9,16 +9,16 @@
 namespace voronerf {
 
 #ifdef __CUDACC__
-#define VN_ROWS_HD __host__ __device__
+#define VN_COUNT_HD __host__ __device__
 #else
-#define VN_ROWS_HD
+#define VN_COUNT_HD
 #endif
 
-struct Rows {
+struct RowCount {
   int64_t value = 0;
-  Rows() = default;
-  VN_ROWS_HD constexpr Rows(int64_t count) : value(count) {}
-  VN_ROWS_HD constexpr operator int64_t() const { return value; }
+  RowCount() = default;
+  VN_COUNT_HD constexpr RowCount(int64_t count) : value(count) {}
+  VN_COUNT_HD constexpr operator int64_t() const { return value; }
 };
 
 }  // namespace voronerf

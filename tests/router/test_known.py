@@ -1,0 +1,283 @@
+"""Calls whose program is known: later calls of a kind run in two operations, with the same bits."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from router_fields import Heads, Sine, perturb, tensors
+from torch import Tensor, nn
+
+from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
+from voronerf.router.dispatch import Dispatch
+
+Call = Callable[[VoronoiRouter], Any]
+
+
+class Named(nn.Module):
+    """Results in a dict and a list, of positions and a direction."""
+
+    def __init__(self, columns: int = 6) -> None:
+        super().__init__()
+        self.layer, self.gain = nn.Linear(columns, 4), 1.0
+
+    def forward(self, x: Tensor, d: Tensor) -> dict[str, Any]:
+        y = self.layer(torch.cat([x, d], -1)) * self.gain
+        return {"colour": y[..., :3].sigmoid(), "more": [y[..., 3].exp()]}
+
+    def density(self, x: Tensor) -> Tensor:
+        return self.layer(torch.cat([x, x], -1))[..., 3].exp()
+
+
+def routed(module: nn.Module, d: int = 3, **options: Any) -> VoronoiRouter:
+    generator = torch.Generator().manual_seed(3)
+    centres = options.pop("diagram", None) or torch.rand(6, d, generator=generator)
+    router = VoronoiRouter(module, centres, **{"coords": f"first{d}", "fuse": True, "way": "fused", **options})
+    return perturb(router, generator)
+
+
+def rows(n: int, columns: int = 3, seed: int = 0) -> Tensor:
+    return torch.rand(n, columns, generator=torch.Generator().manual_seed(seed))
+
+
+def outcome(router: VoronoiRouter, call: Call, *leaves: Tensor) -> list[Tensor]:
+    """Results and gradients of a call."""
+    torch.manual_seed(4)
+    results = tensors(call(router))
+    wanted = [p for p in (*router.parameters(), *leaves) if p.requires_grad]
+    if not any(tensor.requires_grad for tensor in results):
+        return results
+    total = sum((tensor.float().square().sum() for tensor in results), torch.zeros(()))
+    return results + list(torch.autograd.grad(total, wanted, allow_unused=True, materialize_grads=True))
+
+
+@pytest.fixture
+def ordinary(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Tensor]]:
+    """The same where nothing is known."""
+
+    def run(router: VoronoiRouter, call: Call, *leaves: Tensor) -> list[Tensor]:
+        with monkeypatch.context() as patch:
+            patch.setattr(Dispatch, "find", lambda *_: None)
+            return outcome(router, call, *leaves)
+
+    return run
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Of methods, that were not known."""
+    found: list[str] = []
+    route = VoronoiRouter._route_as_it_is
+
+    def noted(self: VoronoiRouter, method: str, /, *args: Any, **kwargs: Any) -> Any:
+        found.append(method)
+        return route(self, method, *args, **kwargs)
+
+    for name in ("_route_as_it_is", "_route_uncompiled"):  # the latter once torch's compiler is imported
+        monkeypatch.setattr(VoronoiRouter, name, noted)
+    return found
+
+
+def net(columns: int = 3) -> nn.Module:
+    return nn.Sequential(nn.Linear(columns, 64), nn.ReLU(), nn.Linear(64, 4))
+
+
+def nested() -> VoronoiDiagram:
+    return VoronoiDiagram(rows(2, seed=7)).refine({0: rows(3, seed=8)})[0]
+
+
+KINDS: dict[str, tuple[Callable[[], VoronoiRouter], Call]] = {
+    "rows": (lambda: routed(net()), lambda r: r(rows(64))),
+    "rays": (lambda: routed(Named()), lambda r: r(rows(60).reshape(6, 10, 3), rows(60, seed=1).reshape(6, 10, 3))),
+    "by name": (lambda: routed(Named()), lambda r: r(rows(40), d=rows(40, seed=1))),
+    "flags": (lambda: routed(Heads()), lambda r: r(rows(40), rows(40, seed=1), density_only=True)),
+    "one dimension": (lambda: routed(Heads()), lambda r: r(rows(40), None)),
+    "a number all cells share": (lambda: routed(Sine(), share=["frequency"]), lambda r: r(rows(40))),
+    "weights of functions": (
+        lambda: routed(nn.utils.parametrizations.weight_norm(nn.Linear(3, 4))),
+        lambda r: r(rows(40)),
+    ),
+    "coords": (lambda: routed(net()), lambda r: r(rows(40), coords=rows(40, seed=2))),
+    "coords by a function": (lambda: routed(net(), coords=lambda x: x.flip(-1)), lambda r: r(rows(40))),
+    "one cell": (lambda: routed(net(), diagram=VoronoiDiagram(torch.zeros(1, 3))), lambda r: r(rows(40))),
+    "two dimensions": (lambda: routed(net(2), 2), lambda r: r(rows(40, 2))),
+    "four dimensions": (lambda: routed(net(5), 4), lambda r: r(rows(40, 5))),
+    "half precision": (lambda: routed(net().bfloat16()), lambda r: r(rows(40).bfloat16())),
+    "nested": (lambda: routed(net(), diagram=nested()), lambda r: r(rows(40))),
+    "stochastic": (lambda: routed(net(), assignment="stochastic", temperature=1.0), lambda r: r(rows(40))),
+}
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_second_call_is_known_and_gives_the_same_bits(
+    kind: str, gradients: bool, ordinary: Callable[..., list[Tensor]], calls: list[str]
+) -> None:
+    make, call = KINDS[kind]
+    router = make()
+    with torch.set_grad_enabled(gradients):
+        first = outcome(router, call)
+        assert calls == ["forward"] and router.explain() == "forward: fused"
+        second, expected = outcome(router, call), ordinary(router, call)
+    assert calls == ["forward", "forward"], "the first, and the last"
+    for found in (first, second):
+        assert all(a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+    assert all(tensor.is_contiguous() for tensor in second)
+
+
+def test_autocast_rounds_alike(ordinary: Callable[..., list[Tensor]], calls: list[str]) -> None:
+    router = routed(net())
+    with torch.autocast("cpu", torch.bfloat16):
+        for _ in range(2):
+            found = outcome(router, lambda r: r(rows(64)))
+        assert calls == ["forward"] and found[0].dtype is torch.bfloat16
+        expected = ordinary(router, lambda r: r(rows(64)))
+    assert all(map(torch.equal, found, expected))
+    assert outcome(router, lambda r: r(rows(64)))[0].dtype is torch.float32
+
+
+@pytest.mark.parametrize("n", [2, 7, 64, 513])
+def test_of_any_number_of_samples(n: int, ordinary: Callable[..., list[Tensor]], calls: list[str]) -> None:
+    router = routed(net())
+    router(rows(64))
+    found = outcome(router, lambda r: r(rows(n)))
+    assert calls == ["forward"]
+    assert all(map(torch.equal, found, ordinary(router, lambda r: r(rows(n)))))
+    for few in (0, 1):  # which have plans of their own
+        assert router(rows(few)).shape == (few, 4)
+    assert len(calls) == 4
+
+
+def test_gradients_to_arguments_and_second_derivatives(ordinary: Callable[..., list[Tensor]], calls: list[str]) -> None:
+    router, x = routed(nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, 1))), rows(64).requires_grad_()
+
+    def eikonal(router: VoronoiRouter) -> list[Tensor]:
+        y = router(x)
+        return [y, *torch.autograd.grad(y.sum(), x, create_graph=True)]
+
+    outcome(router, eikonal, x)
+    found = outcome(router, eikonal, x)
+    assert calls == ["forward"]
+    assert all(map(torch.equal, found, ordinary(router, eikonal, x)))
+
+
+def test_frozen_cells(ordinary: Callable[..., list[Tensor]], calls: list[str]) -> None:
+    router = routed(net())
+    router(rows(64))
+    router.freeze([0, 2])
+    found, expected = outcome(router, lambda r: r(rows(64))), ordinary(router, lambda r: r(rows(64)))
+    assert calls == ["forward", "forward"]
+    assert torch.equal(found[0], expected[0])
+    for own, other in zip(found[1:], expected[1:], strict=True):
+        assert torch.equal(own, other) and not own[[0, 2]].any() and own[[1, 3]].any()
+    x = rows(64).requires_grad_()  # what has gradients leaves frozen cells out of the backward pass
+    for _ in range(2):
+        found = outcome(router, lambda r: r(x), x)
+    assert not found[-1][torch.isin(router.assign(x), torch.tensor([0, 2]))].any()
+
+
+def test_methods_share_the_cells_that_were_drawn(calls: list[str]) -> None:
+    router = routed(Named(), methods=["density"], assignment="stochastic", temperature=10.0)
+    x = rows(200)
+    for _ in range(3):
+        calls.clear()
+        density, found = router.density(x), router(x, x)
+        assert torch.equal(found["more"][0], density), "of the same cells"
+    assert calls == []
+    with torch.no_grad():
+        assert not torch.equal(router.density(x), router.density(x)), "drawn anew for the same method"
+
+
+def doubled(module: nn.Module) -> nn.Module:
+    """A copy with other parameters."""
+    copied = copy.deepcopy(module)
+    with torch.no_grad():
+        for parameter in copied.parameters():
+            parameter.mul_(2)
+    return copied
+
+
+CHANGES: dict[str, Callable[[VoronoiRouter], Any]] = {
+    "an attribute": lambda r: setattr(r.module, "gain", 2.0),
+    "a hook": lambda r: r.module.layer.register_forward_hook(lambda module, args, result: result * 2),
+    "the mode": lambda r: r.eval(),
+    "a parameter": lambda r: setattr(r.module.layer, "weight", nn.Parameter(r.module.layer.weight * 2)),
+    "the module": lambda r: setattr(r, "module", doubled(r.module)),
+    "a part": lambda r: setattr(r.module, "layer", doubled(r.module.layer)),
+    "values": lambda r: r.module.layer.weight.data.mul_(2),
+    "the dtype": lambda r: r.double(),
+    "the backend": lambda r: setattr(r, "backend", "reference"),
+    "the cells": lambda r: r.subdivide(*r.diagram.refine({1: rows(3, seed=9)})),
+    "the rule": lambda r: setattr(r, "coords", lambda x, d: d),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_changes_are_followed(change: str, ordinary: Callable[..., list[Tensor]]) -> None:
+    router, x, d = routed(Named()), rows(64), rows(64, seed=1)
+    for _ in range(2):
+        before = router(x, d)["colour"]
+    CHANGES[change](router)
+    x, d = (x.double(), d.double()) if change == "the dtype" else (x, d)
+    expected = ordinary(router, lambda r: r(x, d))
+    for _ in range(2):
+        assert all(map(torch.equal, outcome(router, lambda r: r(x, d)), expected))
+    same = change in ("the mode", "the backend", "the cells")
+    assert torch.allclose(router(x, d)["colour"].float(), before, atol=1e-6) == (same or change == "the dtype")
+
+
+def test_arguments_unlike_those_of_before(calls: list[str]) -> None:
+    router, x = routed(Named()), rows(64)
+    router(x, rows(64, seed=1))
+    with pytest.raises(ValueError, match="d must be per sample"):
+        router(x, rows(63))
+    with pytest.raises(TypeError, match="must be floating-point"):
+        router(x.int(), x)
+    with torch.inference_mode():
+        made = rows(64)
+    del calls[:]
+    assert torch.equal(router(made, made)["colour"], router(made.clone(), made.clone())["colour"])
+    assert calls == ["forward"], "tensors of inference mode are copied where gradients are kept"
+
+
+def test_a_field_with_a_layer_table_explains_itself_as_any_other() -> None:
+    given, traced = VoronoiRouter(NeRF(width=16, depth=2), rows(6)), routed(net())
+    assert given.explain() == "forward: fused", "which is known beforehand"
+    assert traced.explain() == "forward: not called yet"
+    given(rows(40), nn.functional.normalize(rows(40, seed=1), dim=-1))
+    traced(rows(40))
+    assert given.explain() == traced.explain() == "forward: fused"
+
+
+@pytest.mark.parametrize("make", [lambda: (routed(net()), (rows(64),)), lambda: (routed(Named()), (rows(64),) * 2)])
+def test_known_calls_are_part_of_a_graph(make: Callable[[], tuple[VoronoiRouter, tuple[Tensor, ...]]]) -> None:
+    router, args = make()
+    expected = outcome(router, lambda r: r(*args))
+    torch._dynamo.reset()
+    compiled = torch.compile(router, backend="aot_eager", fullgraph=True)
+    assert all(map(torch.equal, outcome(router, lambda _: compiled(*args)), expected))
+    with torch.no_grad():
+        router.module.register_buffer("unused", torch.zeros(1))
+        next(router.parameters()).mul_(2)
+    assert all(map(torch.equal, outcome(router, lambda _: compiled(*args)), outcome(router, lambda r: r(*args))))
+
+
+def test_one_graph_for_any_number_of_samples() -> None:
+    router = routed(net())
+    router(rows(64))
+    torch._dynamo.reset()
+    compiled = torch.compile(router, backend="eager", fullgraph=True, dynamic=True)
+    for n in (64, 65, 200):
+        assert torch.equal(compiled(rows(n)), router(rows(n)))
+
+
+def test_other_calls_break_a_graph_as_before() -> None:
+    router = routed(nn.utils.parametrizations.weight_norm(nn.Linear(3, 4)))
+    expected = router(rows(64))
+    torch._dynamo.reset()
+    with pytest.raises(Exception, match="or call a router with fuse=True once beforehand"):
+        torch.compile(router, backend="eager", fullgraph=True)(rows(64))
+    assert torch.equal(torch.compile(router, backend="eager")(rows(64)), expected)

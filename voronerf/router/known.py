@@ -1,0 +1,132 @@
+"""Calls that are one program: what runs is known from the first call of their kind, for all that are like it.
+
+n samples, k cells, d coordinates. A later call neither describes its arguments nor sorts its samples beforehand: two
+operations find the cells and compute the results.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from voronerf.ops._core import backends
+from voronerf.ops._core.checks import MAX_COUNT
+from voronerf.router.fused import HALF, Fused, Whole
+from voronerf.router.grouping import Grouping
+from voronerf.router.layout import SAMPLE, Call, rebuild, tensors_of
+
+if TYPE_CHECKING:
+    from voronerf.router.dispatch import CallPlan
+
+_VALUES = {type(None), bool, int, float, str}
+
+
+def kind_of(method: str, training: bool, args: Sequence[Any], kwargs: dict[str, Any], coords: Any) -> Any:
+    """What calls that run alike have in common, all but the number of samples; None for what is not told in short."""
+    kind: list[Any] = [method, training, torch.is_grad_enabled(), *kwargs]
+    device = None
+    for value in (*args, *kwargs.values(), coords):
+        of = type(value)
+        if of is Tensor or of is nn.Parameter:
+            device = value.device
+            kind += (value.shape[1:], value.dtype, device, value.layout, value.requires_grad)
+        elif of in _VALUES:
+            kind += (of, value)
+        else:
+            return None
+    if device is None:
+        return None
+    if torch.is_autocast_enabled(device.type):
+        kind.append(torch.get_autocast_dtype(device.type))
+    return tuple(kind)
+
+
+class Known:
+    """What is known of the calls of one kind, from the first of them and its plan."""
+
+    def __init__(self, plan: CallPlan, fused: Fused, whole: Whole, call: Call, grouping: Grouping) -> None:
+        from voronerf.ops.routed_mlp.native import How, run_routed
+
+        (program, reads, results), given = whole, (*call.args, *call.kwargs.values())
+        self._tensors = [i for i, value in enumerate(given) if isinstance(value, Tensor)]
+        self._reads = [self._tensors[number] for number in reads]
+        self._learns = torch.is_grad_enabled() and any(given[i].requires_grad for i in self._reads)
+        self._module = call.module
+        self.plan, self._method, self._run, self._how = plan, call.method, run_routed, How(program.text)
+        self._leading, self._one, device = len(call.layout.lead), call.layout.lead[0] == 1, grouping.device
+        half = torch.is_autocast_enabled(device.type) or any(given[i].dtype in HALF for i in self._tensors)
+        ones = 0 if call.layout.flat else self._leading - 1
+        self._results = [(shape[ones:], dtype if half and dtype in HALF else torch.float32) for shape, dtype in results]
+        plain = all(len(tail) == 1 and dtype is torch.float32 for tail, dtype in self._results)
+        self._as_they_are = self._leading == 1 and plain
+        self._parameters, self._shapes, self._in_graphs = fused.parameters, program.parameters, not fused.computes
+        parameters = fused.parameters(grouping.k, device, grouping.backend)
+        self._shares = any(p.dim() == len(own) for p, own in zip(parameters, self._shapes, strict=True))
+        value = fused.result
+        self._value: Callable[[list[Tensor]], Any] = functools.partial(rebuild, value)
+        if isinstance(value, Tensor):
+            self._value = lambda own: own[0]
+        elif type(value) in (list, tuple) and all(isinstance(part, Tensor) for part in value):
+            self._value = type(value)
+
+    @staticmethod
+    def of(plan: CallPlan, call: Call, grouping: Grouping) -> Known | None:
+        """What is known of calls like this one; None where more is needed than one program of the compiled module."""
+        fused, layout, device = plan.fused, call.layout, grouping.device
+        whole = "" if fused is None else fused.whole
+        if fused is None or isinstance(whole, str) or fused.module is not call.module:
+            return None
+        if not layout.n or fused.inputs.sources or set(call.kinds.values()) != {SAMPLE}:
+            return None
+        ones = (1,) * (0 if layout.flat else len(layout.lead) - 1)
+        flat = all(shape[: len(ones)] == ones for shape, _ in whole.results)
+        if not flat or any(x.dtype not in (torch.float32, *HALF) for x in tensors_of((call.args, call.kwargs))):
+            return None
+        chosen = backends.chosen("grouped_program", device, torch.float32, backend=grouping.backend)
+        return Known(plan, fused, whole, call, grouping) if chosen == "native" else None
+
+    def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
+        """The results of a call of a router, None where it is unlike the others after all; coords [..., d] are those
+        that it was given."""
+        given = (*args, *kwargs.values()) if kwargs else args
+        if coords is None and type(router.coords) is str:  # as when the kind was found
+            positions, d = given[self._tensors[0]], router._d
+            positions = positions if positions.shape[-1] == d else positions[..., :d]
+            if router._unseen:
+                router._look_at(positions, args, kwargs, coords)
+        else:
+            positions = router._positions(args, kwargs, coords)
+        lead = positions.shape[:-1]
+        n, k = lead[0] if len(lead) == 1 else math.prod(lead), router.num_cells
+        if len(lead) != self._leading or not 0 < n <= MAX_COUNT or router._modules["module"] is not self._module:
+            return None
+        if self._learns and router.frozen_cells is not None:  # whose samples take no part in the backward pass
+            return None
+        if compiles := torch.compiler.is_compiling():
+            drawn = router.assignment == "stochastic" and router.training
+            if drawn or router.methods or not self._in_graphs:
+                return None
+        elif (lead[0] == 1) != self._one or not self.plan.takes_first(n, k):
+            return None
+        for i in self._tensors:
+            shape = (x := given[i]).shape
+            if not shape or shape[0] != lead[0] or (not compiles and x.is_inference() and torch.is_grad_enabled()):
+                return None
+        rows = []
+        for i in self._reads:
+            x = given[i] if given[i].dim() == 2 else given[i].reshape(n, -1)
+            rows.append(x if x.dtype is torch.float32 else x.float())
+        parameters = self._parameters(k, rows[0].device, router.backend)
+        if self._shares:
+            parameters = [p[None] if p.dim() == len(own) else p for p, own in zip(parameters, self._shapes)]
+        if self._learns:  # of views the engine knows whether their gradients are asked for, of leaves it does not
+            rows, parameters = [x.view_as(x) for x in rows], [p.view_as(p) for p in parameters]
+        found = self._run(self._how, rows, parameters, k, **router._places_of(self._method, positions))
+        if not self._as_they_are:
+            found = [own.reshape(*lead, *tail).to(dtype) for own, (tail, dtype) in zip(found, self._results)]
+        return self._value(found)
