@@ -110,12 +110,12 @@ bool descend(const DescentTree& tree, const T* points, int32_t* leaves, int32_t*
              int threads, const Find& find) {
   const int64_t blocks = ceil_div<int64_t>(n, kDescentBlock);
   std::atomic<bool> arrived{true};
-  Items items(blocks);
+  Items items(blocks, 1, threads);
   parallel(static_cast<int>(std::min<int64_t>(threads, blocks)), [&](int thread) {
     int32_t* own = workspace + thread * descent_stride(m);
     auto& block = *reinterpret_cast<DescentBlock<T>*>(own);
     int32_t* place = own + sizeof(DescentBlock<double>) / sizeof(int32_t);
-    for (int64_t b, end; items.take(b, end);) {
+    for (int64_t b, end; items.take(thread, b, end);) {
       const int64_t start = b * kDescentBlock;
       const int32_t rows = static_cast<int32_t>(std::min<int64_t>(kDescentBlock, n - start));
       const auto in_block = [&](const T* at, const int32_t* which, int32_t count, int32_t first, int32_t size,

@@ -1,6 +1,6 @@
 // Only the cells of the samples are touched; a step has some thousands of them, and the grid a quarter of a million
-// cells. A cell may be named more than once. So first every sample finds what it makes of its cell alone, which the
-// threads share; then a cell gets that of any of its samples, and then the largest.
+// cells. First the threads find the cells of samples and what these make of them. A cell may be named more than once,
+// so then the grid is cut into parts: in each one thread goes through the samples in their order.
 #include "rays/observe_occupancy.h"
 
 #include <algorithm>
@@ -18,23 +18,27 @@ void observe_occupancy_cpu(const ObservedSamples& in, float* density, uint8_t* o
     for (int64_t i = begin; i < end; ++i) {
       const int64_t cell = observed_cell(in, i);
       cells[i] = observes(in, i, cell) ? static_cast<int32_t>(cell) : -1;
-      __builtin_prefetch(density + cell, 1);
-      __builtin_prefetch(occupied + cell, 1);
-    }
-    for (int64_t i = begin; i < end; ++i) {
-      if (cells[i] < 0) continue;
-      values[i] = std::max(density[cells[i]] * in.decay, observed_density(in, i));
+      if (cells[i] >= 0) values[i] = observed_density(in, i);
     }
   });
-  for (int64_t i = 0; i < in.m; ++i) {
-    if (cells[i] >= 0) density[cells[i]] = values[i];
-  }
-  for (int64_t i = 0; i < in.m; ++i) {
-    if (cells[i] < 0) continue;
-    float& kept = density[cells[i]];
-    kept = std::max(kept, values[i]);
-    occupied[cells[i]] = kept >= in.threshold;
-  }
+  const int64_t all = in.x * in.y * in.z, parts = std::max<int64_t>(1, std::min<int64_t>(threads, all));
+  parallel_for(parts, 1, threads, [&](int64_t part) {
+    const auto first = static_cast<uint32_t>(all * part / parts),
+               size = static_cast<uint32_t>(all * (part + 1) / parts) - first;
+    const auto each = [&](const auto& body) {
+      for (int64_t i = 0; i < in.m; ++i) {
+        if (static_cast<uint32_t>(cells[i]) - first < size) body(density[cells[i]], values[i], occupied[cells[i]]);
+      }
+    };
+    // A cell gets what one of its samples makes of it, and then the most.
+    each([&](float& kept, float& value, uint8_t&) { value = std::max(kept * in.decay, value); });
+    each([&](float& kept, float& value, uint8_t&) { kept = value; });
+    each([&](float& kept, float& value, uint8_t& filled) {
+      kept = std::max(kept, value);
+      // Other threads read the lines of cells that stay as they are.
+      if (const bool now = kept >= in.threshold; now != (filled != 0)) filled = now;
+    });
+  });
 }
 
 }  // namespace voronerf

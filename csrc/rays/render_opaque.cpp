@@ -78,8 +78,8 @@ class Pool {
         cell_offsets_(call.network.k + 1) {}
 
   // False if a place is at no leaf.
-  bool run(Items& items) {
-    while (refill(items) > 0) {
+  bool run(Items& items, int thread) {
+    while (refill(items, thread) > 0) {
       if (!wave()) return false;
       drop();
     }
@@ -94,9 +94,9 @@ class Pool {
     std::vector<float> depths, deltas, positions, raw;
   };
 
-  int64_t refill(Items& items) {
+  int64_t refill(Items& items, int thread) {
     for (; count_ < size_; ++count_) {
-      if (next_ == end_ && !items.take(next_, end_)) {
+      if (next_ == end_ && !items.take(thread, next_, end_)) {
         next_ = end_ = 0;
         break;
       }
@@ -229,15 +229,15 @@ bool render_opaque_cpu(const Program& program, const ProgramInputs& network, con
   const Workspace workspace(rows.workspace() * std::max(threads, 1));
   const Call call{
       network, rows, march, room, cells, rule, out, inputs.size() > 1 ? inputs[1].width : 0, isa, std::max(threads, 1)};
-  Items items(march.r, kRun);
   const int team = static_cast<int>(std::min<int64_t>(threads, ceil_div<int64_t>(march.r, kRun)));
+  Items items(march.r, kRun, team);
   std::vector<std::unique_ptr<Pool>> pools;  // made here, as nothing may be thrown in a team
   for (int thread = 0; thread < team; ++thread) {
     pools.push_back(std::make_unique<Pool>(call, workspace.data() + thread * rows.workspace()));
   }
   std::atomic<bool> sound{true};
   parallel(team, [&](int thread) {
-    if (!pools[static_cast<size_t>(thread)]->run(items)) sound = false;
+    if (!pools[static_cast<size_t>(thread)]->run(items, thread)) sound = false;
   });
   return sound;
 }

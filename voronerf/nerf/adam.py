@@ -132,7 +132,6 @@ class Adam(torch.optim.Adam):
         self.update(None if overflow is None else Guard(overflow, overflow, overflow, scale))
         return loss
 
-    @torch.no_grad()
     def after_step(self, step: int) -> None:
         """Weight decay of the groups that have it, and the averages of the weights, at some of the steps.
 
@@ -143,13 +142,21 @@ class Adam(torch.optim.Adam):
         Args:
             step: The number of the step that was made, from 0.
         """
-        for group in self.param_groups if step % SHRINK_EVERY == 0 else ():
+        if step % SHRINK_EVERY == 0:
+            self._shrink()
+        if self.average and step % AVERAGE_EVERY == 0:
+            self._average(step)
+
+    @torch.no_grad()
+    def _shrink(self) -> None:
+        for group in self.param_groups:
             held = [p for p in group["params"] if p.grad is not None] if group.get("shrink") else []
             for parameter, parts in zip(held, trained_parts(held), strict=True):
                 for part in parts:
                     parameter[part].mul_(1 - SHRINK_EVERY * group["lr"] * group["shrink"])
-        if not self.average or step % AVERAGE_EVERY:
-            return
+
+    @torch.no_grad()
+    def _average(self, step: int) -> None:
         fading = min(self.average, 1 - 1 / max(1, WINDOW * step)) ** AVERAGE_EVERY
         # Those that have state: a look at it would make state for all of them.
         parameters = [p for group in self.param_groups for p in group["params"] if self.state.get(p)]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
 
 import torch
@@ -53,7 +55,9 @@ class StepOutput:
     def samples(self) -> int:
         """How many the rays had; waits for the device."""
         rows = self._output.samples.rows
-        return len(self._now(self._output.weights)) if rows is None else int(rows)
+        if self._recording is not None:
+            return self._recording.rows_of(self._output.weights)
+        return len(self._output.weights) if rows is None else int(rows)
 
     @property
     def batch(self) -> Batch:
@@ -128,6 +132,7 @@ class TrainingStep:
     ) -> None:
         self.batches, self.loss, self.optimizer, self.strategy, self.guard = batches, loss, optimizer, strategy, guard
         self.generator, self.autocast, self.scaler = generator, autocast, scaler
+        self.as_it_is: Callable[[], AbstractContextManager[None]] = nullcontext  # around a step that is not replayed
         self._rays = self._wait = self._left = 0  # steps that run as they are, the next time, and still this time
         self.forget()
 
@@ -136,6 +141,7 @@ class TrainingStep:
         self._recording: Recording | None = None
         self._made: tuple[Batch, RenderOutput] | None = None  # when it was recorded
         self._gradients = list[tuple[nn.Parameter, Tensor]]()
+        self._known: Radiance | None = None  # of the last step
         self._depends = list[Any](), list[Any]()
         self._obstacle = "no step was made yet"
 
@@ -148,27 +154,24 @@ class TrainingStep:
     def __call__(self, rays: int) -> StepOutput:
         """Makes a step with so many rays."""
         self._rays = rays
-        obstacle = self._standing_obstacle()
-        if obstacle is not None:
+        recording, depends, watched = self._recording, self._what_it_depends_on(), is_watched()
+        if recording is not None and not watched and _same(depends, self._depends):
+            if recording.replay(backends.threads()):
+                self._wait = self._left = 0
+                for parameter, gradient in self._gradients:
+                    parameter.grad = gradient
+                batch, output = cast(Any, self._made)
+                return StepOutput(batch, output, recording)
+        elif obstacle := "a mode, a transform or a profiler of torch watches" if watched else self._standing_obstacle():
             self.forget()
             self._obstacle = obstacle
             return StepOutput(*self._run(rays))
-        threads, recording = backends.threads(), self._recording
-        objects, values = self._what_it_depends_on(threads)
-        same = len(objects) == len(self._depends[0]) and all(map(operator.is_, objects, self._depends[0]))
-        same = same and values == self._depends[1]
-        if recording is not None and same and recording.replay(threads):
-            self._wait = self._left = 0
-            for parameter, gradient in self._gradients:
-                parameter.grad = gradient
-            batch, output = cast(Any, self._made)
-            return StepOutput(batch, output, recording)
         if self._left:
             self._left -= 1
             return StepOutput(*self._run(rays))
-        return self._record(threads)
+        return self._record()
 
-    def _record(self, threads: int) -> StepOutput:
+    def _record(self) -> StepOutput:
         """A step as it is, recorded if nothing keeps it from that."""
         self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
         self.forget()
@@ -179,10 +182,14 @@ class TrainingStep:
             parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
             self._gradients = [(p, p.grad) for p in parameters if p.grad is not None]
         self._obstacle = recording.obstacle or ""
-        self._depends = self._what_it_depends_on(threads)
+        self._depends = self._what_it_depends_on()
         return StepOutput(*made)
 
     def _run(self, rays: int) -> tuple[Batch, RenderOutput]:
+        with self.as_it_is():
+            return self._run_step(rays)
+
+    def _run_step(self, rays: int) -> tuple[Batch, RenderOutput]:
         batch = self.batches.draw(rays, self.generator)
         self.optimizer.zero_grad(set_to_none=True)
         if self.autocast is None:
@@ -223,31 +230,35 @@ class TrainingStep:
             return "it runs under autocast"
         if self.batches.fetch is not None:
             return "its pictures are read from disk"
-        if is_watched():
-            return "a mode, a transform or a profiler of torch watches"
         for part in (self.batches, self.loss, renderer.sampler, self.optimizer, self.strategy):
             if part is not None and not type(part).__module__.startswith("voronerf."):
                 return f"{type(part).__name__} may do in Python what is not seen"
         return self.loss.why_not_fused()
 
-    def _what_it_depends_on(self, threads: int) -> tuple[list[Any], list[Any]]:
+    def _what_it_depends_on(self) -> tuple[list[Any], list[Any]]:
         """What a recording holds for: objects, and values that may be equal without being the same object."""
         renderer, optimizer, strategy = self.loss.renderer, self.optimizer, self.strategy
-        known = self.loss.radiance()
-        objects: list[Any] = [self.guard, self.generator, optimizer.state]
+        objects: list[Any] = [self.guard, self.generator, self.autocast, optimizer.state, native.cpu(), renderer.field]
         for part in (self.batches, self.loss, renderer, renderer.sampler, strategy):
-            objects += () if part is None else vars(part).values()
+            objects += () if part is None else part.__dict__.values()
+        known: Radiance | str | None = self._known
+        if known is None or not known.router.gives(known.cells):
+            known = self.loss.radiance()
         if isinstance(known, Radiance):
             router = known.router
             objects += [known.networks, router.diagram, router.frozen_cells]
             objects += [router.assignment, router.temperature, router.backend]
             objects += known.cells.parameters
-        values: list[Any] = [threads, native.cpu(), torch.is_grad_enabled()]
+            self._known = known
+        values: list[Any] = [torch.is_grad_enabled(), len(optimizer.state)]
         for group in optimizer.param_groups:
-            objects += [value for name, value in group.items() if name not in ("lr", "params")]
-            for parameter in group["params"]:
-                moments = optimizer.state.get(parameter)
-                objects += [parameter, parameter._backward_hooks, parameter._post_accumulate_grad_hooks]
-                objects.append(moments and moments.get("exp_avg"))
-                values += [parameter.data_ptr(), parameter.requires_grad]
+            objects += [group["betas"], group["eps"], group.get("sparse")]
+            for own in group["params"]:
+                objects += [own, own._backward_hooks, own._post_accumulate_grad_hooks]
+                values += [own.data_ptr(), own.requires_grad]
         return objects, values
+
+
+def _same(one: tuple[list[Any], list[Any]], other: tuple[list[Any], list[Any]]) -> bool:
+    """Whether the same objects and equal values are in both."""
+    return len(one[0]) == len(other[0]) and all(map(operator.is_, one[0], other[0])) and one[1] == other[1]

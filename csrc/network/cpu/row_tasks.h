@@ -65,16 +65,15 @@ template <typename Pack, typename Ahead, typename Run>
 void for_each_task(const RowTasks& tasks, float* memory, int64_t stride, int threads, const Pack& pack,
                    const Ahead& ahead, const Run& run) {
   const int64_t count = static_cast<int64_t>(tasks.tasks.size());
-  Items items(count);
+  Items items(count, 1, threads);
   parallel(static_cast<int>(std::min<int64_t>(threads, count)), [&](int thread) {
     float* own = memory + thread * stride;
     int64_t packed = -1;
-    for (int64_t i, end; items.take(i, end);) {
+    for (int64_t i, end; items.take(thread, i, end);) {
       const RowTask& task = tasks.tasks[i];
       if (task.cell != packed) pack(task.cell, own, packed < 0);
       packed = task.cell;
-      // The other threads take as many tasks in the same time.
-      const int64_t next = i + threads;
+      const int64_t next = i + 1;
       if (next < count && tasks.tasks[next].cell != packed) ahead(tasks.tasks[next].cell);
       run(task, own);
     }

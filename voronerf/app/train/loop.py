@@ -65,23 +65,19 @@ def train(
         clock: Counts seconds.
     """
     strategy, sampler, optimizer = state.strategy, state.sampler, state.optimizer
-    one_thread, before = state.thread_deterministic, state.step
+    before, one_thread = state.step, backends.torch_on_one_thread if state.thread_deterministic else nullcontext
+    state.training_step.as_it_is = one_thread
     while state.fraction < 1 and state.seconds < until and not state.stopped:
         started = clock()
-        with backends.torch_on_one_thread() if one_thread else nullcontext():
-            split = strategy.step_pre_backward(optimizer, state.fraction, state.step)
-            if split is not None:
-                state.begin_stage(split)
-                if not strategy.inherit:  # the averages are of networks that are no more
-                    optimizer.drop_averages()
-                for callback in callbacks:
-                    callback.after_split(state, split)
-            optimizer.set_learning_rate(state.learning_rate())
-            sampler.step_pre_backward(state.renderer.field, state.step - state.began, state.generator)
-            if not state.router.training:
-                state.renderer.train()
-            made = state.training_step(state.rays)
-            optimizer.after_step(state.step)
+        if strategy.is_due(state.fraction, state.step):
+            with one_thread():
+                _split(state, callbacks)
+        optimizer.set_learning_rate(state.learning_rate())
+        sampler.step_pre_backward(state.renderer.field, state.step - state.began, state.generator)
+        if not state.router.training:
+            state.renderer.train()
+        made = state.training_step(state.rays)
+        optimizer.after_step(state.step)
         state.count_step(made.rays)
         if state.device.type == "cpu" or state.step % READ_EVERY == 0:
             state.read_output(made)
@@ -94,6 +90,19 @@ def train(
         with state.averaged():
             sampler.finish(state.renderer.field, state.config.seed)
         state.add_seconds(clock() - started)
+
+
+def _split(state: State, callbacks: Sequence[Callback]) -> None:
+    """Makes a split that is due, if there are enough samples for it."""
+    strategy, optimizer = state.strategy, state.optimizer
+    done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
+    if done is None:
+        return
+    state.begin_stage(done)
+    if not strategy.inherit:  # the averages are of networks that are no more
+        optimizer.drop_averages()
+    for callback in callbacks:
+        callback.after_split(state, done)
 
 
 def run(state: State, callbacks: Sequence[Callback] = (), *, clock: Callable[[], float] = time.perf_counter) -> None:

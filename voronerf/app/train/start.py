@@ -34,10 +34,11 @@ def judge_start(state: State, made: StepOutput) -> None:
         state: After a step.
         made: That step.
     """
-    sampler, draw = state.sampler, sum(stage.cells == 1 for stage in state.stages)
-    if not isinstance(sampler, Occupancy) or state.router.num_cells > 1 or draw > DRAWS:
+    sampler = state.sampler
+    if not isinstance(sampler, Occupancy) or state.step - state.began != sampler.settling_steps + JUDGED:
         return
-    if state.step - state.began != sampler.settling_steps + JUDGED:
+    draw = sum(stage.cells == 1 for stage in state.stages)
+    if state.router.num_cells > 1 or draw > DRAWS:
         return
     why = why_nothing_is_learnt(made.batch, made.output)
     if why is None:

@@ -13,6 +13,7 @@ recorded run had. A run that would exceed it is not made: :meth:`Recording.repla
 from __future__ import annotations
 
 import ctypes
+import functools
 import threading
 import traceback
 from collections.abc import Callable
@@ -82,7 +83,7 @@ class Recording(TorchDispatchMode):
         self._compiled, self._calls = native.compiled, native.compiled.Recording()
         self._counts = list[Count]()
         self._numbers = list[tuple[Tensor, Callable[[], float]]]()
-        self._draws = list[tuple[Tensor, Callable[[], Tensor]]]()
+        self._draws = list[Callable[[], Any]]()
         self._generators: dict[int, torch.Generator] = {}  # of the draws, by identity
         self._memory: dict[int, Tensor] = {}  # of rows, by address
         self.obstacle: str | None = None
@@ -133,10 +134,10 @@ class Recording(TorchDispatchMode):
                 rows = count.given()
                 if not 0 < rows <= count.most:
                     return False
-                count.memory[0] = rows
+                count.memory.fill_(rows)
         before = [generator.get_state() for generator in self._generators.values()]
-        for drawn, draw in self._draws:
-            drawn.copy_(draw())
+        for draw in self._draws:
+            draw()
         for number, value in self._numbers:
             number.fill_(value())
         made: bool = self._calls.replay(threads)
@@ -147,6 +148,13 @@ class Recording(TorchDispatchMode):
     def rows(self, place: int) -> int:
         """A number of rows of the last run; they are numbered in the order of the recorded one."""
         return int(self._counts[place].memory)
+
+    def rows_of(self, tensor: Tensor) -> int:
+        """How many rows of a tensor of the recorded run the last run has filled."""
+        for memory, rows, _, _ in self._counts:
+            if tensor.shape[0] == rows:
+                return int(memory)
+        return tensor.shape[0]
 
     def now(self, tensor: Tensor) -> Tensor:
         """A tensor of the recorded run, with as many rows as the last run has filled."""
@@ -173,7 +181,10 @@ class Recording(TorchDispatchMode):
         elif torch.Tag.nondeterministic_seeded in func.tags and not any(isinstance(each, Tensor) for each in args):
             generator = kwargs.get("generator") or torch.default_generator
             self._generators[id(generator)] = generator
-            self._draws.append((result, lambda: func(*args, **kwargs)))
+            if name == "aten::randint" and len(args) == 3:
+                self._draws.append(functools.partial(result.random_, args[0], args[1], generator=generator))
+            else:
+                self._draws.append(lambda: result.copy_(func(*args, **kwargs)))
         elif name not in _HARMLESS and not name.startswith("profiler::"):
             self._refuse(f"torch computes {name.split('::')[-1]}{_line()}")
         return result
