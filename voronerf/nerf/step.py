@@ -241,7 +241,7 @@ class TrainingStep:
         objects: list[Any] = [self.guard, self.generator, self.autocast, optimizer.state, native.cpu(), renderer.field]
         for part in (self.batches, self.loss, renderer, renderer.sampler, strategy):
             objects += () if part is None else part.__dict__.values()
-        known: Radiance | str | None = self._known
+        known: Any = self._known
         if known is None or not known.router.gives(known.cells):
             known = self.loss.radiance()
         if isinstance(known, Radiance):

@@ -88,6 +88,10 @@ class Recording(TorchDispatchMode):
         self._memory: dict[int, Tensor] = {}  # of rows, by address
         self.obstacle: str | None = None
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # torch's own imports its compiler, to keep it off this class, which takes over a second
+
     def __enter__(self) -> Recording:
         self._calls.begin()
         active.recording = self
