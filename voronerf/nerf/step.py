@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
 
@@ -28,9 +28,6 @@ LONGEST_WAIT = 64
 class StepOutput:
     """What a step has found, until the next step of the same object.
 
-    Attributes:
-        loss: [], without gradients.
-
     Examples:
         >>> import torch
         >>> from voronerf import NeRF
@@ -44,7 +41,11 @@ class StepOutput:
 
     def __init__(self, batch: Batch, output: RenderOutput, recording: Recording | None = None) -> None:
         self._batch, self._output, self._recording = batch, output, recording
-        self.loss = output.loss.detach()
+
+    @property
+    def loss(self) -> Tensor:
+        """The loss [], without gradients."""
+        return self._output.loss.detach()
 
     @property
     def rays(self) -> int:
@@ -139,10 +140,9 @@ class TrainingStep:
     def forget(self) -> None:
         """Records the next step anew."""
         self._recording: Recording | None = None
-        self._made: tuple[Batch, RenderOutput] | None = None  # when it was recorded
-        self._gradients = list[tuple[nn.Parameter, Tensor]]()
-        self._known: Radiance | None = None  # of the last step
-        self._depends = list[Any](), list[Any]()
+        self._made: Any = None  # batch and output, when it was recorded
+        self._known: Radiance | None = None
+        self._objects, self._values = list[Any](), list[Any]()
         self._obstacle = "no step was made yet"
 
     def explain(self) -> str:
@@ -153,14 +153,11 @@ class TrainingStep:
 
     def __call__(self, rays: int) -> StepOutput:
         """Makes a step with so many rays."""
-        self._rays = rays
-        recording, depends, watched = self._recording, self._what_it_depends_on(), is_watched()
-        if recording is not None and not watched and _same(depends, self._depends):
+        self._rays, recording, watched = rays, self._recording, is_watched()
+        if recording is not None and not watched and self._holds(recording):
             if recording.replay(backends.threads()):
                 self._wait = self._left = 0
-                for parameter, gradient in self._gradients:
-                    parameter.grad = gradient
-                batch, output = cast(Any, self._made)
+                batch, output = self._made
                 return StepOutput(batch, output, recording)
         elif obstacle := "a mode, a transform or a profiler of torch watches" if watched else self._standing_obstacle():
             self.forget()
@@ -169,20 +166,18 @@ class TrainingStep:
         if self._left:
             self._left -= 1
             return StepOutput(*self._run(rays))
-        return self._record()
+        return self._record(recording.drawn if recording is not None and recording.drawn_now else ())
 
-    def _record(self) -> StepOutput:
-        """A step as it is, recorded if nothing keeps it from that."""
+    def _record(self, drawn: Sequence[Tensor]) -> StepOutput:
+        """A step as it is, recorded if nothing keeps it from that; with random numbers that are drawn already."""
         self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
         self.forget()
-        with Recording() as recording:
+        with Recording(drawn) as recording:
             made = self._run(recording.count(lambda: self._rays))
+        self._obstacle = recording.obstacle or ""
         if recording.obstacle is None:
             self._recording, self._made = recording, made
-            parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-            self._gradients = [(p, p.grad) for p in parameters if p.grad is not None]
-        self._obstacle = recording.obstacle or ""
-        self._depends = self._what_it_depends_on()
+            self._guard(recording)
         return StepOutput(*made)
 
     def _run(self, rays: int) -> tuple[Batch, RenderOutput]:
@@ -235,30 +230,47 @@ class TrainingStep:
                 return f"{type(part).__name__} may do in Python what is not seen"
         return self.loss.why_not_fused()
 
-    def _what_it_depends_on(self) -> tuple[list[Any], list[Any]]:
-        """What a recording holds for: objects, and values that may be equal without being the same object."""
-        renderer, optimizer, strategy = self.loss.renderer, self.optimizer, self.strategy
-        objects: list[Any] = [self.guard, self.generator, self.autocast, optimizer.state, native.cpu(), renderer.field]
-        for part in (self.batches, self.loss, renderer, renderer.sampler, strategy):
-            objects += () if part is None else part.__dict__.values()
-        known: Any = self._known
-        if known is None or not known.router.gives(known.cells):
-            known = self.loss.radiance()
-        if isinstance(known, Radiance):
-            router = known.router
-            objects += [known.networks, router.diagram, router.frozen_cells]
-            objects += [router.assignment, router.temperature, router.backend]
-            objects += known.cells.parameters
-            self._known = known
-        values: list[Any] = [torch.is_grad_enabled(), len(optimizer.state)]
+    def _guard(self, recording: Recording) -> None:
+        """Notes what a recording depends on."""
+        renderer, optimizer, known = self.loss.renderer, self.optimizer, self.loss.radiance()
+        assert isinstance(known, Radiance), known
+        self._known = known
+        for part in (self.batches, self.loss, renderer, renderer.sampler, self.strategy, optimizer):
+            if part is not None:
+                recording.guard(vars(part))
+        recording.guard(renderer.fields)
+        for module in cast(nn.Module, renderer.field).modules():  # the router, perhaps in a wrapper
+            for name, members in vars(module).items():
+                if name in ("_parameters", "_buffers", "_modules") or name.endswith("_hooks"):
+                    recording.guard(members)
+        for module in known.router.module.modules():
+            recording.guard(vars(module))
         for group in optimizer.param_groups:
-            objects += [group["betas"], group["eps"], group.get("sparse")]
+            recording.guard(group, skip="lr")
+        self._objects, self._values = self._current()
+
+    def _holds(self, recording: Recording) -> bool:
+        """Whether all is as when it was recorded."""
+        if not recording.holds():
+            return False
+        objects, values = self._current()
+        if values != self._values or not all(map(operator.is_, objects, self._objects)):
+            return False
+        known = cast(Radiance, self._known)
+        if known.cells.activation is not None:  # of a field with a layer table, whose members are guarded
+            return True
+        now = self.loss.radiance()
+        same = isinstance(now, Radiance) and now.networks is known.networks
+        return same and all(map(operator.is_, cast(Radiance, now).cells.parameters, known.cells.parameters))
+
+    def _current(self) -> tuple[list[Any], list[Any]]:
+        """What is in no dictionary that is guarded: objects, and numbers."""
+        router, optimizer = cast(Radiance, self._known).router, self.optimizer
+        objects = [self.batches, self.loss, optimizer, self.strategy, self.guard, self.generator, self.autocast]
+        objects += [router.assignment, router.temperature, router.backend, router.coords]
+        values: list[Any] = [backends.threads(), native.cpu().isa, torch.is_grad_enabled(), len(optimizer.state)]
+        for group in optimizer.param_groups:
             for own in group["params"]:
-                objects += [own, own._backward_hooks, own._post_accumulate_grad_hooks]
+                objects += [own._backward_hooks, own._post_accumulate_grad_hooks]
                 values += [own.data_ptr(), own.requires_grad]
         return objects, values
-
-
-def _same(one: tuple[list[Any], list[Any]], other: tuple[list[Any], list[Any]]) -> bool:
-    """Whether the same objects and equal values are in both."""
-    return len(one[0]) == len(other[0]) and all(map(operator.is_, one[0], other[0])) and one[1] == other[1]

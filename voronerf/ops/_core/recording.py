@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,6 +61,11 @@ class Recording(TorchDispatchMode):
 
     Attributes:
         obstacle: Why they cannot be made again; None if they can.
+        drawn: The random numbers of the last run, in the order in which they were drawn.
+        drawn_now: Whether a replay has drawn them that was then not made.
+
+    Args:
+        drawn: The first random numbers, in the place of new ones.
 
     Examples:
         >>> import torch
@@ -76,15 +82,15 @@ class Recording(TorchDispatchMode):
         True
     """
 
-    def __init__(self) -> None:
+    def __init__(self, drawn: Sequence[Tensor] = ()) -> None:
         super().__init__()
         from voronerf.ops._core import native
 
         self._compiled, self._calls = native.compiled, native.compiled.Recording()
         self._counts = list[Count]()
         self._numbers = list[tuple[Tensor, Callable[[], float]]]()
-        self._draws = list[Callable[[], Any]]()
-        self._generators: dict[int, torch.Generator] = {}  # of the draws, by identity
+        self._draws, self._known = list[Callable[[], Any]](), [*drawn]
+        self.drawn, self.drawn_now = list[Tensor](), False
         self._memory: dict[int, Tensor] = {}  # of rows, by address
         self.obstacle: str | None = None
 
@@ -125,7 +131,7 @@ class Recording(TorchDispatchMode):
         self.obstacle = self.obstacle or why or None
 
     def replay(self, threads: int) -> bool:
-        """Makes the calls again; False, with the generators as they were, where there is no memory for the rows.
+        """Makes the calls again; False where there is no memory for the rows, perhaps with random numbers drawn.
 
         Args:
             threads: Of the calls.
@@ -133,21 +139,31 @@ class Recording(TorchDispatchMode):
         Raises:
             ValueError: As of the calls, for what they find in their arguments.
         """
+        self.drawn_now = False
         for count in self._counts:
             if count.given is not None:
                 rows = count.given()
                 if not 0 < rows <= count.most:
                     return False
                 count.memory.fill_(rows)
-        before = [generator.get_state() for generator in self._generators.values()]
         for draw in self._draws:
             draw()
         for number, value in self._numbers:
             number.fill_(value())
-        made: bool = self._calls.replay(threads)
-        for generator, state in zip(self._generators.values(), () if made else before):
-            generator.set_state(state)
-        return made
+        self.drawn_now = True
+        if self._calls.replay(threads):
+            self.drawn_now = False
+            return True
+        return False
+
+    def guard(self, members: dict[str, Any], skip: str = "") -> None:
+        """From now on the recording holds for the same objects in a dictionary alone, but for that of a key."""
+        self._calls.guard(members, skip)
+
+    def holds(self) -> bool:
+        """Whether all dictionaries have the same objects as when they were guarded."""
+        held: bool = self._calls.holds()
+        return held
 
     def rows(self, place: int) -> int:
         """A number of rows of the last run; they are numbered in the order of the recorded one."""
@@ -177,16 +193,17 @@ class Recording(TorchDispatchMode):
         name, kwargs = func._schema.name, kwargs or {}
         if name in _NEW:
             return self._new(func, [*args], kwargs, args[0] if name == "aten::empty" else args[1])
-        result = func(*args, **kwargs)
+        random = torch.Tag.nondeterministic_seeded in func.tags and not any(isinstance(each, Tensor) for each in args)
+        result = self._known.pop(0).clone() if random and self._known else func(*args, **kwargs)
         if func.is_view:
             moved = isinstance(result, Tensor) and result.storage_offset() != args[0].storage_offset()
             if moved and self._is_counted(result):
                 self._refuse(f"a part of the rows of a step is read{_line()}")
-        elif torch.Tag.nondeterministic_seeded in func.tags and not any(isinstance(each, Tensor) for each in args):
-            generator = kwargs.get("generator") or torch.default_generator
-            self._generators[id(generator)] = generator
+        elif random:
+            self.drawn.append(result)
             if name == "aten::randint" and len(args) == 3:
-                self._draws.append(functools.partial(result.random_, args[0], args[1], generator=generator))
+                draw = functools.partial(result.random_, args[0], args[1], generator=kwargs.get("generator"))
+                self._draws.append(draw)
             else:
                 self._draws.append(lambda: result.copy_(func(*args, **kwargs)))
         elif name not in _HARMLESS and not name.startswith("profiler::"):
@@ -241,7 +258,7 @@ def varying(value: Callable[[], float]) -> float | Tensor:
 
 def _line() -> str:
     """Where the package, or its caller, is."""
-    for frame, line in traceback.walk_stack(None):
+    for frame, line in traceback.walk_stack(sys._getframe()):
         file = frame.f_code.co_filename
         if not file.startswith(_PASSED_OVER):
             return f", in {Path(file).name}:{line}"
