@@ -143,13 +143,14 @@ class TrainingStep:
         self._made: Any = None  # batch and output, when it was recorded
         self._known: Radiance | None = None
         self._objects, self._values = list[Any](), list[Any]()
-        self._obstacle = "no step was made yet"
+        self._obstacle = ""
 
     def explain(self) -> str:
         """Whether steps are replayed, and what keeps them from it."""
-        if self._recording is None:
-            return f"step: runs as it is, since {self._obstacle}"
-        return f"step: recorded and replayed, {len(self._recording)} calls"
+        if self._recording is not None:
+            return f"step: recorded and replayed, {len(self._recording)} calls"
+        obstacle = self._obstacle or self._standing_obstacle()
+        return "step: will be recorded" if obstacle is None else f"step: runs as it is, since {obstacle}"
 
     def __call__(self, rays: int) -> StepOutput:
         """Makes a step with so many rays."""

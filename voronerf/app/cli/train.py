@@ -104,7 +104,8 @@ def train(
     with busy(f"reading {config.data}"):
         scene = load_scene(config.data, **config.reading)
     if explain:
-        for line in build(config, scene).ray_loss.explain().splitlines():
+        state = build(config, scene)
+        for line in (*state.ray_loss.explain().splitlines(), state.training_step.explain()):
             say(line)
         return 0
     chosen = choose_directory(config, scene, resume=resume)
