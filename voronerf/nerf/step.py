@@ -17,6 +17,7 @@ from voronerf.nerf.radiance import Radiance
 from voronerf.nerf.split import SplitStrategy
 from voronerf.ops import Guard
 from voronerf.ops._core import backends, native
+from voronerf.ops._core.capture import Capture
 from voronerf.ops._core.custom_op import is_watched
 from voronerf.ops._core.recording import Recording
 from voronerf.ops.adam.reference import judge
@@ -86,8 +87,9 @@ class TrainingStep:
     """A step of a training: rays, loss, gradients, what the sampler and the splits learn, and the optimiser.
 
     The calls of the compiled module that a step makes are recorded, and made again by the steps that follow, in one
-    call for each of them: no Python runs in between, and threads are woken once. Results are the same bits. What keeps
-    a step from that (:meth:`explain`) lets it run as it is. What the objects are set to is followed, by their
+    call for each of them: no Python runs in between, and threads are woken once. Results are the same bits. On CUDA, a
+    step is captured in a CUDA graph, after one of its kind; another number of rays is captured anew. What keeps a step
+    from that (:meth:`explain`) lets it run as it is. What the objects are set to is followed, by their
     attributes; an object that is changed inside needs :meth:`forget`.
 
     Args:
@@ -138,7 +140,7 @@ class TrainingStep:
 
     def forget(self) -> None:
         """Records the next step anew."""
-        self._recording: Recording | None = None
+        self._recording: Recording | Capture | None = None
         self._made: tuple[Batch, RenderOutput] | None = None  # when it was recorded
         self._gradients = list[tuple[nn.Parameter, Tensor]]()
         self._known: Radiance | None = None  # of the last step
@@ -149,6 +151,8 @@ class TrainingStep:
         """Whether steps are replayed, and what keeps them from it."""
         if self._recording is None:
             return f"step: runs as it is, since {self._obstacle}"
+        if isinstance(self._recording, Capture):
+            return "step: captured and replayed as a CUDA graph"
         return f"step: recorded and replayed, {len(self._recording)} calls"
 
     def __call__(self, rays: int) -> StepOutput:
@@ -161,7 +165,7 @@ class TrainingStep:
                 for parameter, gradient in self._gradients:
                     parameter.grad = gradient
                 batch, output = cast(Any, self._made)
-                return StepOutput(batch, output, recording)
+                return StepOutput(batch, output, recording if isinstance(recording, Recording) else None)
         elif obstacle := "a mode, a transform or a profiler of torch watches" if watched else self._standing_obstacle():
             self.forget()
             self._obstacle = obstacle
@@ -169,21 +173,50 @@ class TrainingStep:
         if self._left:
             self._left -= 1
             return StepOutput(*self._run(rays))
-        return self._record()
+        return self._record(_same(depends, self._depends))
 
-    def _record(self) -> StepOutput:
-        """A step as it is, recorded if nothing keeps it from that."""
-        self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
+    def _record(self, known: bool) -> StepOutput:
+        """A step as it is, recorded or captured if nothing keeps it from that.
+
+        Args:
+            known: Whether the step before was of this kind, so that what a first one prepares is there.
+        """
+        before, on_gpu = self._recording, native.on_cuda(self.batches.images)
+        if not on_gpu or known:
+            self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
         self.forget()
-        with Recording() as recording:
-            made = self._run(recording.count(lambda: self._rays))
-        if recording.obstacle is None:
-            self._recording, self._made = recording, made
-            parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-            self._gradients = [(p, p.grad) for p in parameters if p.grad is not None]
-        self._obstacle = recording.obstacle or ""
+        if not on_gpu:
+            with Recording() as recording:
+                made = self._run(recording.count(lambda: self._rays))
+            self._keep(recording, made)
+        elif known:
+            made = self._capture(before if isinstance(before, Capture) else None)
+        else:
+            made, self._obstacle = self._run(self._rays), "no step of its kind was made before"
         self._depends = self._what_it_depends_on()
         return StepOutput(*made)
+
+    def _capture(self, before: Capture | None) -> tuple[Batch, RenderOutput]:
+        """A step as it is, and the graph of those that follow."""
+        capture = Capture(self.batches.place, self.generator, before)
+        made = capture.warm_up(lambda: self._run(self._rays))
+        gradients = self._with_gradients()
+        if capture.obstacle is None:
+            self._keep(capture, capture.capture(lambda: self._run(capture.count(lambda: self._rays))))
+        self._obstacle = capture.obstacle or ""
+        for parameter, gradient in gradients:  # of the step that was made
+            parameter.grad = gradient
+        return made
+
+    def _keep(self, recording: Recording | Capture, made: tuple[Batch, RenderOutput]) -> None:
+        """Steps that follow are replayed, if nothing keeps them from it."""
+        self._obstacle = recording.obstacle or ""
+        if recording.obstacle is None:
+            self._recording, self._made, self._gradients = recording, made, self._with_gradients()
+
+    def _with_gradients(self) -> list[tuple[nn.Parameter, Tensor]]:
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        return [(p, p.grad) for p in parameters if p.grad is not None]
 
     def _run(self, rays: int) -> tuple[Batch, RenderOutput]:
         with self.as_it_is():
@@ -219,12 +252,14 @@ class TrainingStep:
 
     def _standing_obstacle(self) -> str | None:
         """What keeps any step from being replayed, whatever it computes."""
-        renderer = self.loss.renderer
-        if self.batches.device.type != "cpu":
-            return f"it runs on {self.batches.device.type}"
-        if (
-            chosen := backends.chosen("adam", self.batches.device, torch.float32, backend=renderer.backend)
-        ) != "native":
+        renderer, device, place = self.loss.renderer, self.batches.device, self.batches.place
+        if device.type not in ("cpu", "cuda"):
+            return f"it runs on {device.type}"
+        if device.type != place.type or device.index not in (None, place.index):
+            return f"its pictures are on {place}"
+        if self.generator.device.type != device.type:
+            return f"its random numbers are drawn on {self.generator.device.type}"
+        if (chosen := backends.chosen("adam", device, torch.float32, backend=renderer.backend)) != "native":
             return f"it runs on the {chosen} backend"
         if self.autocast is not None:
             return "it runs under autocast"
@@ -251,6 +286,7 @@ class TrainingStep:
             objects += known.cells.parameters
             self._known = known
         values: list[Any] = [torch.is_grad_enabled(), len(optimizer.state)]
+        values += [torch.are_deterministic_algorithms_enabled(), torch.backends.cuda.matmul.fp32_precision]
         for group in optimizer.param_groups:
             objects += [group["betas"], group["eps"], group.get("sparse")]
             for own in group["params"]:

@@ -18,11 +18,14 @@ import threading
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+
+if TYPE_CHECKING:
+    from voronerf.ops._core.capture import Capture
 
 #: Rows that there is memory for, beside those of the recorded run: one for so many, and some.
 SPARE, SOME = 4, 64
@@ -33,10 +36,11 @@ _PASSED_OVER = (str(Path(torch.__file__).absolute().parent), str(Path(__file__).
 
 class _Active(threading.local):
     recording: Recording | None = None
+    capture: Capture | None = None
 
 
 active = _Active()
-"""The recording that the calling thread makes."""
+"""What the calling thread records, or captures on a GPU."""
 
 
 class Count(NamedTuple):
@@ -114,6 +118,13 @@ class Recording(TorchDispatchMode):
             rows = given()
             self._add(torch.tensor([rows]), rows, given)
         return rows
+
+    def vary(self, value: Callable[[], float]) -> Tensor:
+        """A number that changes from run to run, float32 []."""
+        with _disable_current_modes():
+            number = torch.tensor(value(), dtype=torch.float32)
+        self._numbers.append((number, value))
+        return number
 
     def _add(self, memory: Tensor, rows: int, given: Callable[[], int] | None) -> None:
         most = rows + rows // SPARE + SOME
@@ -230,13 +241,8 @@ def following_count(rows: int, follows: Callable[[int], int]) -> int:
 
 def varying(value: Callable[[], float]) -> float | Tensor:
     """A number that changes from run to run, rounded to float32. While it is recorded it is a tensor [] for replays."""
-    recording = active.recording
-    if recording is None:
-        return ctypes.c_float(value()).value
-    with _disable_current_modes():
-        number = torch.tensor(value(), dtype=torch.float32)
-    recording._numbers.append((number, value))
-    return number
+    recording = active.recording or active.capture
+    return ctypes.c_float(value()).value if recording is None else recording.vary(value)
 
 
 def _line() -> str:
