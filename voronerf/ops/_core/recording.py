@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import sys
 import threading
 import traceback
 from collections.abc import Callable
@@ -247,7 +248,7 @@ def varying(value: Callable[[], float]) -> float | Tensor:
 
 def _line() -> str:
     """Where the package, or its caller, is."""
-    for frame, line in traceback.walk_stack(None):
+    for frame, line in traceback.walk_stack(sys._getframe()):
         file = frame.f_code.co_filename
         if not file.startswith(_PASSED_OVER):
             return f", in {Path(file).name}:{line}"
