@@ -181,7 +181,7 @@ class TrainingStep:
         Args:
             known: Whether the step before was of this kind, so that what a first one prepares is there.
         """
-        before, on_gpu = self._recording, native.on_cuda(self.batches.images)
+        before, on_gpu = self._recording, self._on_gpu()
         if not on_gpu or known:
             self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
         self.forget()
@@ -195,6 +195,9 @@ class TrainingStep:
             made, self._obstacle = self._run(self._rays), "no step of its kind was made before"
         self._depends = self._what_it_depends_on()
         return StepOutput(*made)
+
+    def _on_gpu(self) -> bool:
+        return self.batches.device.type == "cuda"
 
     def _capture(self, before: Capture | None) -> tuple[Batch, RenderOutput]:
         """A step as it is, and the graph of those that follow."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 import torch
@@ -60,20 +61,20 @@ class Capture:
         here.wait_stream(self._stream)
         for each in told:
             if _WAITS in str(each.message):
-                self.obstacle = "the host waits for the device in it"
+                self.obstacle = f"the host waits for the device, in {Path(each.filename).name}:{each.lineno}"
             else:
                 warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
         return result
 
     def capture(self, function: Callable[[], T]) -> T:
         """Captures the function, which computes nothing until it is replayed; its result is memory of the replays."""
-        active.capture = self
+        active.vary = self.vary
         try:
             # Other threads, such as a viewer's, may ask the device for memory meanwhile.
             with torch.cuda.graph(self._graph, self._pool, self._stream, capture_error_mode="thread_local"):
                 return function()
         finally:
-            active.capture = None
+            active.vary = None
 
     def count(self, given: Callable[[], int]) -> int:
         """A number of rows that is known before each run; that of this one, to which replays keep."""

@@ -19,14 +19,11 @@ import threading
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
-
-if TYPE_CHECKING:
-    from voronerf.ops._core.capture import Capture
 
 #: Rows that there is memory for, beside those of the recorded run: one for so many, and some.
 SPARE, SOME = 4, 64
@@ -37,11 +34,11 @@ _PASSED_OVER = (str(Path(torch.__file__).absolute().parent), str(Path(__file__).
 
 class _Active(threading.local):
     recording: Recording | None = None
-    capture: Capture | None = None
+    vary: Callable[[Callable[[], float]], Tensor] | None = None
 
 
 active = _Active()
-"""What the calling thread records, or captures on a GPU."""
+"""The recording that the calling thread makes, and what makes numbers for replays, those of a GPU too."""
 
 
 class Count(NamedTuple):
@@ -99,13 +96,13 @@ class Recording(TorchDispatchMode):
 
     def __enter__(self) -> Recording:
         self._calls.begin()
-        active.recording = self
+        active.recording, active.vary = self, self.vary
         super().__enter__()
         return self
 
     def __exit__(self, *error: Any) -> None:
         super().__exit__(*error)
-        active.recording = None
+        active.recording = active.vary = None
         self._calls.end()
         self._refuse(self._calls.obstacle)
 
@@ -242,8 +239,7 @@ def following_count(rows: int, follows: Callable[[int], int]) -> int:
 
 def varying(value: Callable[[], float]) -> float | Tensor:
     """A number that changes from run to run, rounded to float32. While it is recorded it is a tensor [] for replays."""
-    recording = active.recording or active.capture
-    return ctypes.c_float(value()).value if recording is None else recording.vary(value)
+    return ctypes.c_float(value()).value if active.vary is None else active.vary(value)
 
 
 def _line() -> str:
