@@ -18,7 +18,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.recording import active
+from voronerf.ops._core.active import active
 
 _WAITS = "synchronizing CUDA operation"  # in what torch warns of
 T = TypeVar("T")

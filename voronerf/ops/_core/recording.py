@@ -15,7 +15,6 @@ from __future__ import annotations
 import ctypes
 import functools
 import sys
-import threading
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -25,20 +24,13 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
+from voronerf.ops._core.active import active
+
 #: Rows that there is memory for, beside those of the recorded run: one for so many, and some.
 SPARE, SOME = 4, 64
 _NEW = ("aten::new_empty", "aten::empty")
 _HARMLESS = ("aten::promote_types", "aten::result_type")
 _PASSED_OVER = (str(Path(torch.__file__).absolute().parent), str(Path(__file__).absolute()))
-
-
-class _Active(threading.local):
-    recording: Recording | None = None
-    vary: Callable[[Callable[[], float]], Tensor] | None = None
-
-
-active = _Active()
-"""The recording that the calling thread makes, and what makes numbers for replays, those of a GPU too."""
 
 
 class Count(NamedTuple):
