@@ -1,4 +1,4 @@
-"""What the calling thread records, which those look at who take part in it."""
+"""What the calling thread records, for those who take part in it."""
 
 from __future__ import annotations
 

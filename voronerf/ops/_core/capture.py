@@ -20,7 +20,6 @@ from torch import Tensor
 
 from voronerf.ops._core.active import active
 
-_WAITS = "synchronizing CUDA operation"  # in what torch warns of
 T = TypeVar("T")
 
 
@@ -60,9 +59,10 @@ class Capture:
                 torch.cuda.set_sync_debug_mode(mode)
         here.wait_stream(self._stream)
         for each in told:
-            if _WAITS in str(each.message):
+            said = str(each.message)
+            if "synchronizing CUDA operation" in said:
                 self.obstacle = f"the host waits for the device, in {Path(each.filename).name}:{each.lineno}"
-            else:
+            elif "synchronizing operations" not in said:  # as torch says of this mode
                 warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
         return result
 
@@ -84,7 +84,7 @@ class Capture:
 
     def vary(self, value: Callable[[], float]) -> Tensor:
         """A number that changes from run to run, float32 []."""
-        number = torch.empty((), device=self._device)  # filled before each replay, and not by the graph
+        number = torch.empty((), dtype=torch.float32, device=self._device)  # replays fill it, the graph does not
         self._numbers.append((number, value))
         return number
 
