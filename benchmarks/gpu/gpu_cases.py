@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -261,3 +262,43 @@ def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -
         return list(torch.autograd.grad((out if dtype else out.float()).square().mean(), leaves))
 
     return step
+
+
+def captured_trainings(device: str, steps: int = 20, **small: Any) -> list[tuple[str, Callable[[], str]]]:
+    """Names and trainings: steps that are replayed as a graph find what steps as they are do."""
+    whole: dict[str, Any] = {"cells": (), "split_at": ()}
+    kinds = {"training": whole, "training of a nerf": {**whole, "field": "nerf"}, "training before a split": {}}
+    return [(name, functools.partial(_train_both, {**own, **small}, device, steps)) for name, own in kinds.items()]
+
+
+def _train_both(options: dict[str, Any], device: str, steps: int) -> str:
+    """Within a hundredth, since atomic operations add up the gradients of a hash grid's table in any order."""
+    import torch
+    from gpu_journal import settling
+
+    from voronerf.app.scenes import builtin_scene
+    from voronerf.app.train import TrainConfig, build
+
+    found, milliseconds, settle = list[torch.Tensor](), list[float](), settling(device)
+    for as_it_is in (True, False):
+        torch.manual_seed(0)
+        state = build(TrainConfig(device=device, steps=1000, evaluations=1, **options), builtin_scene(32))
+        step, losses, begin = state.training_step, list[torch.Tensor](), 0.0
+        if as_it_is:
+            step.__dict__["_standing_obstacle"] = lambda: "it is asked to"
+        for number in range(3 + steps):  # one that prepares, one that is captured, and a first replay
+            if number == 3:
+                settle()
+                begin = time.perf_counter()
+            state.optimizer.set_learning_rate(1e-4 * (1 + number))
+            losses.append(step(state.rays).loss.clone())
+        settle()
+        milliseconds.append(1e3 * (time.perf_counter() - begin) / steps)
+        assert as_it_is or "CUDA graph" in step.explain(), step.explain()
+        parts = [torch.stack(losses), *state.router.parameters()]
+        found.append(torch.cat([part.detach().reshape(-1) for part in parts]))
+    expected, replayed = found
+    difference = float((replayed - expected).norm() / expected.norm())
+    assert difference <= 1e-2, f"replays differ by {difference:.1e}"
+    said = "the same bits" if torch.equal(expected, replayed) else f"within {difference:.1e}"
+    return f"{milliseconds[0]:.3f} ms a step as it is, {milliseconds[1]:.3f} ms as a graph, {said}"

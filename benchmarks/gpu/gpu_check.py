@@ -9,7 +9,7 @@ is a Blender scene for the trainings.
         build      the extension for this GPU alone
         small      every operation once against float64, each case for itself and with a time limit of its own
         large      networks at 2^22 samples against float64, with gradients
-        captured   steps of the route in CUDA graphs, fused and layer by layer
+        captured   steps of the route in CUDA graphs, fused and layer by layer; steps of trainings, with times
         warp       every operation of Warp beside native, where Warp is installed
         memcheck   compute-sanitizer over the small cases, where it is installed
     2   roofs      networks, look-ups and sorts at full size, beside the machine's own limits
@@ -244,6 +244,7 @@ def highlights(found: dict[str, Any]) -> list[str]:
     for row in rows("training", "trainings"):
         said = f"{row['milliseconds']:.2f} ms a step, PSNR {row['psnr']:.2f} after {row['steps']} steps"
         lines.append(f"training {row['name']}: {said}")
+    lines += [f"{row['name']}: {row['said']}" for row in rows("captured", "cases") if row["right"] and row["said"]]
     for part in JUDGED:
         lines += [f"WRONG in {part}: {row['name']}: {row['said']}" for row in rows(part, "cases") if not row["right"]]
     lines += [f"WRONG in tests: {row['name']}: {row['said']}" for row in rows("tests", "files") if not row["right"]]

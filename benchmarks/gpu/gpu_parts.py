@@ -3,7 +3,7 @@
     machine    what a build and the tests need, each with what is missing
     small      every operation once, forward and backward, against float64: each case for itself
     large      networks at full size
-    captured   steps of the route in CUDA graphs
+    captured   steps of the route, and of trainings, in CUDA graphs
     tests      tests/ops on CUDA, a process for each file
     roofs      the networks, look-ups and sorts at full size, beside the machine's own copy and products
     sizes      a network at many sizes and precisions, beside torch's products
@@ -34,7 +34,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), *(str(ROOT / place) for place in ("benchmarks/gpu", "benchmarks", "tests/cuda_emulation"))]
 
-from gpu_cases import captured_steps, small_cases  # noqa: E402
+from gpu_cases import captured_steps, captured_trainings, small_cases  # noqa: E402
 from gpu_journal import CASE_SECONDS, Again, Case, Journal, one_by_one, settling  # noqa: E402
 from gpu_large import large_cases  # noqa: E402
 from gpu_timings import profile, rivals, roofs, sizes, step, warp  # noqa: E402, warp
@@ -119,8 +119,9 @@ def large(again: Again, journal: Journal) -> int:
 
 
 def captured(again: Again, journal: Journal) -> int:
-    """Steps captured once and replayed: nearest centre, sort, networks and their gradients."""
+    """Steps captured once and replayed: nearest centre, sort, networks and their gradients; and whole trainings."""
     cases: list[Case] = [(name, functools.partial(capture, step)) for name, step in captured_steps("cuda")]
+    cases += captured_trainings("cuda")
     return one_by_one(cases, again, settling("cuda"), journal)
 
 

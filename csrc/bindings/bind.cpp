@@ -338,6 +338,39 @@ void call(const Loaded& loaded, Result& result) {
   }
 }
 
+// Members of dictionaries that must stay the same objects, but for that of the key `skip`.
+class Guards {
+ public:
+  void add(const py::dict& members, const std::string& skip) {
+    Guard guard{members, {}};
+    for (const auto& [key, value] : members) {
+      const bool any = py::isinstance<py::str>(key) && py::cast<std::string>(key) == skip;
+      guard.values.push_back(any ? py::object() : py::reinterpret_borrow<py::object>(value));
+    }
+    guards_.push_back(std::move(guard));
+  }
+  // Compares addresses alone: between the kernels of a loop, whatever is looked at must come from memory.
+  bool hold() const {
+    for (const Guard& guard : guards_) {
+      size_t i = 0;
+      PyObject *key, *value;
+      for (Py_ssize_t place = 0; PyDict_Next(guard.members.ptr(), &place, &key, &value) != 0; ++i) {
+        if (i == guard.values.size()) return false;
+        if (guard.values[i] && guard.values[i].ptr() != value) return false;
+      }
+      if (i != guard.values.size()) return false;
+    }
+    return true;
+  }
+
+ private:
+  struct Guard {
+    py::dict members;
+    std::vector<py::object> values;  // null for any
+  };
+  std::vector<Guard> guards_;
+};
+
 // Calls of a step in their order, with what they have taken, to be made again on the same memory. A number of rows is
 // read again from where it lies, so the memory must do for the most rows.
 class Recording {
@@ -345,7 +378,6 @@ class Recording {
   // Calls of this thread are added from here to `end`, in the place of those from before.
   void begin() {
     calls_.clear();
-    guards_.clear();
     counts_.clear();
     obstacle_.clear();
     recorded() = this;
@@ -367,29 +399,6 @@ class Recording {
   void add(std::unique_ptr<Loaded> loaded) {
     if (loaded->bound->machine != &type_of<Cpu>()) refuse(loaded->function->name + " runs on a device");
     calls_.push_back(std::move(loaded));
-  }
-
-  // From now on the calls hold only for the same objects in a dictionary, but for that of the key `skip`.
-  void guard(const py::dict& members, const std::string& skip) {
-    Guard guard{members, {}};
-    for (const auto& [key, value] : members) {
-      const bool any = py::isinstance<py::str>(key) && py::cast<std::string>(key) == skip;
-      guard.values.push_back(any ? py::object() : py::reinterpret_borrow<py::object>(value));
-    }
-    guards_.push_back(std::move(guard));
-  }
-  // Compares addresses alone: between the kernels of a loop, whatever is looked at must come from memory.
-  bool holds() const {
-    for (const Guard& guard : guards_) {
-      size_t i = 0;
-      PyObject *key, *value;
-      for (Py_ssize_t place = 0; PyDict_Next(guard.members.ptr(), &place, &key, &value) != 0; ++i) {
-        if (i == guard.values.size()) return false;
-        if (guard.values[i] && guard.values[i].ptr() != value) return false;
-      }
-      if (i != guard.values.size()) return false;
-    }
-    return true;
   }
 
   // Makes the calls again; false, before the first of them that would exceed its memory. With a trace they have no
@@ -431,13 +440,7 @@ class Recording {
     return true;
   }
 
-  struct Guard {
-    py::dict members;
-    std::vector<py::object> values;  // null for any
-  };
-
   std::vector<std::unique_ptr<Loaded>> calls_;
-  std::vector<Guard> guards_;
   std::deque<Count> counts_;
   std::string obstacle_;
 };
@@ -515,7 +518,7 @@ constexpr const char* kStub =
     "becomes\n"
     "# so where it is const; None is a null pointer.\n"
     "from collections.abc import Sequence\n"
-    "from typing import NamedTuple, overload\n"
+    "from typing import Any, NamedTuple, overload\n"
     "\n"
     "import torch\n"
     "from torch import Tensor\n"
@@ -529,14 +532,16 @@ constexpr const char* kStub =
     "cuda_architectures: str\n"
     "cuda_major: int\n"
     "\n"
+    "class Guards:\n"
+    "    def add(self, members: Any, skip: str) -> None: ...\n"
+    "    def hold(self) -> bool: ...\n"
+    "\n"
     "class Recording:\n"
     "    obstacle: str\n"
     "    def __len__(self) -> int: ...\n"
     "    def begin(self) -> None: ...\n"
     "    def end(self) -> None: ...\n"
     "    def count(self, memory: int, most: int) -> None: ...\n"
-    "    def guard(self, members: dict[str, object], skip: str) -> None: ...\n"
-    "    def holds(self) -> bool: ...\n"
     "    def replay(self, threads: int) -> bool: ...\n"
     "\n"
     "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n"
@@ -646,13 +651,12 @@ void bind_all(PyObject* python) {
     if (!there) continue;
     bound.def(name.c_str(), [one = &function](const py::args& given) { return call_any(*one, given); });
   }
+  py::class_<Guards>(bound, "Guards").def(py::init()).def("add", &Guards::add).def("hold", &Guards::hold);
   py::class_<Recording>(bound, "Recording")
       .def(py::init())
       .def("begin", &Recording::begin)
       .def("end", &Recording::end)
       .def("count", &Recording::count)
-      .def("guard", &Recording::guard)
-      .def("holds", &Recording::holds)
       .def("replay", &Recording::replay)
       .def("__len__", &Recording::size)
       .def_property_readonly("obstacle", &Recording::obstacle);

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from emulated import emulated
+from graphs import graphs
 from helpers import read_json
 
 from voronerf.app import train as app_train
@@ -61,6 +62,17 @@ def test_steps_to_capture_are_right_on_the_emulated_device(parts):
                 difference = (found.double() - exact).norm()
                 assert difference <= allowed * exact.norm() + 1e-7, (name, list(found.shape))
     assert len(parts.captured_steps("cpu", 1)) == 6
+
+
+@pytest.mark.native
+def test_trainings_to_capture_are_right_on_the_emulated_device(parts, monkeypatch):
+    monkeypatch.setattr(torch.Tensor, "is_cpu", False)
+    monkeypatch.setattr(torch.Tensor, "is_cuda", True)
+    small = {"width": 16, "samples": (8,), "rays": 16, "cells": (), "split_at": ()}
+    with emulated(), graphs() as seen:
+        for name, run in parts.captured_trainings("cpu", 3, **small):
+            assert run().endswith("as a graph, the same bits"), name
+    assert seen.calls == 3 * ["register", "capture", *["replay"] * 4]
 
 
 AFTER_FAULTS = """

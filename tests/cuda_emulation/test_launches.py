@@ -64,7 +64,7 @@ def test_rows_beyond_the_samples_change_nothing(monkeypatch, request):
             request.getfixturevalue("on_device")
         with emulated():
             state, output = trained(6, monkeypatch, empty=True)
-        rows = output.samples.rows
+        rows = output.output.samples.rows
         assert (rows is None) == known and state.router.num_cells == 4
         reservoir = state.strategy.reservoir.samples()[1]
         found.append([*state.router.parameters(), state.sampler.grid.density, reservoir])

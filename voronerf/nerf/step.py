@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
 
@@ -17,6 +17,7 @@ from voronerf.nerf.radiance import Radiance
 from voronerf.nerf.split import SplitStrategy
 from voronerf.ops import Guard
 from voronerf.ops._core import backends, native
+from voronerf.ops._core.capture import Capture
 from voronerf.ops._core.custom_op import is_watched
 from voronerf.ops._core.recording import Recording
 from voronerf.ops.adam.reference import judge
@@ -87,8 +88,9 @@ class TrainingStep:
     """A step of a training: rays, loss, gradients, what the sampler and the splits learn, and the optimiser.
 
     The calls of the compiled module that a step makes are recorded, and made again by the steps that follow, in one
-    call for each of them: no Python runs in between, and threads are woken once. Results are the same bits. What keeps
-    a step from that (:meth:`explain`) lets it run as it is. What the objects are set to is followed, by their
+    call for each of them: no Python runs in between, and threads are woken once. Results are the same bits. On CUDA, a
+    step is captured in a CUDA graph, after one of its kind; another number of rays is captured anew. What keeps a step
+    from that (:meth:`explain`) lets it run as it is. What the objects are set to is followed, by their
     attributes; an object that is changed inside needs :meth:`forget`.
 
     Args:
@@ -139,14 +141,18 @@ class TrainingStep:
 
     def forget(self) -> None:
         """Records the next step anew."""
-        self._recording: Recording | None = None
+        self._recording: Recording | Capture | None = None
         self._made: Any = None  # batch and output, when it was recorded
+        self._gradients = list[tuple[nn.Parameter, Tensor]]()  # of a graph
+        self._guards: native.compiled.Guards | None = None
         self._known: Radiance | None = None
         self._objects, self._values = list[Any](), list[Any]()
         self._obstacle = ""
 
     def explain(self) -> str:
         """Whether steps are replayed, and what keeps them from it."""
+        if isinstance(self._recording, Capture):
+            return "step: captured and replayed as a CUDA graph"
         if self._recording is not None:
             return f"step: recorded and replayed, {len(self._recording)} calls"
         obstacle = self._obstacle or self._standing_obstacle()
@@ -155,11 +161,14 @@ class TrainingStep:
     def __call__(self, rays: int) -> StepOutput:
         """Makes a step with so many rays."""
         self._rays, recording, watched = rays, self._recording, is_watched()
-        if recording is not None and not watched and self._holds(recording):
+        same = not watched and self._holds()
+        if recording is not None and same:
             if recording.replay(backends.threads()):
                 self._wait = self._left = 0
+                for parameter, gradient in self._gradients:
+                    parameter.grad = gradient
                 batch, output = self._made
-                return StepOutput(batch, output, recording)
+                return StepOutput(batch, output, recording if isinstance(recording, Recording) else None)
         elif obstacle := "a mode, a transform or a profiler of torch watches" if watched else self._standing_obstacle():
             self.forget()
             self._obstacle = obstacle
@@ -167,19 +176,56 @@ class TrainingStep:
         if self._left:
             self._left -= 1
             return StepOutput(*self._run(rays))
-        return self._record(recording.drawn if recording is not None and recording.drawn_now else ())
+        return self._record(same)
 
-    def _record(self, drawn: Sequence[Tensor]) -> StepOutput:
-        """A step as it is, recorded if nothing keeps it from that; with random numbers that are drawn already."""
-        self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
+    def _record(self, known: bool) -> StepOutput:
+        """A step as it is, recorded or captured if nothing keeps it from that.
+
+        Args:
+            known: Whether the step before was of this kind, so that what a first one prepares is there.
+        """
+        before, on_gpu = self._recording, self._on_gpu()
+        if not on_gpu or known:
+            self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
         self.forget()
-        with Recording(drawn) as recording:
-            made = self._run(recording.count(lambda: self._rays))
+        if not on_gpu:
+            # What a replay has drawn that there was no memory for.
+            drawn = before.drawn if isinstance(before, Recording) and before.drawn_now else ()
+            with Recording(drawn) as recording:
+                made = self._run(recording.count(lambda: self._rays))
+            self._keep(recording, made)
+        elif known:
+            made = self._capture(before if isinstance(before, Capture) else None)
+        else:
+            made, self._obstacle = self._run(self._rays), "no step of its kind was made before"
+        self._guard()
+        return StepOutput(*made)
+
+    def _on_gpu(self) -> bool:
+        return self.batches.device.type == "cuda"
+
+    def _capture(self, before: Capture | None) -> tuple[Batch, RenderOutput]:
+        """A step as it is, and the graph of those that follow."""
+        capture = Capture(self.batches.place, self.generator, before)
+        made = capture.warm_up(lambda: self._run(self._rays))
+        gradients = self._with_gradients()
+        if capture.obstacle is None:
+            self._keep(capture, capture.capture(lambda: self._run(capture.count(lambda: self._rays))))
+        self._obstacle = capture.obstacle or ""
+        for parameter, gradient in gradients:  # of the step that was made
+            parameter.grad = gradient
+        return made
+
+    def _keep(self, recording: Recording | Capture, made: tuple[Batch, RenderOutput]) -> None:
+        """Steps that follow are replayed, if nothing keeps them from it."""
         self._obstacle = recording.obstacle or ""
         if recording.obstacle is None:
             self._recording, self._made = recording, made
-            self._guard(recording)
-        return StepOutput(*made)
+            self._gradients = self._with_gradients() if isinstance(recording, Capture) else []
+
+    def _with_gradients(self) -> list[tuple[nn.Parameter, Tensor]]:
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+        return [(p, p.grad) for p in parameters if p.grad is not None]
 
     def _run(self, rays: int) -> tuple[Batch, RenderOutput]:
         with self.as_it_is():
@@ -215,12 +261,14 @@ class TrainingStep:
 
     def _standing_obstacle(self) -> str | None:
         """What keeps any step from being replayed, whatever it computes."""
-        renderer = self.loss.renderer
-        if self.batches.device.type != "cpu":
-            return f"it runs on {self.batches.device.type}"
-        if (
-            chosen := backends.chosen("adam", self.batches.device, torch.float32, backend=renderer.backend)
-        ) != "native":
+        renderer, device, place = self.loss.renderer, self.batches.device, self.batches.place
+        if device.type not in ("cpu", "cuda"):
+            return f"it runs on {device.type}"
+        if device.type != place.type or device.index not in (None, place.index):
+            return f"its pictures are on {place}"
+        if self.generator.device.type != device.type:
+            return f"its random numbers are drawn on {self.generator.device.type}"
+        if (chosen := backends.chosen("adam", device, torch.float32, backend=renderer.backend)) != "native":
             return f"it runs on the {chosen} backend"
         if self.autocast is not None:
             return "it runs under autocast"
@@ -231,28 +279,30 @@ class TrainingStep:
                 return f"{type(part).__name__} may do in Python what is not seen"
         return self.loss.why_not_fused()
 
-    def _guard(self, recording: Recording) -> None:
-        """Notes what a recording depends on."""
+    def _guard(self) -> None:
+        """Notes what the step that was made depends on."""
         renderer, optimizer, known = self.loss.renderer, self.optimizer, self.loss.radiance()
-        assert isinstance(known, Radiance), known
-        self._known = known
-        for part in (self.batches, self.loss, renderer, renderer.sampler, self.strategy, optimizer):
+        if not isinstance(known, Radiance):
+            return
+        self._known, self._guards = known, native.compiled.Guards()
+        grid = getattr(renderer.sampler, "grid", None)
+        for part in (self.batches, self.loss, renderer, renderer.sampler, grid, self.strategy, optimizer):
             if part is not None:
-                recording.guard(vars(part))
-        recording.guard(renderer.fields)
+                self._guards.add(vars(part), "")
+        self._guards.add(renderer.fields, "")
         for module in cast(nn.Module, renderer.field).modules():  # the router, perhaps in a wrapper
             for name, members in vars(module).items():
                 if name in ("_parameters", "_buffers", "_modules") or name.endswith("_hooks"):
-                    recording.guard(members)
+                    self._guards.add(members, "")
         for module in known.router.module.modules():
-            recording.guard(vars(module))
+            self._guards.add(vars(module), "")
         for group in optimizer.param_groups:
-            recording.guard(group, skip="lr")
+            self._guards.add(group, "lr")
         self._objects, self._values = self._current()
 
-    def _holds(self, recording: Recording) -> bool:
-        """Whether all is as when it was recorded."""
-        if not recording.holds():
+    def _holds(self) -> bool:
+        """Whether all is as it was noted."""
+        if self._guards is None or not self._guards.hold():
             return False
         objects, values = self._current()
         if values != self._values or not all(map(operator.is_, objects, self._objects)):
@@ -270,6 +320,7 @@ class TrainingStep:
         objects = [self.batches, self.loss, optimizer, self.strategy, self.guard, self.generator, self.autocast]
         objects += [router.assignment, router.temperature, router.backend, router.coords]
         values: list[Any] = [backends.threads(), native.cpu().isa, torch.is_grad_enabled(), len(optimizer.state)]
+        values += [torch.are_deterministic_algorithms_enabled(), torch.backends.cuda.matmul.fp32_precision]
         for group in optimizer.param_groups:
             for own in group["params"]:
                 objects += [own._backward_hooks, own._post_accumulate_grad_hooks]

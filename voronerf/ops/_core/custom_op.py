@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.library import CustomOpDef
 
-from voronerf.ops._core.recording import active
+from voronerf.ops._core.active import active
 
 # torch has no public names for these questions; without an answer the custom op is called.
 _LISTENERS = [

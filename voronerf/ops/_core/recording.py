@@ -15,7 +15,6 @@ from __future__ import annotations
 import ctypes
 import functools
 import sys
-import threading
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,19 +24,13 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
+from voronerf.ops._core.active import active
+
 #: Rows that there is memory for, beside those of the recorded run: one for so many, and some.
 SPARE, SOME = 4, 64
 _NEW = ("aten::new_empty", "aten::empty")
 _HARMLESS = ("aten::promote_types", "aten::result_type")
 _PASSED_OVER = (str(Path(torch.__file__).absolute().parent), str(Path(__file__).absolute()))
-
-
-class _Active(threading.local):
-    recording: Recording | None = None
-
-
-active = _Active()
-"""The recording that the calling thread makes."""
 
 
 class Count(NamedTuple):
@@ -100,13 +93,13 @@ class Recording(TorchDispatchMode):
 
     def __enter__(self) -> Recording:
         self._calls.begin()
-        active.recording = self
+        active.recording, active.vary = self, self.vary
         super().__enter__()
         return self
 
     def __exit__(self, *error: Any) -> None:
         super().__exit__(*error)
-        active.recording = None
+        active.recording = active.vary = None
         self._calls.end()
         self._refuse(self._calls.obstacle)
 
@@ -120,6 +113,13 @@ class Recording(TorchDispatchMode):
             rows = given()
             self._add(torch.tensor([rows]), rows, given)
         return rows
+
+    def vary(self, value: Callable[[], float]) -> Tensor:
+        """A number that changes from run to run, float32 []."""
+        with _disable_current_modes():
+            number = torch.tensor(value(), dtype=torch.float32)
+        self._numbers.append((number, value))
+        return number
 
     def _add(self, memory: Tensor, rows: int, given: Callable[[], int] | None) -> None:
         most = rows + rows // SPARE + SOME
@@ -155,15 +155,6 @@ class Recording(TorchDispatchMode):
             self.drawn_now = False
             return True
         return False
-
-    def guard(self, members: dict[str, Any], skip: str = "") -> None:
-        """From now on the recording holds for the same objects in a dictionary alone, but for that of a key."""
-        self._calls.guard(members, skip)
-
-    def holds(self) -> bool:
-        """Whether all dictionaries have the same objects as when they were guarded."""
-        held: bool = self._calls.holds()
-        return held
 
     def rows(self, place: int) -> int:
         """A number of rows of the last run; they are numbered in the order of the recorded one."""
@@ -247,13 +238,7 @@ def following_count(rows: int, follows: Callable[[int], int]) -> int:
 
 def varying(value: Callable[[], float]) -> float | Tensor:
     """A number that changes from run to run, rounded to float32. While it is recorded it is a tensor [] for replays."""
-    recording = active.recording
-    if recording is None:
-        return ctypes.c_float(value()).value
-    with _disable_current_modes():
-        number = torch.tensor(value(), dtype=torch.float32)
-    recording._numbers.append((number, value))
-    return number
+    return ctypes.c_float(value()).value if active.vary is None else active.vary(value)
 
 
 def _line() -> str:

@@ -27,8 +27,8 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import backends
+from voronerf.ops._core.active import active
 from voronerf.ops._core.backends import BackendUnavailable
-from voronerf.ops._core.recording import active
 
 _REMEDY = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
 

@@ -1,0 +1,170 @@
+"""CUDA graphs of the emulated device: ``with emulated(), graphs() as seen: ...``.
+
+In a capture nothing is computed: launches are kept, of this project's kernels and of torch's operations, and replays
+alone make them. A read of the host, which ends a capture on a GPU, is an error there, and a warning in torch's mode for
+it. Streams are in order by themselves.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
+from types import SimpleNamespace
+from typing import Any
+from unittest import mock
+
+import torch
+from launches import FREE, READING, aten
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from voronerf.ops._core import native as _native
+
+
+def reads(function: Any, args: Any) -> bool:
+    """Whether the host waits for the device."""
+    masks = args[1] if function is aten.index.Tensor else ()
+    by_bool = any(index is not None and index.dtype == torch.bool for index in masks)
+    return by_bool or function in READING or function is aten.lift_fresh.default
+
+
+class Warned(TorchDispatchMode):
+    """Warns of reads, as ``torch.cuda.set_sync_debug_mode("warn")``."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        if reads(function, args):
+            asks = next(f for f, _ in traceback.walk_stack(sys._getframe(1)) if "torch" not in f.f_code.co_filename)
+            where = asks.f_code.co_filename, asks.f_lineno  # torch's own code is no Python on a GPU
+            warnings.warn_explicit("called a synchronizing CUDA operation", UserWarning, *where)
+        return function(*args, **(kwargs or {}))
+
+
+class Graph(TorchDispatchMode):
+    """A ``torch.cuda.CUDAGraph``; a mode while it is captured."""
+
+    def __init__(self, seen: Seen) -> None:
+        super().__init__()
+        self._seen, self._work, self._generators = seen, list[Callable[[], Any]](), set[int]()
+
+    def register_generator_state(self, generator: torch.Generator) -> None:
+        self._seen.calls.append("register")
+        self._generators.add(generator._cdata)
+
+    def pool(self) -> Graph:
+        return self
+
+    def add(self, function: Callable[..., Any], *args: Any) -> None:
+        self._work.append(lambda: function(*args))
+
+    def replay(self) -> None:
+        self._seen.calls.append("replay")
+        for each in self._work:
+            each()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        kwargs = kwargs or {}
+        assert not reads(function, args), f"{function} in a capture"
+        name = function.overloadpacket.__name__
+        if function.is_view or name in FREE:
+            result = function(*args, **kwargs)
+            return result.zero_() if "empty" in name else result  # torch may look for shapes in it, as an index
+        generator = kwargs.get("generator")
+        assert generator is None or generator._cdata in self._generators, "not registered"
+        state = None if generator is None else generator.get_state()
+        written = {
+            id(value): value
+            for value, about in zip((*args, *kwargs.values()), function._schema.arguments, strict=False)
+            if about.alias_info is not None and about.alias_info.is_write
+        }
+        before = [(value, value.clone()) for value in written.values()]
+        result = function(*args, **kwargs)
+        for value, was in before:
+            value.copy_(was)
+        if state is not None:
+            generator.set_state(state)
+        new = [value for value in tree_leaves(result) if isinstance(value, Tensor) and id(value) not in written]
+        for value in new:
+            value.zero_()
+
+        def again() -> None:
+            found = function(*args, **kwargs)
+            for value, other in zip(new, tree_leaves(found) if new else (), strict=True):
+                value.copy_(other)
+
+        self.add(again)
+        return result
+
+
+class Kernels:
+    """The compiled module, whose launches a capture keeps."""
+
+    def __init__(self, compiled: Any, seen: Seen) -> None:
+        self._compiled, self._seen = compiled, seen
+
+    def __getattr__(self, name: str) -> Any:
+        found, graph = getattr(self._compiled, name), self._seen.capturing
+        if graph is None or isinstance(found, type) or not callable(found) or name.endswith("_workspace"):
+            return found
+
+        def call(*arguments: Any) -> Any:
+            assert not any(isinstance(each, _native.compiled.Cpu) for each in arguments), f"{name} of the processor"
+            if any(isinstance(each, _native.compiled.Cuda) for each in arguments):
+                return graph.add(found, *arguments)
+            return found(*arguments)
+
+        return call
+
+
+class Seen:
+    """What was asked of torch's graphs.
+
+    Attributes:
+        calls: In order: "register", "capture", "replay".
+        pools: What each capture was given as its memory.
+        capturing: The graph of now.
+    """
+
+    def __init__(self) -> None:
+        self.calls, self.pools = list[str](), list[Any]()
+        self.capturing: Graph | None = None
+
+    @contextmanager
+    def capture(self, graph: Graph, pool: Any, stream: Any, capture_error_mode: str) -> Iterator[None]:
+        self.calls.append("capture")
+        self.pools.append(pool)
+        self.capturing = graph
+        with graph:
+            yield
+        self.capturing = None
+
+
+@contextmanager
+def graphs() -> Iterator[Seen]:
+    """Torch's graphs and streams are the emulation's."""
+    seen, modes = Seen(), ExitStack()
+
+    def set_mode(mode: str) -> None:
+        modes.close()
+        if mode == "warn":
+            modes.enter_context(Warned())
+
+    doubles = {
+        "Stream": lambda device: SimpleNamespace(wait_stream=lambda other: None),
+        "current_stream": lambda device: SimpleNamespace(wait_stream=lambda other: None),
+        "stream": nullcontext,
+        "CUDAGraph": lambda: Graph(seen),
+        "graph": seen.capture,
+        "get_sync_debug_mode": lambda: 0,
+        "set_sync_debug_mode": set_mode,
+    }
+    with (
+        mock.patch.multiple(torch.cuda, **doubles),
+        mock.patch("voronerf.nerf.TrainingStep._on_gpu", lambda step: True),
+        mock.patch("voronerf.ops._core.custom_op._LISTENERS", []),
+        mock.patch.object(_native, "compiled", Kernels(_native.compiled, seen)),
+    ):
+        yield seen
