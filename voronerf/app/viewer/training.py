@@ -103,4 +103,4 @@ class Training(Callback):
             f"{self.cells} cells, {speed:.1f} k rays/s  \n"
             f"loss {now.loss:.5f}" + (f", PSNR {metrics[-1]['psnr']:.2f} dB" if metrics else "")
         )
-        self.viewer.show_curve([(line["seconds"], line["psnr"]) for line in metrics])
+        self.viewer.show_curve([(line["seconds"], line["psnr"]) for line in metrics if line["part"] == 1])
