@@ -29,6 +29,14 @@ console = rich.get_console()
 console.soft_wrap = True
 
 
+def _raise_again() -> None:
+    """In place of rich's exit with status 1 for a pipe that was closed: see main."""
+    raise
+
+
+console.on_broken_pipe = _raise_again  # type: ignore[method-assign]
+
+
 def say(line: str) -> None:
     """Prints a line as plain text, with control characters escaped."""
     console.print(printable(line), highlight=False, markup=False, emoji=False)
