@@ -28,6 +28,7 @@ from voronerf.town import train as territories_train
 from voronerf.town.editing import Source, check_out
 from voronerf.town.geometry import Similarity, Solid
 from voronerf.town.group import Group, local_rank, restarts
+from voronerf.town.run import stored_territories
 
 #: Numbers of a transform on the command line.
 MOVE = "tx ty tz rx ry rz s"
@@ -176,7 +177,8 @@ def train_territories(
 
     Args:
         config: The settings of each territory.
-        territories: How many; default the least power of two that gives each process one.
+        territories: How many; default those of the run that goes on, else the least power of two that gives each
+            process one.
         resume: Continue the run in --out from its last checkpoint.
         file: JSON of settings by their names, such as the config.json of a run; options that are given come first.
         checkpoint_every: Seconds of training between checkpoints.
@@ -193,7 +195,8 @@ def train_territories(
                 stack.enter_context(contextlib.redirect_stdout(null))
                 stack.enter_context(contextlib.redirect_stderr(null))
             group.meet()
-            count = territories or 1 << (group.size - 1).bit_length()
+            stored = stored_territories(config.out) if resume and config.out is not None else None
+            count = territories or stored or 1 << (group.size - 1).bit_length()
             return _train_territories(config, group, count, resume, checkpoint_every, panels)
     except Exception as error:
         if group.may_tell(error):
