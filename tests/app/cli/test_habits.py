@@ -80,6 +80,7 @@ def test_tensorboard(tmp_path, fails, monkeypatch):
     assert found.count("train/loss") == found.count("train/cells") == 1  # of 16 steps the tenth
     assert found.count("test/psnr") == found.count("test/ssim") == 2 and "test/lpips" not in found
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    monkeypatch.setattr("voronerf.app.cli.train.load_scene", None)  # data is read after it
     fails("needs tensorboard: pip install 'voronerf[tensorboard]'", "train --tensorboard --out", tmp_path / "x", TINY)
     assert not (tmp_path / "x").exists()
 

@@ -19,7 +19,7 @@ from voronerf.app.files import json_text, write_text
 from voronerf.app.scenes import BUILTIN, load_scene
 from voronerf.app.scenes.record import read_scene
 from voronerf.app.train.build import present_device
-from voronerf.app.train.callbacks import CHECKPOINT_EVERY
+from voronerf.app.train.callbacks import CHECKPOINT_EVERY, counted
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.run_directory import choose_directory, held
@@ -37,7 +37,7 @@ MOVE = "tx ty tz rx ry rz s"
 def tell(out: Path, made: Source) -> int:
     """Says what was written."""
     counts = {"cell": made.parts.num_cells, "part": len(made.parts.parts)}
-    cells, parts = (f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items())
+    cells, parts = (counted(count, name) for name, count in counts.items())
     size = sum(file.stat().st_size for file in (out / "checkpoints").iterdir())
     say(f"wrote {out}: {cells} in {parts}, {size / 2**20:.1f} MiB")
     return 0
@@ -235,7 +235,8 @@ def _train_territories(
             if summary["complete"]:
                 opened = open_run(out, scene=scene, backend=config.backend)
                 summary |= opened.evaluate(views=config.eval_views, lpips=config.lpips, track=tracked)
-                say(f"{count} territories, {summary['cells']} cells: psnr {summary['psnr']:.2f} dB")
+                cells = counted(summary["cells"], "cell")
+                say(f"{count} territories, {cells}: psnr {summary['psnr']:.2f} dB")
                 if panels:
                     write_panels(
                         opened.renderer, opened.diagram, opened.scene, out / "images", views=panels, track=tracked

@@ -73,7 +73,9 @@ class Checkpoints(Callback):
         when = f"at {state.seconds:.0f} s, step {state.step}"
         if stage.split_cells:
             balance = f", imbalance of their importance {stage.balance_before:.3f} -> {stage.balance_after:.4f}"
-            state.report(f"{stage.cells} cells {when}{balance if state.config.centres == 'balanced' else ''}")
+            state.report(
+                f"{counted(stage.cells, 'cell')} {when}{balance if state.config.centres == 'balanced' else ''}"
+            )
         else:
             state.report(f"no cell split {when}: none holds {MIN_SAMPLES} of the {len(done.points)} samples kept")
 
@@ -287,7 +289,12 @@ def views_of(scores: Mapping[str, Any]) -> str:
     views, part = scores.get("views"), scores.get("part", 1)
     if not isinstance(views, int) or not isinstance(part, int | float):
         return ""
-    return f"the middle {part:.0%} of " * (part < 1) + f"{views:,} view{'s' * (views != 1)}"
+    return f"the middle {part:.0%} of " * (part < 1) + counted(views, "view")
+
+
+def counted(count: int, noun: str) -> str:
+    """A number of things, such as "1 cell" or "16 cells"."""
+    return f"{count:,} {noun}{'s' * (count != 1)}"
 
 
 def one_colour_psnr(scene: Scene) -> float:
@@ -326,6 +333,15 @@ def why_scores_are_poor(
     return None
 
 
+def tensorboard_writer() -> Any:
+    """What writes the files of TensorBoard; raises ImportError where it is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise ImportError("--tensorboard needs tensorboard: pip install 'voronerf[tensorboard]'") from None
+    return SummaryWriter
+
+
 class TensorBoard(Callback):
     """Writes loss, speed, cells and scores for TensorBoard.
 
@@ -348,11 +364,7 @@ class TensorBoard(Callback):
     EVERY = 10  # steps between two losses
 
     def __init__(self, folder: Path, scores: Scores) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            raise ImportError("--tensorboard needs tensorboard: pip install 'voronerf[tensorboard]'") from None
-        self._make, self.folder, self.scores, self.written = SummaryWriter, folder, scores, 0
+        self._make, self.folder, self.scores, self.written = tensorboard_writer(), folder, scores, 0
         self.writer: Any = None
 
     def on_start(self, state: State) -> None:
