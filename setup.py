@@ -136,6 +136,17 @@ def compiler() -> list[str]:
     return shlex.split(os.environ.get("CXX", "")) or [default]
 
 
+def check_compiler() -> None:
+    """Say what to install where there is no C++ compiler."""
+    for program in compiler()[: 2 if Path(compiler()[0]).name in LAUNCHERS else 1]:
+        if shutil.which(program) is None:
+            raise SystemExit(
+                f"voronerf: there must be a C++17 compiler, g++ or clang++, got no {program}: install the package g++ "
+                "(Debian, Ubuntu), gcc-c++ (Fedora), gcc (Arch), cxx-compiler (conda-forge), LLVM (Windows) or, on "
+                "macOS, xcode-select --install; CXX names another"
+            )
+
+
 def host_compiler() -> list[str]:
     """Flags of nvcc for the C++ compiler. It takes one program: no launcher, and arguments are passed on to it."""
     words = compiler()
@@ -320,6 +331,8 @@ def write_if_changed(path: Path, text: str) -> None:
 
 
 if __name__ == "__main__":
+    if {"bdist_wheel", "editable_wheel", "build", "build_ext"}.intersection(sys.argv):  # before pages of copied files
+        check_compiler()
     setup(
         packages=[*find_packages(include=["voronerf", "voronerf.*"]), "voronerf.kernels"],
         package_dir={"voronerf": "voronerf", "voronerf.kernels": "kernels"},

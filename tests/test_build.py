@@ -134,6 +134,20 @@ def test_cuda_is_compiled_for_the_gpu_that_is_there(build, monkeypatch, tmp_path
             assert architectures is not None or "no GPU here; VORONERF_CUDA=1 compiles it" in found.outcome
 
 
+@pytest.mark.parametrize("cxx", ["nocompiler -m64", "ccache nocompiler"])
+def test_without_a_compiler_a_line_says_what_to_install(build, monkeypatch, tmp_path, cxx):
+    program(tmp_path / "ccache")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("CXX", cxx)
+    wanted = r"there must be a C\+\+17 compiler, g\+\+ or clang\+\+, got no nocompiler: install the package g\+\+ "
+    with pytest.raises(SystemExit, match=wanted) as stop:
+        build["check_compiler"]()
+    assert "\n" not in stop.value.code
+    command = [sys.executable, str(ROOT / "setup.py"), "build_ext"]
+    made = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert made.returncode == 1 and made.stderr == f"{stop.value.code}\n" and not made.stdout
+
+
 def test_one_word_and_none(build, monkeypatch):
     monkeypatch.setenv("CXX", "ccache")
     assert build["host_compiler"]() == ["-ccbin", "ccache"]

@@ -290,6 +290,20 @@ def test_an_order_that_leaves_the_rows_is_refused(backend, wrong):
     refuses(message, grouped_program, *given, program=program, order=order, backend=backend)
 
 
+def test_a_spread_parameter_in_what_a_linear_step_adds_is_refused():
+    """It was read as columns that follow each other."""
+    b = Builder()
+    x, matrix, bias = b.input(3), b.parameter(4, 3), b.parameter(4)
+    added = Columns(PARAMETER, bias, 0, 4, spread=True)
+    made = b.linear(x, matrix, 4, add=added)
+    program = b.program([made])
+    (step,) = (step for step in program.steps if step.op == "linear")
+    assert not step.operands[1].spread  # the builder makes columns of it
+    steps = tuple(each._replace(operands=(x, added)) if each is step else each for each in program.steps)
+    rule = "Program: steps must be without spread columns in what a linear one adds, got Step(op='linear'"
+    refuses(rule, replace, program, steps=steps)
+
+
 def test_a_program_of_what_is_not_there_is_refused():
     """The compiled module trusts a program: each number of one, larger than it is, is refused where it is made."""
     program = every_step()

@@ -203,6 +203,59 @@ def test_layers_that_are_made_inside_of_forward(kept: bool, fuse: bool, generato
         router(torch.rand(100, 3, generator=generator))
 
 
+# Parameters past their names ------------------------------------------------------------------------------------------
+
+
+class Scaled(nn.Module):
+    """A layer and a parameter, beside what a test adds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer, self.a = nn.Linear(3, 4), nn.Parameter(torch.ones(4))
+
+
+def _function(module: Scaled) -> Any:
+    return lambda x: module.layer(x)
+
+
+KEPT: dict[str, tuple[Any, str]] = {
+    "view": (lambda m: m.a[:2], "a view of the parameter `a`"),
+    "data": (lambda m: m.a.data, "a view of the parameter `a`"),
+    "list": (lambda m: [1, m.a[:2]], "a view of the parameter `a`"),
+    "dict": (lambda m: {"x": (m.layer.weight.t(),)}, r"a view of the parameter `layer\.weight`"),
+    "function": (_function, "a function that holds the module"),
+    "functions": (lambda m: [_function(m)], "a function that holds the module"),
+    "default": (lambda m: lambda x, layer=m.layer: layer(x), "a function that holds the module|the part `layer`"),
+    "method": (lambda m: (lambda old: lambda x: old(x))(m.layer.forward), "holds the part `layer`"),
+}
+
+
+@pytest.mark.parametrize("fuse", [True, False])
+@pytest.mark.parametrize("case", KEPT)
+def test_parameters_that_are_kept_past_their_names_are_refused(
+    case: str, fuse: bool, generator: torch.Generator
+) -> None:
+    field, (make, said) = Scaled(), KEPT[case]
+    field.kept = make(field)
+    with pytest.raises(TypeError, match=rf"but a Scaled keeps in `kept` .*{said}"):
+        router_of(field, generator, fuse=fuse)
+    with pytest.raises(TypeError, match=r"but `1`, a Scaled, keeps in `kept` "):
+        router_of(nn.Sequential(nn.ReLU(), field), generator, fuse=fuse)
+
+
+def test_a_buffer_that_is_a_view_of_a_parameter_is_refused(generator: torch.Generator) -> None:
+    field = Scaled()
+    field.register_buffer("part_of_a", field.a.detach()[:2])
+    with pytest.raises(TypeError, match="keeps in `part_of_a` a view of the parameter `a`"):
+        router_of(field, generator)
+
+
+def test_what_a_copy_takes_along_is_not_refused(generator: torch.Generator) -> None:
+    field = Scaled()
+    field.method, field.copied, field.free = field.layer.forward, field.a.detach().clone(), lambda x: x + 1
+    router_of(field, generator)
+
+
 # Positions ------------------------------------------------------------------------------------------------------------
 
 

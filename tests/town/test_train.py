@@ -105,6 +105,14 @@ def test_a_run_that_was_stopped_and_continued_is_the_same(whole, resumed):
     assert last.with_name("last-1.safetensors").is_file() and same(whole, resumed)
 
 
+def test_a_run_continues_on_another_number_of_ranks_that_need_not_name_its_territories(tmp_path, whole):
+    run = tmp_path / "run"
+    assert on_ranks(is_asked_to_stop, command(run), 12, folder=tmp_path)[0] == [130, 130]
+    args = ["train-territories", "--resume", "--out", str(run), "--panels", "0"]
+    assert on_ranks(main, args, folder=tmp_path, size=1)[0] == [0]
+    assert same(whole, run)
+
+
 def test_a_rank_that_is_killed(tmp_path, whole):
     """The other says so; started again as by torchrun, the run ends bit for bit as one that nothing happened to."""
     args = command(tmp_path / "run", "--checkpoint-every", "1e-6")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import fnmatch
+import types
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.router.grouping import SHARED, cell_parameters, owned_parameters
-from voronerf.router.layout import tensors_of
+from voronerf.router.layout import DEEPEST, contents, tensors_of
 
 _OP = "VoronoiRouter"
 
@@ -45,6 +46,66 @@ def check_module(module: nn.Module) -> None:
         if reason:
             where = f"`{name}`, a {type(part).__name__}," if name else f"a {type(part).__name__}"
             raise TypeError(f"{_OP}: module must treat samples one by one, but {where} {reason}")
+    _check_reach(module)
+
+
+def _check_reach(module: nn.Module) -> None:
+    """Raises TypeError where parameters are reached past their names, which are all that cells replace."""
+    own = {address: name for name, p in module.named_parameters() if (address := _address(p))}
+    objects = {id(p): f"parameter `{name}`" for name, p in module.named_parameters()}
+    objects |= {id(part): f"part `{name}`" if name else "module" for name, part in module.named_modules()}
+    for name, part in module.named_modules():
+        where = f"`{name}`, a {type(part).__name__}," if name else f"a {type(part).__name__}"
+        kept = {key: value for key, value in vars(part).items() if key not in ("_parameters", "_buffers", "_modules")}
+        for attribute, value in (kept | dict(part.named_buffers(recurse=False))).items():
+            for leaf in _leaves(value):
+                reason = ""
+                if isinstance(leaf, Tensor) and _address(leaf) in own:
+                    reason = (
+                        f"a view of the parameter `{own[_address(leaf)]}`, which cells replace (make it in forward)"
+                    )
+                elif isinstance(leaf, types.FunctionType) and (held := _held_by(leaf, objects)):
+                    reason = f"a function that holds the {held}, of which cells have their own (make it a method)"
+                if reason:
+                    raise TypeError(
+                        f"{_OP}: module must reach parameters by name, but {where} keeps in `{attribute}` {reason}"
+                    )
+
+
+def _address(tensor: Tensor) -> int:
+    """Of a tensor's memory; 0 where it has none."""
+    try:
+        return tensor.untyped_storage().data_ptr()
+    except (RuntimeError, NotImplementedError):  # sparse, or without values
+        return 0
+
+
+def _leaves(value: Any) -> list[Any]:
+    """Tensors and functions in a value, in what it holds, and so on."""
+    found, seen, level = [], set[int](), [value]
+    for _ in range(DEEPEST):
+        items = [item for item in level if id(item) not in seen and not isinstance(item, nn.Module)]
+        seen.update(map(id, items))
+        held = [contents(item) for item in items]
+        found += [item for item, inner in zip(items, held, strict=True) if inner is None]
+        level = [item for inner in held for item in (inner or {}).values()]
+    return found
+
+
+def _held_by(function: types.FunctionType, objects: dict[int, str]) -> str:
+    """Which of some objects a function reaches; a copy of the function is the same function."""
+    names = function.__code__.co_names
+    found = [function.__globals__[name] for name in names if name in function.__globals__]
+    for cell in function.__closure__ or ():
+        with contextlib.suppress(ValueError):  # a cell that is still empty
+            found.append(cell.cell_contents)
+    found += [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
+    for held in found:
+        for item in (*held, held) if isinstance(held, (list, tuple)) else (held,):
+            item = item.__self__ if isinstance(item, types.MethodType) else item
+            if id(item) in objects:
+                return objects[id(item)]
+    return ""
 
 
 def _refusal(part: nn.Module) -> str:

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from voronerf.router.grouping import Grouping
 
 _OP = "VoronoiRouter"
-_DEEPEST = 6  # objects within objects that are searched for tensors
+DEEPEST = 6  # objects within objects that are searched for tensors
 _LEAVES = {type(None), type(...), bool, int, float, str, torch.Size, torch.dtype, torch.device}
 SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
 
@@ -34,7 +34,7 @@ def map_tree(value: Any, change: Callable[..., Any], name: str = "", nested: boo
 
     ``change`` gets a leaf's name ("x", "samples.origins", "views.0"), the leaf, and whether it is inside an object.
     """
-    items = None if depth > _DEEPEST else _items(value)
+    items = None if depth > DEEPEST else contents(value)
     if items is None:
         return change(name, value, nested)
     nested = nested or not isinstance(value, (dict, list, tuple))
@@ -42,7 +42,7 @@ def map_tree(value: Any, change: Callable[..., Any], name: str = "", nested: boo
     return value if all(new[key] is item for key, item in items.items()) else _rebuilt(value, items, new)
 
 
-def _items(value: Any) -> dict[Any, Any] | None:
+def contents(value: Any) -> dict[Any, Any] | None:
     """What a container holds, by key, index or attribute; None for a leaf."""
     if isinstance(value, (Tensor, int, str)):
         return None
@@ -92,8 +92,8 @@ def _collect(items: Iterable[Any], found: list[Tensor], depth: int) -> None:
             continue
         if isinstance(item, Tensor):
             found.append(item)
-        elif depth <= _DEEPEST:
-            _collect(item if kind in (list, tuple) else (_items(item) or {}).values(), found, depth + 1)
+        elif depth <= DEEPEST:
+            _collect(item if kind in (list, tuple) else (contents(item) or {}).values(), found, depth + 1)
 
 
 def map_tensors(value: Any, change: Callable[[Tensor], Any]) -> Any:

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf.app.files import read_json
 from voronerf.app.run import Run, shown_scene
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import placed, read_scene
@@ -46,6 +47,13 @@ TOWN = "town.json"
 def is_town(run: Path) -> bool:
     """Whether a run directory holds a run of several parts."""
     return (run / TOWN).is_file()
+
+
+def stored_territories(run: Path) -> int | None:
+    """The number of territories that a run was trained in; None where it does not say one."""
+    values = read_json(run / TOWN) if is_town(run) else None
+    count = values.get("territories") if isinstance(values, dict) else None
+    return count if isinstance(count, int) and count > 0 else None
 
 
 def write_parts(run: Path, config: TrainConfig, parts: Parts, grid: OccupancyGrid | None) -> None:

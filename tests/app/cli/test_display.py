@@ -1,7 +1,10 @@
 import math
 from types import SimpleNamespace
 
-from voronerf.app.cli.display import TrainingDisplay
+import pytest
+
+from voronerf.app.cli.display import TrainingDisplay, console
+from voronerf.app.train.callbacks import counted
 
 
 def test_the_loss_is_that_of_the_steps_whose_loss_was_read():
@@ -25,3 +28,23 @@ def test_what_goes_on_beside_a_training_has_a_bar_with_its_name():
     next(iter(parts))
     parts.close()  # as where a training is stopped
     assert [task.description for task in display.progress.tasks] == ["run"]
+
+
+@pytest.mark.parametrize(("width", "absent"), [(160, ()), (100, ("rays/s",)), (80, ("rays/s", "loss", "step"))])
+def test_a_narrow_terminal_keeps_bar_time_and_psnr(width, absent, monkeypatch):
+    monkeypatch.setattr(console, "_width", width)
+    monkeypatch.setattr(console, "_height", 25)
+    display = TrainingDisplay("builtin")
+    display.scores = SimpleNamespace(metrics=[{"psnr": 22.5}])
+    router = SimpleNamespace(num_cells=16)
+    display.after_step(SimpleNamespace(step=12345, loss=0.1, router=router, fraction=0.5, rays_done=1e6, seconds=9.0))
+    text = display.progress.tasks[0].fields["text"]
+    assert [word for word in ("rays/s", "loss", "step") if word not in text] == list(absent)
+    with console.capture() as shown:
+        console.print(display.progress.get_renderable())
+    (line,) = shown.get().splitlines()
+    assert len(line) <= width and "50 %" in line and "psnr 22.50 dB" in line and "-:--:--" in line and "━" * 12 in line
+
+
+def test_one_is_no_plural():
+    assert [counted(n, "cell") for n in (0, 1, 1600)] == ["0 cells", "1 cell", "1,600 cells"]

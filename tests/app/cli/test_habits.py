@@ -11,6 +11,7 @@ import pytest
 from cli_commands import TINY, words
 
 from voronerf.app.cli import info, main, train
+from voronerf.app.train.run_directory import read_curve
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -34,6 +35,22 @@ def test_runs_are_compared(tmp_path, capsys):
         ["PSNR", "[dB]", "30.12", "31.50"] in rows and ["SSIM", "0.9000", "-"] in rows and ["LPIPS", "-", "-"] in rows
     )
     assert not any(row[0] in ("width", "out") for row in rows if row) and any(row[:1] == ["cells"] for row in rows)
+
+
+def test_scores_of_parts_of_views_are_marked(tmp_path, capsys):
+    short, long = make_run(tmp_path / "short", 30.125, [16]), make_run(tmp_path / "long", 27.5, [16])
+    for run, views, part in ((short, 1, 1 / 16), (long, 3, 1.0)):
+        figures = json.loads((run / "summary.json").read_text())
+        (run / "summary.json").write_text(json.dumps({**figures, "views": views, "part": part}))
+    assert main(words("compare", short, long)) == 0
+    shown = capsys.readouterr().out
+    rows = [line.split() for line in shown.replace("│", " ").splitlines()]
+    assert ["PSNR", "[dB]", "30.12*", "27.50"] in rows and ["SSIM", "0.9000*", "0.9000"] in rows
+    assert "the middle 6% of 1 view" in shown and "3 views" in shown
+    (short / "metrics.jsonl").write_text(
+        '{"step": 1, "seconds": 1, "psnr": 20.0, "part": 1}\n{"step": 2, "seconds": 2, "psnr": 30.0, "part": 0.06}\n'
+    )
+    assert read_curve(short) == [(1, 20.0)]
 
 
 def test_what_is_not_compared(tmp_path, fails):
@@ -63,6 +80,7 @@ def test_tensorboard(tmp_path, fails, monkeypatch):
     assert found.count("train/loss") == found.count("train/cells") == 1  # of 16 steps the tenth
     assert found.count("test/psnr") == found.count("test/ssim") == 2 and "test/lpips" not in found
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    monkeypatch.setattr("voronerf.app.cli.train.load_scene", None)  # data is read after it
     fails("needs tensorboard: pip install 'voronerf[tensorboard]'", "train --tensorboard --out", tmp_path / "x", TINY)
     assert not (tmp_path / "x").exists()
 

@@ -1,6 +1,8 @@
 """What is typed wrong: one plain line, with what was meant; help by groups; and the few words that are no command."""
 
+import os
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -100,3 +102,16 @@ def test_ctrl_c_while_the_program_is_loaded_leaves_no_traceback():
     )
     assert loading.returncode == -signal.SIGINT and loading.stderr == ""
     assert started.stdout == f"voronerf {__version__}\nTrue\n"
+
+
+@pytest.mark.skipif(not hasattr(select, "poll"), reason="pipes cannot be asked here")
+@pytest.mark.parametrize("buffered", ["", "1"])
+@pytest.mark.parametrize(("command", "status"), [("train --help", 141), ("--help", 141), ("info", 141), ("xyzzy", 1)])
+def test_a_closed_pipe_ends_a_command_quietly(command, status, buffered):
+    reading, writing = os.pipe()
+    os.close(reading)
+    given = {"stdout": writing, "stderr": subprocess.PIPE, "env": {**os.environ, "PYTHONUNBUFFERED": buffered}}
+    done = subprocess.run([sys.executable, "-m", "voronerf", *command.split()], text=True, **given)
+    os.close(writing)
+    said = "voronerf: error: there is no command xyzzy; see voronerf --help\n"
+    assert (done.returncode, done.stderr) == (status, said if status == 1 else "")

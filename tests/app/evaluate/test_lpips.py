@@ -112,6 +112,8 @@ def test_where_weights_are_looked_for(tmp_path, weights, monkeypatch):
     save_file(weights, scenes / "lpips" / "lpips_alex.safetensors")
     found, line = find_lpips(None, str(scenes / "lego"))
     assert found is not None and str(scenes / "lpips") in line
+    (scenes / "lego" / "transforms.json").touch()
+    assert find_lpips(None, str(scenes / "lego" / "transforms.json"))[0] is not None
     assert find_lpips(None, "builtin")[0] is None
     monkeypatch.setenv("VORONERF_DATA", str(scenes))
     assert find_lpips(None, "builtin")[0] is not None

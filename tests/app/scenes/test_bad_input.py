@@ -77,6 +77,10 @@ def test_downscale(tmp_path):
         ('{"frames": [1]}', "frame 0 has no file_path"),
         ('{"frames": [{"file_path": 3}]}', "frame 0 has no file_path"),
         ('{"frames": [{"file_path": "a\\u0000"}]}', "frame 0 has no file_path"),
+        (
+            '{"frames": [{"file_path": "\\ud800.png"}]}',
+            r"frame 0: file_path must be text without surrogates, got '\ud800",
+        ),
         ('{"frames": [{"file_path": "x.png"}]}', "frame 0 (x.png): transform_matrix"),
         ("[" * 100_000, "is not JSON: it is nested too deeply"),
     ],

@@ -204,3 +204,26 @@ def test_a_full_disk_is_one_line(folder, monkeypatch):
     refuses("cannot hold the 0.00 GiB of images: No space left", load_scene, folder, images="disk", error=SceneError)
     monkeypatch.undo()
     assert len(load_scene(folder).train) == 6
+
+
+def test_the_built_in_scene_is_kept(cache, monkeypatch):
+    plain = builtin_scene(8)
+    monkeypatch.setattr("voronerf.app.scenes.CACHED", 8)
+    first = load_scene("builtin:8")
+    assert len(list(cache.iterdir())) == 2 and not first.train.on_disk
+    monkeypatch.setattr("voronerf.app.scenes.builtin.pictures._images", None)  # which would make them
+    for scene in (load_scene("builtin:8"), first):
+        assert scene.train.images.equal(plain.train.images) and scene.test.images.equal(plain.test.images)
+
+
+def test_without_a_cache_the_built_in_scene_is_computed(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("VORONERF_CACHE", str(tmp_path / "file"))
+    monkeypatch.setattr("voronerf.app.scenes.CACHED", 8)
+    assert load_scene("builtin:8").train.images.shape == (100, 8, 8, 4)
+
+
+def test_a_file_of_a_scene_stands_for_its_folder(folder):
+    (file,) = folder.glob("transforms_train.json")
+    assert load_scene(file).train.images.equal(load_scene(folder).train.images)
+    refuses("is not a folder", load_scene, next(folder.rglob("*.png")), error=SceneError)

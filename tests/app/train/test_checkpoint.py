@@ -64,6 +64,9 @@ def test_broken_files_are_named(tmp_path):
     save_file({"x": torch.zeros(1)}, path, {"format": "pt"})
     other = "not a voronerf-checkpoint-2 file, its format is 'pt'"
     refuses(other, load_checkpoint, path, error=CheckpointError)
+    save_file({"x": torch.zeros(1)}, path, {"format": "voronerf-checkpoint-12"})
+    newer = "must be a voronerf-checkpoint-2 file, got voronerf-checkpoint-12 of a newer voronerf"
+    refuses(newer, load_checkpoint, path, error=CheckpointError)
 
 
 def test_tensors_are_pages_of_files(tmp_path):

@@ -13,7 +13,7 @@ from tiny_runs import Each, small, started, steps_of
 from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Checkpoints, Divergence, Scores, TrainConfig, TrainingError, build, run
-from voronerf.app.train.callbacks import why_scores_are_poor
+from voronerf.app.train.callbacks import views_of, why_scores_are_poor
 from voronerf.app.train.defaults import resolve
 from voronerf.app.train.run_directory import write_curve
 
@@ -65,6 +65,15 @@ def test_evaluations_take_a_tenth_of_the_budget(monkeypatch, seconds):
     assert scores.summary["complete"] and scores.summary["views"] >= 1 and scores.summary["psnr"] > 0
     assert (scores.summary["part"] == 1) == (seconds <= 3)
     assert len(found) == (4 if seconds < 1 else 2 if seconds < 3 else 1)
+
+
+def test_the_middle_of_several_views_is_scored_where_time_is_short_for_one(monkeypatch):
+    _, scores, _ = scored(monkeypatch, lambda now: 8.0)
+    assert scores.summary["part"] < 1 and scores.summary["views"] > 1
+    line = {"psnr": 20.0, "views": 4, "part": 1 / 9}
+    assert views_of(line) == "the middle 11% of 4 views" and views_of({"views": 1, "part": 1}) == "1 view"
+    config = TrainConfig(lr=0.01)
+    assert why_scores_are_poor([{"psnr": 30.0, "part": 1}, line], config, 25.0, settled=True) is None
 
 
 def test_views_that_become_cheaper_are_scored_later(monkeypatch):

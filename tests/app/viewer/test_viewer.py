@@ -223,6 +223,7 @@ def test_keyframes_become_a_path_that_render_takes(run, scene, tab) -> None:
         tab.set("Keyframes", "add")
         tab.until(lambda index=index: f"{index + 1} keyframe" in str(tab.gui["No keyframes."]))
     assert {"/keyframes/0", "/keyframes/1", "/keyframes/line"} <= set(tab.nodes)
+    assert tab.nodes["/keyframes/0"]["thickness_units"] == "screen"  # else they cover a picture of a large scene
     tab.set("Seconds", 1.0)
     pictures = len(tab.pictures)
     tab.set("Preview", True)
@@ -284,6 +285,20 @@ def test_cameras_in_a_plane_have_space_around_them(scene) -> None:
     cameras = orbit_cameras(4, radius=2.0, elevation=0.0, width=8, height=8, focal=9.0)
     low, high = scene_bounds(replace(scene, box=None, train=replace(scene.train, cameras=cameras)))
     assert bool((high - low > 1).all()) and bool((low < -2).any()) and bool((high > 2).any())
+
+
+def test_a_picture_at_rest_is_as_large_as_the_window(scene, tab) -> None:
+    assert max(tab.rest().shape) == 128
+    for size, longest in (((200, 150), 200), ((5000, 3000), 320)):
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr("voronerf.app.viewer.client.FULL", 320)
+            tab.size = size
+            tab.look(scene.test.cameras, 0)
+            assert tab.rest().shape[1] == longest
+    tab.set("Pixels", 160)
+    tab.until(lambda: tab.viewer.list_clients()[0].longest == 160)
+    tab.look(scene.test.cameras, 1)
+    assert tab.rest().shape[1] == 160
 
 
 def test_a_canvas_without_pixels_is_passed_over(scene, tab) -> None:

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from voronerf.app.cli.display import console, printable
 from voronerf.app.files import read_json
+from voronerf.app.train.callbacks import views_of
 from voronerf.app.train.config import ConfigError
 from voronerf.app.train.run_directory import check_folders, read_metrics
 
@@ -18,12 +19,16 @@ FIGURES = (
     *(("cells", "cells", 0), ("parameters", "parameters", 0), ("steps", "steps", 0), ("seconds", "training [s]", 0)),
     *(("rays_per_second", "rays/s", 0), ("psnr", "PSNR [dB]", 2), ("ssim", "SSIM", 4), ("lpips", "LPIPS", 4)),
 )
+#: Those that are of test views, and the mark of them where only the middle of views was scored.
+SCORES, PARTLY = ("psnr", "ssim", "lpips"), "*"
 #: Settings that say where a run is, rather than what it is.
 PLACES = ("out", "resume", "allow_outside", "panels", "tensorboard")
 
 
 def compare(runs: tuple[Path, ...], /) -> int:
     """Show the scores of trained runs side by side, and the settings in which they differ.
+
+    A star marks scores of the middle of views, which are not to be compared with those of whole ones.
 
     Args:
         runs: The run directories, at least two. A run that has not ended shows its last evaluation.
@@ -36,7 +41,10 @@ def compare(runs: tuple[Path, ...], /) -> int:
     for run in runs:
         table.add_column(escape(printable(str(run))), justify="right", overflow="fold")
     for key, heading, places in FIGURES:
-        table.add_row(escape(heading), *(shown(figures.get(key), places) for figures, _ in found))
+        marks = [PARTLY * (key in SCORES and figures.get("part", 1) != 1) for figures, _ in found]
+        numbers = (shown(figures.get(key), places) for figures, _ in found)
+        table.add_row(escape(heading), *map("".join, zip(numbers, marks, strict=True)))
+    table.add_row("scores of", *(views_of(figures) or "-" for figures, _ in found))
     table.add_section()
     for name in dict.fromkeys(name for _, settings in found for name in settings if name not in PLACES):
         values = [escape(printable(str(settings.get(name)))) for _, settings in found]

@@ -17,16 +17,28 @@ from rich.progress import (
     TimeRemainingColumn,
     track,
 )
+from rich.table import Column
 
-from voronerf.app.train.callbacks import Scores
+from voronerf.app.train.callbacks import Scores, counted
 from voronerf.app.train.loop import Callback
 from voronerf.app.train.state import State
 
 LONGEST_LINE = 900
+#: Width of a bar, and of all in the live line of a training beside its name and its text.
+BAR = 24
+BESIDE = BAR + len(" 100 %    0:00:00 ")
 
 #: The one of rich, so that a bar of another module can show below one of these.
 console = rich.get_console()
 console.soft_wrap = True
+
+
+def _raise_again() -> None:
+    """In place of rich's exit with status 1 for a pipe that was closed: see main."""
+    raise
+
+
+console.on_broken_pipe = _raise_again  # type: ignore[method-assign]
 
 
 def say(line: str) -> None:
@@ -42,7 +54,7 @@ def tracked(parts: Sequence[Any], name: str) -> Iterable[Any]:
 @contextlib.contextmanager
 def busy(name: str) -> Iterator[None]:
     """A context that shows a name and its seconds on a terminal, for what takes long and tells nothing on the way."""
-    columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn()
+    columns = TextColumn("{task.description}"), BarColumn(bar_width=BAR), TimeElapsedColumn()
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         bar.add_task(escape(printable(name)), total=None)
         yield
@@ -60,6 +72,14 @@ def one_line(text: str) -> str:
     return line if len(line) <= LONGEST_LINE else f"{line[:head]} ... {line[-tail:]}"
 
 
+def fitting(parts: Sequence[tuple[int, str]], room: int) -> str:
+    """Parts of a line in so many characters: those of the lowest ranks are left out first, but never the last one."""
+    kept = list(parts)
+    while len(kept) > 1 and len("  ".join(text for _, text in kept)) > room:
+        kept.remove(min(kept))
+    return "  ".join(text for _, text in kept)
+
+
 class TrainingDisplay(Callback):
     """Shows step, stage, rays/s, loss, PSNR and the time left in a live line, while ``progress`` is entered.
 
@@ -72,9 +92,9 @@ class TrainingDisplay(Callback):
         self.quiet = quiet
         self.progress = Progress(
             TextColumn("[bold]{task.description}"),
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=BAR),
             TextColumn("{task.percentage:3.0f} %"),
-            TextColumn("{task.fields[text]}"),
+            TextColumn("{task.fields[text]}", table_column=Column(no_wrap=True)),
             TimeRemainingColumn(),
             console=console,
             disable=not console.is_terminal,
@@ -95,11 +115,13 @@ class TrainingDisplay(Callback):
         cells = state.router.num_cells
         psnr = self.scores.metrics[-1].get("psnr") if self.scores is not None and self.scores.metrics else None
         shown = [
-            *(f"step {state.step}", "coarse" if cells == 1 else f"{cells} cells"),
-            *(f"{state.rays_done / max(state.seconds, 1e-9) / 1000:.1f} k rays/s", f"loss {self.loss:.5f}"),
-            *([] if psnr is None else [f"psnr {psnr:.2f} dB"]),
+            *((2, f"step {state.step}"), (3, "coarse" if cells == 1 else counted(cells, "cell"))),
+            (0, f"{state.rays_done / max(state.seconds, 1e-9) / 1000:.1f} k rays/s"),
+            (1, f"loss {self.loss:.5f}"),
+            *([] if psnr is None else [(4, f"psnr {psnr:.2f} dB")]),
         ]
-        self.progress.update(self.task, completed=state.fraction, text="  ".join(shown))
+        room = console.width - len(self.progress.tasks[0].description) - BESIDE
+        self.progress.update(self.task, completed=state.fraction, text=fitting(shown, room))
 
     def track(self, parts: Sequence[Any], name: str) -> Iterable[Any]:
         """Yields the parts of a task beside the training, with a bar below its live line."""

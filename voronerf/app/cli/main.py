@@ -6,6 +6,7 @@ import contextlib
 import gc
 import os
 import re
+import select
 import signal
 import sys
 import threading
@@ -21,7 +22,7 @@ from rich.table import Table
 from voronerf import __version__
 from voronerf.app.cli.compare import compare
 from voronerf.app.cli.demo import demo
-from voronerf.app.cli.display import one_line, say
+from voronerf.app.cli.display import console, one_line, say
 from voronerf.app.cli.eval import evaluate_run
 from voronerf.app.cli.export import export
 from voronerf.app.cli.info import info
@@ -76,8 +77,8 @@ def main(args: list[str] | None = None) -> int:
         args: The command line without the program's name; default ``sys.argv[1:]``.
 
     Returns:
-        0 when all went well, 1 for an error, 130 when training was stopped. Errors are one line on stderr;
-        with VORONERF_TRACEBACK=1 they are shown whole.
+        0 when all went well, 1 for an error, 130 when training was stopped, 141 when nobody reads the output any more.
+        Errors are one line on stderr; with VORONERF_TRACEBACK=1 they are shown whole.
     """
     args = sys.argv[1:] if args is None else args
     if not gc.isenabled():  # see voronerf/__init__.py
@@ -89,7 +90,27 @@ def main(args: list[str] | None = None) -> int:
     threading.excepthook = _show_thread_error
     ends_with_checkpoint = bool(args) and args[0] in TRAININGS
     with contextlib.nullcontext() if ends_with_checkpoint else _exit_on_sigterm():
-        return _run(args)
+        try:
+            status = _run(args)
+        except SystemExit:
+            if not _nobody_reads():
+                raise
+            status = 0
+        if not _nobody_reads():
+            return status
+        # What is not written yet would print a traceback at the end of the process.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return status or 128 + 13  # SIGPIPE, such as of `voronerf train --help | head`
+
+
+def _nobody_reads() -> bool:
+    """Whether what is printed goes into a pipe that was closed."""
+    try:
+        poll = select.poll()
+        poll.register(sys.stdout.fileno(), 0)
+        return bool(poll.poll(0))  # only of errors
+    except (AttributeError, OSError, ValueError):  # Windows, no output, or none with a file
+        return False
 
 
 @contextlib.contextmanager
@@ -120,6 +141,8 @@ def _run(args: list[str]) -> int:
         print("voronerf: interrupted", file=sys.stderr)
         return 130
     except EXPECTED as error:
+        if isinstance(error, BrokenPipeError) and _nobody_reads():
+            return 0
         if os.environ.get("VORONERF_TRACEBACK"):
             raise
         said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
@@ -160,7 +183,7 @@ def _show_commands() -> int:
     print(
         "usage: voronerf COMMAND ...\n\nMany small networks, one per Voronoi cell of space, trained and run as one.\n"
     )
-    Console().print(table)
+    console.print(table, soft_wrap=False)
     print("\nvoronerf COMMAND --help shows the options of one, voronerf --version the version.")
     return 0
 

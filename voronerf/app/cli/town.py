@@ -19,7 +19,7 @@ from voronerf.app.files import json_text, write_text
 from voronerf.app.scenes import BUILTIN, load_scene
 from voronerf.app.scenes.record import read_scene
 from voronerf.app.train.build import present_device
-from voronerf.app.train.callbacks import CHECKPOINT_EVERY
+from voronerf.app.train.callbacks import CHECKPOINT_EVERY, counted
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.run_directory import choose_directory, held
@@ -28,6 +28,7 @@ from voronerf.town import train as territories_train
 from voronerf.town.editing import Source, check_out
 from voronerf.town.geometry import Similarity, Solid
 from voronerf.town.group import Group, local_rank, restarts
+from voronerf.town.run import stored_territories
 
 #: Numbers of a transform on the command line.
 MOVE = "tx ty tz rx ry rz s"
@@ -36,7 +37,7 @@ MOVE = "tx ty tz rx ry rz s"
 def tell(out: Path, made: Source) -> int:
     """Says what was written."""
     counts = {"cell": made.parts.num_cells, "part": len(made.parts.parts)}
-    cells, parts = (f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items())
+    cells, parts = (counted(count, name) for name, count in counts.items())
     size = sum(file.stat().st_size for file in (out / "checkpoints").iterdir())
     say(f"wrote {out}: {cells} in {parts}, {size / 2**20:.1f} MiB")
     return 0
@@ -176,7 +177,8 @@ def train_territories(
 
     Args:
         config: The settings of each territory.
-        territories: How many; default the least power of two that gives each process one.
+        territories: How many; default those of the run that goes on, else the least power of two that gives each
+            process one.
         resume: Continue the run in --out from its last checkpoint.
         file: JSON of settings by their names, such as the config.json of a run; options that are given come first.
         checkpoint_every: Seconds of training between checkpoints.
@@ -193,7 +195,8 @@ def train_territories(
                 stack.enter_context(contextlib.redirect_stdout(null))
                 stack.enter_context(contextlib.redirect_stderr(null))
             group.meet()
-            count = territories or 1 << (group.size - 1).bit_length()
+            stored = stored_territories(config.out) if resume and config.out is not None else None
+            count = territories or stored or 1 << (group.size - 1).bit_length()
             return _train_territories(config, group, count, resume, checkpoint_every, panels)
     except Exception as error:
         if group.may_tell(error):
@@ -232,7 +235,8 @@ def _train_territories(
             if summary["complete"]:
                 opened = open_run(out, scene=scene, backend=config.backend)
                 summary |= opened.evaluate(views=config.eval_views, lpips=config.lpips, track=tracked)
-                say(f"{count} territories, {summary['cells']} cells: psnr {summary['psnr']:.2f} dB")
+                cells = counted(summary["cells"], "cell")
+                say(f"{count} territories, {cells}: psnr {summary['psnr']:.2f} dB")
                 if panels:
                     write_panels(
                         opened.renderer, opened.diagram, opened.scene, out / "images", views=panels, track=tracked

@@ -28,7 +28,14 @@ from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.run import open_run
 from voronerf.app.scenes import Scene, SceneError, load_scene
 from voronerf.app.train.build import build, present_device
-from voronerf.app.train.callbacks import CHECKPOINT_EVERY, Checkpoints, Divergence, Scores, TensorBoard
+from voronerf.app.train.callbacks import (
+    CHECKPOINT_EVERY,
+    Checkpoints,
+    Divergence,
+    Scores,
+    TensorBoard,
+    tensorboard_writer,
+)
 from voronerf.app.train.checkpoint import last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.defaults import machine_speed, why_no_occupancy
@@ -101,6 +108,8 @@ def train(
         raise ConfigError(f"--checkpoint-every must be a positive number of seconds, got {checkpoint_every:g}")
     if view:
         import_viewer().check_address(host, port)
+    if tensorboard:
+        tensorboard_writer()
     with busy(f"reading {config.data}"):
         scene = load_scene(config.data, **config.reading)
     if explain:

@@ -143,8 +143,9 @@ def find_lpips(
     if named:
         return Lpips(read_weights(_files(path))), f"LPIPS weights from {path}"
     folders = [Path(root) / "lpips" for root in (os.environ.get("VORONERF_DATA"),) if root]
-    if data and Path(data).is_dir():
-        folders.append(Path(data).resolve().parent / "lpips")
+    if data and Path(data).exists():
+        place = Path(data).resolve()  # a folder, or a file that stands for it
+        folders.append((place if place.is_dir() else place.parent).parent / "lpips")
     for folder in folders:
         if any(file.suffix in SUFFIXES for file in folder.glob("*")):
             return Lpips(read_weights(_files(folder))), f"LPIPS weights from {folder}"

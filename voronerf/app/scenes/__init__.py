@@ -22,6 +22,7 @@ __all__ = ["Scene", "SceneError", "Split", "builtin_scene", "city_scene", "load_
 
 BUILTIN_SIZE = 100
 BUILTIN, CITY = "builtin", "builtin-city"  # or with a size, builtin:400, and with blocks, builtin-city:4x4
+CACHED = 100  # pixels a side, from which on the built-in scene is kept
 MOST_PIXELS = 1600  # a side of the built-in scene
 
 
@@ -46,6 +47,16 @@ FORMATS = {
 }
 
 
+def _computed(size: int) -> Scene:
+    """The built-in scene, which is kept in the cache from a size on that takes seconds."""
+    if size < CACHED:
+        return builtin_scene(size)
+    try:
+        return builtin_scene(size, images="cached")
+    except SceneError:  # no cache can be written
+        return builtin_scene(size)
+
+
 def is_builtin(source: str | Path | None) -> bool:
     """Whether a source names a scene that is computed, and no folder."""
     return str(source).partition(":")[0] in (BUILTIN, CITY)
@@ -66,7 +77,7 @@ def load_scene(
     Args:
         source: "builtin", or "builtin:400" of 400 pixels; "builtin-city" of one block or "builtin-city:4x4" of 16; or a
             folder with `transforms_train.json` (Blender synthetic), `transforms.json` (instant-ngp, nerfstudio), a
-            COLMAP model in `sparse/0`, or LLFF's `poses_bounds.npy`.
+            COLMAP model in `sparse/0`, or LLFF's `poses_bounds.npy`; such a file stands for its folder.
         downscale: factor by which images are reduced, >= 1; built-in scenes have 100 pixels, or the size that is named,
             divided by it. None is 1, and for photographs the least factor that leaves at most 512 pixels a side.
         allow_outside: also read images that lie outside of the folder, which a scene may name by `..`, an absolute path
@@ -110,8 +121,10 @@ def load_scene(
             raise SceneError(
                 f"{source}: images must be auto or memory for a built-in scene other than a city, got disk"
             )
-        return builtin_scene(full // downscale)
+        return _computed(full // downscale)
     folder = Path(source)
+    if folder.is_file() and folder.name in (signs := {each.sign: name for name, each in FORMATS.items()}):
+        folder, format = folder.parent, signs[folder.name] if format == "auto" else format
     if not folder.exists():
         raise SceneError(f"{folder}: there is no such folder")
     if not folder.is_dir():

@@ -76,6 +76,8 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or "\0" in name:
             raise SceneError(f"{path}: frame {position} has no file_path")
+        if not is_text(name):
+            raise SceneError(f"{path}: frame {position}: file_path must be text without surrogates, got {name!r:.60}")
         where = f"{path}: frame {position} ({name})"
         pose = pose_of(frame.get("transform_matrix"), where)
         image = _find_image(path.parent, name, allow_outside, where)
@@ -135,6 +137,11 @@ def focal_length(entries: dict[str, Any], key: str, side: int, path: Path) -> fl
     return focal
 
 
+def is_text(name: str) -> bool:
+    """Whether a name has no half of a pair of UTF-16, which JSON may hold and no file is called."""
+    return not any("\ud800" <= char <= "\udfff" for char in name)
+
+
 def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Path | None:
     """Finds an image file; Blender's files leave out the suffix, and files from Windows may have its separators."""
     for spelt in dict.fromkeys((name, name.replace("\\", "/"))):
@@ -150,7 +157,7 @@ def _mask(folder: Path, name: object, allow_outside: bool, where: str) -> Path |
     """The mask of a frame; None without one."""
     if name is None:
         return None
-    if not isinstance(name, str) or "\0" in name:
+    if not isinstance(name, str) or "\0" in name or not is_text(name):
         raise SceneError(f"{where}: mask_path must be a file name, got {name!r:.60}")
     mask = folder / name.replace("\\", "/")
     _check_inside(mask, folder, allow_outside, f"{where}: mask_path")

@@ -34,6 +34,8 @@ CHECKPOINT_EVERY, KEPT = 30.0, 3
 SHARE, VIEWS = 0.1, 20
 #: About the pixels that are rendered to learn what a view takes, and the least side of a part of one, for LPIPS.
 PROBE, PROBE_SIDE = 1024, 31
+#: The most views whose middle is scored where time is short for one.
+PARTS = 8
 #: Side of the corner of a view that tells what LPIPS takes.
 LPIPS_PROBE = 128
 #: Entries of the last evaluation that summary.json repeats.
@@ -71,7 +73,9 @@ class Checkpoints(Callback):
         when = f"at {state.seconds:.0f} s, step {state.step}"
         if stage.split_cells:
             balance = f", imbalance of their importance {stage.balance_before:.3f} -> {stage.balance_after:.4f}"
-            state.report(f"{stage.cells} cells {when}{balance if state.config.centres == 'balanced' else ''}")
+            state.report(
+                f"{counted(stage.cells, 'cell')} {when}{balance if state.config.centres == 'balanced' else ''}"
+            )
         else:
             state.report(f"no cell split {when}: none holds {MIN_SAMPLES} of the {len(done.points)} samples kept")
 
@@ -217,7 +221,9 @@ class Scores(Callback):
             left -= self.clock() - started
             views = min(views, int(max(left, 0) / max(each, 1e-9)))
             if last and views < 1:
-                views, middle = 1, min(most, math.ceil(math.sqrt(each / max(left, 1e-9))))
+                afford = max(left, 1e-9) / max(each, 1e-9)  # views, of which this is less than one
+                views = max(1, min(every, PARTS, int(afford * most**2)))
+                middle = min(most, math.ceil(math.sqrt(views / afford)))
         if views:
             begun = self.clock()
             stop = lambda: state.stopped or self.clock() - begun > left  # noqa: E731
@@ -266,10 +272,9 @@ class Scores(Callback):
         self.metrics = [line for line in self.metrics if line["step"] < state.step] + [now]
         if self.out is not None:
             write_text(self.out / "metrics.jsonl", "".join(json_text(line) + "\n" for line in self.metrics))
-        part = f"the middle {1 / middle**2:.0%} of " if middle > 1 else ""
         state.report(
-            f"{state.seconds:7.1f} s  step {state.step:6d}  {now['cells']:4d} cells  "
-            f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({part}{len(scores)} view{'s' * (len(scores) != 1)})"
+            f"{state.seconds:7.1f} s  step {state.step:6d}  {now['cells']:4d} cell{'s' * (now['cells'] != 1)}  "
+            f"psnr {now['psnr']:6.2f}  ssim {now['ssim']:.4f}  ({views_of(now)})"
         )
         if math.isnan(self.one_colour):
             self.one_colour = one_colour_psnr(state.scene)
@@ -277,6 +282,19 @@ class Scores(Callback):
         poor = why_scores_are_poor(self.metrics, state.config, self.one_colour, settled=settled)
         if poor is not None:
             state.report(poor)
+
+
+def views_of(scores: Mapping[str, Any]) -> str:
+    """What scores are of, such as "3 views" or "the middle 6% of 1 view"; nothing where they do not say it."""
+    views, part = scores.get("views"), scores.get("part", 1)
+    if not isinstance(views, int) or not isinstance(part, int | float):
+        return ""
+    return f"the middle {part:.0%} of " * (part < 1) + counted(views, "view")
+
+
+def counted(count: int, noun: str) -> str:
+    """A number of things, such as "1 cell" or "16 cells"."""
+    return f"{count:,} {noun}{'s' * (count != 1)}"
 
 
 def one_colour_psnr(scene: Scene) -> float:
@@ -297,7 +315,9 @@ def why_scores_are_poor(
         one_colour: See :func:`one_colour_psnr`.
         settled: Whether the run is so far that it must have learnt something.
     """
-    *earlier, now = (math.nan if m["psnr"] is None else m["psnr"] for m in metrics)
+    if metrics[-1].get("part", 1) < 1:
+        return None  # the middle of views has scores of its own
+    *earlier, now = (math.nan if m["psnr"] is None else m["psnr"] for m in metrics if m.get("part", 1) == 1)
     best = max((psnr for psnr in earlier if math.isfinite(psnr)), default=-math.inf)
     assert config.lr is not None
     usual = config.field_type.learning_rate(config.network_options)
@@ -311,6 +331,15 @@ def why_scores_are_poor(
             f"is probably too high, try --lr {rate:.2g}{other}"
         )
     return None
+
+
+def tensorboard_writer() -> Any:
+    """What writes the files of TensorBoard; raises ImportError where it is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise ImportError("--tensorboard needs tensorboard: pip install 'voronerf[tensorboard]'") from None
+    return SummaryWriter
 
 
 class TensorBoard(Callback):
@@ -335,11 +364,7 @@ class TensorBoard(Callback):
     EVERY = 10  # steps between two losses
 
     def __init__(self, folder: Path, scores: Scores) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            raise ImportError("--tensorboard needs tensorboard: pip install 'voronerf[tensorboard]'") from None
-        self._make, self.folder, self.scores, self.written = SummaryWriter, folder, scores, 0
+        self._make, self.folder, self.scores, self.written = tensorboard_writer(), folder, scores, 0
         self.writer: Any = None
 
     def on_start(self, state: State) -> None:

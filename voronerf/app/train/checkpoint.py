@@ -8,6 +8,7 @@ each tensor and one for the JSON.
 from __future__ import annotations
 
 import json
+import re
 import threading
 import warnings
 import zlib
@@ -164,6 +165,9 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
+            version = re.fullmatch(r"voronerf-checkpoint-(\d{1,9})", str(metadata.get("format")))
+            if version and int(version[1]) > int(FORMAT.rpartition("-")[2]):
+                raise CheckpointError(f"{path}: must be a {FORMAT} file, got {version[0]} of a newer voronerf")
             if metadata.get("format") != FORMAT:
                 raise CheckpointError(f"{path}: not a {FORMAT} file, its format is {metadata.get('format')!r}")
             sums = parse_json(metadata["checksums"])

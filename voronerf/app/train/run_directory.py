@@ -147,8 +147,8 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
 
 
 def read_curve(run: Path) -> list[tuple[float, float]]:
-    """Training seconds and PSNR of the evaluations of a run, without those whose PSNR is not finite."""
-    points = [(line.get("seconds"), line.get("psnr")) for line in read_metrics(run)]
+    """Training seconds and PSNR of the evaluations of a run, of whole views and where the PSNR is finite."""
+    points = [(line.get("seconds"), line.get("psnr")) for line in read_metrics(run) if line.get("part", 1) == 1]
     return [(x, y) for x, y in points if isinstance(x, (int, float)) and isinstance(y, (int, float))]
 
 

@@ -27,8 +27,8 @@ from voronerf.nerf.cameras import Cameras
 if TYPE_CHECKING:
     from voronerf.app.viewer.viewer import Viewer
 
-#: Pixels along the longer side of the sharp picture, at first and at most.
-SHARP, LARGEST = 512, 2048
+#: Pixels along the longer side of the sharp picture: at first those of the window, in this range; and at most.
+SHARP, FULL, LARGEST = 512, 1536, 2048
 #: Training views that are drawn at most, evenly spread, and the longer side of their pictures.
 MOST_VIEWS, THUMBNAIL = 200, 96
 #: Vertical angles of view in degrees that can be chosen.
@@ -50,6 +50,7 @@ class Client:
         fov: Its vertical angle of view in radians.
         look: What it shows.
         longest: Pixels along the longer side of its sharp picture.
+        follows: Whether these are still those of the window.
         version: Counts what changes its picture.
         moved_at: When that was last.
         wants_coarse: Whether it needs a coarse picture now.
@@ -61,7 +62,7 @@ class Client:
 
     def __init__(self, handle: viser.ClientHandle, viewer: Viewer) -> None:
         self.handle, self.viewer = handle, viewer
-        self.longest = SHARP
+        self.longest, self.follows = SHARP, True
         self.times: deque[float] = deque(maxlen=20)  # when the last coarse pictures were drawn
         self.said_at = 0.0
         self.version, self.moved_at, self.drawn_at, self.cost = 0, 0.0, 0.0, 0.0
@@ -116,6 +117,8 @@ class Client:
         there = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)
         if there and np.isfinite(numbers).all() and 0 < now.fov < math.pi:
             self.aspect, self.fov = now.aspect, now.fov
+            if self.follows:
+                self.longest = int(min(max(SHARP, now.image_width, now.image_height), FULL))
             self.camera = partial(make_camera, SO3(now.wxyz).as_matrix(), now.position, now.fov, now.aspect)
 
     def change(self, **look: Any) -> None:
@@ -176,7 +179,8 @@ class Client:
         self.state = gui.add_markdown("rendering")
         pane = gui.add_dropdown("Show", PANES, initial_value="colour", hint="What each pixel shows.")
         self.on(pane.on_update, lambda: self.change(pane=chosen(pane)))
-        size = gui.add_slider("Pixels", 128, LARGEST, 64, SHARP, hint="Along the longer side of a picture at rest.")
+        hint = "Along the longer side of a picture at rest; at first those of the window."
+        size = gui.add_slider("Pixels", 128, LARGEST, 1, self.longest, hint=hint)
         self.on(size.on_update, lambda: self._resize(chosen(size)))
         self.angle = gui.add_slider("Field of view", NARROWEST, WIDEST, 1, NARROWEST, hint="Top to bottom, in degrees.")
         self.on(self.angle.on_update, lambda: self._choose_angle(chosen(self.angle)))
@@ -215,7 +219,7 @@ class Client:
         register(lambda _: self.viewer.serve_client(self, work))
 
     def _resize(self, longest: int) -> None:
-        self.longest = longest
+        self.longest, self.follows = longest, False
         self.change()
 
     # --- cells -----------------------------------------------------------------------------------------------------

@@ -63,7 +63,16 @@ class Keyframes:
         with client.handle.atomic():
             for number, camera in enumerate(self.cameras):
                 name, size = f"/keyframes/{number}", SIZE * float((high - low).norm())
-                nodes.append(scene.add_camera_frustum(name, scale=size, color=(90, 90, 90), **frustum(camera, 0)))
+                # In units of the scene the lines around the camera itself would cover the picture.
+                node = scene.add_camera_frustum(
+                    name,
+                    scale=size,
+                    color=(90, 90, 90),
+                    thickness=1.5,
+                    thickness_units="screen",
+                    **frustum(camera, 0),
+                )
+                nodes.append(node)
             if count > 1:
                 line = smooth_path(same_size(self.cameras), POINTS, closed=bool(self.closed.value)).origins.numpy()
                 points = np.stack((line[:-1], line[1:]), 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from voronerf.app.train.callbacks import Scores
+from voronerf.app.train.callbacks import Scores, counted
 from voronerf.app.train.loop import Callback
 from voronerf.app.train.state import State
 from voronerf.app.viewer.pictures import Subject
@@ -100,7 +100,7 @@ class Training(Callback):
         speed = now.rays_done / max(now.seconds, 1e-9) / 1000
         self.line.content = (
             f"step {now.step:,}, {now.seconds:.0f} s, {now.fraction:.0%}  \n"
-            f"{self.cells} cells, {speed:.1f} k rays/s  \n"
+            f"{counted(self.cells, 'cell')}, {speed:.1f} k rays/s  \n"
             f"loss {now.loss:.5f}" + (f", PSNR {metrics[-1]['psnr']:.2f} dB" if metrics else "")
         )
-        self.viewer.show_curve([(line["seconds"], line["psnr"]) for line in metrics])
+        self.viewer.show_curve([(line["seconds"], line["psnr"]) for line in metrics if line["part"] == 1])

@@ -326,6 +326,8 @@ def check(program: Program) -> None:
             if not (depth and width):  # the products walk them with loops that test at the end
                 return False
             inside = (depth, start + width) if transposed else (width, start + depth)
+            spread = any(isinstance(each, Columns) and each.spread for each in operands[1:])
+            _rule("steps", not spread, step, "without spread columns in what a linear one adds")
             others = all(fits(each, width, rows=each.of == VALUE) for each in operands[1:])
             return inside[0] == o and inside[1] <= i and others and not tables.setdefault(matrix, False)
         if not _sums(step) or step.out >= len(sums):

@@ -10,7 +10,15 @@ from torch import Tensor
 from voronerf.ops.march_rays.reference import hashed_uniforms
 
 
-class Runs(NamedTuple):
+class _Runs(NamedTuple):
+    ends: Tensor
+    shift: Tensor
+    first: Tensor
+    bits: int
+    total: int
+
+
+class Runs(_Runs):
     """Pixels to draw from, in rising runs: few entries where most of a row counts.
 
     Attributes:
@@ -20,6 +28,9 @@ class Runs(NamedTuple):
         bits: of `first`: about as many places as a run has.
         total: the pixels of all runs.
 
+    Raises:
+        ValueError: Where these do not fit each other, which is looked at when runs are made.
+
     Examples:
         >>> import torch
         >>> from voronerf.ops import Runs
@@ -27,11 +38,22 @@ class Runs(NamedTuple):
         8
     """
 
-    ends: Tensor
-    shift: Tensor
-    first: Tensor
-    bits: int
-    total: int
+    __slots__ = ()
+
+    def __new__(cls, ends: Tensor, shift: Tensor, first: Tensor, bits: int, total: int) -> Runs:
+        """Runs that fit each other; dtypes and shapes are left to ``draw_pixels``."""
+        plain = all(type(each) is Tensor and each.dim() == 1 and not each.is_meta for each in (ends, shift, first))
+        if plain and len(ends) and 0 <= bits <= 48 and 1 <= total <= 2**48:
+            if int(ends[0]) < 1 or int(ends[-1]) != total or not bool((ends[1:] > ends[:-1]).all()):
+                raise ValueError(
+                    f"Runs: ends must rise from 1 or more to the total, {total}, got {ends.tolist()!r:.60}"
+                )
+            wanted = _first_runs(ends, bits, total)
+            if first.shape != wanted.shape or not torch.equal(first.to(wanted), wanted):
+                raise ValueError(
+                    f"Runs: first must hold the run of each {1 << bits}th of {total} pixels, got {first.tolist()!r:.60}"
+                )
+        return super().__new__(cls, ends, shift, first, bits, total)
 
     @staticmethod
     def of(start: Tensor, length: Tensor) -> Runs:
@@ -39,9 +61,13 @@ class Runs(NamedTuple):
         ends = length.cumsum(0)
         total = int(ends[-1])
         bits = max(total // len(ends), 1).bit_length()
-        places = torch.arange(0, total, 1 << bits, device=ends.device)
-        first = torch.searchsorted(ends, places, right=True).int()
-        return Runs(ends, start - (ends - length), first, bits, total)
+        return Runs(ends, start - (ends - length), _first_runs(ends, bits, total), bits, total)
+
+
+def _first_runs(ends: Tensor, bits: int, total: int) -> Tensor:
+    """int32, the first run that ends behind place 0, 2^bits, 2 * 2^bits and so on."""
+    places = torch.arange(0, total, 1 << bits, device=ends.device)
+    return torch.searchsorted(ends, places, right=True).int()
 
 
 class Known(NamedTuple):

@@ -7,21 +7,18 @@ scene unit wide. Each block adds the same number of views from its streets and f
 from __future__ import annotations
 
 import math
-import os
 import re
 from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from voronerf.app.scenes.builtin.caster import Caster
 from voronerf.app.scenes.builtin.city_solids import city
-from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, render_views
+from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, keep_in_store, render_views
 from voronerf.app.scenes.builtin.solids import Array, rotation
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.scene import Scene, Split
-from voronerf.app.scenes.store import Make, stored
 from voronerf.nerf.cameras import Cameras, look_at
 
 TRAIN_VIEWS, TEST_VIEWS = 40, 8  # of a block; half of them from the street
@@ -73,12 +70,7 @@ def city_scene(
 
     def views(part: str, seed: int, count: int) -> Split:
         cameras = city_cameras(size, sides, count, seed)
-
-        def keep(shape: tuple[int, int, int, int], make: Make) -> Tensor:
-            found = stored(f"{name}-{part}", [made_of, size, count, seed], FORMULA, shape, make, os.cpu_count() or 1)
-            return found if images == "disk" else found.clone()
-
-        kept = None if images == "memory" else keep
+        kept = keep_in_store(f"{name}-{part}", [made_of, size, count, seed], FORMULA, images)
         return replace(render_views(cameras, part, caster, kept), on_disk=images == "disk")
 
     train, test = views("train", 0, train_views), views("test", 1, test_views)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 from voronerf.app.scenes.builtin.caster import Caster
 from voronerf.app.scenes.builtin.solids import Array, Solid, normalised, turned
 from voronerf.app.scenes.scene import Split
+from voronerf.app.scenes.store import Make, stored
 from voronerf.nerf.cameras import Cameras
 
 SUPERSAMPLES = 3  # on each side of a pixel
@@ -25,13 +27,23 @@ BAND = 1 << 16  # rays at a time, so that their arrays stay in the cache
 BOXES = 1 << 13  # of solids that are projected at a time
 
 # from a shape [c, h, w, 4] and a function that makes image i to the images
-Keep = Callable[[tuple[int, int, int, int], Callable[[int], NDArray[np.uint8]]], Tensor]
+Keep = Callable[[tuple[int, int, int, int], Make], Tensor]
 
 
 def bounds(solids: Sequence[Solid]) -> Array:
     """The box that holds all solids, [2, 3]."""
     boxes = np.stack([solid.bounds() for solid in solids])
     return np.stack((boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)))
+
+
+def keep_in_store(name: str, sources: Sequence[Any], formula: int, images: str) -> Keep | None:
+    """What keeps images in a store of the cache, and for "cached" copies them into memory; None for "memory"."""
+
+    def keep(shape: tuple[int, int, int, int], make: Make) -> Tensor:
+        found = stored(name, sources, formula, shape, make, os.cpu_count() or 1)
+        return found if images == "disk" else found.clone()
+
+    return None if images == "memory" else keep
 
 
 def render_views(cameras: Cameras, name: str, caster: Caster, keep: Keep | None = None) -> Split:

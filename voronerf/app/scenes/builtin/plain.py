@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from voronerf.app.scenes.builtin.caster import Caster
-from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, render_views
+from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, keep_in_store, render_views
 from voronerf.app.scenes.builtin.solids import Box, Cylinder, Solid, Sphere, Torus, rotation
 from voronerf.app.scenes.builtin.textures import barber_pole, bricks, checker, diagonals, globe, mosaic, plain, spiral
 from voronerf.app.scenes.scene import Scene
@@ -25,18 +25,23 @@ TRAIN_VIEWS, TEST_VIEWS = 100, 25
 DISTANCE = 4.0
 ANGLE_X = 0.6911112  # horizontal field of view of the Blender scenes, radians
 NEAR, FAR = 2.0, 6.0
+FORMULA = 1  # of what is in the scene: raised by a change, so that no store has the old one
 
 
-def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views: int = TEST_VIEWS) -> Scene:
+def builtin_scene(
+    size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views: int = TEST_VIEWS, images: str = "memory"
+) -> Scene:
     """Computes the scene.
 
     Args:
         size: of the square images, pixels.
         train_views: spread over the upper hemisphere on a spherical Fibonacci lattice.
         test_views: on an orbit that rises and falls twice, apart from the training views.
+        images: "memory"; or "cached", which also keeps them in a store of the cache, where a next call finds them.
 
     Raises:
-        ValueError: a size or number of views below 1.
+        ValueError: a size or number of views below 1, or another place for the images.
+        SceneError: the store cannot be written.
 
     Examples:
         >>> from voronerf.app.scenes import builtin_scene
@@ -48,14 +53,20 @@ def builtin_scene(size: int = 100, *, train_views: int = TRAIN_VIEWS, test_views
         raise ValueError(
             f"builtin: size, train_views and test_views must be >= 1, got {size}, {train_views} and {test_views}"
         )
+    if images not in ("memory", "cached"):
+        raise ValueError(f"builtin: images must be memory or cached, got {images!r:.60}")
     height = (torch.arange(train_views) + 0.5) / train_views
     golden = math.pi * (3 - math.sqrt(5))
     turn = 2 * math.pi * torch.arange(test_views) / test_views
     train = _cameras(torch.asin(0.02 + 0.96 * height), golden * torch.arange(train_views), size)
     test = _cameras(torch.deg2rad(28 + 16 * torch.sin(2 * turn)), turn + 0.05, size)
     caster = Caster(SOLIDS, LIGHT)
-    parts = render_views(train, "train", caster), render_views(test, "test", caster)
-    return Scene("builtin", *parts, NEAR, FAR, torch.from_numpy(bounds(SOLIDS)), "linear", "white")
+    train_split, test_split = (
+        render_views(cameras, part, caster, keep_in_store(f"builtin-{part}", [size, len(cameras)], FORMULA, images))
+        for part, cameras in (("train", train), ("test", test))
+    )
+    box = torch.from_numpy(bounds(SOLIDS))
+    return Scene("builtin", train_split, test_split, NEAR, FAR, box, "linear", "white")
 
 
 def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
