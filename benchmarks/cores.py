@@ -1,11 +1,12 @@
 """What more cores give to a training: steps by the clock on one core and on all, what a region of threads costs, and a
 model of more cores than the machine has.
 
-    python benchmarks/cores.py --data DATA --json benchmarks/results/cores.json    three minutes of two quiet cores
+    OMP_WAIT_POLICY=passive GOMP_SPINCOUNT=1000 python benchmarks/cores.py --data DATA --json FILE
 
-DATA holds the scenes lego and bonsai. By the clock, trainings of the same steps take turns: on one thread and on all
-cores, replayed (voronerf/nerf/step.py) and as they are, and beside another training in a process of its own. The first
-quarter of the turns, with the split, and the end of a training are left out.
+takes three minutes of two quiet cores. DATA holds the scenes lego and bonsai; `voronerf train` sets these variables
+itself (docs/kernels.md). By the clock, trainings of the same steps take turns: on one thread and on all cores, replayed
+(voronerf/nerf/step.py) and as they are, and beside another training in a process of its own. The first quarter of the
+turns, with the split, and the end of a training are left out.
 
 The model is of one thread, by its processor time. Calls of the compiled module are traced in other steps of each turn
 (csrc/common/trace.h): each run of items that threads would share is given to whichever of 2, 8, 16 and 32 would be free
@@ -19,8 +20,8 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import os
 import statistics
-import threading
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -44,8 +45,9 @@ TRACED, TIMED = 16, 32
 LINE, SAMPLE_BYTES, ENTRY_BYTES, TAUGHT_BYTES = 16, 450, 8, 24
 """Entries of a cache line; bytes that a step reads and writes of a sample (positions to gradients), of an entry (its
 gradient, twice), and of one in a line with a gradient (itself and two moments, each read and written)."""
-CALLS, SERIAL_US = 100, 40
-"""Regions of a recording, and what one thread does before each of them, in microseconds."""
+CALLS, SERIAL_US, TRIALS = 100, 40, 5
+"""Regions of a recording; what one thread does before each of them, in microseconds; measurements, of which the least
+disturbed stands."""
 
 
 class Case(NamedTuple):
@@ -58,7 +60,7 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "default": Case("lego", 4, {"steps": 1500}, 2),
+    "default": Case("lego", 4, {"steps": 1500}, 1),
     "bonsai": Case("bonsai", 2, {"steps": 500}),
     "nerf": Case("lego", 4, {"steps": 300, "field": "nerf"}),
 }
@@ -209,9 +211,8 @@ def model(found: list[dict[str, list[float]]], moved: float, region_us: float) -
 
 def region(cores: int) -> dict[str, Any]:
     """What a region without work costs, in microseconds, with serial work before it: as a team of its own, woken each
-    time; the same where another thread of the process has had a team, as autograd's has, whereupon OpenMP lets threads
-    sleep sooner; and in a recording whose team waits for it. A recording that is replayed on one thread has no team, so
-    calls that were recorded for more threads have one each."""
+    time, and in a recording whose team waits for it. A recording that is replayed on one thread has no team, so calls
+    that were recorded for more threads have one each."""
     points, cells = torch.rand(2048, 3), torch.empty(2048, dtype=torch.int32)
     pair = [torch.zeros(1), torch.zeros(1)], [torch.zeros(1), torch.zeros(1)]
 
@@ -236,25 +237,9 @@ def region(cores: int) -> dict[str, Any]:
     k = max(1, round(tried * SERIAL_US / min(microseconds(trial, 1) for _ in range(8))))
     one, several = record(k, 1), record(k, cores)
 
-    def medians() -> list[float]:
-        found = [[microseconds(one, 1), microseconds(several, 1), microseconds(several, cores)] for _ in range(21)][1:]
-        return [statistics.median(column) for column in zip(*found, strict=True)]
-
-    def team(made: threading.Event, end: threading.Event) -> None:
-        several.replay(cores)
-        made.set()
-        end.wait()
-
-    serial, own, inside = medians()
-    made, end = threading.Event(), threading.Event()
-    thread = threading.Thread(target=team, args=(made, end))
-    thread.start()
-    made.wait()
-    serial_beside, beside, inside_beside = medians()
-    end.set()
-    thread.join()
-    shown = {"serial_us": serial, "own_team_us": own - serial, "own_team_beside_another_us": beside - serial_beside}
-    shown["in_recording_us"] = (inside - serial + inside_beside - serial_beside) / 2
+    found = [[microseconds(one, 1), microseconds(several, 1), microseconds(several, cores)] for _ in range(21)][1:]
+    serial, alone, inside = (statistics.median(column) for column in zip(*found, strict=True))
+    shown = {"serial_us": serial, "own_team_us": alone - serial, "in_recording_us": inside - serial}
     return {"case": "a region", "threads": cores, **{name: round(value, 2) for name, value in shown.items()}}
 
 
@@ -290,6 +275,7 @@ def measure(name: str, case: Case, cores: int, region_us: float) -> list[dict[st
     row = {
         **known,
         **counts,
+        "explained": state.training_step.explain(),
         "ms": ms,
         "processor_ms": processor_ms,
         "x on all cores": round(ms["one thread"] / ms["all cores"], 2),
@@ -320,9 +306,9 @@ def python_percent(training: Training) -> float:
 
 def tables(results: list[dict[str, Any]]) -> str:
     """Those of docs/performance.md."""
-    short = {way: way.replace("two at once, ", "") for way in ways(2)}
-    clock = [f"| by the clock, ms | {' | '.join(short.values())} | x | x, as it is | Python, % | as it is |"]
-    clock.append("|" + "---|" * (len(short) + 5))
+    names = list(ways(2))
+    clock = [f"| by the clock, ms | {' | '.join(names)} | x | x, as it is | Python, % | as it is |"]
+    clock.append("|" + "---|" * (len(names) + 5))
     models = [
         f"| model | one thread, ms | serial, % | regions | {' | '.join(f'{n} cores' for n in TEAMS)} | at 40 GB/s |"
     ]
@@ -330,7 +316,7 @@ def tables(results: list[dict[str, Any]]) -> str:
     for row in results[1:]:
         name = f"{row['case']}, {' x '.join(map(str, row['size']))}"
         if "ms" in row:
-            shown = [f"{row['ms'][way]:.2f}" for way in short]
+            shown = [f"{row['ms'][way]:.2f}" for way in names]
             shown += [f"{row[f'x on all cores{how}']:.2f}" for how in ("", ", as it is")]
             shown += [f"{row[f'python_percent{how}']:.1f}" for how in ("", ", as it is")]
             clock.append(f"| {name} | {' | '.join(shown)} |")
@@ -350,8 +336,12 @@ def main(arguments: list[str] | None = None) -> None:
     options: argparse.Namespace = parser.parse_args(arguments)
     if options.data is None and not options.quick:
         parser.error("--data must name the folder of the scenes")
+    waiting = {name: os.environ.get(name) for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
+    if waiting["OMP_WAIT_POLICY"] is None and not options.quick:
+        parser.error("OMP_WAIT_POLICY must be set, to passive with GOMP_SPINCOUNT=1000 as voronerf train has it")
     cores = max(2, torch.get_num_threads())
-    results = [region(cores)]
+    trials = [region(cores) for _ in range(TRIALS)]
+    results = [min(trials, key=lambda each: sum(value for name, value in each.items() if name.endswith("_us")))]
     print(results[0])
     cases = QUICK if options.quick else {name: CASES[name] for name in options.case or CASES}
     for name, case in cases.items():
@@ -365,7 +355,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(tables(results))
     if options.json is not None:
         with threads(cores):
-            known = metadata(command="python benchmarks/cores.py --data DATA", benchmark="cores", seed=0)
+            known = metadata(command="python benchmarks/cores.py --data DATA", benchmark="cores", seed=0, **waiting)
         write_text(options.json, json.dumps({"metadata": known, "results": results}, indent=2) + "\n")
 
 

@@ -32,6 +32,8 @@ def test_more_cores_are_bound_by_what_is_serial_and_by_memory():
     assert cores.model([step] * 3, 80e9 * 0.004, 0.0)["x on 32 cores at 80 GB/s"] == pytest.approx(10 / 5, abs=0.01)
 
 
-def test_the_folder_of_the_scenes_must_be_given():
-    with pytest.raises(SystemExit, match="cores: error: --data must name"):
-        cores.main([])
+def test_what_is_missing_is_said(monkeypatch):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    for arguments, said in (([], "--data must name"), (["--data", "."], "OMP_WAIT_POLICY must be set")):
+        with pytest.raises(SystemExit, match=f"cores: error: {said}"):
+            cores.main(arguments)
