@@ -1,150 +1,361 @@
-"""Which part of a training step, and of a picture, is serial, and what more cores would give.
+"""What more cores give to a training: steps by the clock on one core and on all, what a region of threads costs, and a
+model of more cores than the machine has.
 
-    python benchmarks/cores.py --data lego --json benchmarks/results/cores.json    half a minute of one core
+    OMP_WAIT_POLICY=passive GOMP_SPINCOUNT=1000 python benchmarks/cores.py --data DATA --json FILE
 
-All runs on one thread, by its processor time, so that other processes disturb little. Calls of the compiled module are
-traced (csrc/common/trace.h): each run of items that threads would share is given to whichever of 2, 8, 16 and 32 would
-be free first. What lies outside of such regions is serial: Python, torch's own operations, and the compiled module's
-before and after its regions. A step on so many cores takes the serial time and the longest of the threads', or the time
-in which memory moves the step's bytes.
+takes three minutes of two quiet cores. DATA holds the scenes lego and bonsai; `voronerf train` sets these variables
+itself (docs/kernels.md). By the clock, trainings of the same steps take turns: on one thread and on all cores, replayed
+(voronerf/nerf/step.py) and as they are, and beside another training in a process of its own. The first quarter of the
+turns, with the split, and the end of a training are left out.
+
+The model is of one thread, by its processor time. Calls of the compiled module are traced in other steps of each turn
+(csrc/common/trace.h): each run of items that threads would share is given to whichever of 2, 8, 16 and 32 would be free
+first. What lies outside of such regions is serial: Python, torch's own operations, and the compiled module's before and
+after its regions. A step on so many cores takes the serial time, what a region costs for each of them, and the longest
+of the threads' times, or the time in which memory moves the step's bytes.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
+import os
 import statistics
 import time
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from harness import Parser, metadata
+from harness import Parser, metadata, threads
 
 from voronerf.app.files import write_text
 from voronerf.app.scenes import load_scene
 from voronerf.app.train import Callback, TrainConfig, build, train
 from voronerf.app.train.state import State
 from voronerf.ops._core import native
+from voronerf.ops._core.recording import Recording
 
 TEAMS = (2, 8, 16, 32)
 REST = "Python and torch"
 BANDWIDTHS = {"40": 40e9, "80": 80e9}
-CASES: dict[str, tuple[dict[str, Any], int, int]] = {
-    "default": ({"rays": 512}, 400, 64),
-    "default, few samples": ({"rays": 64}, 400, 64),
-    "nerf": ({"field": "nerf"}, 120, 12),
-}
-"""Settings, steps before those that are traced, and how many are."""
+TRACED, TIMED = 16, 32
+"""Steps of a turn: with a trace, where there is one, and by the clock. In every 16th step the grid learns more."""
 LINE, SAMPLE_BYTES, ENTRY_BYTES, TAUGHT_BYTES = 16, 450, 8, 24
 """Entries of a cache line; bytes that a step reads and writes of a sample (positions to gradients), of an entry (its
 gradient, twice), and of one in a line with a gradient (itself and two moments, each read and written)."""
+CALLS, SERIAL_US, TRIALS = 100, 40, 5
+"""Regions of a recording; what one thread does before each of them, in microseconds; measurements, of which the least
+disturbed stands."""
 
 
-class Parts(Callback):
-    """Traces the steps after ``warm`` of them, and stops after ``count`` more."""
+class Case(NamedTuple):
+    """A training."""
 
-    def __init__(self, warm: int, count: int) -> None:
-        self.last, self.warm = warm + count, warm
-        self.steps: list[dict[str, list[float]]] = []
-        self.began = 0.0
+    data: str
+    downscale: int
+    settings: dict[str, Any]
+    picture: int | None = None  # by what the scene is made smaller for a picture; None for no picture
+
+
+CASES = {
+    "default": Case("lego", 4, {"steps": 1500}, 1),
+    "bonsai": Case("bonsai", 2, {"steps": 500}),
+    "nerf": Case("lego", 4, {"steps": 300, "field": "nerf"}),
+}
+QUICK = {"quick": Case("builtin:32", 1, {"steps": TRACED + TIMED + 2}, 1)}
+
+
+class Way(NamedTuple):
+    """How steps are made."""
+
+    threads: int
+    replayed: bool = True
+    beside: int = 0  # threads of another training, at the same time
+
+
+def ways(cores: int) -> dict[str, Way]:
+    """Those that are compared, by name."""
+    return {
+        "one thread": Way(1),
+        "all cores": Way(cores),
+        "one thread, as it is": Way(1, False),
+        "all cores, as it is": Way(cores, False),
+        "two at once, one thread each": Way(1, True, 1),
+        "two at once, all cores each": Way(cores, True, cores),
+    }
+
+
+class Other(Callback):
+    """Another training, again and again while it is wanted, in a process of its own."""
+
+    def __init__(self, case: Case) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.wanted, self.works = context.Value("i", 0), context.Value("i", 1)
+        self.process = context.Process(target=self._train, args=(case, self.wanted, self.works), daemon=True)
+        self.process.start()
+        self.work(0)
+
+    def work(self, count: int) -> None:
+        """Returns when it trains on so many threads, 0 for not at all."""
+        self.wanted.value = count
+        while self.works.value != count:
+            if not self.process.is_alive():
+                raise RuntimeError("the other training has failed")
+            time.sleep(1e-3)
+
+    @staticmethod
+    def _train(case: Case, wanted: Any, works: Any) -> None:
+        torch.set_num_threads(1)
+        scene = load(case)
+
+        class Wait(Callback):
+            def after_step(self, state: State) -> None:
+                while not wanted.value:
+                    works.value = 0
+                    time.sleep(1e-3)
+                works.value = wanted.value
+                torch.set_num_threads(wanted.value)
+
+        while True:
+            train(build(config(case), scene), [Wait()])
+
+
+class Training(Callback):
+    """A training that is made one way, in turns."""
+
+    def __init__(self, case: Case, scene: Any, way: Way) -> None:
+        self.way, self.state = way, build(config(case), scene)
+        if not way.replayed:
+            self.state.training_step._standing_obstacle = lambda: "it is timed"  # type: ignore[method-assign]
+        self.ms: list[float] = []
+        self.processor_ms: list[float] = []
+        self.traced: list[dict[str, list[float]]] = []
+        self._left, self._traces, self._began, self._processor = 0, False, 0.0, 0.0
+
+    def turn(self, other: Other) -> None:
+        """Makes the steps of a turn."""
+        with threads(self.way.threads):
+            other.work(self.way.beside)
+            self._run(TRACED + 1, self.way == Way(1, self.way.replayed))
+            before = self.state.seconds
+            self._run(TIMED, False)
+            self.processor_ms.append(1e3 * self._processor / (TIMED - 1))
+            self.ms.append(1e3 * (self.state.seconds - before) / TIMED)
+            other.work(0)
+
+    def _run(self, count: int, traces: bool) -> None:
+        self._left, self._traces, self._began, self._processor = count, traces, 0.0, 0.0
+        self.state.clear_stop()
+        train(self.state, [self])
+        native.compiled.trace(False)
 
     def after_step(self, state: State) -> None:
-        """Keeps what was traced."""
-        seconds, calls = time.process_time() - self.began, native.compiled.trace(state.step >= self.warm)
-        if state.step > self.warm:
-            self.steps.append(parts(seconds, calls))
-        if state.step >= self.last:
-            native.compiled.trace(False)
+        """Keeps what was traced, and the processor time; of the first step only its end is known."""
+        seconds, calls = time.process_time() - self._began, native.compiled.trace(self._traces)
+        if self._began:
+            self._processor += seconds
+            if self._traces:
+                self.traced.append(parts(seconds, calls))
+        self._left -= 1
+        if self._left == 0:
             state.stop()
-        self.began = time.process_time()
+        self._began = time.process_time()
+
+
+def config(case: Case) -> TrainConfig:
+    """The settings of a training."""
+    return TrainConfig(data=case.data, downscale=case.downscale, **case.settings)
+
+
+def load(case: Case, downscale: int | None = None) -> Any:
+    """The scene of a training."""
+    return load_scene(case.data, downscale=downscale or case.downscale)
 
 
 def parts(seconds: float, calls: list[Any]) -> dict[str, list[float]]:
-    """Of each compiled function and of the rest: seconds, those in regions, and what all takes on each of TEAMS."""
-    found: dict[str, list[float]] = defaultdict(lambda: [0.0] * (2 + len(TEAMS)))
-    for name, whole, _, inside, shared in calls:
-        added = whole, inside, *(whole - inside + each for each in shared)
+    """Of each compiled function and of the rest: seconds, those in regions, how many, and what all takes on TEAMS."""
+    found: dict[str, list[float]] = defaultdict(lambda: [0.0] * (3 + len(TEAMS)))
+    for name, whole, regions, inside, shared in calls:
+        added = whole, inside, regions, *(whole - inside + each for each in shared)
         found[name] = [a + b for a, b in zip(found[name], added, strict=True)]
     rest = seconds - sum(each[0] for each in found.values())
-    found[REST] = [rest, 0.0, *[rest] * len(TEAMS)]
+    found[REST] = [rest, 0.0, 0.0, *[rest] * len(TEAMS)]
     return dict(found)
 
 
-def row(case: str, found: list[dict[str, list[float]]], moved: float, **more: Any) -> dict[str, Any]:
-    """A result: medians of the parts over the steps, in microseconds; the mean of what most steps do not have, and of
-    Python and torch, which take several times as long in every 8th and 16th step."""
+def model(found: list[dict[str, list[float]]], moved: float, region_us: float) -> dict[str, Any]:
+    """Of medians of the parts over the steps, in microseconds; the mean of what most steps do not have, and of Python
+    and torch, which take several times as long in every 8th and 16th step."""
     table = {}
     for name in dict.fromkeys(name for each in found for name in each):
-        own = [each.get(name, [0.0] * (2 + len(TEAMS))) for each in found]
+        own = [each.get(name, [0.0] * (3 + len(TEAMS))) for each in found]
         seldom = name == REST or 2 * sum(name in each for each in found) < len(found)
         middle = statistics.mean if seldom else statistics.median
-        table[name] = [1e6 * middle(each) for each in zip(*own, strict=True)]
-    whole, inside, *on = (sum(column) for column in zip(*table.values(), strict=True))
-    serial = whole - inside
+        table[name] = [middle(each) for each in zip(*own, strict=True)]
+    whole, inside, regions, *on = (sum(column) for column in zip(*table.values(), strict=True))
+    serial, cost = whole - inside, 1e-6 * region_us * regions
     times = {}
-    for team, us in zip(TEAMS, on, strict=True):
+    for team, seconds in zip(TEAMS, on, strict=True):
         for name, rate in BANDWIDTHS.items():
-            times[f"x on {team} cores at {name} GB/s"] = whole / (serial + max(us - serial, 1e6 * moved / rate))
-    listed = {name: {"us": each[0], "serial_us": each[0] - each[1]} for name, each in table.items()}
-    shown = {"case": case, **more, "ms": whole / 1e3, "serial_percent": 100 * serial / whole, "bytes": moved}
-    return {**shown, **{name: round(value, 2) for name, value in times.items()}, "parts": listed}
+            on_team = serial + cost + max(seconds - serial, moved / rate)
+            times[f"x on {team} cores at {name} GB/s"] = round(whole / on_team, 2)
+    listed = {
+        name: {"us": round(1e6 * each[0], 1), "serial_us": round(1e6 * (each[0] - each[1]), 1)}
+        for name, each in table.items()
+    }
+    shown = {"traced_ms": round(1e3 * whole, 3), "serial_percent": round(100 * serial / whole, 1)}
+    return {**shown, "regions": round(regions, 1), "bytes": moved, **times, "parts": listed}
 
 
-def measure(case: str, data: Path) -> list[dict[str, Any]]:
-    """The rows of a training's steps and, by default, of a picture of its field."""
-    settings, warm, count = CASES[case]
-    scene = load_scene(str(data))
-    state = build(TrainConfig(data=str(data), steps=1500, **settings), scene)
-    traced = Parts(warm, count)
-    samples: list[int] = []
-    inner = state.sampler.step_post_backward
+def region(cores: int) -> dict[str, Any]:
+    """What a region without work costs, in microseconds, with serial work before it: as a team of its own, woken each
+    time, and in a recording whose team waits for it. A recording that is replayed on one thread has no team, so calls
+    that were recorded for more threads have one each."""
+    points, cells = torch.rand(2048, 3), torch.empty(2048, dtype=torch.int32)
+    pair = [torch.zeros(1), torch.zeros(1)], [torch.zeros(1), torch.zeros(1)]
 
-    def post(output: Any) -> None:
-        samples.append(len(output.weights))
-        inner(output)
+    def record(k: int, count: int) -> Recording:
+        centres = torch.rand(k, 3)
+        with threads(count), Recording() as recording:
+            n, machine = recording.count(lambda: len(points)), native.cpu()
+            for _ in range(CALLS):
+                native.compiled.nearest_centre(points, centres, cells, n, k, machine)  # one run of points
+                native.compiled.average(0.5, *pair, [1, 1], machine)  # two runs of one number
+        if recording.obstacle is not None:
+            raise RuntimeError(recording.obstacle)
+        return recording
 
-    state.sampler.step_post_backward = post  # type: ignore[method-assign]
-    train(state, [traced])
-    n = statistics.median(samples[warm:])
+    def microseconds(recording: Recording, count: int) -> float:
+        began = time.perf_counter()
+        recording.replay(count)
+        return 1e6 * (time.perf_counter() - began) / CALLS
+
+    tried = 256
+    trial = record(tried, 1)
+    k = max(1, round(tried * SERIAL_US / min(microseconds(trial, 1) for _ in range(8))))
+    one, several = record(k, 1), record(k, cores)
+
+    found = [[microseconds(one, 1), microseconds(several, 1), microseconds(several, cores)] for _ in range(21)][1:]
+    serial, alone, inside = (statistics.median(column) for column in zip(*found, strict=True))
+    shown = {"serial_us": serial, "own_team_us": alone - serial, "in_recording_us": inside - serial}
+    return {"case": "a region", "threads": cores, **{name: round(value, 2) for name, value in shown.items()}}
+
+
+def measure(name: str, case: Case, cores: int, region_us: float) -> list[dict[str, Any]]:
+    """The row of a training and, if there is one, of a picture of its field."""
+    scene, other = load(case), Other(case)
+    trainings = {way: Training(case, scene, how) for way, how in ways(cores).items()}
+    turns = (case.settings["steps"] - 1) // (TRACED + 1 + TIMED)
+    for number in range(turns):
+        if number == turns // 4:  # from here on
+            for training in trainings.values():
+                for kept in (training.ms, training.processor_ms, training.traced):
+                    kept.clear()
+        for training in list(trainings.values())[:: 1 if number % 2 else -1]:
+            training.turn(other)
+    other.process.terminate()
+    other.process.join()
+    ms, processor_ms = (
+        {way: round(statistics.median(getattr(training, kind)), 3) for way, training in trainings.items()}
+        for kind in ("ms", "processor_ms")
+    )
+    one, as_it_is = trainings["one thread"], trainings["one thread, as it is"]
+    state = one.state
+    with threads(1):
+        samples = state.training_step(state.rays).samples
     gradients = [
         p.grad.view(-1) for router in state.routers.values() for p in router.parameters() if p.grad is not None
     ]
     lines = sum(int((each[: len(each) // LINE * LINE].view(-1, LINE) != 0).any(1).sum()) for each in gradients)
-    moved = SAMPLE_BYTES * n + ENTRY_BYTES * state.parameter_count + TAUGHT_BYTES * LINE * lines
-    rows = [row(case, traced.steps, moved, rays=state.rays, samples=n, parameters=state.parameter_count)]
-    if case != "default":
-        return rows
+    moved = SAMPLE_BYTES * samples + ENTRY_BYTES * state.parameter_count + TAUGHT_BYTES * LINE * lines
+    known = {"case": name, "scene": Path(case.data).name, "size": scene.train.cameras.size(0), **case.settings}
+    counts = {"turns": len(one.ms), "rays": state.rays, "samples": samples, "parameters": state.parameter_count}
+    row = {
+        **known,
+        **counts,
+        "explained": state.training_step.explain(),
+        "ms": ms,
+        "processor_ms": processor_ms,
+        "x on all cores": round(ms["one thread"] / ms["all cores"], 2),
+        "x on all cores, as it is": round(ms["one thread, as it is"] / ms["all cores, as it is"], 2),
+        "python_percent": python_percent(one),
+        "python_percent, as it is": python_percent(as_it_is),
+        **model(one.traced, moved, region_us),
+    }
+    if case.picture is None:
+        return [row]
+    view = load(case, case.picture).train
     state.renderer.train(False)
-    view = scene.train
     found = []
-    for _ in range(3):
-        native.compiled.trace(True)
-        began = time.process_time()
-        state.renderer.image(view.cameras, 0, near=scene.near, far=scene.far, box=scene.box, heaviest=False)
-        found.append(parts(time.process_time() - began, native.compiled.trace(False)))
-    width, height = view.cameras.size(0)
-    return [*rows, row(f"picture, {case}", found, 0.0, rays=width * height)]
+    with threads(1):
+        for _ in range(3):
+            native.compiled.trace(True)
+            began = time.process_time()
+            state.renderer.image(view.cameras, 0, near=scene.near, far=scene.far, box=scene.box, heaviest=False)
+            found.append(parts(time.process_time() - began, native.compiled.trace(False)))
+    return [row, {"case": f"picture, {name}", "size": view.cameras.size(0), **model(found, 0.0, region_us)}]
+
+
+def python_percent(training: Training) -> float:
+    """What a step takes outside of compiled calls, of its processor time without a trace."""
+    rest_ms = 1e3 * statistics.mean(each[REST][0] for each in training.traced)
+    return round(100 * rest_ms / statistics.median(training.processor_ms), 1)
+
+
+def tables(results: list[dict[str, Any]]) -> str:
+    """Those of docs/performance.md."""
+    names = list(ways(2))
+    clock = [f"| by the clock, ms | {' | '.join(names)} | x | x, as it is | Python, % | as it is |"]
+    clock.append("|" + "---|" * (len(names) + 5))
+    models = [
+        f"| model | one thread, ms | serial, % | regions | {' | '.join(f'{n} cores' for n in TEAMS)} | at 40 GB/s |"
+    ]
+    models.append("|" + "---|" * (len(TEAMS) + 5))
+    for row in results[1:]:
+        name = f"{row['case']}, {' x '.join(map(str, row['size']))}"
+        if "ms" in row:
+            shown = [f"{row['ms'][way]:.2f}" for way in names]
+            shown += [f"{row[f'x on all cores{how}']:.2f}" for how in ("", ", as it is")]
+            shown += [f"{row[f'python_percent{how}']:.1f}" for how in ("", ", as it is")]
+            clock.append(f"| {name} | {' | '.join(shown)} |")
+        fast, slow = ([row[f"x on {team} cores at {rate} GB/s"] for team in TEAMS] for rate in ("80", "40"))
+        shown = [f"{row['traced_ms']:.2f}", f"{row['serial_percent']:.1f}", f"{row['regions']:.0f}"]
+        models.append(f"| {name} | {' | '.join([*shown, *(f'{x:.2f} x' for x in (*fast, slow[2]))])} |")
+    return "\n".join([*clock, "", *models])
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Prints the shares, and writes the JSON."""
+    """Prints the results, and writes the JSON."""
     parser = Parser("cores", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--data", type=Path, required=True, help="a scene")
+    parser.add_argument("--data", type=Path, help="the folder of the scenes")
     parser.add_argument("--case", choices=CASES, action="append", help="of these alone")
+    parser.add_argument("--quick", action="store_true", help="a few steps of the built-in scene instead")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the results go as well")
     options: argparse.Namespace = parser.parse_args(arguments)
-    torch.set_num_threads(1)
-    results = []
-    for case in options.case or CASES:
-        for each in measure(case, options.data):
+    if options.data is None and not options.quick:
+        parser.error("--data must name the folder of the scenes")
+    waiting = {name: os.environ.get(name) for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
+    if waiting["OMP_WAIT_POLICY"] is None and not options.quick:
+        parser.error("OMP_WAIT_POLICY must be set, to passive with GOMP_SPINCOUNT=1000 as voronerf train has it")
+    cores = max(2, torch.get_num_threads())
+    trials = [region(cores) for _ in range(TRIALS)]
+    results = [min(trials, key=lambda each: sum(value for name, value in each.items() if name.endswith("_us")))]
+    print(results[0])
+    cases = QUICK if options.quick else {name: CASES[name] for name in options.case or CASES}
+    for name, case in cases.items():
+        if not options.quick:
+            case = case._replace(data=str(options.data / case.data))
+        for each in measure(name, case, cores, results[0]["in_recording_us"]):
             results.append(each)
-            print(*(f"{name} {value:.4g}" for name, value in each.items() if isinstance(value, float | int)), case)
-            for name, part in sorted(each["parts"].items(), key=lambda item: -item[1]["us"]):
-                print(f"    {name:24} {part['us']:9.0f} us, serial {part['serial_us']:7.0f}")
+            print(*(f"{key} {value}," for key, value in each.items() if key != "parts"), flush=True)
+            for part, took in sorted(each["parts"].items(), key=lambda item: -item[1]["us"]):
+                print(f"    {part:24} {took['us']:9.0f} us, serial {took['serial_us']:7.0f}")
+    print(tables(results))
     if options.json is not None:
-        known = metadata(command="python benchmarks/cores.py", benchmark="cores", scene=options.data.name)
+        with threads(cores):
+            known = metadata(command="python benchmarks/cores.py --data DATA", benchmark="cores", seed=0, **waiting)
         write_text(options.json, json.dumps({"metadata": known, "results": results}, indent=2) + "\n")
 
 
