@@ -6,6 +6,7 @@
 #include <condition_variable>
 #include <cstdint>
 #include <mutex>
+#include <thread>
 #include <utility>
 
 #if defined(__x86_64__)
@@ -62,9 +63,9 @@ class Team {
 
  private:
   static constexpr uint64_t kMost = 1024, kEnd = ~uint64_t{0};
-  // A thread that waits looks again and again for as long as it takes to sleep and to be woken, then it sleeps: so it
-  // loses at most half of its time, and takes a core from others on the machine for no longer.
-  static constexpr std::chrono::microseconds kLook{50};
+  // A thread that waits looks again and again for about as long as it takes to sleep and to be woken, then it sleeps:
+  // so it loses at most half of its time. In between it yields to whoever wants the core.
+  static constexpr std::chrono::microseconds kLook{200};
 
   void post(uint64_t job) {
     job_.store(job);
@@ -85,6 +86,7 @@ class Team {
         _mm_pause();
 #endif
       }
+      std::this_thread::yield();
     } while (std::chrono::steady_clock::now() < until);
     std::unique_lock<std::mutex> lock(mutex_);
     sleepers_.fetch_add(1);
