@@ -16,7 +16,7 @@ from voronerf.nerf.loss import Batch, RayLoss, RenderOutput
 from voronerf.nerf.radiance import Radiance
 from voronerf.nerf.split import SplitStrategy
 from voronerf.ops import Guard
-from voronerf.ops._core import backends, native
+from voronerf.ops._core import backends
 from voronerf.ops._core.capture import Capture
 from voronerf.ops._core.custom_op import is_watched
 from voronerf.ops._core.recording import Recording
@@ -144,7 +144,8 @@ class TrainingStep:
         self._recording: Recording | Capture | None = None
         self._made: Any = None  # batch and output, when it was recorded
         self._gradients = list[tuple[nn.Parameter, Tensor]]()  # of a graph
-        self._guards: native.compiled.Guards | None = None
+        self._guards: Any = None
+        self._cpu: Callable[[], Any]
         self._known: Radiance | None = None
         self._objects, self._values = list[Any](), list[Any]()
         self._obstacle = ""
@@ -284,7 +285,9 @@ class TrainingStep:
         renderer, optimizer, known = self.loss.renderer, self.optimizer, self.loss.radiance()
         if not isinstance(known, Radiance):
             return
-        self._known, self._guards = known, native.compiled.Guards()
+        from voronerf.ops._core import native  # which is not everywhere
+
+        self._known, self._guards, self._cpu = known, native.compiled.Guards(), native.cpu
         grid = getattr(renderer.sampler, "grid", None)
         for part in (self.batches, self.loss, renderer, renderer.sampler, grid, self.strategy, optimizer):
             if part is not None:
@@ -319,7 +322,7 @@ class TrainingStep:
         router, optimizer = cast(Radiance, self._known).router, self.optimizer
         objects = [self.batches, self.loss, optimizer, self.strategy, self.guard, self.generator, self.autocast]
         objects += [router.assignment, router.temperature, router.backend, router.coords]
-        values: list[Any] = [backends.threads(), native.cpu().isa, torch.is_grad_enabled(), len(optimizer.state)]
+        values: list[Any] = [backends.threads(), self._cpu().isa, torch.is_grad_enabled(), len(optimizer.state)]
         values += [torch.are_deterministic_algorithms_enabled(), torch.backends.cuda.matmul.fp32_precision]
         for group in optimizer.param_groups:
             for own in group["params"]:
