@@ -28,6 +28,7 @@ def run(tmp_path_factory, scene):
 def viewer(run, monkeypatch):
     viewers = pytest.importorskip("voronerf.app.viewer", reason="viser is not installed")
     monkeypatch.setattr("voronerf.app.viewer.client.SHARP", 128)
+    monkeypatch.setattr("voronerf.app.viewer.client.FULL", 128)
     viewer = viewers.view_run(run, port=0)
     yield viewer
     viewer.close()
