@@ -8,6 +8,7 @@
 #include <cstdlib>
 
 #include "cases.h"
+#include "common/parallel.h"
 #include "encoding/adam.h"
 #include "encoding/encode.h"
 #include "encoding/spherical_harmonics.h"
@@ -309,16 +310,19 @@ int main(int count, char** arguments) {
     for (const Isa isa : {Isa::portable, Isa::neon, Isa::avx2, Isa::avx512, Isa::avx512_bf16}) {
       if (!voronerf::isa_supported(isa)) continue;
       start_case(i, isa == Isa::portable);
-      search<float>(isa);
-      if (i % 4 == 0) search<double>(isa);
-      locate<float>(isa);
-      if (i % 4 == 0) locate<double>(isa);
-      composite(isa);
-      encode(isa);
-      harmonics(isa);
-      march(isa);
-      loss(isa);
-      adam(isa);
+      const auto ops = [&] {
+        search<float>(isa);
+        if (i % 4 == 0) search<double>(isa);
+        locate<float>(isa);
+        if (i % 4 == 0) locate<double>(isa);
+        composite(isa);
+        encode(isa);
+        harmonics(isa);
+        march(isa);
+        loss(isa);
+        adam(isa);
+      };
+      i % 2 == 0 ? ops() : voronerf::with_team(3, ops);  // as a recording is replayed
     }
     sort();
     resample();
