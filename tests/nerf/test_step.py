@@ -1,6 +1,7 @@
 """A training step that is recorded and replayed."""
 
 import threading
+from itertools import pairwise
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ from voronerf.nerf import (
     orbit_cameras,
 )
 from voronerf.ops import Guard
+from voronerf.ops._core.recording import Recording
 
 pytestmark = pytest.mark.native
 BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
@@ -112,6 +114,46 @@ def test_more_samples_than_there_is_memory_for(monkeypatch):
         assert as_it_is or training.recorded == before + 1
         found.append([*steps, *training.everything()])
     assert same(*found)
+
+
+def test_more_and_more_samples_and_none():
+    """Step after step beyond the memory, then no samples at all, and some again."""
+    found = []
+    for as_it_is in (False, True):
+        training, steps = Training(), []
+        grid = training.sampler.grid
+        for slices in (1, 1, 1, 1, 2, 4, 8, 16, 16, 0, 0, 3, 3, 3):
+            grid.occupied[:] = False
+            grid.occupied[:slices] = True
+            grid.density[:] = 0
+            grid.density[:slices] = 1e3
+            steps += training.train(1, as_it_is=as_it_is)
+        found.append([*steps, *training.everything()])
+        counts = [each[1].item() for each in steps[5::6]]
+        assert counts[9] == 0 and all(1.25 * before + 64 < now for before, now in pairwise(counts[4:8])), counts
+    assert same(*found)
+
+
+def test_gradients_are_there_after_each_step():
+    """Also where a loop drops them, or a step in between was not replayed."""
+    one, other = Training(), Training()
+    for training, as_it_is in ((one, False), (other, True)):
+        training.train(5, as_it_is=as_it_is)
+        training.optimizer.zero_grad()
+        training.train(1, as_it_is=as_it_is)
+        training.kept = [p.grad.clone() for p in training.router.parameters()]
+        with torch.autograd.profiler.profile():
+            training.train(1, as_it_is=as_it_is)
+        training.train(3, as_it_is=as_it_is)
+    assert same(one.kept, other.kept) and same(one.everything(), other.everything())
+
+
+def test_numbers_of_rows_that_are_much_the_same():
+    """A tensor may have one row more than there are rays."""
+    with Recording() as recording:
+        recording.count(lambda: 8)
+        recording.count(lambda: 9)
+    assert recording.obstacle == "two numbers of rows are much the same, 9"
 
 
 @pytest.mark.parametrize(

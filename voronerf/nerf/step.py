@@ -143,7 +143,7 @@ class TrainingStep:
         """Records the next step anew."""
         self._recording: Recording | Capture | None = None
         self._made: Any = None  # batch and output, when it was recorded
-        self._gradients = list[tuple[nn.Parameter, Tensor]]()  # of a graph
+        self._gradients = list[tuple[nn.Parameter, Tensor]]()  # the memory that replays write
         self._guards: Any = None
         self._cpu: Callable[[], Any]
         self._known: Radiance | None = None
@@ -166,32 +166,33 @@ class TrainingStep:
         if recording is not None and same:
             if recording.replay(backends.threads()):
                 self._wait = self._left = 0
-                for parameter, gradient in self._gradients:
-                    parameter.grad = gradient
+                if any(p.grad is not gradient for p, gradient in self._gradients[:1]):  # a step in between had others
+                    self._give_gradients()
                 batch, output = self._made
                 return StepOutput(batch, output, recording if isinstance(recording, Recording) else None)
         elif obstacle := "a mode, a transform or a profiler of torch watches" if watched else self._standing_obstacle():
             self.forget()
             self._obstacle = obstacle
             return StepOutput(*self._run(rays))
-        if self._left:
+        # What a replay has drawn that there was no memory for: the step is made with it.
+        drawn = recording.drawn if isinstance(recording, Recording) and recording.drawn_now else []
+        if self._left and not drawn:
             self._left -= 1
             return StepOutput(*self._run(rays))
-        return self._record(same)
+        return self._record(same, drawn)
 
-    def _record(self, known: bool) -> StepOutput:
+    def _record(self, known: bool, drawn: list[Tensor]) -> StepOutput:
         """A step as it is, recorded or captured if nothing keeps it from that.
 
         Args:
             known: Whether the step before was of this kind, so that what a first one prepares is there.
+            drawn: Its random numbers, where they are drawn already.
         """
         before, on_gpu = self._recording, self._on_gpu()
         if not on_gpu or known:
             self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
         self.forget()
         if not on_gpu:
-            # What a replay has drawn that there was no memory for.
-            drawn = before.drawn if isinstance(before, Recording) and before.drawn_now else ()
             with Recording(drawn) as recording:
                 made = self._run(recording.count(lambda: self._rays))
             self._keep(recording, made)
@@ -221,8 +222,11 @@ class TrainingStep:
         """Steps that follow are replayed, if nothing keeps them from it."""
         self._obstacle = recording.obstacle or ""
         if recording.obstacle is None:
-            self._recording, self._made = recording, made
-            self._gradients = self._with_gradients() if isinstance(recording, Capture) else []
+            self._recording, self._made, self._gradients = recording, made, self._with_gradients()
+
+    def _give_gradients(self) -> None:
+        for parameter, gradient in self._gradients:
+            parameter.grad = gradient
 
     def _with_gradients(self) -> list[tuple[nn.Parameter, Tensor]]:
         parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
@@ -311,7 +315,7 @@ class TrainingStep:
         if values != self._values or not all(map(operator.is_, objects, self._objects)):
             return False
         known = cast(Radiance, self._known)
-        if known.cells.activation is not None:  # of a field with a layer table, whose members are guarded
+        if known.cells.table is not None:  # of a field with a layer table, whose members are guarded
             return True
         now = self.loss.radiance()
         same = isinstance(now, Radiance) and now.networks is known.networks

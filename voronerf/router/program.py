@@ -6,7 +6,7 @@ n samples, k cells, w columns.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,8 +36,6 @@ class CellProgram(NamedTuple):
         parameters: [k, ...], or without k where all cells share it: the module's own, or made of them.
         table: Gives the arguments of `routed_mlp` for the same parameters, of a field with a layer table.
         after: The steps from what the table puts out, one input, to the results; None without a table.
-        activation: The same as it was found; None without a table.
-        owners: What the parameters are members of, and these, of a field with a layer table.
     """
 
     program: Program
@@ -46,8 +44,6 @@ class CellProgram(NamedTuple):
     parameters: list[Tensor]
     table: Callable[[], Mapping[str, Any]] | None = None
     after: Program | None = None
-    activation: Activation | None = None
-    owners: Sequence[tuple[Mapping[str, Any], tuple[Any, ...]]] = ()
 
 
 @dataclass(frozen=True)
@@ -108,9 +104,7 @@ def program_of_table(field: LayeredField, k: int, activation: Activation) -> Cel
     program = _activated(layers.text, biased, activation.program.text)
     reads = (0, 1) if layers.uses_directions else (0,)
     table = functools.partial(parameters_of_table, field, k)
-    parts = [part._parameters for part in (field, *linears)]  # type: ignore[attr-defined]
-    owners = [(own, tuple(own.values())) for own in parts]
-    return CellProgram(program, reads, activation.shapes, parameters, table, activation.program, activation, owners)
+    return CellProgram(program, reads, activation.shapes, parameters, table, activation.program)
 
 
 @functools.lru_cache(maxsize=64)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
-import operator
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, cast
@@ -601,16 +600,6 @@ class VoronoiRouter(nn.Module):
             if any(p.shape[0] == k and p.dim() > len(shape) for p, shape in own)
             else "all cells share all parameters"
         )
-
-    def gives(self, known: CellProgram) -> bool:
-        """Whether a short look shows that `program` would give the same again: of fields with a layer table."""
-        activation, field = known.activation, self.module
-        if activation is None or self._given is None or not activation.holds(cast(LayeredField, field)):
-            return False
-        for own, members in known.owners:
-            if len(own) != len(members) or not all(map(operator.is_, own.values(), members)):
-                return False
-        return True
 
     def explain(self) -> str:
         """How each method has been carried out, a line for each: fused, grouped or cell by cell, and why.
