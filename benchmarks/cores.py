@@ -34,14 +34,15 @@ from voronerf.app.files import write_text
 from voronerf.app.scenes import load_scene
 from voronerf.app.train import Callback, TrainConfig, build, train
 from voronerf.app.train.state import State
+from voronerf.nerf.schedule import GROUP
 from voronerf.ops._core import native
 from voronerf.ops._core.recording import Recording
 
 TEAMS = (2, 8, 16, 32)
 REST = "Python and torch"
 BANDWIDTHS = {"40": 40e9, "80": 80e9}
-TRACED, TIMED = 16, 32
-"""Steps of a turn: with a trace, where there is one, and by the clock. In every 16th step the grid learns more."""
+TRACED, TIMED = GROUP, 2 * GROUP
+"""Steps of a turn: with a trace, where there is one, and by the clock."""
 LINE, SAMPLE_BYTES, ENTRY_BYTES, TAUGHT_BYTES = 16, 450, 8, 24
 """Entries of a cache line; bytes that a step reads and writes of a sample (positions to gradients), of an entry (its
 gradient, twice), and of one in a line with a gradient (itself and two moments, each read and written)."""
@@ -111,6 +112,8 @@ class Other(Callback):
         scene = load(case)
 
         class Wait(Callback):
+            group = GROUP
+
             def after_step(self, state: State) -> None:
                 while not wanted.value:
                     works.value = 0
@@ -125,6 +128,8 @@ class Other(Callback):
 class Training(Callback):
     """A training that is made one way, in turns."""
 
+    group = GROUP
+
     def __init__(self, case: Case, scene: Any, way: Way) -> None:
         self.way, self.state = way, build(config(case), scene)
         if not way.replayed:
@@ -132,36 +137,37 @@ class Training(Callback):
         self.ms: list[float] = []
         self.processor_ms: list[float] = []
         self.traced: list[dict[str, list[float]]] = []
-        self._left, self._traces, self._began, self._processor = 0, False, 0.0, 0.0
+        self._steps, self._end, self._traces, self._began, self._processor = 0, 0, False, 0.0, 0.0
 
     def turn(self, other: Other) -> None:
         """Makes the steps of a turn."""
         with threads(self.way.threads):
             other.work(self.way.beside)
-            self._run(TRACED + 1, self.way == Way(1, self.way.replayed))
+            self._run(TRACED, self.way == Way(1, self.way.replayed))
             before = self.state.seconds
             self._run(TIMED, False)
-            self.processor_ms.append(1e3 * self._processor / (TIMED - 1))
+            self.processor_ms.append(1e3 * self._processor / TIMED)
             self.ms.append(1e3 * (self.state.seconds - before) / TIMED)
             other.work(0)
 
     def _run(self, count: int, traces: bool) -> None:
-        self._left, self._traces, self._began, self._processor = count, traces, 0.0, 0.0
+        self._steps, self._end = self.state.step, self.state.step + count
+        self._traces, self._began, self._processor = traces, time.process_time(), 0.0
         self.state.clear_stop()
+        native.compiled.trace(traces)
         train(self.state, [self])
         native.compiled.trace(False)
 
     def after_step(self, state: State) -> None:
-        """Keeps what was traced, and the processor time; of the first step only its end is known."""
+        """Keeps what was traced, a step, and the processor time."""
         seconds, calls = time.process_time() - self._began, native.compiled.trace(self._traces)
-        if self._began:
-            self._processor += seconds
-            if self._traces:
-                self.traced.append(parts(seconds, calls))
-        self._left -= 1
-        if self._left == 0:
+        self._processor += seconds
+        if self._traces:
+            steps, found = state.step - self._steps, parts(seconds, calls)
+            self.traced.append({name: [value / steps for value in own] for name, own in found.items()})
+        if state.step >= self._end:
             state.stop()
-        self._began = time.process_time()
+        self._steps, self._began = state.step, time.process_time()
 
 
 def config(case: Case) -> TrainConfig:
@@ -186,8 +192,8 @@ def parts(seconds: float, calls: list[Any]) -> dict[str, list[float]]:
 
 
 def model(found: list[dict[str, list[float]]], moved: float, region_us: float) -> dict[str, Any]:
-    """Of medians of the parts over the steps, in microseconds; the mean of what most steps do not have, and of Python
-    and torch, which take several times as long in every 8th and 16th step."""
+    """Of medians of the parts over the groups of steps, in microseconds a step; the mean of what most of them do not
+    have, and of Python and torch."""
     table = {}
     for name in dict.fromkeys(name for each in found for name in each):
         own = [each.get(name, [0.0] * (3 + len(TEAMS))) for each in found]
@@ -213,7 +219,7 @@ def region(cores: int) -> dict[str, Any]:
     """What a region without work costs, in microseconds, with serial work before it: as a team of its own, woken each
     time, and in a recording whose team waits for it. A recording that is replayed on one thread has no team, so calls
     that were recorded for more threads have one each."""
-    points, cells = torch.rand(2048, 3), torch.empty(2048, dtype=torch.int32)
+    points, cells, share = torch.rand(2048, 3), torch.empty(2048, dtype=torch.int32), torch.tensor(0.5)
     pair = [torch.zeros(1), torch.zeros(1)], [torch.zeros(1), torch.zeros(1)]
 
     def record(k: int, count: int) -> Recording:
@@ -222,7 +228,7 @@ def region(cores: int) -> dict[str, Any]:
             n, machine = recording.count(lambda: len(points)), native.cpu()
             for _ in range(CALLS):
                 native.compiled.nearest_centre(points, centres, cells, n, k, machine)  # one run of points
-                native.compiled.average(0.5, *pair, [1, 1], machine)  # two runs of one number
+                native.compiled.average(share, *pair, [1, 1], machine)  # two runs of one number
         if recording.obstacle is not None:
             raise RuntimeError(recording.obstacle)
         return recording
@@ -247,7 +253,7 @@ def measure(name: str, case: Case, cores: int, region_us: float) -> list[dict[st
     """The row of a training and, if there is one, of a picture of its field."""
     scene, other = load(case), Other(case)
     trainings = {way: Training(case, scene, how) for way, how in ways(cores).items()}
-    turns = (case.settings["steps"] - 1) // (TRACED + 1 + TIMED)
+    turns = (case.settings["steps"] - 1) // (TRACED + TIMED)
     for number in range(turns):
         if number == turns // 4:  # from here on
             for training in trainings.values():

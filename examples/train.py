@@ -10,7 +10,7 @@ from voronerf.app.evaluate import evaluate, mean_scores
 from voronerf.app.scenes import load_scene
 from voronerf.nerf import Adam, Occupancy, PlannedSplit, RayBatches, RayLoss, Renderer, SplitStrategy, TrainingStep
 from voronerf.nerf.samplers import usual_samples
-from voronerf.nerf.schedule import learning_rate, next_rays
+from voronerf.nerf.schedule import GROUP, learning_rate, next_rays
 
 torch.manual_seed(0)
 scene, seconds = load_scene(sys.argv[1]), float(sys.argv[2])
@@ -20,7 +20,7 @@ samples = usual_samples((cube[1][0] - cube[0][0]) / pixel, contracted=contracted
 field = HashGridField(**HashGridField.scene_options(pixel, cube, contracted, seconds))
 router = VoronoiRouter(field, torch.zeros(1, 3), coords="first3", way="fused", share=["features"])  # one cell: coarse
 sampler = Occupancy(OccupancyGrid.for_training(scene.box, samples, contraction=space.contraction), samples, space=space)
-renderer = Renderer({"field": router}, sampler)
+renderer = Renderer({"field": router}, sampler).train()
 loss = RayLoss(renderer, sparse_depth=0.003)
 optimizer = Adam.of({"field": router}, lr=0.02, views=len(views), sparse=["features"])
 strategy = SplitStrategy({"field": router}, [PlannedSplit(at=0.2, children=16)], generator=generator)
@@ -30,12 +30,10 @@ training_step = TrainingStep(batches, loss, optimizer, strategy=strategy, genera
 rays, step, start = 512, 0, time.perf_counter()
 while (fraction := (time.perf_counter() - start) / seconds) < 1:
     strategy.step_pre_backward(optimizer, fraction, step)  # into 16 cells, each with a copy of the coarse network
-    sampler.step_pre_backward(router.train(), step, generator)
-    optimizer.set_learning_rate(learning_rate(0.02, fraction, step, hold=0.25))
-    made = training_step(rays)
-    optimizer.after_step(step)
+    optimizer.set_learning_rate(learning_rate(0.02, fraction, step + GROUP // 2, hold=0.25))
+    made = training_step(rays, GROUP, at=step)
+    step += GROUP
     rays = next_rays(rays, made.samples, rays=512, samples=sampler.strata, growth=8, contracted=contracted)
-    step += 1
 with optimizer.averaged():
     sampler.finish(router, seed=0)
     psnr = mean_scores(evaluate(renderer, scene, views=20))["psnr"]

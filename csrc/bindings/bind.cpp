@@ -2,6 +2,7 @@
 #include "bindings/bind.h"
 
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 
 #include <algorithm>
 #include <cstring>
@@ -401,21 +402,28 @@ class Recording {
     calls_.push_back(std::move(loaded));
   }
 
-  // Makes the calls again; false, before the first of them that would exceed its memory. With a trace they have no
-  // team.
-  bool replay(int threads) {
+  // Makes the calls again, so many times in a row. Before each time the next random numbers, `bytes` for each of
+  // `places`, are copied there. Gives how often they were made: it ends before a call that would exceed its memory.
+  // With a trace they have no team.
+  int replay(int threads, int times, std::uintptr_t drawn, const std::vector<std::uintptr_t>& places, size_t bytes) {
     const py::gil_scoped_release released;
-    bool fits = true;
+    int made = 0;
     std::exception_ptr failure;
     with_team(tracing ? 1 : threads, [&] {
       try {
-        for (size_t i = 0; i < calls_.size() && fits; ++i) fits = again(*calls_[i]);
+        for (; made < times; ++made) {
+          for (const std::uintptr_t place : places) {
+            std::memcpy(reinterpret_cast<void*>(place), reinterpret_cast<const void*>(drawn), bytes);
+            drawn += bytes;
+          }
+          if (!std::all_of(calls_.begin(), calls_.end(), [](const auto& each) { return again(*each); })) break;
+        }
       } catch (...) {
         failure = std::current_exception();
       }
     });
     if (failure) std::rethrow_exception(failure);
-    return fits;
+    return made;
   }
 
   size_t size() const { return calls_.size(); }
@@ -542,7 +550,7 @@ constexpr const char* kStub =
     "    def begin(self) -> None: ...\n"
     "    def end(self) -> None: ...\n"
     "    def count(self, memory: int, most: int) -> None: ...\n"
-    "    def replay(self, threads: int) -> bool: ...\n"
+    "    def replay(self, threads: int, times: int, drawn: int, places: list[int], bytes: int) -> int: ...\n"
     "\n"
     "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n"
     "def trace(on: bool) -> list[tuple[str, float, int, float, list[float]]]: ...\n";

@@ -76,11 +76,15 @@ void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const 
   });
 }
 
-void average_cpu(float share, const float* const* parameters, float* const* averages, const std::vector<int64_t>& sizes,
-                 int threads) {
-  for_blocks(sizes, threads, [&](size_t i, int64_t begin, int64_t end) {
-    const float* __restrict__ parameter = parameters[i];
+void average_cpu(const float* share, const float* const* parameters, float* const* averages,
+                 const std::vector<int64_t>& sizes, int threads) {
+  for_blocks(sizes, threads, [&, share = *share](size_t i, int64_t begin, int64_t end) {
     float* __restrict__ average = averages[i];
+    if (parameters == nullptr) {
+      for (int64_t j = begin; j < end; ++j) average[j] *= 1.0f - share;
+      return;
+    }
+    const float* __restrict__ parameter = parameters[i];
     for (int64_t j = begin; j < end; ++j) average[j] += share * (parameter[j] - average[j]);
   });
 }

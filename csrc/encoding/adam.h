@@ -31,9 +31,9 @@ void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const 
               float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
               Isa isa, int threads);
 
-// Averages of parameters go a share of the way to them.
-void average_cpu(float share, const float* const* parameters, float* const* averages, const std::vector<int64_t>& sizes,
-                 int threads);
+// Averages go a share [1] of the way to parameters, or to 0 where there are none.
+void average_cpu(const float* share, const float* const* parameters, float* const* averages,
+                 const std::vector<int64_t>& sizes, int threads);
 
 // A step on CUDA, in two launches. corrected: [2, number of parameters], working memory.
 void adam_cuda(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,

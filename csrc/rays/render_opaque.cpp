@@ -186,7 +186,10 @@ class Pool {
   void drop() {
     int64_t kept = 0;
     for (int64_t i = 0; i < count_; ++i) {
-      if (stop_[i] >= call_.march.s || !(call_.out.light[number_[i]] > call_.rule.opaque)) continue;
+      if (stop_[i] >= call_.march.s || !(call_.out.light[number_[i]] > call_.rule.opaque)) {
+        finish(number_[i], far_[i]);
+        continue;
+      }
       const int64_t q = call_.directions;
       number_[kept] = number_[i], start_[kept] = stop_[i], near_[kept] = near_[i], far_[kept] = far_[i];
       most_[kept] = most_[i], front_[kept] = front_[i];
@@ -196,6 +199,21 @@ class Pool {
       ++kept;
     }
     count_ = kept;
+  }
+
+  // The sums of a ray become what it sees: one that is opaque has the colour of what it has met.
+  void finish(int64_t ray, float far) const {
+    const SeeOutputs& out = call_.out;
+    const SeeRule& rule = call_.rule;
+    float *const colour = out.colour + 3 * ray, &opacity = out.opacity[ray];
+    out.depth[ray] = opacity > 0.0f ? out.depth[ray] / opacity : far;
+    if (out.light[ray] <= rule.opaque) {
+      for (int i = 0; i < 3; ++i) colour[i] /= opacity;
+      opacity = 1.0f;
+    }
+    if (rule.background == nullptr) return;
+    const float* const background = rule.background + (rule.background_per_ray ? 3 * ray : 0);
+    for (int i = 0; i < 3; ++i) colour[i] += (1.0f - opacity) * background[i];
   }
 
   const Call& call_;

@@ -21,14 +21,16 @@ struct SeeCells {
 
 struct SeeRule {
   float density_scale;
-  bool activated;  // the networks put out colour and density as they are
-  float opaque;    // a ray ends behind a wave after which no more light than this is left
-  int64_t wave;    // samples of a ray that are evaluated at once
+  bool activated;           // the networks put out colour and density as they are
+  float opaque;             // a ray ends behind a wave after which no more light than this is left
+  int64_t wave;             // samples of a ray that are evaluated at once
+  const float* background;  // [r,3], or [3], or null for black
+  bool background_per_ray;
 };
 
 struct SeeOutputs {
-  float* colour;                   // [r,3]
-  float *opacity, *depth, *light;  // [r]: sums of weights and of weights times depth, and what light is left
+  float* colour;                   // [r,3], the background included
+  float *opacity, *depth, *light;  // [r]: 1 for rays that have ended; mean depth, far without samples; what is left
   float* heaviest;                 // [r], depth of the heaviest sample, far without any; or null
 };
 

@@ -24,7 +24,7 @@ from voronerf.nerf import (
 )
 from voronerf.nerf.loss import RenderOutput
 from voronerf.nerf.radiance import radiance_of
-from voronerf.nerf.samplers import REVISIT_EVERY
+from voronerf.nerf.schedule import GROUP
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 WHITE = torch.ones(3)
@@ -110,7 +110,7 @@ def test_voxels_of_a_sampler_stay_empty():
     sampler.grid = OccupancyGrid(BOX, 8, threshold=0.1)
     ball, random = Ball(), seeded(0)
     rays = Rays(torch.tensor([[0.0, 0, -3]]).expand(50, 3), torch.tensor([[0.0, 0, 1]]).expand(50, 3))
-    for step in range(sampler.settling_steps, sampler.settling_steps + REVISIT_EVERY):
+    for step in range(sampler.settling_steps, sampler.settling_steps + GROUP):
         sampler.step_pre_backward(ball, step, random)
         found = render_rays(ball, rays, 0.0, 6.0, samples=sampler, jitter=True, generator=random)
         none = torch.zeros(())

@@ -7,6 +7,7 @@ import torch
 
 from voronerf import HashGridField, VoronoiDiagram, VoronoiRouter
 from voronerf.nerf.adam import Adam
+from voronerf.nerf.schedule import GROUP
 
 
 def test_dense_groups_are_torchs():
@@ -95,9 +96,9 @@ def test_averages_are_exponential_over_a_growing_window(decay):
         optimizer.update()
         optimizer.after_step(step)
         now = weight.detach().clone()
-        if step % 8 == 0:
+        if step % GROUP == 0:
             window = min(1 / (1 - decay), max(1, step / 30))
-            new = 1 - (1 - 1 / window) ** 8
+            new = 1 - (1 - 1 / window) ** GROUP
             expected = now if expected is None else expected + (now - expected) * new
         if step % 10 == 9:
             with optimizer.averaged():

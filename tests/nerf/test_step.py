@@ -134,6 +134,32 @@ def test_more_and_more_samples_and_none():
     assert same(*found)
 
 
+@pytest.mark.parametrize("cells", [1, 6])
+def test_steps_in_one_call_are_the_same_bits(cells, threads, monkeypatch):
+    """With what sampler and optimiser do before and after them; parts of a call may exceed the memory."""
+    monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 96)  # a multiple of the steps of a call
+    found = []
+    for calls in ([16] * 14, [1] * 224, [5, 11, 3, 13] * 7):
+        training, done = Training(cells), 0
+        training.optimizer.average, grid = 0.9, training.sampler.grid
+        for steps in calls:
+            if done == 160:  # many more samples, as a call of 16 goes on
+                grid.density[:], grid.occupied[:] = 1e3, True
+            training.optimizer.set_learning_rate(0.01 / (1 + done // 16))
+            made = training.step(40 + done // 16, steps, at=done)
+            done += steps
+        assert "replayed" in training.step.explain() and set(training.step._between) == {"before", "after"}
+        with training.optimizer.averaged():
+            shown = [p.detach().clone() for p in training.router.parameters()]
+        found.append([made.loss, made.output.weights, *shown, *training.everything()])
+    assert same(found[0], found[1]) and same(found[0], found[2])
+
+
+def test_no_steps_are_refused():
+    with pytest.raises(ValueError, match="TrainingStep: steps must be >= 1, got 0"):
+        Training().step(64, 0)
+
+
 def test_gradients_are_there_after_each_step():
     """Also where a loop drops them, or a step in between was not replayed."""
     one, other = Training(), Training()

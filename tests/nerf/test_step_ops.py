@@ -18,7 +18,8 @@ from voronerf.nerf import (
     SplitStrategy,
     orbit_cameras,
 )
-from voronerf.nerf.samplers import REVISIT_EVERY, SETTLING_STEPS
+from voronerf.nerf.samplers import SETTLING_STEPS
+from voronerf.nerf.schedule import GROUP
 
 SEEDS_MEMORY_VIEWS = {
     *("randint", "empty", "new_empty", "view", "unsqueeze", "expand", "select", "slice", "detach", "alias"),
@@ -67,6 +68,6 @@ def test_a_step_computes_in_ops_alone(contracted):
 
     step(SETTLING_STEPS)  # in which what is computed becomes known
     with Calls() as calls:
-        output = step(SETTLING_STEPS + REVISIT_EVERY)
+        output = step(SETTLING_STEPS + GROUP)
     assert len(output.weights) and len(strategy.reservoir) and not bool(sampler.grid.occupied.flatten()[empty].any())
     assert calls.names <= SEEDS_MEMORY_VIEWS, calls.names - SEEDS_MEMORY_VIEWS

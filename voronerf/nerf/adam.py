@@ -12,15 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from voronerf.nerf import schedule
 from voronerf.ops._core.recording import varying
 from voronerf.ops.adam import Guard, Rule, adam, average
 from voronerf.router import VoronoiRouter
 from voronerf.router.optimizers import trained_parts
 
-#: Steps from one weight decay of the tables to the next, since a large table takes time to read.
-SHRINK_EVERY = 16
-#: Steps from one update of the averages to the next: weights of steps in between are much the same.
-AVERAGE_EVERY = 8
 #: The window of an average is at most this part of the steps done, since weights move far in the first steps.
 WINDOW = 1 / 30
 #: Weight decay of tables: of what nothing asks for again, such as noise that early steps have left in empty space. With
@@ -58,7 +55,7 @@ class Adam(torch.optim.Adam):
         >>> for step in range(400):
         ...     weight.grad = torch.ones(3)
         ...     optimizer.update()
-        ...     optimizer.after_step(step)
+        ...     optimizer.after_step(step + 1)
         >>> with optimizer.averaged():
         ...     shown = weight.detach().clone()
         >>> bool((shown > weight).all())
@@ -85,7 +82,7 @@ class Adam(torch.optim.Adam):
         backend: str = "auto",
     ) -> None:
         super().__init__(params, lr=lr, betas=betas, eps=eps, fused=True)
-        self.average, self.backend = average, backend
+        self.average, self.backend, self.steps_done = average, backend, 0
 
     @classmethod
     def of(
@@ -133,31 +130,38 @@ class Adam(torch.optim.Adam):
         return loss
 
     def after_step(self, step: int) -> None:
-        """Weight decay of the groups that have it, and the averages of the weights, at some of the steps.
+        """Weight decay of the groups that have it, and the averages of the weights, after each `GROUP` of steps.
+
+        In between weights are much the same, and a large table takes time to read.
 
         Decay is apart from the gradients (Loshchilov and Hutter 2019): weights are multiplied by 1 - lr * RATE for each
         step. Parameters without a gradient and frozen cells stay. An average's decay per step is 1 - 1 / w with the
         window w = `WINDOW` * step, until it reaches ``average``.
 
         Args:
-            step: The number of the step that was made, from 0.
+            step: Steps done.
         """
-        if step % SHRINK_EVERY == 0:
+        self.steps_done = step
+        if step % schedule.GROUP == 0:
             self._shrink()
-        if self.average and step % AVERAGE_EVERY == 0:
-            self._average(step)
+            self._average()
 
     @torch.no_grad()
     def _shrink(self) -> None:
         for group in self.param_groups:
             held = [p for p in group["params"] if p.grad is not None] if group.get("shrink") else []
-            for parameter, parts in zip(held, trained_parts(held), strict=True):
-                for part in parts:
-                    parameter[part].mul_(1 - SHRINK_EVERY * group["lr"] * group["shrink"])
+            shrunk = [p[part] for p, parts in zip(held, trained_parts(held), strict=True) for part in parts]
+            if shrunk:
+                average(shrunk, None, varying(functools.partial(_shrinks, group)), backend=self.backend)
+
+    def _moved(self) -> float:
+        """By what share averages now move to the weights."""
+        return 1 - min(self.average, 1 - 1 / max(1, WINDOW * self.steps_done)) ** schedule.GROUP
 
     @torch.no_grad()
-    def _average(self, step: int) -> None:
-        fading = min(self.average, 1 - 1 / max(1, WINDOW * step)) ** AVERAGE_EVERY
+    def _average(self) -> None:
+        if not self.average:
+            return
         # Those that have state: a look at it would make state for all of them.
         parameters = [p for group in self.param_groups for p in group["params"] if self.state.get(p)]
         averages, weights = list[Tensor](), list[Tensor]()
@@ -168,7 +172,7 @@ class Adam(torch.optim.Adam):
             averages += [state[_AVERAGE][part] for part in parts]
             weights += [parameter[part] for part in parts]
         if weights:
-            average(averages, weights, 1 - fading, backend=self.backend)
+            average(averages, weights, varying(self._moved), backend=self.backend)
 
     def drop_averages(self) -> None:
         """Begins all averages anew at the next update."""
@@ -219,6 +223,11 @@ class Adam(torch.optim.Adam):
         if state["step"].device != parameter.device:
             state["step"] = state["step"].to(parameter.device)
         return state
+
+
+def _shrinks(group: Mapping[str, Any]) -> float:
+    """By what share the weights of a group get smaller at once."""
+    return schedule.GROUP * float(group["lr"]) * float(group["shrink"])
 
 
 def parameter_groups(

@@ -14,7 +14,6 @@ from voronerf.nerf.cameras import Rays
 from voronerf.nerf.field import Field
 from voronerf.nerf.radiance import radiance_of, router_of
 from voronerf.nerf.samplers import Occupancy
-from voronerf.nerf.volume import normalised
 from voronerf.ops.composite import composite
 from voronerf.ops.render_opaque import OF_PROGRAM
 from voronerf.ops.render_opaque.reference import Wave, walk
@@ -94,8 +93,8 @@ def render_until_opaque(
     network = _network(field, rays, sampler)
     if network is not None:
         rule = {"spacing": sampler.space.spacing, "backend": sampler.backend, "heaviest": heaviest}
-        rule |= {"wave": FINE_WAVE, "opaque": OPAQUE}
-        found = sampler.grid.see(rays, near, far, sampler.picture_samples, **network, **rule)
+        rule |= {"wave": FINE_WAVE, "opaque": OPAQUE, "background": None if background is None else background.to(near)}
+        seen = sampler.grid.see(rays, near, far, sampler.picture_samples, **network, **rule)
     else:
         wave = WAVE if contraction is None else CONTRACTED_WAVE
 
@@ -104,22 +103,15 @@ def render_until_opaque(
             samples, stop = sampler.march(now, near[live], far[live], start=start, most=wave, picture=True)
             rgb, sigma = (each.to(near.dtype) for each in field(samples.inputs, now.directions, samples.ray_index))
             along = samples.depths, samples.deltas
-            seen = composite(sigma, rgb, *along, ray_offsets=samples.ray_offsets, backend=sampler.backend)
-            return Wave(seen, samples.ray_index, samples.ray_offsets, samples.depths, stop)
+            part = composite(sigma, rgb, *along, ray_offsets=samples.ray_offsets, backend=sampler.backend)
+            return Wave(part, samples.ray_index, samples.ray_offsets, samples.depths, stop)
 
-        found = walk(look, far, sampler.picture_samples, wave, OPAQUE, heaviest)
-    colour, opacity, depth, through, at = found
-    depth = normalised(depth, opacity, far)
-    ended = through <= OPAQUE
-    colour /= torch.where(ended, opacity, 1)[:, None]
-    opacity = torch.where(ended, 1, opacity)
-    if background is not None:
-        colour += (1 - opacity)[:, None] * background.to(colour)
+        seen = walk(look, far, sampler.picture_samples, wave, OPAQUE, background, heaviest)
     places = rays.origins
     if heaviest:
-        places = rays.origins + at[:, None] * rays.directions
+        places = rays.origins + seen.heaviest[:, None] * rays.directions
         places = places if contraction is None else contraction.points(places)
-    return RayColours(colour, opacity, depth, places)
+    return RayColours(seen.colour, seen.opacity, seen.depth, places)
 
 
 def _network(field: Field, rays: Rays, sampler: Occupancy) -> dict[str, Any] | None:

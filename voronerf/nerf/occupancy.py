@@ -26,7 +26,7 @@ from voronerf.ops.draw_points import draw_points
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.observe_occupancy.reference import cells_of as voxels_of
-from voronerf.ops.render_opaque import RaySums, render_opaque
+from voronerf.ops.render_opaque import RaysSeen, render_opaque
 
 #: Voxels of a grid along each axis, of a box and of contracted space, which is all the world.
 RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
@@ -311,7 +311,7 @@ class OccupancyGrid:
         given = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return march_rays(*given, contraction=self._numbers, **rule)
 
-    def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaySums:
+    def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaysSeen:
         """What rays see of networks in occupied voxels; other arguments are those of `voronerf.ops.render_opaque`."""
         given = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return render_opaque(*given, contraction=self._numbers, **rule)

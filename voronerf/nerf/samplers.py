@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from voronerf.nerf import schedule
 from voronerf.nerf.cameras import Rays
 from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.field import Field
@@ -28,6 +29,7 @@ from voronerf.nerf.sampling import (
 )
 from voronerf.nerf.schedule import WARMUP_STEPS
 from voronerf.nerf.volume import Rendered, Samples, Space
+from voronerf.ops._core.recording import fixed_count
 from voronerf.ops.resample import resample
 
 if TYPE_CHECKING:
@@ -41,9 +43,9 @@ SETTLING_PART = 4
 #: as the learning rate may rise for. A young field is thin everywhere: a grid would take it for empty, and what is
 #: emptied no longer learns. The more samples a step has, the fewer steps would empty all.
 SETTLING_STEPS = 400
-#: Steps between evaluations of random voxels of the occupancy grid, the share of all that are evaluated, and how many
+#: The share of all voxels of the occupancy grid that are evaluated at random before each `GROUP` of steps, and how many
 #: at most: as many as a few steps have samples.
-REVISIT_EVERY, REVISITED, MOST_REVISITED = 16, 1 / 8, 32_768
+REVISITED, MOST_REVISITED = 1 / 8, 32_768
 #: Samples of a ray of a picture for each of training, whose samples are jittered and so cover each stratum over time.
 #: At most so many: of the 256 of a long training, twice as many would make no picture more than 0.05 dB better.
 PICTURE_SAMPLES, MOST_PICTURE_SAMPLES = 2, 384
@@ -163,6 +165,22 @@ class Sampler:
             generator: Of random choices.
         """
 
+    def asks_at(self, step: int) -> bool:
+        """Whether :meth:`step_pre_backward` asks the field before a step.
+
+        Args:
+            step: The number of the step, from 0.
+        """
+        return False
+
+    def steps_alike(self, step: int) -> int:
+        """How many steps may follow one call of :meth:`step_pre_backward`.
+
+        Args:
+            step: The number of the first of them.
+        """
+        return 1
+
     def step_post_backward(self, output: RenderOutput) -> None:
         """Called after the loss of a step was computed.
 
@@ -216,8 +234,8 @@ class Stratified(Sampler):
 class Occupancy(Sampler):
     """`Stratified` without the samples in empty voxels of a grid: rays have as many as are left.
 
-    In a training the grid learns from the samples of each step. At every `REVISIT_EVERY` th step the field is evaluated
-    in random voxels, so that what was wrongly found empty comes back.
+    In a training the grid learns from the samples of each step. Before each `GROUP` of steps the field is evaluated in
+    random voxels, so that what was wrongly found empty comes back.
 
     Attributes:
         grid: Which space is empty; all space outside its box is.
@@ -295,13 +313,22 @@ class Occupancy(Sampler):
     def step_pre_backward(self, field: Field, step: int, generator: torch.Generator) -> None:
         """Evaluates random voxels; see :meth:`Sampler.step_pre_backward`."""
         self.settling = step < self.settling_steps
-        if self.settling or step % REVISIT_EVERY:
+        if not self.asks_at(step):
             return
         every = self.grid.occupied.numel()
         count = min(max(1, int(every * REVISITED)), MOST_REVISITED)
         seed = draw_seed(self.grid.box.device, generator)
         with evaluating(field):
-            self.grid.revisit(field, count, seed, fixed=self.empty, backend=self.backend)
+            self.grid.revisit(field, fixed_count(count), seed, fixed=self.empty, backend=self.backend)
+
+    def asks_at(self, step: int) -> bool:
+        """Before each `GROUP` of steps, once the grid learns; see :meth:`Sampler.asks_at`."""
+        return step >= self.settling_steps and step % schedule.GROUP == 0
+
+    def steps_alike(self, step: int) -> int:
+        """Up to the next evaluation of voxels; see :meth:`Sampler.steps_alike`."""
+        settling = self.settling_steps - step
+        return settling if settling > 0 else schedule.GROUP - step % schedule.GROUP
 
     def step_post_backward(self, output: RenderOutput) -> None:
         """Teaches the grid what the samples of a step found; see :meth:`Sampler.step_post_backward`."""

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import math
 
+#: The learning rate, the rays of a step, averaged weights and what is known of empty space change with every so many
+#: steps of a training, in between steps are replayed in one call. Longer groups gain little: in these, 3 % of the time
+#: is spent in between.
+GROUP = 16
 #: The most steps that the learning rate rises for. While it is small the densities stay low, so that an occupancy grid,
 #: which forgets in eight to thirty steps, would empty itself for good: it learns only afterwards.
 WARMUP_STEPS = 100

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import operator
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -10,6 +11,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from voronerf.nerf import schedule
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.loss import Batch, RayLoss, RenderOutput
@@ -88,10 +90,10 @@ class TrainingStep:
     """A step of a training: rays, loss, gradients, what the sampler and the splits learn, and the optimiser.
 
     The calls of the compiled module that a step makes are recorded, and made again by the steps that follow, in one
-    call for each of them: no Python runs in between, and threads are woken once. Results are the same bits. On CUDA, a
-    step is captured in a CUDA graph, after one of its kind; another number of rays is captured anew. What keeps a step
-    from that (:meth:`explain`) lets it run as it is. What the objects are set to is followed, by their
-    attributes; an object that is changed inside needs :meth:`forget`.
+    call for all of them that are asked for at once: no Python runs in between, and threads are woken once. Results are
+    the same bits. On CUDA, a step is captured in a CUDA graph, after one of its kind; another number of rays is
+    captured anew. What keeps a step from that (:meth:`explain`) lets it run as it is. What the objects are set to is
+    followed, by their attributes; an object that is changed inside needs :meth:`forget`.
 
     Args:
         batches: Where rays come from.
@@ -114,8 +116,8 @@ class TrainingStep:
         >>> sampler = Occupancy(OccupancyGrid.for_training(box, 16), 16)
         >>> loss, optimizer = RayLoss(Renderer({"field": router}, sampler)), Adam.of({"field": router}, lr=0.01)
         >>> step = TrainingStep(batches, loss, optimizer, generator=torch.Generator().manual_seed(0))
-        >>> losses = [float(step(rays=32).loss) for _ in range(10)]
-        >>> losses[-1] < losses[0]
+        >>> first, last = float(step(rays=32).loss), float(step(rays=32, steps=20).loss)
+        >>> last < first
         True
         >>> print(step.explain())
         step: recorded and replayed, 10 calls
@@ -147,6 +149,7 @@ class TrainingStep:
         self._guards: Any = None
         self._cpu: Callable[[], Any]
         self._known: Radiance | None = None
+        self._between = dict[str, Recording]()
         self._objects, self._values = list[Any](), list[Any]()
         self._obstacle = ""
 
@@ -159,41 +162,111 @@ class TrainingStep:
         obstacle = self._obstacle or self._standing_obstacle()
         return "step: will be recorded" if obstacle is None else f"step: runs as it is, since {obstacle}"
 
-    def __call__(self, rays: int) -> StepOutput:
-        """Makes a step with so many rays."""
-        self._rays, recording, watched = rays, self._recording, is_watched()
-        same = not watched and self._holds()
+    def __call__(self, rays: int, steps: int = 1, *, at: int | None = None) -> StepOutput:
+        """Makes steps in a row, with the same learning rate.
+
+        Args:
+            rays: Of each step.
+            steps: How many, at least 1.
+            at: Steps done before. With it, the sampler's ``step_pre_backward`` is called before these steps, and the
+                optimiser's ``after_step`` after them; they are recorded, too. None where the loop calls them.
+
+        Returns:
+            What the last step has found.
+
+        Raises:
+            ValueError: Fewer steps than 1.
+        """
+        if steps < 1:
+            raise ValueError(f"TrainingStep: steps must be >= 1, got {steps}")
+        self._rays, same, made = rays, None, 0
+        if at is not None:
+            same = self._before(at)
+        while True:
+            times, output, same = self._make(steps - made, same)
+            made += times
+            if made == steps:
+                break
+        if at is not None:
+            self._after(at + steps, same)
+        return output
+
+    def _make(self, steps: int, same: bool | None) -> tuple[int, StepOutput, bool | None]:
+        """Makes the next of so many steps, or more of them.
+
+        Args:
+            steps: At least 1.
+            same: Whether all is as it was noted; None where that is not known.
+
+        Returns:
+            How many, what the last has found, and whether all is still as it was.
+        """
+        recording = self._recording
+        same = self._is_same() if same is None else same
         if recording is not None and same:
-            if recording.replay(backends.threads()):
+            if times := recording.replay(backends.threads(), steps):
                 self._wait = self._left = 0
                 if any(p.grad is not gradient for p, gradient in self._gradients[:1]):  # a step in between had others
                     self._give_gradients()
                 batch, output = self._made
-                return StepOutput(batch, output, recording if isinstance(recording, Recording) else None)
-        elif obstacle := "a mode, a transform or a profiler of torch watches" if watched else self._standing_obstacle():
+                return times, StepOutput(batch, output, recording if isinstance(recording, Recording) else None), True
+        elif obstacle := self._standing_obstacle():
             self.forget()
             self._obstacle = obstacle
-            return StepOutput(*self._run(rays))
-        # What a replay has drawn that there was no memory for: the step is made with it.
-        drawn = recording.drawn if isinstance(recording, Recording) and recording.drawn_now else []
-        if self._left and not drawn:
+            return 1, StepOutput(*self._run(self._rays)), None
+        if self._left:
             self._left -= 1
-            return StepOutput(*self._run(rays))
-        return self._record(same, drawn)
+            return 1, StepOutput(*self._run(self._rays)), None
+        return 1, self._record(same), None
 
-    def _record(self, known: bool, drawn: list[Tensor]) -> StepOutput:
+    def _before(self, step: int) -> bool | None:
+        """The sampler before a step, replayed where it asks the field; gives what :meth:`_beside` gives."""
+        sampler, field = self.loss.renderer.sampler, self.loss.renderer.field
+        ask = functools.partial(sampler.step_pre_backward, field, step, self.generator)
+        if sampler.asks_at(step):
+            return self._beside("before", ask, self._is_same())
+        ask()
+        return None
+
+    def _after(self, step: int, same: bool | None) -> None:
+        """The optimiser after so many steps; what it computes is replayed."""
+        self.optimizer.steps_done = step
+        if step % schedule.GROUP == 0:
+            learn = functools.partial(self.optimizer.after_step, step)
+            self._beside("after", learn, self._is_same() if same is None else same)
+
+    def _beside(self, name: str, function: Callable[[], None], same: bool) -> bool | None:
+        """Calls a function of the same objects, or makes its calls again; whether all is as it was noted, if known."""
+        if not same or not isinstance(self._recording, Recording):
+            function()
+            return None
+        if name in self._between:
+            self._between[name].replay(backends.threads())
+            return True
+        with Recording() as recording:
+            function()
+        if recording.obstacle is None:
+            self._between[name] = recording
+        return None
+
+    def _is_same(self) -> bool:
+        """Whether all is as it was noted, and nothing of torch watches."""
+        return not is_watched() and self._holds()
+
+    def _record(self, known: bool) -> StepOutput:
         """A step as it is, recorded or captured if nothing keeps it from that.
 
         Args:
             known: Whether the step before was of this kind, so that what a first one prepares is there.
-            drawn: Its random numbers, where they are drawn already.
         """
         before, on_gpu = self._recording, self._on_gpu()
         if not on_gpu or known:
             self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
+        between = self._between if known else {}
         self.forget()
+        self._between = between
         if not on_gpu:
-            with Recording(drawn) as recording:
+            with Recording() as recording:
                 made = self._run(recording.count(lambda: self._rays))
             self._keep(recording, made)
         elif known:
@@ -266,6 +339,8 @@ class TrainingStep:
 
     def _standing_obstacle(self) -> str | None:
         """What keeps any step from being replayed, whatever it computes."""
+        if is_watched():
+            return "a mode, a transform or a profiler of torch watches"
         renderer, device, place = self.loss.renderer, self.batches.device, self.batches.place
         if device.type not in ("cpu", "cuda"):
             return f"it runs on {device.type}"
@@ -295,7 +370,7 @@ class TrainingStep:
         grid = getattr(renderer.sampler, "grid", None)
         for part in (self.batches, self.loss, renderer, renderer.sampler, grid, self.strategy, optimizer):
             if part is not None:
-                self._guards.add(vars(part), "")
+                self._guards.add(vars(part), "steps_done")
         self._guards.add(renderer.fields, "")
         for module in cast(nn.Module, renderer.field).modules():  # the router, perhaps in a wrapper
             for name, members in vars(module).items():

@@ -33,7 +33,7 @@ from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
 from voronerf.ops.ray_runs.reference import OwnSamples
 from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradient
-from voronerf.ops.render_opaque import RaySums, render_opaque
+from voronerf.ops.render_opaque import RaysSeen, render_opaque
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.scale_gradient import scale_gradient
@@ -50,7 +50,7 @@ __all__ = [
     "March",
     "OwnSamples",
     "PixelRays",
-    "RaySums",
+    "RaysSeen",
     "RenderLoss",
     "Rule",
     "Runs",

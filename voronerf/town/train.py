@@ -254,9 +254,9 @@ def _learn(state: State, batch: Batch, output: RenderOutput) -> None:
     """What comes after the loss of a step has left its gradients."""
     state.sampler.step_post_backward(output)
     state.optimizer.update(state.guard, output.loss)
-    state.optimizer.after_step(state.step)
     state.strategy.step_post_backward(output)
-    state.count_step(len(batch.rays))
+    state.count_steps(1, len(batch.rays))
+    state.optimizer.after_step(state.step - state.began)
     state.read_output(StepOutput(batch, output))
 
 

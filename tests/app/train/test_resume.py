@@ -162,7 +162,7 @@ def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
 
 @pytest.mark.parametrize("contraction", ["none", "sphere"])
 def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch, contraction):
-    monkeypatch.setattr("voronerf.nerf.samplers.REVISIT_EVERY", 2)
+    monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 2)
     for name in ("SETTLING_STEPS", "WARMUP_STEPS"):
         monkeypatch.setattr(f"voronerf.nerf.samplers.{name}", 5)
     monkeypatch.setattr("voronerf.nerf.schedule.FILL", 1.5)  # other numbers of rays in every step

@@ -39,7 +39,7 @@ def test_a_start_that_failed_begins_again_and_learns(scene, monkeypatch):
     steps_of(state, 30)
     assert said == ["nothing is learnt by step 50: all space is empty; begins again from another draw, 1 of 3"]
     assert state.began == 50 and state.sampler.grid.share == 1 and state.rays == 64 and not state.optimizer.state
-    assert len(state.strategy.reservoir) == 0 and state.learning_rate() == pytest.approx(0.01 * state.config.lr)
+    assert len(state.strategy.reservoir) == 0 and state.learning_rate() < 0.1 * state.config.lr
     steps_of(state, 100)
     assert len(said) == 1 and state.sampler.grid.share == 1 and state.loss < 0.03
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import read_json, refuses, script, trained
+from helpers import read_json, refuses, same, script, trained
 from tiny_runs import HIERARCHICAL, Each, small, started, steps_of
 
 from voronerf.app import open_run
@@ -240,7 +240,7 @@ def test_training_through_an_occupancy_grid(tmp_path, scene, monkeypatch):
 def test_a_grid_settles_before_it_learns(scene, monkeypatch, contraction, settling):
     monkeypatch.setattr("voronerf.nerf.samplers.SETTLING_STEPS", 4)
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 2)
-    monkeypatch.setattr("voronerf.nerf.samplers.REVISIT_EVERY", 1)
+    monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 1)
     state = build(small(contraction=contraction, occupancy=True, cells=()), scene)
     new, learnt, most = state.sampler.grid.density.clone(), [], []
     sample = state.sampler.sample
@@ -269,8 +269,27 @@ def test_holes_of_the_grid_are_filled_once_at_the_end_by_the_averaged_field(scen
     assert len(filled) == 1
 
 
-def test_a_step_takes_more_rays_where_space_is_empty(scene):
+@pytest.mark.native
+def test_results_do_not_depend_on_how_many_steps_are_made_at_once(scene, monkeypatch):
+    """One by one, as a callback wants it; in groups; and stopped in the middle of some."""
+    monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 20)
+    monkeypatch.setattr("voronerf.nerf.schedule.FILL", 1.5)  # other numbers of rays
+    given = {"field": "hashgrid", "depth": 1, "occupancy": True, "steps": 90, "split_at": (0.6,), "cells": (3,)}
+    alone, groups, stopped = (build(small(**given), scene) for _ in range(3))
+    made = []
+    train(groups)
+    steps_of(alone, 90, Each(lambda state: made.append(state.step)))
+    for count in (7, 30, 53):
+        steps_of(stopped, count)
+    assert made == list(range(1, 91)) and groups.step == stopped.step == 90 and groups.rays > 64
+    for other in (alone, stopped):
+        assert same(groups.router.state_dict(), other.router.state_dict())
+        assert same(groups.sampler.grid.state_dict(), other.sampler.grid.state_dict())
+
+
+def test_a_step_takes_more_rays_where_space_is_empty(scene, monkeypatch):
     """A quarter of the samples of the first steps, by at most eight times the rays."""
+    monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 1)
     state = build(small(field="hashgrid", depth=1, occupancy=True, steps=12, cells=()), scene)
     rays, voxels = [], state.sampler.grid.occupied.numel()
     for kept in (voxels, voxels // 4, voxels // 16, 0):

@@ -22,6 +22,7 @@ from rich.table import Column
 from voronerf.app.train.callbacks import Scores, counted
 from voronerf.app.train.loop import Callback
 from voronerf.app.train.state import State
+from voronerf.nerf.schedule import GROUP
 
 LONGEST_LINE = 900
 #: Width of a bar, and of all in the live line of a training beside its name and its text.
@@ -88,6 +89,8 @@ class TrainingDisplay(Callback):
         quiet: Leave out lines that stay.
     """
 
+    group = GROUP
+
     def __init__(self, label: str, *, quiet: bool = False) -> None:
         self.quiet = quiet
         self.progress = Progress(
@@ -110,8 +113,8 @@ class TrainingDisplay(Callback):
         return self
 
     def after_step(self, state: State) -> None:
-        """Shows the state after a step; the loss is smoothed over about twenty steps."""
-        self.loss = state.loss if math.isnan(self.loss) else 0.95 * self.loss + 0.05 * state.loss
+        """Shows the state after a step; the loss is smoothed over about three groups of steps."""
+        self.loss = state.loss if math.isnan(self.loss) else 0.7 * self.loss + 0.3 * state.loss
         cells = state.router.num_cells
         psnr = self.scores.metrics[-1].get("psnr") if self.scores is not None and self.scores.metrics else None
         shown = [

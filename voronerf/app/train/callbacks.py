@@ -26,6 +26,7 @@ from voronerf.app.train.loop import Callback, TrainingError
 from voronerf.app.train.resume import snapshot
 from voronerf.app.train.run_directory import read_metrics
 from voronerf.app.train.state import State
+from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.split import MIN_SAMPLES, SplitDone
 
 #: Seconds of training between checkpoints, and how many are kept.
@@ -55,6 +56,8 @@ class Checkpoints(Callback):
         out: The run directory.
         every: Seconds of training between two checkpoints.
     """
+
+    group = GROUP
 
     def __init__(self, out: Path, every: float = CHECKPOINT_EVERY) -> None:
         self.out, self.every = out, every
@@ -113,6 +116,8 @@ class Divergence(Callback):
         out: The run directory, for the message.
     """
 
+    group = GROUP
+
     def __init__(self, out: Path) -> None:
         self.out = out
 
@@ -152,6 +157,8 @@ class Scores(Callback):
         metrics: All evaluations, in order.
         summary: What ``summary.json`` holds, after the end.
     """
+
+    group = GROUP
 
     def __init__(
         self,
@@ -361,7 +368,8 @@ class TensorBoard(Callback):
         ...     beside = [scores, TensorBoard(Path(folder), scores)]  # callbacks of `run`
     """
 
-    EVERY = 10  # steps between two losses
+    group = GROUP
+    EVERY = 2 * GROUP  # steps between two losses
 
     def __init__(self, folder: Path, scores: Scores) -> None:
         self._make, self.folder, self.scores, self.written = tensorboard_writer(), folder, scores, 0

@@ -7,13 +7,16 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 
-from voronerf.app.train.start import judge_start
+from voronerf.app.train.start import judge_start, steps_to_judgement
 from voronerf.app.train.state import State
+from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.split import SplitDone
 from voronerf.ops._core import backends
 
 #: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
-READ_EVERY = 50
+READ_EVERY = 3 * GROUP
+#: Seconds after which a training answers, to Ctrl-C and to its callbacks, if its steps are not longer.
+ANSWER = 0.1
 
 
 class TrainingError(RuntimeError):
@@ -25,6 +28,10 @@ class Callback:
 
     Its time is not training time, except in :meth:`after_split`.
 
+    Attributes:
+        group: How many steps may lie between two calls of :meth:`after_step`. Up to 16 of them are made in one call,
+            which is faster. Results do not depend on it.
+
     Examples:
         >>> from voronerf.app.train import Callback
         >>> class Losses(Callback):
@@ -34,6 +41,8 @@ class Callback:
         ...         self.losses.append(state.loss)
     """
 
+    group: int = 1
+
     def on_start(self, state: State) -> None:
         """Called before the first step of this process."""
 
@@ -41,7 +50,7 @@ class Callback:
         """Called after cells were split, before the step that follows."""
 
     def after_step(self, state: State) -> None:
-        """Called after each step."""
+        """Called after each step, or after up to ``group`` of them."""
 
     def on_end(self, state: State) -> None:
         """Called when the training has ended, or was stopped."""
@@ -65,24 +74,26 @@ def train(
         clock: Counts seconds.
     """
     strategy, sampler, optimizer = state.strategy, state.sampler, state.optimizer
+    group = min((callback.group for callback in callbacks), default=GROUP)
     before, one_thread = state.step, backends.torch_on_one_thread if state.thread_deterministic else nullcontext
-    state.training_step.as_it_is = one_thread
+    state.training_step.as_it_is, quick = one_thread, GROUP
     while state.fraction < 1 and state.seconds < until and not state.stopped:
         started = clock()
         if strategy.is_due(state.fraction, state.step):
             with one_thread():
                 _split(state, callbacks)
         optimizer.set_learning_rate(state.learning_rate())
-        sampler.step_pre_backward(state.renderer.field, state.step - state.began, state.generator)
         if not state.router.training:
             state.renderer.train()
-        made = state.training_step(state.rays)
-        optimizer.after_step(state.step)
-        state.count_step(made.rays)
+        steps = min(state.steps_alike(), steps_to_judgement(state), group, quick)
+        made = state.training_step(state.rays, steps, at=state.step - state.began)
+        state.count_steps(steps, made.rays)
         if state.device.type == "cpu" or state.step % READ_EVERY == 0:
             state.read_output(made)
         judge_start(state, made)
-        state.add_seconds(clock() - started)
+        taken = clock() - started
+        state.add_seconds(taken)
+        quick = max(1, int(steps * ANSWER / max(taken, 1e-9)))
         for callback in callbacks:
             callback.after_step(state)
     if state.fraction >= 1 and state.step > before:  # once, however often this is called

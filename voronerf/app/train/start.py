@@ -6,6 +6,7 @@ r rays of a batch.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import torch
 
@@ -13,6 +14,7 @@ from voronerf.app.train.build import make_grid, make_routers
 from voronerf.app.train.state import State
 from voronerf.nerf.loss import Batch, RenderOutput
 from voronerf.nerf.samplers import Occupancy
+from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.step import StepOutput
 
 #: Steps after the grid has settled after which a start is judged, and how often a training begins again at most.
@@ -34,8 +36,7 @@ def judge_start(state: State, made: StepOutput) -> None:
         state: After a step.
         made: That step.
     """
-    sampler = state.sampler
-    if not isinstance(sampler, Occupancy) or state.step - state.began != sampler.settling_steps + JUDGED:
+    if state.step != _judged_at(state):
         return
     draw = sum(stage.cells == 1 for stage in state.stages)
     if state.router.num_cells > 1 or draw > DRAWS:
@@ -46,11 +47,21 @@ def judge_start(state: State, made: StepOutput) -> None:
     config = state.config
     for name, router in make_routers(replace(config, seed=config.seed + STRIDE * draw)).items():
         state.routers[name].load_state_dict(router.state_dict())
-    sampler.grid = make_grid(config, state.scene, state.device)
+    cast(Occupancy, state.sampler).grid = make_grid(config, state.scene, state.device)
     state.optimizer.state.clear()
     state.strategy.forget()
     state.begin_again()
     state.report(f"nothing is learnt by step {state.step}: {why}; begins again from another draw, {draw} of {DRAWS}")
+
+
+def steps_to_judgement(state: State) -> int:
+    """How many steps can be made before :func:`judge_start` may judge; `GROUP` where it will not."""
+    left = _judged_at(state) - state.step
+    return left if left > 0 else GROUP
+
+
+def _judged_at(state: State) -> int:
+    return state.began + state.sampler.settling_steps + JUDGED if isinstance(state.sampler, Occupancy) else 0
 
 
 def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:

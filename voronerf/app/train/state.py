@@ -14,6 +14,7 @@ from torch import Tensor
 
 from voronerf.app.scenes import Scene
 from voronerf.app.train.config import TrainConfig
+from voronerf.nerf import schedule
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.loss import RayLoss
@@ -135,8 +136,12 @@ class State:
     @property
     def fraction(self) -> float:
         """How much of the training is done, 0..1."""
+        return self.fraction_at(self.step)
+
+    def fraction_at(self, step: int) -> float:
+        """How much of the training is done after so many steps, if they are made by now."""
         if self.config.steps is not None:
-            return min(1.0, self.step / self.config.steps)
+            return min(1.0, step / self.config.steps)
         training = float(self.config.budget or 1.0) - self.evaluation_seconds - self.reserved_seconds
         return min(1.0, self.seconds / max(training, 1e-9))
 
@@ -164,9 +169,20 @@ class State:
         return not isinstance(router.program(*_samples(6 if self.renderer.cones else 3), trace=True), str)
 
     def learning_rate(self) -> float:
-        """The learning rate of the next step."""
-        hold = self.config.field_type.lr_hold
-        return learning_rate(float(self.config.lr or 0), self.fraction, self.step, hold=hold, began=self.began)
+        """The learning rate of the next step: that of the middle of its group."""
+        group = schedule.GROUP
+        middle = self.step - (self.step - self.began) % group + group // 2
+        highest, hold = float(self.config.lr or 0), self.config.field_type.lr_hold
+        return learning_rate(highest, self.fraction_at(middle), middle, hold=hold, began=self.began)
+
+    def steps_alike(self) -> int:
+        """How many of the next steps can be made in one call: nothing changes between them."""
+        age = self.step - self.began
+        most = min(schedule.GROUP - age % schedule.GROUP, self.sampler.steps_alike(age))
+        if self.config.steps is not None:
+            most = min(most, self.config.steps - self.step)
+        due = (n for n in range(1, most) if self.strategy.is_due(self.fraction_at(self.step + n), self.step + n))
+        return next(due, most)
 
     @property
     def began(self) -> int:
@@ -184,7 +200,7 @@ class State:
     def read_output(self, made: StepOutput) -> None:
         """Reads loss, guard and number of samples of a step, which waits for the device; finds the rays of the next."""
         self.loss, self.skipped_in_a_row = float(made.loss), int(self.guard.in_a_row)
-        if isinstance(self.sampler, Occupancy):
+        if isinstance(self.sampler, Occupancy) and (self.step - self.began) % schedule.GROUP == 0:
             self.rays = next_rays(
                 self.rays,
                 made.samples,
@@ -212,10 +228,10 @@ class State:
         self.rays = int(self.config.rays or 0)
         self._enter(Stage(1, self.seconds, self.step, None, None, 0))
 
-    def count_step(self, rays: int) -> None:
-        """Counts a step with so many rays."""
-        self.step += 1
-        self.rays_done += rays
+    def count_steps(self, count: int, rays: int) -> None:
+        """Counts steps with so many rays each."""
+        self.step += count
+        self.rays_done += count * rays
 
     def add_seconds(self, seconds: float) -> None:
         """Counts seconds of training."""

@@ -10,6 +10,7 @@ from voronerf.app.train.loop import Callback
 from voronerf.app.train.state import State
 from voronerf.app.viewer.pictures import Subject
 from voronerf.app.viewer.viewer import Viewer
+from voronerf.nerf.schedule import GROUP
 
 #: Seconds between two changes of the lines and the curve that tell of the training.
 TELL = 1.0
@@ -47,6 +48,8 @@ class Training(Callback):
         state: What is viewed.
         scores: Whose curve is shown.
     """
+
+    group = GROUP
 
     def __init__(self, viewer: Viewer, state: State, scores: Scores) -> None:
         self.viewer, self.state, self.scores, self.cells = viewer, state, scores, state.router.num_cells

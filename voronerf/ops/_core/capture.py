@@ -88,15 +88,17 @@ class Capture:
         self._numbers.append((number, value))
         return number
 
-    def replay(self, threads: int) -> bool:
-        """Makes the work again; False where the rows are other ones.
+    def replay(self, threads: int, times: int = 1) -> int:
+        """Makes the work again so many times, and gives how often: not at all where the rows are other ones.
 
         Args:
             threads: As of a recording; the device has its own.
+            times: How often.
         """
         if any(given() != rows for rows, given in self._rows):
-            return False
+            return 0
         for number, value in self._numbers:
             number.fill_(value())
-        self._graph.replay()
-        return True
+        for _ in range(times):
+            self._graph.replay()
+        return times

@@ -2,21 +2,21 @@
 
 While a function is recorded, it runs as ever. Each of its calls of the compiled module is kept with what it has loaded
 (csrc/bindings/bind.cpp), and everything that it asks of torch is looked at: new memory is made large enough for later
-runs, random draws are noted and drawn again before each of them, and views change nothing. Whatever else torch computes
+runs, random integers are drawn again for each of them, and views change nothing. Whatever else torch computes
 would be missing later, so it keeps the function from being replayed: :attr:`Recording.obstacle` says what it is.
 
-What changes from run to run lies in memory: numbers of rows (:meth:`Recording.count`, :func:`read_count`), other
-numbers (:func:`varying`), and what earlier calls have computed. There is memory for a quarter more rows than the
+What changes lies in memory: numbers of rows (:meth:`Recording.count`, :func:`read_count`), other numbers
+(:func:`varying`), random integers, and what earlier calls have computed. Several runs can be made in one call; between
+them only random integers change, and what calls compute. There is memory for a quarter more rows than the
 recorded run had. A run that would exceed it is not made: :meth:`Recording.replay` says so.
 """
 
 from __future__ import annotations
 
 import ctypes
-import functools
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -54,11 +54,6 @@ class Recording(TorchDispatchMode):
 
     Attributes:
         obstacle: Why they cannot be made again; None if they can.
-        drawn: The random numbers of the last run, in the order in which they were drawn.
-        drawn_now: Whether a replay has drawn them that was then not made.
-
-    Args:
-        drawn: The first random numbers, in the place of new ones.
 
     Examples:
         >>> import torch
@@ -70,20 +65,20 @@ class Recording(TorchDispatchMode):
         ...     cells = nearest_centre(points, centres)
         >>> _ = points.copy_(torch.rand(5, 3))
         >>> recording.obstacle, recording.replay(threads=1)
-        (None, True)
+        (None, 1)
         >>> bool((cells == nearest_centre(points, centres)).all())
         True
     """
 
-    def __init__(self, drawn: Sequence[Tensor] = ()) -> None:
+    def __init__(self) -> None:
         super().__init__()
         from voronerf.ops._core import native
 
         self._compiled, self._calls = native.compiled, native.compiled.Recording()
         self._counts = list[Count]()
         self._numbers = list[tuple[Tensor, Callable[[], float]]]()
-        self._draws, self._known = list[Callable[[], Any]](), [*drawn]
-        self.drawn, self.drawn_now = list[Tensor](), False
+        self._drawn = list[Tensor]()
+        self._range: tuple[int, int, torch.Generator, torch.dtype, int] | None = None  # that all are drawn from
         self._memory: dict[int, Tensor] = {}  # of rows, by address
         self.obstacle: str | None = None
 
@@ -132,31 +127,38 @@ class Recording(TorchDispatchMode):
     def _refuse(self, why: str) -> None:
         self.obstacle = self.obstacle or why or None
 
-    def replay(self, threads: int) -> bool:
-        """Makes the calls again; False where there is no memory for the rows, perhaps with random numbers drawn.
+    def replay(self, threads: int, times: int = 1) -> int:
+        """Makes the calls again.
 
         Args:
             threads: Of the calls.
+            times: How often, in a row.
+
+        Returns:
+            How often they were made: less where there is no memory for the rows.
 
         Raises:
             ValueError: As of the calls, for what they find in their arguments.
         """
-        self.drawn_now = False
         for count in self._counts:
             if count.given is not None:
                 rows = count.given()
                 if not 0 < rows <= count.most:
-                    return False
+                    return 0
                 count.memory.fill_(rows)
-        for draw in self._draws:
-            draw()
         for number, value in self._numbers:
             number.fill_(value())
-        self.drawn_now = True
-        if self._calls.replay(threads):
-            self.drawn_now = False
-            return True
-        return False
+        if self._range is None:
+            return self._calls.replay(threads, times, 0, [], 0)
+        low, high, generator, dtype, size = self._range
+        before, drawn = generator.get_state(), torch.empty(times, len(self._drawn), size, dtype=dtype)
+        drawn.random_(low, high, generator=generator)
+        places = [each.data_ptr() for each in self._drawn]
+        made: int = self._calls.replay(threads, times, drawn.data_ptr(), places, size * drawn.element_size())
+        if made < times:  # what follows draws the others again
+            generator.set_state(before)
+            drawn[:made].random_(low, high, generator=generator)
+        return made
 
     def rows(self, place: int) -> int:
         """A number of rows of the last run; they are numbered in the order of the recorded one."""
@@ -186,19 +188,17 @@ class Recording(TorchDispatchMode):
         name, kwargs = func._schema.name, kwargs or {}
         if name in _NEW:
             return self._new(func, [*args], kwargs, args[0] if name == "aten::empty" else args[1])
-        random = torch.Tag.nondeterministic_seeded in func.tags and not any(isinstance(each, Tensor) for each in args)
-        result = self._known.pop(0).clone() if random and self._known else func(*args, **kwargs)
+        result = func(*args, **kwargs)
         if func.is_view:
             moved = isinstance(result, Tensor) and result.storage_offset() != args[0].storage_offset()
             if moved and self._is_counted(result):
                 self._refuse(f"a part of the rows of a step is read{_line()}")
-        elif random:
-            self.drawn.append(result)
-            if name == "aten::randint" and len(args) == 3:
-                draw = functools.partial(result.random_, args[0], args[1], generator=kwargs.get("generator"))
-                self._draws.append(draw)
-            else:
-                self._draws.append(lambda: result.copy_(func(*args, **kwargs)))
+        elif name == "aten::randint" and len(args) == 3 and kwargs.get("generator") is not None:
+            self._drawn.append(result)
+            drawn_from = (args[0], args[1], kwargs["generator"], result.dtype, result.numel())
+            if self._range not in (None, drawn_from):
+                self._refuse("random integers of two kinds are drawn")
+            self._range = drawn_from
         elif name not in _HARMLESS and not name.startswith("profiler::"):
             self._refuse(f"torch computes {name.split('::')[-1]}{_line()}")
         return result
@@ -226,6 +226,11 @@ def read_count(memory: Tensor) -> int:
         rows = int(memory)
     recording._add(memory, rows, None)
     return rows
+
+
+def fixed_count(rows: int) -> int:
+    """A number of rows that is the same in each run."""
+    return rows if active.recording is None else active.recording.count(lambda: rows)
 
 
 def following_count(rows: int, follows: Callable[[int], int]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -82,15 +82,26 @@ def adam(
 
 
 @torch.no_grad()
-def average(averages: Sequence[Tensor], parameters: Sequence[Tensor], share: float, *, backend: str = "auto") -> None:
-    """Moves averages a share of the way to parameters, in place; tensors and backends are those of `adam`."""
-    device = parameters[0].device
+def average(
+    averages: Sequence[Tensor], parameters: Sequence[Tensor] | None, share: float | Tensor, *, backend: str = "auto"
+) -> None:
+    """Moves averages a share of the way to parameters, or to zero, in place; tensors and backends as of `adam`.
+
+    Args:
+        averages: What is moved.
+        parameters: Of the same shapes; None for zero.
+        share: 0..1; or float32 [].
+        backend: As of `adam`.
+    """
+    device = averages[0].device
     if device.type == "cpu" and backends.chosen(_OP, device, torch.float32, backend=backend) == "native":
         from voronerf.ops.adam.native import average as run
 
         run(averages, parameters, share)
+    elif parameters is None:
+        torch._foreach_mul_(list(averages), 1 - share)
     else:
-        torch._foreach_lerp_(list(averages), list(parameters), share)
+        torch._foreach_lerp_(list(averages), list(parameters), cast(float, share))
 
 
 def _check_all(

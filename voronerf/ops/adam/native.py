@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
@@ -36,7 +37,7 @@ def adam(
         compiled.adam(given, *tensors, machine)
 
 
-def average(averages: Sequence[Tensor], parameters: Sequence[Tensor], share: float) -> None:
+def average(averages: Sequence[Tensor], parameters: Sequence[Tensor] | None, share: float | Tensor) -> None:
     """See ``voronerf.ops.adam.average``; on the CPU."""
-    sizes = [parameter.numel() for parameter in parameters]
+    share, sizes = torch.as_tensor(share, dtype=torch.float32), [each.numel() for each in averages]
     native.compiled.average(share, parameters, averages, sizes, native.cpu())

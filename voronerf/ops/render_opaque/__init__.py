@@ -13,7 +13,7 @@ from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
 from voronerf.ops.grouped_mlp.checks import check_routed
 from voronerf.ops.render_loss.reference import scaled
-from voronerf.ops.render_opaque.reference import RaySums
+from voronerf.ops.render_opaque.reference import RaysSeen
 from voronerf.ops.routed_mlp.program import check_program
 
 #: Names of the arguments of `routed_mlp` that a network has; the others are of the samples, or of the backward pass.
@@ -76,9 +76,10 @@ def render_opaque(
     opaque: Annotated[float, "[0, 1)"] = 0.02,
     spacing: Annotated[str, "linear|disparity"] = "linear",
     contraction: Annotated[Tensor | None, "same [4] or [5, 3]"] = None,
+    background: Annotated[Tensor | None, "same [3] or [r, 3]"] = None,
     heaviest: bool = True,
     backend: str = "auto",
-) -> RaySums:
+) -> RaysSeen:
     """Renders rays without gradients and without randomness: each is walked until it is opaque.
 
     Equivalent to ``march_rays``, ``routed_mlp``, activations as in ``render_loss`` and ``composite`` for a few samples
@@ -105,11 +106,12 @@ def render_opaque(
         opaque: a ray ends with a wave behind which no more than this share of the light is left, in [0, 1).
         spacing: of the strata, "linear" or "disparity".
         contraction: as in ``march_rays``, or None.
+        background: [3] or [r, 3], the colour behind everything; None is black.
         heaviest: whether to find the heaviest sample of each ray; else ``heaviest`` is the far end.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
-        RaySums(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]), sums without a background.
+        RaysSeen(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]).
 
     Raises:
         ValueError: ``density_scale`` with ``activated``, or neither.
@@ -123,6 +125,6 @@ def render_opaque(
         >>> ray = torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]), torch.zeros(1), torch.full((1,), 4.0)
         >>> box, occupied = torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), torch.ones(1, 1, 1, dtype=torch.bool)
         >>> seen = render_opaque(*ray, occupied, box, 64, network, density_scale=1.0)
-        >>> seen.colour.round(decimals=2), (seen.depth / seen.opacity).round(decimals=2), float(seen.light) < 0.02
-        (tensor([[0.5000, 0.5000, 0.5000]]), tensor([1.0600]), True)
+        >>> seen.colour, seen.opacity, seen.depth.round(decimals=2), float(seen.light) < 0.02
+        (tensor([[0.5000, 0.5000, 0.5000]]), tensor([1.]), tensor([1.0600]), True)
     """

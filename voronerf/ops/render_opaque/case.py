@@ -39,6 +39,7 @@ def _make(draw: Draw, n: int) -> Arguments:
     call["spacing"] = draw.among("spacing", "linear", "disparity")
     sphere = draw.uniform(4) + 0.1
     call["contraction"] = draw.among("contraction", None, sphere, draw.uniform(5, 3) + 0.1)
+    call["background"] = draw.among("background", None, draw.uniform(3), draw.uniform(n, 3))
     return {**call, "heaviest": draw.among("heaviest", True, False)}
 
 

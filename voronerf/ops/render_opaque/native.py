@@ -18,7 +18,7 @@ from voronerf.ops.grouped_program.native import program_inputs, program_of
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.render_opaque import reference
-from voronerf.ops.render_opaque.reference import RaySums
+from voronerf.ops.render_opaque.reference import RaysSeen
 from voronerf.ops.routed_mlp import native as routed_mlp
 from voronerf.ops.routed_mlp.program import cells_of
 
@@ -26,11 +26,13 @@ _OP = declared("render_opaque")
 _rays = _OP.inputs(
     native.compiled.MarchInputs, **{**INPUTS, "uniforms": "None", "seed": "None", "start": "None", "most": "samples"}
 )
-_rule, _outputs = _OP.inputs(native.compiled.SeeRule), _OP.outputs(native.compiled.SeeOutputs)
+_PER_RAY = "background is not None and background.dim() == 2"
+_rule = _OP.inputs(native.compiled.SeeRule, background_per_ray=_PER_RAY)
+_outputs = _OP.outputs(native.compiled.SeeOutputs)
 
 
 @torch.no_grad()
-def render_opaque(*flat: Any) -> RaySums:
+def render_opaque(*flat: Any) -> RaysSeen:
     """Every ray up to the first surface, in float32; see ``voronerf.ops.render_opaque``."""
     given = _OP.Inputs._make(flat)
     network = given.network
@@ -44,7 +46,7 @@ def render_opaque(*flat: Any) -> RaySums:
     if not plain or torch.is_autocast_enabled("cpu"):
         narrow = {name: [_narrow(part) for part in network.get(name, ())] for name in ("weights", "biases")}
         narrow = network | ({} if "program" in network else {**narrow, "features": _narrow(network["features"])})
-        composed: RaySums = partial(reference.render_opaque, backend="native")(*given._replace(network=narrow))
+        composed: RaysSeen = partial(reference.render_opaque, backend="native")(*given._replace(network=narrow))
         return composed
     rows = taken.rows(torch.zeros(k + 1, dtype=torch.int32))
     lowered = lower(program_of(rows, taken.how).text, False)
@@ -53,7 +55,7 @@ def render_opaque(*flat: Any) -> RaySums:
         centres = child_offsets = child = None
     if child_offsets is not None:
         check_tree(child_offsets, child, len(centres), "render_opaque")
-    found: RaySums = _OP.allocate(given)
+    found: RaysSeen = _OP.allocate(given)
     outputs, compiled = _outputs(found), native.compiled
     sound = compiled.render_opaque(
         lowered.program,

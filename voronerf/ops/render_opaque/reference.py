@@ -16,19 +16,19 @@ from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.routed_mlp.program import routed_program
 
 
-class RaySums(NamedTuple):
+class RaysSeen(NamedTuple):
     """What rays see.
 
     Attributes:
-        colour: [r, 3], the sum of weight times colour: without a background, and not divided by the opacity.
-        opacity: [r], the sum of the weights.
-        depth: [r], the sum of weight times depth.
-        light: [r], the share of the light that is left.
+        colour: [r, 3], the background included.
+        opacity: [r], 1 for a ray that has ended.
+        depth: [r], the mean by weight; the far end for a ray without any.
+        light: [r], the share of the light that is left. A ray that has ended has the colour of what it has met by then.
         heaviest: [r], the depth of the heaviest sample; the far end for a ray without any.
 
     Examples:
-        >>> from voronerf.ops import RaySums
-        >>> RaySums._fields
+        >>> from voronerf.ops import RaysSeen
+        >>> RaysSeen._fields
         ('colour', 'opacity', 'depth', 'light', 'heaviest')
     """
 
@@ -58,7 +58,7 @@ class Wave(NamedTuple):
 
 
 @torch.no_grad()
-def render_opaque(*flat: Any, backend: str = "reference") -> RaySums:
+def render_opaque(*flat: Any, backend: str = "reference") -> RaysSeen:
     """Every ray up to the first surface; see ``voronerf.ops.render_opaque``.
 
     ``backend`` is that of the operations it is made of.
@@ -91,14 +91,20 @@ def render_opaque(*flat: Any, backend: str = "reference") -> RaySums:
         seen = composite(density, colours, march.depths, march.deltas, **packed)
         return Wave(seen, march.ray_index, march.ray_offsets, march.depths, march.stop)
 
-    return walk(look, given.far, given.samples, wave, given.opaque, given.heaviest)
+    return walk(look, given.far, given.samples, wave, given.opaque, given.background, given.heaviest)
 
 
 @torch.no_grad()
 def walk(
-    look: Callable[[Tensor, Tensor | None], Wave], far: Tensor, samples: int, wave: int, opaque: float, heaviest: bool
-) -> RaySums:
-    """Rays in waves, and what they add up to.
+    look: Callable[[Tensor, Tensor | None], Wave],
+    far: Tensor,
+    samples: int,
+    wave: int,
+    opaque: float,
+    background: Tensor | None,
+    heaviest: bool,
+) -> RaysSeen:
+    """Rays in waves, and what they see.
 
     Args:
         look: The next wave of some rays, int64, from strata int32 on, or with None from the first.
@@ -106,6 +112,7 @@ def walk(
         samples: s.
         wave: Samples of a ray in a wave, at the most.
         opaque: Rays end with a wave after which no more light than this is left.
+        background: [3] or [r, 3]; None is black.
         heaviest: Whether to find the heaviest samples.
     """
     colour, opacity, depth = far.new_zeros(len(far), 3), torch.zeros_like(far), torch.zeros_like(far)
@@ -126,7 +133,12 @@ def walk(
         through[live] = light
         more = ((found.stop < samples) & (light > opaque)).nonzero()[:, 0]
         live, start = live[more], found.stop[more]
-    return RaySums(colour, opacity, depth, through, at)
+    depth = torch.where(opacity > 0, depth / opacity, far)
+    ended = through <= opaque
+    colour, opacity = torch.where(ended[:, None], colour / opacity[:, None], colour), opacity.masked_fill(ended, 1)
+    if background is not None:
+        colour = colour + (1 - opacity)[:, None] * background.to(colour)
+    return RaysSeen(colour, opacity, depth, through, at)
 
 
 def _heaviest(wave: Wave, most: int) -> tuple[Tensor, Tensor]:
