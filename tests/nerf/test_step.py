@@ -194,6 +194,7 @@ def test_numbers_of_rows_that_are_much_the_same():
         lambda t: t.optimizer.param_groups[0].update(betas=(0.5, 0.6)),
         lambda t: t.optimizer.load_state_dict(t.optimizer.state_dict()),
         lambda t: t.optimizer.state.clear(),
+        lambda t: t.optimizer.drop_averages(),
         lambda t: t.router.module.colour.weight.requires_grad_(False),
         lambda t: t.router.module.colour.weight.register_hook(lambda gradient: 2 * gradient),
         lambda t: t.router.module.register_forward_hook(lambda *given: None),
@@ -208,9 +209,12 @@ def test_what_changes_is_followed(change):
         for as_it_is in (False, True):
             torch.set_num_threads(before)
             training = Training(cells=3)
+            training.optimizer.average = 0.9
             training.train(4, as_it_is=as_it_is)
+            for _ in range(2):
+                training.step(64, at=15)
             change(training)
-            steps = training.train(4, as_it_is=as_it_is)
+            steps = [*training.train(4, as_it_is=as_it_is), training.step(64, at=15).loss]
             found.append([*steps, *(e for e in training.everything() if e is not None)])
     finally:
         torch.set_num_threads(before)

@@ -169,7 +169,7 @@ def test_averages_of_frozen_cells_stay():
     old = [optimizer.state[p]["average"].clone() for p in router.parameters()]
     gradients(router, points)
     optimizer.step()
-    optimizer.after_step(8)
+    optimizer.after_step(16)
     for p, before in zip(router.parameters(), old, strict=True):
         now = optimizer.state[p]["average"]
         assert torch.equal(now[FROZEN], before[FROZEN]) and not torch.equal(now[LEARNING], before[LEARNING])

@@ -216,6 +216,8 @@ class TrainingStep:
             return 1, StepOutput(*self._run(self._rays)), None
         if self._left:
             self._left -= 1
+            if not same:
+                self.forget()
             return 1, StepOutput(*self._run(self._rays)), None
         return 1, self._record(same), None
 
@@ -380,6 +382,8 @@ class TrainingStep:
             self._guards.add(vars(module), "")
         for group in optimizer.param_groups:
             self._guards.add(group, "lr")
+        for members in (optimizer.state, *optimizer.state.values()):
+            self._guards.add(members, "")
         self._objects, self._values = self._current()
 
     def _holds(self) -> bool:

@@ -166,6 +166,7 @@ def test_a_stopped_run_goes_on_with_the_command_that_it_prints(tmp_path, monkeyp
     write_blender(data, builtin_scene(16, train_views=4, test_views=2), 0.7)
     stop = lambda display, state: state.step == 3 and state.stop()  # noqa: E731
     with monkeypatch.context() as patched:
+        patched.setattr(TrainingDisplay, "group", 1)
         patched.setattr(TrainingDisplay, "after_step", stop)
         assert main([*words("train --data"), str(data), "--out", str(out), *words(TINY), "--downscale", "1"]) == 130
     (said,) = re.findall("continue with: voronerf (.*)", capsys.readouterr().out)

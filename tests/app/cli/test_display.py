@@ -14,7 +14,7 @@ def test_the_loss_is_that_of_the_steps_whose_loss_was_read():
     for step, loss in ((51, math.nan), (52, math.nan), (53, 0.4), (54, 0.2)):
         state = SimpleNamespace(step=step, loss=loss, router=router, fraction=0.5, rays_done=100, seconds=1.0)
         display.after_step(state)
-    assert display.loss == 0.95 * 0.4 + 0.05 * 0.2
+    assert display.loss == 0.7 * 0.4 + 0.3 * 0.2
 
 
 def test_what_goes_on_beside_a_training_has_a_bar_with_its_name():

@@ -77,7 +77,7 @@ def test_tensorboard(tmp_path, fails, monkeypatch):
     pytest.importorskip("torch.utils.tensorboard", reason="tensorboard is not complete")
     assert main(words("train --tensorboard --out", tmp_path / "run", TINY)) == 0
     found = scalars(tmp_path / "run" / "tensorboard")
-    assert found.count("train/loss") == found.count("train/cells") == 1  # of 16 steps the tenth
+    assert found.count("train/loss") == found.count("train/cells") == 1  # after 16 steps
     assert found.count("test/psnr") == found.count("test/ssim") == 2 and "test/lpips" not in found
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     monkeypatch.setattr("voronerf.app.cli.train.load_scene", None)  # data is read after it

@@ -369,7 +369,6 @@ class TensorBoard(Callback):
     """
 
     group = GROUP
-    EVERY = 2 * GROUP  # steps between two losses
 
     def __init__(self, folder: Path, scores: Scores) -> None:
         self._make, self.folder, self.scores, self.written = tensorboard_writer(), folder, scores, 0
@@ -381,7 +380,7 @@ class TensorBoard(Callback):
 
     def after_step(self, state: State) -> None:
         """Writes the state after a step, and the evaluations since the step before."""
-        if state.step % self.EVERY == 0:
+        if state.step % GROUP == 0:
             speed = state.rays_done / max(state.seconds, 1e-9)
             for name, value in (("loss", state.loss), ("rays_per_second", speed), ("cells", state.router.num_cells)):
                 self.writer.add_scalar(f"train/{name}", value, state.step)
