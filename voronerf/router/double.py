@@ -145,7 +145,8 @@ def _noting(kind: type[nn.Module], place: int, reads: set[tuple[int, str]]) -> t
         return kind.__getattribute__(self, name)
 
     names = {"__module__": kind.__module__, "__qualname__": kind.__qualname__, "__getattribute__": noted}
-    made: type[nn.Module] = type(kind)(kind.__name__, (_Unregistered, kind), names)
+    metaclass: Any = type(kind)
+    made: type[nn.Module] = metaclass(kind.__name__, (_Unregistered, kind), names)
     return made
 
 

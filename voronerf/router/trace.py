@@ -147,8 +147,9 @@ class Trace(TorchFunctionMode):
     def _custom_functions(self) -> Iterator[None]:
         """Records the custom functions of autograd that this thread calls."""
         code, calls = torch.autograd.Function.apply.__func__.__code__, dict[FrameType, _Begun]()  # type: ignore[attr-defined]
-        before = sys.getprofile()
-        if before is not None and not callable(before):  # such as that of cProfile, which could not be set again
+        before: Any = sys.getprofile()
+        in_c = before is not None and not callable(before)  # such as cProfile's, which has its own way to go on
+        if in_c and not hasattr(before, "enable"):
             yield
             return
 
@@ -162,11 +163,15 @@ class Trace(TorchFunctionMode):
                 self._end(calls.pop(frame), value)
                 self._running = False
 
+        if in_c:
+            before.disable()
         sys.setprofile(see)
         try:
             yield
         finally:
-            sys.setprofile(before)
+            sys.setprofile(None if in_c else before)
+            if in_c:
+                before.enable()
 
     def _begin(self, func: Any, args: Any, kwargs: Any) -> _Begun:
         """Records a function that is about to be called, and how to call it."""
