@@ -108,10 +108,13 @@ def test_an_optimiser_that_was_made_before_wrapping_is_told(generator: torch.Gen
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for _ in range(63):  # as where gradients are accumulated
+        for _ in range(64):  # as where gradients are accumulated; the first call finds none
             step()
-    with pytest.warns(UserWarning, match=r"no optimizer has changed the parameters.*make it of router.parameters\(\)"):
+    with pytest.warns(
+        UserWarning, match=r"no optimizer has changed the parameters.*make it of router.parameters\(\)"
+    ) as told:
         step()
+    assert told[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for _ in range(65):  # once

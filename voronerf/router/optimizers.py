@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import gc
-import itertools
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 from voronerf.router.grouping import cell_parameters
 
 _OP = "VoronoiRouter"
-_PATIENCE = 64  # backward passes without a step; with gradients that are accumulated there are some
+PATIENCE = 64  # calls without a step; where gradients are accumulated there are some
 
 
 def check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, method: str) -> None:
@@ -98,26 +97,31 @@ def watch_optimizers(module: nn.Module, line: str) -> list[Any]:
     return [optimizer.register_step_pre_hook(check) for optimizer in found if ours(optimizer)]
 
 
-def watch_training(module: nn.Module) -> None:
-    """Warns where a module gets gradients but no optimiser changes it, such as one of its parameters before it was
-    routed; looks at one parameter, in the first `_PATIENCE` backward passes."""
-    first = next((parameter for parameter in module.parameters() if parameter.requires_grad), None)
-    if first is None:
-        return
-    passes, version = itertools.count(1), first._version
+class Untrained:
+    """Finds out whether a module gets gradients but no optimiser changes it, such as one of its parameters before it
+    was routed. It is asked in each call, since a hook on a parameter would keep gradients from being added at once.
 
-    def check(parameter: Tensor) -> None:
-        if parameter._version != version:
-            handle.remove()
-        elif next(passes) == _PATIENCE:
-            handle.remove()
-            warnings.warn(
-                f"{_OP}: no optimizer has changed the parameters in {_PATIENCE} backward passes; make it of "
-                "router.parameters(), since those that the module had before it was wrapped are not trained",
-                stacklevel=2,
-            )
+    Args:
+        module: The routed module.
+    """
 
-    handle = first.register_post_accumulate_grad_hook(check)
+    def __init__(self, module: nn.Module) -> None:
+        self._parameters = [p for p in module.parameters() if p.requires_grad][:1]
+        self._were, self._calls = [p.detach().clone() for p in self._parameters], 0
+
+    def is_over(self, warn: Callable[[str, str], None]) -> bool:
+        """Whether there is nothing more to find out; takes a topic and a message for a warning."""
+        self._calls += 1
+        if self._calls <= PATIENCE:
+            return False
+        for parameter, was in zip(self._parameters, self._were, strict=True):
+            if parameter.grad is not None and torch.equal(parameter.detach(), was):
+                message = (
+                    f"no optimizer has changed the parameters in {PATIENCE} calls, but they have gradients; make it of "
+                    "router.parameters(), since those that the module had before it was wrapped are not trained"
+                )
+                warn("untrained", message)
+        return True
 
 
 # Frozen cells ---------------------------------------------------------------------------------------------------------
@@ -186,7 +190,7 @@ def _of_cells(optimizer: torch.optim.Optimizer, parameter: Tensor) -> list[Tenso
 
 
 class FrozenRows:
-    """The parameters of frozen cells as they were when they were frozen, to find out whether a step changes them.
+    """The parameters of frozen cells, to find out whether an optimiser that was not given changes them.
 
     Args:
         module: The routed module.
@@ -194,23 +198,24 @@ class FrozenRows:
     """
 
     def __init__(self, module: nn.Module, frozen: Tensor) -> None:
-        self._frozen = frozen
-        self._were = [(p, p._version, p.detach()[frozen]) for p in cell_parameters(module)]
+        self._frozen, self._calls = frozen, 0
+        self._were = [(p, p.detach()[frozen]) for p in cell_parameters(module)]
 
-    def outlive_a_step(self) -> bool:
-        """Whether a step was made, and the rows are the same; False before there was one.
+    def is_over(self, warn: Callable[[str, str], None]) -> bool:
+        """Whether there is nothing more to find out; looks in every call whose number is a power of 2.
 
         Raises:
-            ValueError: If an optimiser has changed them.
+            ValueError: If the parameters have changed.
         """
-        if all(parameter._version == version for parameter, version, _ in self._were):
-            return False
-        if not all(torch.equal(parameter.detach()[self._frozen], rows) for parameter, _, rows in self._were):
+        self._calls += 1
+        looks = self._calls > 1 and not self._calls & (self._calls - 1)
+        if looks and not all(torch.equal(parameter.detach()[self._frozen], rows) for parameter, rows in self._were):
+            self._calls -= 1
             raise ValueError(
                 f"{_OP}.freeze: an optimizer that was not given has changed frozen cells; write "
                 "router.freeze(cells, optimizer=optimizer), or unfreeze cells before they are written to"
             )
-        return True
+        return self._calls >= PATIENCE
 
 
 def trained_parts(parameters: Sequence[Tensor]) -> list[list[Any]]:

@@ -37,13 +37,13 @@ from voronerf.router.known import Known, kind_of
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, doubt_of, find_positions, first_tensor
 from voronerf.router.optimizers import (
     FrozenRows,
+    Untrained,
     check_optimizer,
     drop_state,
     freeze_cells,
     keep_frozen,
     move_state,
     watch_optimizers,
-    watch_training,
 )
 from voronerf.router.probe import Options
 from voronerf.router.program import CellProgram, program_of_table
@@ -163,10 +163,9 @@ class VoronoiRouter(nn.Module):
         self.diagram = own if first is None or first.is_meta else own.to(first.device)
         self.module: nn.Module = clone_module(module)
         stack_parameters(self.module, own.num_cells, share)
-        watch_training(self.module)
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
         self._watches: list[Any] = []  # of optimisers that hold the state of other cells
-        self._frozen_rows: FrozenRows | None = None  # until a step was made
+        self._doubts: list[Untrained | FrozenRows] = [Untrained(self.module)]  # asked in the first training calls
         self.assignment, self.temperature = assignment, temperature
         if coords is None and isinstance(module, LayeredField):
             coords = cast(Coordinates, f"first{own.centres.shape[1]}")
@@ -253,7 +252,7 @@ class VoronoiRouter(nn.Module):
             ValueError: For parameters of other names or shapes, or buffers that differ from the shared ones.
         """
         fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
-        self._frozen_rows = None
+        self._trust_frozen()
 
     def apply(self, fn: Callable[[nn.Module], Any]) -> VoronoiRouter:
         """Applies a function to the modules of each cell in turn, such as one that initialises layers.
@@ -274,7 +273,7 @@ class VoronoiRouter(nn.Module):
             True
         """
         apply_to_cells(self.module, self.num_cells, fn)
-        self._frozen_rows = None
+        self._trust_frozen()
         return self
 
     def _check_index(self, method: str, index: int) -> int:
@@ -328,7 +327,7 @@ class VoronoiRouter(nn.Module):
         if optimizer is not None:
             keep_frozen(optimizer)
         elif self.frozen_cells is not None:
-            self._frozen_rows = FrozenRows(self.module, self.frozen_cells)
+            self._doubts.append(FrozenRows(self.module, self.frozen_cells))
 
     def unfreeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
         """Lets frozen cells learn again, with the optimiser's moments that they had; takes what `freeze` takes."""
@@ -353,7 +352,7 @@ class VoronoiRouter(nn.Module):
         return torch.zeros(k, dtype=torch.bool, device=device).index_fill(0, given.long(), True)
 
     def _set_frozen(self, frozen: Tensor | None) -> None:
-        self._frozen_rows = None
+        self._trust_frozen()
         self.frozen_cells = frozen if frozen is not None and bool(frozen.any()) else None
         freeze_cells(self.module, self.frozen_cells)
 
@@ -481,7 +480,7 @@ class VoronoiRouter(nn.Module):
                 renew_cells(self.module, torch.zeros(diagram.num_cells, dtype=torch.int64))
                 self._set_frozen(None)
                 self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
-        self._frozen_rows = None
+        self._trust_frozen()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # Calls ------------------------------------------------------------------------------------------------------------
@@ -557,8 +556,8 @@ class VoronoiRouter(nn.Module):
         """
         diagram: Any = self._modules["diagram"]
         k, centres, frozen = diagram.num_cells, diagram._buffers["centres"], self._buffers["frozen_cells"]
-        if frozen is not None:
-            self._check_frozen()
+        if self._doubts:
+            self._ask_doubts()
         if k == 1:
             return {"frozen": frozen}
         d, drawn = centres.shape[1], self.assignment == "stochastic" and self.training
@@ -574,7 +573,7 @@ class VoronoiRouter(nn.Module):
     def _places_of(self, method: str, positions: Tensor) -> dict[str, Any]:
         """The same for a call of a method at positions [..., d]; methods that share positions share their cells."""
         if self.methods:
-            self._check_frozen()
+            self._ask_doubts()
             return {"frozen": self.frozen_cells, "cells": self._group(method, positions).cells}
         return self.places(positions if positions.dim() == 2 else positions.flatten(0, -2))
 
@@ -693,7 +692,7 @@ class VoronoiRouter(nn.Module):
     def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
         refuse_transforms()
-        self._check_frozen()
+        self._ask_doubts()
         called, like = getattr(self.module, method), kind_of(method, self.module.training, args, kwargs, coords)
         layered = method == "forward" and self._table is not None
         if layered and (each := each_direction(args, kwargs)) is not None:
@@ -706,11 +705,14 @@ class VoronoiRouter(nn.Module):
         grouping = self._group(method, positions)
         return self._dispatch.evaluate(call, grouping, self._options, self.frozen_cells).restored(call.layout)
 
-    def _check_frozen(self) -> None:
-        """Raises ValueError where an optimiser has changed frozen cells."""
-        rows = self._frozen_rows
-        if rows is not None and not torch.compiler.is_compiling() and rows.outlive_a_step():
-            self._frozen_rows = None
+    def _ask_doubts(self) -> None:
+        """Warns or raises, in the first training calls, where optimisers do not do what is expected of them."""
+        if torch.is_grad_enabled() and not torch.compiler.is_compiling():
+            self._doubts = [doubt for doubt in self._doubts if not doubt.is_over(self._dispatch.warn_once)]
+
+    def _trust_frozen(self) -> None:
+        """Frozen cells may be others from now on."""
+        self._doubts = [doubt for doubt in self._doubts if not isinstance(doubt, FrozenRows)]
 
     @property
     def _options(self) -> Options:
@@ -755,7 +757,7 @@ class VoronoiRouter(nn.Module):
         return grouping
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_watches": [], "_frozen_rows": None, "_assigned": None}
+        return {**self.__dict__, "_watches": [], "_doubts": [], "_assigned": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -770,7 +772,8 @@ class VoronoiRouter(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:
         self._dispatch.forget()
-        self._assigned = self._frozen_rows = None
+        self._assigned = None
+        self._trust_frozen()
         super()._apply(fn, recurse)
         freeze_cells(self.module, self.frozen_cells)
         return self
