@@ -98,14 +98,14 @@ class Town:
         """Exchanges the bounds of occupied space between ranks."""
         bounds = torch.zeros_like(self.bounds)
         for number, state in self.states.items():
-            bounds[number] = self.members[number].place.bounds(sampler_of(state).grid)
+            bounds[number] = self.members[number].place.bounds(grid_of(state))
         self.bounds = self.group.total(bounds)
 
 
-def sampler_of(state: State) -> Occupancy:
-    """The sampler of a territory, which skips what is empty."""
-    assert isinstance(state.sampler, Occupancy)
-    return state.sampler
+def grid_of(state: State) -> OccupancyGrid:
+    """Which space of a territory is empty; `check_territories` rejects settings without a grid."""
+    assert state.sampler.grid is not None
+    return state.sampler.grid
 
 
 def check_territories(config: TrainConfig, count: int, ranks: int) -> None:
@@ -160,13 +160,13 @@ def build_town(
             obstacle = obstacle or "its activations are not a sigmoid and a scaled softplus"
         if obstacle is not None:
             raise ConfigError(f"--field {config.field} cannot be trained in territories: {obstacle}")
-        sampler = sampler_of(state)
         if contraction is None:
+            sampler, grid = state.sampler, grid_of(state)
             state.renderer.sampler = Occupancy(
-                sampler.grid,
+                grid,
                 sampler.samples,
                 space=sampler.space,
-                empty=place.outside(sampler.grid),
+                empty=place.outside(grid),
                 backend=sampler.backend,
             )
         members[number] = Territory(place, state.renderer, state.draws)
@@ -279,10 +279,7 @@ def save(town: Town) -> None:
     if group.any(failure is not None):
         raise failure or RankLost("another rank could not write the checkpoint")
     own = {
-        number: [
-            {k: v.cpu() for k, v in each.state_dict().items()}
-            for each in (state.router.diagram, sampler_of(state).grid)
-        ]
+        number: [{k: v.cpu() for k, v in each.state_dict().items()} for each in (state.router.diagram, grid_of(state))]
         for number, state in town.states.items()
     }
     found = {number: told for each in group.gather(own) for number, told in each.items()}

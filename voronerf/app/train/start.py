@@ -12,7 +12,6 @@ import torch
 from voronerf.app.train.build import make_grid, make_routers
 from voronerf.app.train.state import State
 from voronerf.nerf.loss import Batch, RenderOutput
-from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.step import StepOutput
 
 #: Steps after the grid has settled after which a start is judged, and how often a training begins again at most.
@@ -35,7 +34,7 @@ def judge_start(state: State, made: StepOutput) -> None:
         made: That step.
     """
     sampler = state.sampler
-    if not isinstance(sampler, Occupancy) or state.step - state.began != sampler.settling_steps + JUDGED:
+    if sampler.grid is None or state.step - state.began != sampler.settling_steps + JUDGED:
         return
     draw = sum(stage.cells == 1 for stage in state.stages)
     if state.router.num_cells > 1 or draw > DRAWS:
@@ -46,7 +45,7 @@ def judge_start(state: State, made: StepOutput) -> None:
     config = state.config
     for name, router in make_routers(replace(config, seed=config.seed + STRIDE * draw)).items():
         state.routers[name].load_state_dict(router.state_dict())
-    sampler.grid = make_grid(config, state.scene, state.device)
+    sampler.grid.load_state_dict(make_grid(config, state.scene, state.device).state_dict())
     state.optimizer.state.clear()
     state.strategy.forget()
     state.begin_again()

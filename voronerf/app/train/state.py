@@ -18,7 +18,7 @@ from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.renderer import Renderer
-from voronerf.nerf.samplers import Occupancy, Sampler
+from voronerf.nerf.samplers import Sampler
 from voronerf.nerf.schedule import learning_rate, next_rays
 from voronerf.nerf.split import SplitDone, SplitStrategy
 from voronerf.nerf.step import StepOutput, TrainingStep
@@ -184,7 +184,7 @@ class State:
     def read_output(self, made: StepOutput) -> None:
         """Reads loss, guard and number of samples of a step, which waits for the device; finds the rays of the next."""
         self.loss, self.skipped_in_a_row = float(made.loss), int(self.guard.in_a_row)
-        if isinstance(self.sampler, Occupancy):
+        if self.sampler.grid is not None:
             self.rays = next_rays(
                 self.rays,
                 made.samples,
