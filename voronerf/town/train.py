@@ -32,6 +32,7 @@ from voronerf.app.train.checkpoint import (
     save_checkpoint,
 )
 from voronerf.app.train.defaults import resolve
+from voronerf.app.train.loop import make_split
 from voronerf.app.train.resume import snapshot
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Perspective, RenderOutput, StepOutput
@@ -236,13 +237,9 @@ def train(
 
 def _prepare(state: State) -> Batch:
     """What comes before the loss of a step: splits, empty space, rays."""
-    strategy, optimizer = state.strategy, state.optimizer
-    if strategy.splits or len(strategy.reservoir) >= (strategy.planned.children if strategy.planned else 0):
-        done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
-        if done is not None:
-            state.begin_stage(done)
-            if not strategy.inherit:
-                optimizer.drop_averages()
+    optimizer = state.optimizer
+    if state.strategy.has_samples():
+        make_split(state)
     optimizer.set_learning_rate(state.learning_rate())
     state.sampler.step_pre_backward(state.renderer.field, state.step, state.generator)
     state.renderer.train()
@@ -375,8 +372,7 @@ def summary_of(town: Town) -> dict[str, Any]:
     """What ``summary.json`` says of a training, on all ranks alike; scores are added to it."""
     own = torch.zeros(5, dtype=torch.float64)
     for state in town.states.values():
-        left = len(state.strategy.plan) - state.strategy.splits
-        counts = state.parameter_count, left, state.skipped, state.rays_done, state.router.num_cells
+        counts = state.parameter_count, state.strategy.left, state.skipped, state.rays_done, state.router.num_cells
         own += torch.tensor(counts, dtype=torch.float64)
     told = town.group.total(own)
     parameters, left, skipped, rays, cells = map(int, told.tolist())

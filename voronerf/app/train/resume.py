@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -131,7 +130,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
             raise ValueError(f"{source}: step, times and stages must be counts, {came}")
     except ValueError as error:
         raise CheckpointError(str(error)) from None
-    config = TrainConfig.from_json(json.dumps(stored.config), source)
+    config = TrainConfig.from_values(stored.config, source)
     least = int(config.rays or 0)
     most = int(least * config.field_type.ray_growth)
     if not least <= stored.rays <= most:

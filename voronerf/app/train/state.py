@@ -20,7 +20,7 @@ from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Sampler
 from voronerf.nerf.schedule import learning_rate, next_rays
-from voronerf.nerf.split import SplitDone, SplitStrategy
+from voronerf.nerf.split import SplitDone, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.ops import Guard
 from voronerf.ops._core import backends
@@ -85,7 +85,7 @@ class State:
     renderer: Renderer
     ray_loss: RayLoss
     optimizer: Adam
-    strategy: SplitStrategy
+    strategy: Strategy
     batches: RayBatches
     generator: torch.Generator
     draws: torch.Generator
@@ -110,7 +110,7 @@ class State:
             self.batches,
             self.ray_loss,
             self.optimizer,
-            strategy=self.strategy,
+            strategy=self.strategy,  # type: ignore[arg-type]
             guard=self.guard,
             generator=self.draws,
             autocast=HALVES.get(self.config.precision),
