@@ -6,7 +6,7 @@ import sys
 from paper.main import main
 from paper.runs import data_folder
 
-from voronerf.app.cli.main import EXPECTED
+from voronerf.app.cli.program import EXPECTED
 
 if __name__ == "__main__":
     # built-in scenes have no folder beside which weights for LPIPS would be found

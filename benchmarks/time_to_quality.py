@@ -28,7 +28,7 @@ from harness import metadata
 from rival_ngp import Rival, RivalConfig
 from turns import CLOCKS, Training, take_turns
 
-from voronerf.app.cli.main import EXPECTED
+from voronerf.app.cli.program import EXPECTED
 from voronerf.app.evaluate.plots import plot_curves
 from voronerf.app.files import write_text
 from voronerf.app.scenes import Scene, load_scene

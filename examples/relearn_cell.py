@@ -35,7 +35,7 @@ def main() -> None:
 
     with torch.no_grad():
         before, parameters = router(points), [p.clone() for p in router.parameters()]
-    router.freeze([cell for cell in range(router.num_cells) if cell != 5])
+    router.freeze([cell for cell in range(router.num_cells) if cell != 5], optimizer=optimizer)
     fit(router, optimizer, changed, 100)
 
     with torch.no_grad():

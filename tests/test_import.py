@@ -52,22 +52,26 @@ def test_neither_first_calls_nor_a_training_print_or_import_compilers(code: str)
 
 def test_a_missing_torch_is_one_line(tmp_path) -> None:
     line = "voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch\n"
-    without = "import sys; sys.modules['torch'] = None; sys.argv[0] = {!r}; import voronerf"
-    for program, text in (("notebook", f"ImportError: {line}"), ("/bin/voronerf", f"voronerf: error: {line}")):
-        run = subprocess.run([sys.executable, "-c", without.format(program)], capture_output=True, text=True)
+    without, program = (
+        "import sys; sys.modules['torch'] = None; ",
+        "from voronerf.app.cli import main; sys.exit(main())",
+    )
+    for code, text in (("from voronerf import NeRF", f"ImportError: {line}"), (program, f"voronerf: error: {line}")):
+        run = subprocess.run([sys.executable, "-c", without + code], capture_output=True, text=True)
         assert run.returncode == 1 and run.stderr.endswith(text) and run.stderr.count("Traceback") == ("I" in text[:1])
         assert "During handling" not in run.stderr
 
 
 def test_threads_of_the_command_sleep_while_they_wait() -> None:
     """A library leaves that to its program, and the command to its user."""
-    code = "import os, sys; sys.modules['torch'] = None; sys.argv[0] = {!r}\ntry: import voronerf\n"
-    code += "except BaseException: print(*map(os.environ.get, ('OMP_WAIT_POLICY', 'GOMP_SPINCOUNT')))"
+    code = "import os, sys; sys.modules['torch'] = None; {}"
+    code += "; print(*map(os.environ.get, ('OMP_WAIT_POLICY', 'GOMP_SPINCOUNT')))"
+    command = "from voronerf.app.cli import main; main()"
     for program, given, found in (
-        ("/bin/voronerf", {}, "passive 1000"),
-        ("/bin/voronerf", {"OMP_WAIT_POLICY": "active"}, "active None"),
-        ("/bin/voronerf", {"GOMP_SPINCOUNT": "7"}, "passive 7"),
-        ("notebook", {}, "None None"),
+        (command, {}, "passive 1000"),
+        (command, {"OMP_WAIT_POLICY": "active"}, "active None"),
+        (command, {"GOMP_SPINCOUNT": "7"}, "passive 7"),
+        ("import voronerf.app.cli", {}, "None None"),
     ):
         env = {name: value for name, value in os.environ.items() if "OMP_" not in name} | given
         run = subprocess.run([sys.executable, "-c", code.format(program)], env=env, capture_output=True, text=True)

@@ -116,7 +116,7 @@ def test_backends_alone_choose() -> None:
     ("source", "module", "fault"),
     [
         ("from voronerf.router import VoronoiRouter", "voronerf.ops.nearest_centre", "from a layer above"),
-        ("def f():\n    import voronerf.app.cli.main", "voronerf.app.train.loop", "from a layer above"),
+        ("def f():\n    import voronerf.app.cli.program", "voronerf.app.train.loop", "from a layer above"),
         ("from voronerf import diagram", "voronerf.ops.cell_sort.reference", "from a layer above"),
         ("from ..train import loop", "voronerf.app.scenes.blender", "from a layer above"),
         ("from voronerf.ops._core import _C", "voronerf.ops.nearest_centre", "only native may"),

@@ -13,7 +13,6 @@ VN_BINDINGS(module) {
   module.cpu("measure_peak", VN_CPU(measure_peak));
   module.plain("bfloat16_gain", VN_CPU(bfloat16_gain));
   module.plain("advise_huge_pages", VN_CPU(advise_huge_pages));
-  module.plain("keep_freed_memory", VN_CPU(keep_freed_memory));
 }
 
 }  // namespace voronerf

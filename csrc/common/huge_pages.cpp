@@ -3,9 +3,6 @@
 #ifdef __linux__
 #include <sys/mman.h>
 #endif
-#ifdef __GLIBC__
-#include <malloc.h>
-#endif
 
 namespace voronerf {
 
@@ -31,12 +28,5 @@ void advise_huge_pages(void* memory, int64_t bytes) {
 void advise_huge_pages(void*, int64_t) {}
 
 #endif
-
-void keep_freed_memory() {
-#ifdef __GLIBC__
-  (void)mallopt(M_MMAP_THRESHOLD, 1 << 25);  // the most that glibc takes
-  (void)mallopt(M_TRIM_THRESHOLD, 1 << 30);
-#endif
-}
 
 }  // namespace voronerf

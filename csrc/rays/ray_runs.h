@@ -1,6 +1,6 @@
 // Rays that pass through the cells of several ranks: which samples are a rank's own, which of them make a run, and rays
 // put together from the partial sums of runs (render_loss.h). What a run is, is said in
-// voronerf/town/distributed/sums.py.
+// voronerf/ops/ray_runs/__init__.py.
 #pragma once
 
 #include <cstdint>

@@ -8,9 +8,9 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from voronerf.app.cli.main import COMMANDS
 from voronerf.app.cli.opening import Opening
 from voronerf.app.cli.parsing import field_docs, group_name
+from voronerf.app.cli.program import COMMANDS
 from voronerf.app.train.config import TrainConfig
 
 HEADER = ["| option | values | default | |", "|---|---|---|---|"]

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
 from voronerf import ops
-from voronerf.app.cli.main import NO_MEMORY
+from voronerf.app.cli.program import NO_MEMORY
 from voronerf.ops._core import backends, tolerances
 from voronerf.ops._core.cases import SIZES, Draw, cases
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from attempts import REFUSED, RIGHT, Failed
 from given import FIELDS, TINY
 
-from voronerf.app.cli.main import main
+from voronerf.app.cli import main
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.town import group
 

@@ -53,7 +53,7 @@ def options() -> dict[str, set[str]]:
 
 
 def test_every_option_is_on_the_page() -> None:
-    from voronerf.app.cli.main import COMMANDS
+    from voronerf.app.cli.program import COMMANDS
     from voronerf.app.train.config import TrainConfig
 
     assert set(options()) == set(COMMANDS)

@@ -124,7 +124,7 @@ def test_large_results_ask_for_huge_pages() -> None:
         pytest.skip("huge pages are switched off here")
     program = """
 import resource, torch
-from voronerf.ops._core.native import on_huge_pages
+from voronerf.ops._core.memory import on_huge_pages
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 before = faults()
 out = torch.empty(1 << 24)
@@ -137,13 +137,13 @@ print(faults() - before, int(out.count_nonzero()))
 
 
 def test_what_a_step_frees_is_kept() -> None:
-    """In a fresh process: a step finds the memory of an equal one before it."""
+    """By the program, in a fresh process: a step finds the memory of an equal one before it."""
     if platform.libc_ver()[0] != "glibc":
         pytest.skip("glibc alone can be asked")
     program = """
 import resource, torch
-from voronerf.ops._core.native import compiled
-compiled.keep_freed_memory()
+from voronerf.app.cli import _prepare
+_prepare()
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 step = lambda: [torch.ones(1 << 22) for _ in range(16)]
 found = []

@@ -66,7 +66,7 @@ def test_steps_leave_frozen_cells_bit_for_bit(name, before):
     for _ in range(before):
         gradients(router, points)
         optimizer.step()
-    router.freeze(FROZEN)
+    router.freeze(FROZEN, optimizer=optimizer)
 
     def bits():
         state = [v for p in router.parameters() for v in optimizer.state[p].values() if torch.is_tensor(v) and v.dim()]
@@ -84,6 +84,40 @@ def test_steps_leave_frozen_cells_bit_for_bit(name, before):
         parameters = len(list(router.parameters()))
         assert all(torch.equal(a[FROZEN], b[FROZEN]) for a, b in zip(now[:parameters], held))
         assert not any(state[FROZEN].any() for state in now[parameters:])
+
+
+@pytest.mark.parametrize("kind", ["table", "fused", "loop"])
+def test_an_optimiser_that_was_not_given_is_found_out(kind):
+    router, points = make(kind), torch.rand(200, 3)
+    optimizer = torch.optim.AdamW(router.parameters(), lr=0.1)
+    router.freeze(FROZEN)
+    gradients(router, points)
+    optimizer.step()
+    with pytest.raises(ValueError, match=r"not given has changed frozen cells; write router.freeze\(cells, optimizer="):
+        gradients(router, points)
+    with pytest.raises(ValueError, match="has changed frozen cells"):
+        gradients(router, points)
+    router.freeze(optimizer=optimizer)
+    gradients(router, points)
+    with pytest.raises(ValueError, match="freeze: optimizer must hold the router's parameters"):
+        router.freeze(optimizer=torch.optim.SGD([torch.nn.Parameter(torch.ones(1))], 0.1))
+    own, other = make(kind), make(kind)
+    own.freeze(FROZEN)
+    optimizer = Adam([{"params": list(own.parameters())}], lr=0.1)
+    for _ in range(3):
+        gradients(own, points)
+        optimizer.step()
+    own.load_cell(1, other.cell(0))  # by the router itself
+    gradients(own, points)
+
+
+def test_optimisers_get_no_hooks_of_others():
+    router, other = make("grouped"), make("grouped")
+    optimizer, bystander = (torch.optim.SGD(r.parameters(), 0.1) for r in (router, other))
+    router.freeze(FROZEN, optimizer=optimizer)
+    router.freeze(LEARNING, optimizer=optimizer)
+    assert len(optimizer._optimizer_step_pre_hooks) == len(optimizer._optimizer_step_post_hooks) == 1
+    assert not bystander._optimizer_step_pre_hooks and not bystander._optimizer_step_post_hooks
 
 
 def test_cells_learn_again_with_their_moments():
@@ -181,6 +215,7 @@ def test_copies_children_and_states():
     for again in (copy.deepcopy(router), pickle.loads(pickle.dumps(router)), router.double().float()):
         assert again.frozen.tolist() == [False, True, False, True]
         optimizer = torch.optim.AdamW(again.parameters())
+        again.freeze([], optimizer=optimizer)
         old = [p.detach().clone() for p in again.parameters()]
         gradients(again, torch.rand(50, 3))
         optimizer.step()

@@ -101,16 +101,40 @@ def test_an_optimiser_that_was_made_before_wrapping_is_told(generator: torch.Gen
     field, x = net(), torch.rand(20, 3, generator=generator)
     optimizer = torch.optim.Adam(field.parameters())
     router = router_of(field, generator)
-    router(x).sum().backward()
-    with pytest.warns(
-        UserWarning, match=r"optimizer \(Adam\) trains nothing.*make it of router.parameters\(\)"
-    ) as told:
+
+    def step() -> None:
+        router(x).sum().backward()
         optimizer.step()
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(64):  # as where gradients are accumulated; the first call finds none
+            step()
+    with pytest.warns(
+        UserWarning, match=r"no optimizer has changed the parameters.*make it of router.parameters\(\)"
+    ) as told:
+        step()
     assert told[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        optimizer.step()  # once
-        torch.optim.SGD(router.parameters(), 0.1).step()
+        for _ in range(65):  # once
+            step()
+
+
+def test_a_fused_optimiser_with_the_state_of_other_cells_is_stopped(generator: torch.Generator) -> None:
+    """It would write past the end of that state."""
+    router, x = router_of(net(), generator, k=1), torch.rand(20, 3, generator=generator)
+    old, other = torch.optim.Adam(router.parameters(), fused=True), torch.optim.Adam(net().parameters(), fused=True)
+    router(x).sum().backward()
+    old.step()
+    router.subdivide(VoronoiDiagram(torch.rand(4, 3, generator=generator)), torch.zeros(4, dtype=torch.int64))
+    assert not other._optimizer_step_pre_hooks
+    router(x).sum().backward()
+    with pytest.raises(ValueError, match=r"\(Adam\) holds the state of other cells.*subdivide\(..., optimizer="):
+        old.step()
+    new = torch.optim.Adam(router.parameters(), fused=True)
+    new.step()
+    new.step()
 
 
 def test_optimisers_that_train_something_are_not_told(generator: torch.Generator) -> None:
@@ -120,8 +144,9 @@ def test_optimisers_that_train_something_are_not_told(generator: torch.Generator
         warnings.simplefilter("error")
         torch.optim.Adam(other.parameters()).step()
         right = torch.optim.Adam(routers[0].parameters())
-        routers[0](x).sum().backward()
-        right.step()
+        for _ in range(65):
+            routers[0](x).sum().backward()
+            right.step()
         both = torch.optim.Adam([*fields[1].parameters(), *routers[1].parameters()])
         routers[1](x).sum().backward()
         both.step()

@@ -15,7 +15,7 @@ from helpers import refuses, trained
 
 from voronerf import town
 from voronerf.app import open_run
-from voronerf.app.cli.main import main
+from voronerf.app.cli import main
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.scenes.record import read_scene, write_scene
 from voronerf.app.train.checkpoint import Checkpoint, CheckpointError, checkpoint_path, load_checkpoint, save_checkpoint

@@ -9,7 +9,7 @@ import pytest
 import torch
 from ranks import complaints, network_files, new_store, on_ranks, town_tensors
 
-from voronerf.app.cli.main import main
+from voronerf.app.cli import main
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.town import group, open_run, rays, train

@@ -12,7 +12,7 @@ from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import RenderedImage, Renderer, render_rays
 from voronerf.nerf.samplers import SAMPLERS, Hierarchical, Occupancy, Sampler, Stratified
 from voronerf.nerf.sampling import stratified_depths
-from voronerf.nerf.split import PlannedSplit, SplitDone, SplitStrategy
+from voronerf.nerf.split import PlannedSplit, SplitDone, SplitStrategy, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.nerf.volume import Rendered, Samples, Space
 
@@ -43,6 +43,7 @@ __all__ = [
     "SplitDone",
     "SplitStrategy",
     "StepOutput",
+    "Strategy",
     "Stratified",
     "TrainingStep",
     "focus_point",

@@ -12,7 +12,6 @@ from voronerf.nerf.cameras import Rays
 from voronerf.nerf.occupancy import HIDDEN
 from voronerf.nerf.radiance import Radiance, radiance_of, router_of
 from voronerf.nerf.renderer import Renderer
-from voronerf.nerf.samplers import Hierarchical, Occupancy
 from voronerf.nerf.sampling import colour_loss
 from voronerf.nerf.volume import Samples
 from voronerf.ops._core import backends
@@ -127,7 +126,7 @@ class RayLoss:
                 in less time; the loss has none then.
         """
         field = self.radiance()
-        if isinstance(field, str) and isinstance(self.renderer.sampler, Occupancy):  # perhaps not traced yet
+        if isinstance(field, str) and self.renderer.sampler.grid is not None:  # perhaps not traced yet
             middle = (batch.near + batch.far)[:, None] / 2
             samples = self.renderer.sampler.space.samples(batch.rays, middle, middle.expand(-1, 2))
             field = self.radiance((samples.inputs, batch.rays.directions))
@@ -146,7 +145,7 @@ class RayLoss:
     def radiance(self, samples: tuple[Tensor, Tensor] | None = None) -> Radiance | str:
         """What the field computes; or why the operations are separate. Samples are those of `radiance_of`."""
         renderer = self.renderer
-        if not isinstance(renderer.sampler, Occupancy):
+        if renderer.sampler.grid is None:
             return "empty space is not skipped"
         return radiance_of(renderer.field, samples, inputs=6 if renderer.cones else 3, backend=renderer.backend)
 
@@ -205,11 +204,8 @@ class RayLoss:
 
     def explain(self) -> str:
         """How a step is computed, and what keeps it from a faster way: some lines."""
-        renderer, sampler = self.renderer, self.renderer.sampler
-        counts = f"{sampler.samples}" + (f" and {sampler.fine_samples}" if isinstance(sampler, Hierarchical) else "")
-        lines = [f"samples: {type(sampler).__name__}, {counts} a ray"]
-        if isinstance(sampler, Occupancy):
-            lines[0] += f", of which {sampler.grid.share:.0%} of the grid are left"
+        renderer = self.renderer
+        lines = [f"samples: {renderer.sampler.explain()}"]
         obstacle = self.why_not_fused()
         separate = obstacle is not None
         if not separate:

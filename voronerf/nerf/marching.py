@@ -5,7 +5,7 @@ r rays, s strata of a ray. Units as in `voronerf.nerf.volume`.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,10 +13,12 @@ from torch import Tensor
 from voronerf.nerf.cameras import Rays
 from voronerf.nerf.field import Field
 from voronerf.nerf.radiance import radiance_of, router_of
-from voronerf.nerf.samplers import Occupancy
 from voronerf.ops.composite import composite
 from voronerf.ops.render_opaque import OF_PROGRAM
 from voronerf.ops.render_opaque.reference import Wave, walk
+
+if TYPE_CHECKING:
+    from voronerf.nerf.samplers import Occupancy
 
 OPAQUE = 0.05  # a ray ends when it lets less than this through: what is behind counts as of the colour before it
 #: Samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain. Pictures of

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from voronerf.nerf.cameras import Cameras, Rays
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
-from voronerf.nerf.marching import RayColours, render_until_opaque
+from voronerf.nerf.marching import RayColours
 from voronerf.nerf.occupancy import OccupancyGrid
-from voronerf.nerf.samplers import Occupancy, Sampler, Stratified
+from voronerf.nerf.samplers import Sampler, Stratified
 from voronerf.nerf.volume import Rendered, Samples, per_ray, render_samples
 
 
@@ -88,7 +88,7 @@ class Renderer:
     @property
     def occupancy(self) -> OccupancyGrid | None:
         """Which space the sampler skips."""
-        return self.sampler.grid if isinstance(self.sampler, Occupancy) else None
+        return self.sampler.grid
 
     @property
     def cones(self) -> bool:
@@ -155,9 +155,9 @@ class Renderer:
             background: [3] or [r, 3]; None is black.
             heaviest: whether to find the heaviest samples; without it that part of the result means nothing.
         """
-        if isinstance(self.sampler, Occupancy):
-            given = self.field, rays, near, far, self.sampler
-            return render_until_opaque(*given, background=background, heaviest=heaviest)
+        given = self.field, rays, near, far
+        if (seen := self.sampler.see(*given, background=background, heaviest=heaviest)) is not None:
+            return seen
         last = self.render(rays, near, far, background=background)[-1]
         places = rays.origins
         if heaviest:

@@ -18,6 +18,7 @@ from voronerf.nerf.cameras import Rays
 from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.field import Field
 from voronerf.nerf.fields.hashgrid import LONG
+from voronerf.nerf.marching import RayColours, render_until_opaque
 from voronerf.nerf.occupancy import DECAY, OccupancyGrid, draw_seed
 from voronerf.nerf.sampling import (
     blurred_weights,
@@ -60,8 +61,9 @@ Look = Callable[[str, Samples], Rendered]
 class Sampler:
     """Where along rays a field is asked, and what becomes of that between the steps of a training.
 
-    A subclass defines :meth:`sample`. One with several passes defines :meth:`draw` and :meth:`loss_before` too, and
-    one that learns from a training the two methods of steps.
+    A subclass defines :meth:`sample`. One with several passes defines :meth:`draw` and :meth:`loss_before` too, one
+    that learns from a training the two methods of steps, and one that skips empty space ``grid``. Nothing asks for the
+    class of a sampler.
 
     Attributes:
         passes: How often a ray is sampled, each time with a number of samples of its own.
@@ -69,6 +71,7 @@ class Sampler:
         samples: s, of the first pass.
         space: How the field sees the scene.
         backend: Of the ops.
+        settling_steps: The first steps of a training, in which the grid learns nothing.
 
     Args:
         samples: s, of the first pass, at least 1.
@@ -93,6 +96,7 @@ class Sampler:
 
     passes: ClassVar[int] = 1
     skips: ClassVar[bool] = False
+    settling_steps: int = 0
 
     def __init__(self, samples: int, *, space: Space | None = None, backend: str = "auto") -> None:
         if samples < 1:
@@ -103,6 +107,20 @@ class Sampler:
     def networks(cones: bool) -> tuple[str, ...]:
         """The names of a cell's networks; "field" gives the colours."""
         return ("field",)
+
+    @property
+    def grid(self) -> OccupancyGrid | None:
+        """Which space is empty and skipped; None for a sampler that skips nothing."""
+        return None
+
+    @property
+    def strata(self) -> int:
+        """The most samples of a ray of the next training step, of the first pass."""
+        return self.samples
+
+    def explain(self) -> str:
+        """What is sampled, in a line."""
+        return f"{type(self).__name__}, {self.samples} a ray"
 
     def sample(
         self,
@@ -145,6 +163,15 @@ class Sampler:
             generator: Of the jitter.
         """
         return self.sample(rays, near, far, jitter=jitter, generator=generator), ()
+
+    def see(
+        self, field: Field, rays: Rays, near: Tensor, far: Tensor, *, background: Tensor | None, heaviest: bool
+    ) -> RayColours | None:
+        """What rays of a picture see, where that needs fewer samples than :meth:`draw` gives; else None.
+
+        Arguments are those of :func:`voronerf.nerf.render_until_opaque`.
+        """
+        return None
 
     def loss_before(self, before: Rendered, last: Rendered, target: Tensor) -> Tensor:
         """What a pass adds to the loss of the last one.
@@ -296,7 +323,7 @@ class Occupancy(Sampler):
         self._leave_empty()
 
     @property
-    def settling_steps(self) -> int:
+    def settling_steps(self) -> int:  # type: ignore[override]
         """The first steps of a training, in which the grid learns nothing."""
         return SETTLING_STEPS if isinstance(self.grid.contraction, Contraction) else WARMUP_STEPS
 
@@ -304,6 +331,16 @@ class Occupancy(Sampler):
     def strata(self) -> int:
         """Strata of a ray of a training step: `samples`, or a part of them while the grid settles."""
         return max(1, self.samples // SETTLING_PART) if self.settling else self.samples
+
+    def explain(self) -> str:
+        """What is sampled, and what the grid leaves of it."""
+        return f"{super().explain()}, of which {self.grid.share:.0%} of the grid are left"
+
+    def see(
+        self, field: Field, rays: Rays, near: Tensor, far: Tensor, *, background: Tensor | None, heaviest: bool
+    ) -> RayColours:
+        """Walks rays to the first surface; see :meth:`Sampler.see`."""
+        return render_until_opaque(field, rays, near, far, self, background=background, heaviest=heaviest)
 
     def _leave_empty(self) -> None:
         if self.empty is not None:
@@ -424,6 +461,10 @@ class Hierarchical(Stratified):
             raise ValueError(f"{type(self).__name__}: fine_samples must be >= 1, got {fine_samples}")
         self.fine_samples = fine_samples
         *_, self.first = self.networks(self.space.cones)
+
+    def explain(self) -> str:
+        """What is sampled in both passes."""
+        return f"{type(self).__name__}, {self.samples} and {self.fine_samples} a ray"
 
     @staticmethod
     def networks(cones: bool) -> tuple[str, ...]:

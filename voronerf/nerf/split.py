@@ -101,7 +101,74 @@ class SplitDone(NamedTuple):
     importance: Tensor
 
 
-class SplitStrategy:
+class Strategy:
+    """What a training asks of a rule when and where cells divide; this one never divides them.
+
+    Attributes:
+        inherit: Whether new cells start as copies of their parent.
+        splits: How many splits were made.
+        left: How many are still planned.
+
+    Examples:
+        >>> from voronerf.nerf import Strategy
+        >>> Strategy().is_due(0.5, step=10)
+        False
+    """
+
+    inherit: bool = True
+    splits: int = 0
+
+    @property
+    def left(self) -> int:
+        """How many splits are still planned."""
+        return 0
+
+    def is_due(self, fraction: float, step: int) -> bool:
+        """Whether the next split is to be made now; arguments as of :meth:`step_pre_backward`."""
+        return False
+
+    def has_samples(self) -> bool:
+        """Whether enough samples were kept for the next split."""
+        return True
+
+    def step_pre_backward(
+        self, optimizer: torch.optim.Optimizer | None, fraction: float, step: int
+    ) -> SplitDone | None:
+        """Called before each step: makes the next split if it is due.
+
+        Args:
+            optimizer: Of the networks; None for none.
+            fraction: How much of the training is done, 0..1.
+            step: Steps done.
+
+        Returns:
+            What was split; None for nothing.
+        """
+        return None
+
+    def step_post_backward(self, output: RenderOutput) -> None:
+        """Called after the loss of a step was computed.
+
+        Args:
+            output: What :class:`voronerf.nerf.RayLoss` gave.
+        """
+
+    def forget(self) -> None:
+        """Drops what was learnt for the next split."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The tensors from which `load_state_dict` restores the strategy."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restores what `state_dict` gave.
+
+        Raises:
+            ValueError: The state is of another strategy.
+        """
+
+
+class SplitStrategy(Strategy):
     """Splits the cells of routers at planned times by the samples that are still wrong (Elsner et al. 2023, section 3).
 
     Call :meth:`step_pre_backward` before each step of a training and :meth:`step_post_backward` after its loss.
@@ -168,6 +235,15 @@ class SplitStrategy:
     def planned(self) -> PlannedSplit | None:
         """The next split; None after the last, when no samples are kept any more."""
         return self.plan[self.splits] if self.splits < len(self.plan) else None
+
+    @property
+    def left(self) -> int:
+        """How many splits of the plan are still to be made."""
+        return len(self.plan) - self.splits
+
+    def has_samples(self) -> bool:
+        """Whether the first split has a sample for each of its cells; later ones wait for them by themselves."""
+        return self.splits > 0 or len(self.reservoir) >= (self.planned.children if self.planned else 0)
 
     def is_due(self, fraction: float, step: int) -> bool:
         """Whether the next split is to be made now; arguments as of :meth:`step_pre_backward`."""

@@ -28,7 +28,7 @@ from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.double import Double
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
-from voronerf.router.grouping import Grouping, cell_parameters, keep_freed_memory, owned_parameters, parts_of
+from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters, parts_of
 from voronerf.router.known import Known
 from voronerf.router.layout import Call, Results, map_tensors
 from voronerf.router.probe import Options, Probe, check_rays
@@ -176,8 +176,6 @@ class Dispatch:
             options: What the user asked for.
             frozen: bool [k]; samples in these cells are evaluated without gradients.
         """
-        if grouping.device.type == "cpu":
-            keep_freed_memory()
         self._check_parameters(call, grouping.k, options.names)
         plan = self._plan(call, grouping, options)
         if frozen is None or not torch.is_grad_enabled() or not call.layout.n:

@@ -33,11 +33,15 @@ class Double:
     """Copies of the parts of a module, which share its buffers and have registries of their own.
 
     Each run begins with the attributes that the module has, so what ``forward`` assigns is of that run alone.
+
+    Args:
+        module: The routed module, or a field.
+        reads: Collects (place, name) of the attributes that are read of the copies; None where nobody asks.
     """
 
-    def __init__(self, module: nn.Module) -> None:
+    def __init__(self, module: nn.Module, reads: set[tuple[int, str]] | None = None) -> None:
         parts = parts_of(module)
-        twins = {key: _twin(part) for key, part in parts.items()}
+        twins = {key: _twin(part, place, reads) for place, (key, part) in enumerate(parts.items())}
         for key, part in parts.items():  # a compiled part runs as it was before
             twins[key] = twins.get(id(getattr(part, "_orig_mod", None)), twins[key])
         self.module, self.parts = twins[id(module)], list(twins.values())  # in the order of ``modules()``
@@ -114,13 +118,36 @@ class Double:
             registry.clear()
 
 
-def _twin(part: nn.Module) -> nn.Module:
+def _twin(part: nn.Module, place: int, reads: set[tuple[int, str]] | None) -> nn.Module:
     """An empty object for a part, or the part itself if it holds nothing that changes."""
     empty = not (part._parameters or part._modules or part._buffers)
-    if (empty and type(part).__module__.startswith(_LAYERS)) or isinstance(part, torch.jit.ScriptModule):
+    plain = empty and type(part).__module__.startswith(_LAYERS) and reads is None
+    if plain or isinstance(part, torch.jit.ScriptModule):
         return part
-    twin: nn.Module = object.__new__(type(part))
+    twin: nn.Module = object.__new__(type(part) if reads is None else _noting(type(part), place, reads))
     return twin
+
+
+class _Unregistered:
+    """Keeps a class with a registry of its subclasses from adding those of :func:`_noting`."""
+
+    __slots__ = ()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        pass
+
+
+def _noting(kind: type[nn.Module], place: int, reads: set[tuple[int, str]]) -> type[nn.Module]:
+    """A subclass that collects (place, name) of the attributes that are read of its object."""
+
+    def noted(self: nn.Module, name: str) -> Any:
+        reads.add((place, name))
+        return kind.__getattribute__(self, name)
+
+    names = {"__module__": kind.__module__, "__qualname__": kind.__qualname__, "__getattribute__": noted}
+    metaclass: Any = type(kind)
+    made: type[nn.Module] = metaclass(kind.__name__, (_Unregistered, kind), names)
+    return made
 
 
 def _versions(placed: list[tuple[dict[str, Any], str, Any]]) -> list[int]:

@@ -14,9 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from voronerf import ops
-from voronerf.ops._core.backends import BackendUnavailable
+from voronerf.ops._core.memory import LARGE, on_huge_pages
 
-_LARGE, _PAGE = 1 << 22, 1 << 21  # bytes
 SHARED = "_voronerf_shared"
 """Where a part of a routed module keeps the names of its parameters that all cells share."""
 
@@ -201,40 +200,15 @@ def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
     return list({id(parameter): parameter for parameter in owned}.values())
 
 
-@functools.cache
-def keep_freed_memory() -> Any:
-    """Lets the C library keep freed memory, so that the next step does not wait for the same pages again.
-
-    Gives the compiled module, or None where there is none: then it is left as it is.
-    """
-    try:
-        from voronerf.ops._core.native import compiled
-    except BackendUnavailable:
-        return None
-    compiled.keep_freed_memory()
-    return compiled
-
-
-def empty_like(tensor: Tensor) -> Tensor:
-    """``torch.empty_like``, from the start of a huge page where it is large: page faults cost more than the values."""
-    if tensor.nbytes < _LARGE or tensor.device.type != "cpu":
-        return torch.empty_like(tensor)
-    spare = tensor.new_empty(tensor.numel() + _PAGE // tensor.element_size())
-    result = spare[-spare.data_ptr() % _PAGE // tensor.element_size() :][: tensor.numel()].view(tensor.shape)
-    if (native := keep_freed_memory()) is not None:
-        native.advise_huge_pages(result, result.nbytes)
-    return result
-
-
 def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
     """[k, ...] -> the tensor of each cell."""
-    large = stacked.nbytes >= _LARGE and stacked.requires_grad and torch.is_grad_enabled()
+    large = stacked.nbytes >= LARGE and stacked.requires_grad and torch.is_grad_enabled()
     found: tuple[Tensor, ...] = _Cells.apply(stacked) if large else stacked.unbind(0)
     return found
 
 
 class _Cells(torch.autograd.Function):
-    """The tensors of cells; their gradients are joined in memory of :func:`empty_like`."""
+    """The tensors of cells; their gradients are joined in memory of `on_huge_pages`."""
 
     generate_vmap_rule = True
 
@@ -252,7 +226,7 @@ class _Cells(torch.autograd.Function):
         (stacked,) = ctx.saved_tensors
         if torch.is_grad_enabled() or torch._C._are_functorch_transforms_active():  # these are differentiated again
             return torch.stack([torch.zeros_like(stacked[0]) if own is None else own for own in gradients])
-        result = empty_like(stacked)
+        result = on_huge_pages(torch.empty_like(stacked))
         for own, gradient in zip(result.unbind(0), gradients, strict=True):
             own.zero_() if gradient is None else own.copy_(gradient)
         return result

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import functools
+import gc
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.optimizer import register_optimizer_step_post_hook, register_optimizer_step_pre_hook
 
 from voronerf.router.grouping import cell_parameters
 
 _OP = "VoronoiRouter"
+PATIENCE = 64  # calls without a step; where gradients are accumulated there are some
 
 
 def check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, method: str) -> None:
@@ -74,68 +74,70 @@ def is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
     return any(isinstance(v, Tensor) and v.dim() > 0 and v.shape != parameter.shape for v in state.values())
 
 
-def watch_optimizers(module: nn.Module, line: str) -> Any:
-    """Makes an optimiser raise at its next step if it holds state of other cells than a module now has.
+def watch_optimizers(module: nn.Module, line: str) -> list[Any]:
+    """Makes the optimisers of a module raise at their next step if they hold state of other cells than it now has.
 
-    The message says to write ``line``. The handle's ``remove()`` ends the watch.
+    The fused ones of PyTorch would write past the end of that state. PyTorch keeps no list of optimisers, the garbage
+    collector does. The message says to write ``line``. The handles' ``remove()`` ends the watch.
     """
     watched = {id(parameter): weakref.ref(parameter) for parameter in cell_parameters(module)}
 
-    def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+    def ours(optimizer: torch.optim.Optimizer) -> list[Any]:
         held = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched]
-        if any(watched[id(parameter)]() is parameter and is_stale(optimizer, parameter) for parameter in held):
+        return [p for p in held if watched[id(p)]() is p]
+
+    def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        if any(is_stale(optimizer, parameter) for parameter in ours(optimizer)):
             raise ValueError(
                 f"{_OP}: optimizer ({type(optimizer).__name__}) holds the state of other cells than the router "
                 f"has; write {line}, or make the optimizer afterwards"
             )
-        if held:
-            watched.clear()  # torch does not let a hook remove itself
 
-    handle = register_optimizer_step_pre_hook(check)
-    weakref.finalize(module, handle.remove)
-    return handle
+    found = [item for item in gc.get_objects() if issubclass(type(item), torch.optim.Optimizer)]
+    return [optimizer.register_step_pre_hook(check) for optimizer in found if ours(optimizer)]
 
 
-def watch_former(module: nn.Module, former: Sequence[nn.Parameter]) -> None:
-    """Warns at the first step of an optimiser of the parameters that a module had before it was routed.
+class Untrained:
+    """Finds out whether a module gets gradients but no optimiser changes it, such as one of its parameters before it
+    was routed. It is asked in each call, since a hook on a parameter would keep gradients from being added at once.
 
-    They get no gradients, so such an optimiser would train nothing.
+    Args:
+        module: The routed module.
     """
-    watched, routed = {id(parameter): weakref.ref(parameter) for parameter in former}, weakref.ref(module)
 
-    def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        now = routed()
-        if not watched or now is None:
-            return
-        held: list[Tensor] = [p for group in optimizer.param_groups for p in group["params"]]
-        old = [p for p in held if id(p) in watched and watched[id(p)]() is p]
-        right = not {id(p) for p in now.parameters()}.isdisjoint(map(id, held))
-        if old and not right and all(p.grad is None for p in old):
-            warnings.warn(
-                f"{_OP}: optimizer ({type(optimizer).__name__}) trains nothing: it holds the parameters that the "
-                "module had before it was wrapped; make it of router.parameters()",
-                stacklevel=3,
-            )
-        if old or right:
-            watched.clear()  # torch does not let a hook remove itself
+    def __init__(self, module: nn.Module) -> None:
+        self._parameters = [p for p in module.parameters() if p.requires_grad][:1]
+        self._were, self._calls = [p.detach().clone() for p in self._parameters], 0
 
-    weakref.finalize(module, register_optimizer_step_pre_hook(check).remove)
+    def is_over(self, warn: Callable[[str, str], None]) -> bool:
+        """Whether there is nothing more to find out; takes a topic and a message for a warning."""
+        self._calls += 1
+        if self._calls <= PATIENCE:
+            return False
+        for parameter, was in zip(self._parameters, self._were, strict=True):
+            if parameter.grad is not None and torch.equal(parameter.detach(), was):
+                message = (
+                    f"no optimizer has changed the parameters in {PATIENCE} calls, but they have gradients; make it of "
+                    "router.parameters(), since those that the module had before it was wrapped are not trained"
+                )
+                warn("untrained", message)
+        return True
 
 
 # Frozen cells ---------------------------------------------------------------------------------------------------------
 
 #: The frozen cells, bool [k], of every routed module that has some, and the runs of the others.
 _FROZEN: weakref.WeakKeyDictionary[nn.Module, tuple[Tensor, list[slice]]] = weakref.WeakKeyDictionary()
-#: What a step must leave as it is: tensors, their frozen cells, and the values of those before the step.
-_HELD: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = {}
+#: The optimisers whose steps put frozen cells back.
+_KEEPING: weakref.WeakSet[torch.optim.Optimizer] = weakref.WeakSet()
 
 
 def freeze_cells(module: nn.Module, frozen: Tensor | None) -> None:
-    """Makes every optimiser leave some cells of a routed module as they are, bool [k]; None for no cells.
+    """Notes the frozen cells of a routed module, bool [k]; None for no cells.
 
     A stacked parameter is one tensor to an optimiser, which moves all of its cells: by weight decay and momentum also
-    those without a gradient. What it changed in frozen cells is therefore put back after its step; an optimiser with
-    ``leaves_frozen`` passes them over by itself.
+    those without a gradient. An optimiser with ``leaves_frozen`` passes over frozen cells by itself, others by
+    :func:`keep_frozen`.
     """
     if frozen is None:
         _FROZEN.pop(module, None)
@@ -143,13 +145,37 @@ def freeze_cells(module: nn.Module, frozen: Tensor | None) -> None:
     edges = torch.nn.functional.pad((~frozen).int(), (1, 1)).diff()
     pairs = zip((edges > 0).nonzero()[:, 0].tolist(), (edges < 0).nonzero()[:, 0].tolist(), strict=True)
     _FROZEN[module] = frozen, [slice(*pair) for pair in pairs]
-    _watch_steps()
 
 
-@functools.cache
-def _watch_steps() -> None:
-    register_optimizer_step_pre_hook(_before_step)
-    register_optimizer_step_post_hook(_after_step)
+def keep_frozen(optimizer: torch.optim.Optimizer) -> None:
+    """Makes each step of an optimiser put back what it has changed in frozen cells, parameters and state.
+
+    A wrapper of the optimiser would do the same, but schedulers and scalers do not take one.
+    """
+    if optimizer in _KEEPING or getattr(optimizer, "leaves_frozen", False):
+        return
+    _KEEPING.add(optimizer)
+    held: list[tuple[Tensor, Tensor, Tensor]] = []  # tensors, their frozen cells, and the values of those before
+
+    def before(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        held.clear()
+        for parameter, frozen in _frozen_parameters(optimizer):
+            for tensor in (parameter.detach(), *_of_cells(optimizer, parameter)):
+                held.append((tensor, frozen, tensor[frozen]))
+
+    @torch.no_grad()
+    def after(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        for tensor, frozen, values in held:
+            tensor[frozen] = values
+        known = {tensor.data_ptr() for tensor, _, _ in held}
+        for parameter, frozen in _frozen_parameters(optimizer):
+            for tensor in _of_cells(optimizer, parameter):
+                if tensor.data_ptr() not in known:  # made in this step
+                    tensor[frozen] = 0
+        held.clear()
+
+    optimizer.register_step_pre_hook(before)
+    optimizer.register_step_post_hook(after)
 
 
 def _frozen_parameters(optimizer: torch.optim.Optimizer) -> list[tuple[Tensor, Tensor]]:
@@ -163,29 +189,33 @@ def _of_cells(optimizer: torch.optim.Optimizer, parameter: Tensor) -> list[Tenso
     return [value for value in state if isinstance(value, Tensor) and value.shape == parameter.shape]
 
 
-def _before_step(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-    if not _FROZEN or (getattr(optimizer, "leaves_frozen", False)):
-        return
-    held = []
-    for parameter, frozen in _frozen_parameters(optimizer):
-        for tensor in (parameter.detach(), *_of_cells(optimizer, parameter)):
-            held.append((tensor, frozen, tensor[frozen]))
-    if held:
-        _HELD[id(optimizer)] = held
+class FrozenRows:
+    """The parameters of frozen cells, to find out whether an optimiser that was not given changes them.
 
+    Args:
+        module: The routed module.
+        frozen: bool [k], its frozen cells.
+    """
 
-@torch.no_grad()
-def _after_step(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-    held = _HELD.pop(id(optimizer), None)
-    if held is None:
-        return
-    for tensor, frozen, values in held:
-        tensor[frozen] = values
-    known = {tensor.data_ptr() for tensor, _, _ in held}
-    for parameter, frozen in _frozen_parameters(optimizer):
-        for tensor in _of_cells(optimizer, parameter):
-            if tensor.data_ptr() not in known:  # made in this step
-                tensor[frozen] = 0
+    def __init__(self, module: nn.Module, frozen: Tensor) -> None:
+        self._frozen, self._calls = frozen, 0
+        self._were = [(p, p.detach()[frozen]) for p in cell_parameters(module)]
+
+    def is_over(self, warn: Callable[[str, str], None]) -> bool:
+        """Whether there is nothing more to find out; looks in every call whose number is a power of 2.
+
+        Raises:
+            ValueError: If the parameters have changed.
+        """
+        self._calls += 1
+        looks = self._calls > 1 and not self._calls & (self._calls - 1)
+        if looks and not all(torch.equal(parameter.detach()[self._frozen], rows) for parameter, rows in self._were):
+            self._calls -= 1
+            raise ValueError(
+                f"{_OP}.freeze: an optimizer that was not given has changed frozen cells; write "
+                "router.freeze(cells, optimizer=optimizer), or unfreeze cells before they are written to"
+            )
+        return self._calls >= PATIENCE
 
 
 def trained_parts(parameters: Sequence[Tensor]) -> list[list[Any]]:

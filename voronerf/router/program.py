@@ -17,11 +17,12 @@ from voronerf.ops._core.layers import MLP
 from voronerf.ops._core.program import Builder, Program
 from voronerf.ops._core.tolerances import agree
 from voronerf.ops.grouped_program import grouped_program
+from voronerf.router.double import Double
 from voronerf.router.grouping import parts_of
 from voronerf.router.layout import tensors_of
 from voronerf.router.lower import Lowering, NotAStep
 from voronerf.router.table import LayeredField, parameters_of_table
-from voronerf.router.watch import Inputs, Watch, reads_of
+from voronerf.router.watch import Inputs, Watch
 
 _ROWS = (37, 31)  # samples of a trace; one of them divides no width
 
@@ -60,11 +61,11 @@ class Activation:
     def of(field: LayeredField) -> Activation:
         """That of a field, from one call of its ``activate`` on a few samples."""
         width, parts = field.layers.out_features, list(parts_of(field).values())  # type: ignore[arg-type]
-        with reads_of(parts) as reads:
-            try:
-                program, shapes = _steps_of(field.activate, width)
-            except Exception:  # of any code: PyTorch computes it
-                program, shapes = None, ()
+        reads = set[tuple[int, str]]()
+        try:
+            program, shapes = _steps_of(Double(parts[0], reads).module.activate, width)  # type: ignore[arg-type]
+        except Exception:  # of any code: PyTorch computes it
+            program, shapes = None, ()
         if any(name in parts[place]._parameters for place, name in reads):
             program = None
         return Activation(field.activate, width, Watch.of(parts[0], reads, Inputs()), program, shapes)

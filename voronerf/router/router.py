@@ -36,11 +36,13 @@ from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.known import Known, kind_of
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, doubt_of, find_positions, first_tensor
 from voronerf.router.optimizers import (
+    FrozenRows,
+    Untrained,
     check_optimizer,
     drop_state,
     freeze_cells,
+    keep_frozen,
     move_state,
-    watch_former,
     watch_optimizers,
 )
 from voronerf.router.probe import Options
@@ -161,9 +163,9 @@ class VoronoiRouter(nn.Module):
         self.diagram = own if first is None or first.is_meta else own.to(first.device)
         self.module: nn.Module = clone_module(module)
         stack_parameters(self.module, own.num_cells, share)
-        watch_former(self.module, list(module.parameters()))
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
-        self._watch: Any = None  # of optimisers that hold the state of other cells
+        self._watches: list[Any] = []  # of optimisers that hold the state of other cells
+        self._doubts: list[Untrained | FrozenRows] = [Untrained(self.module)]  # asked in the first training calls
         self.assignment, self.temperature = assignment, temperature
         if coords is None and isinstance(module, LayeredField):
             coords = cast(Coordinates, f"first{own.centres.shape[1]}")
@@ -250,6 +252,7 @@ class VoronoiRouter(nn.Module):
             ValueError: For parameters of other names or shapes, or buffers that differ from the shared ones.
         """
         fill_cell(self.module, self._check_index("load_cell", index), module, "VoronoiRouter.load_cell")
+        self._trust_frozen()
 
     def apply(self, fn: Callable[[nn.Module], Any]) -> VoronoiRouter:
         """Applies a function to the modules of each cell in turn, such as one that initialises layers.
@@ -270,6 +273,7 @@ class VoronoiRouter(nn.Module):
             True
         """
         apply_to_cells(self.module, self.num_cells, fn)
+        self._trust_frozen()
         return self
 
     def _check_index(self, method: str, index: int) -> int:
@@ -284,8 +288,10 @@ class VoronoiRouter(nn.Module):
         none = torch.zeros(self.num_cells, dtype=torch.bool, device=device)
         return none if self.frozen_cells is None else self.frozen_cells.clone()
 
-    def freeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
-        """Keeps the parameters of some cells as they are: the same bits after any step of any optimiser.
+    def freeze(
+        self, cells: Sequence[int] | Tensor | None = None, *, optimizer: torch.optim.Optimizer | None = None
+    ) -> None:
+        """Keeps the parameters of some cells as they are: the same bits after any step of the optimiser.
 
         Results of samples in frozen cells are constants: they have no gradient, neither to parameters nor to arguments,
         and take no part in the backward pass. Momentum, weight decay and the moments of Adam leave frozen cells alone.
@@ -295,9 +301,13 @@ class VoronoiRouter(nn.Module):
 
         Args:
             cells: Numbers of cells, or bool [k]; None for all. Cells that were frozen before stay frozen.
+            optimizer: The optimiser that holds this router's parameters; from now on its steps put back what they have
+                changed in frozen cells. :class:`voronerf.nerf.Adam` leaves them by itself. If another one that is not
+                given changes frozen cells in its first step, the next call raises.
 
         Raises:
-            ValueError: For a cell number out of range, or a mask of another length.
+            ValueError: For a cell number out of range, a mask of another length, or an optimiser that holds none of the
+                router's parameters.
             TypeError: For what are neither numbers of cells nor a mask.
 
         Examples:
@@ -305,14 +315,19 @@ class VoronoiRouter(nn.Module):
             >>> from voronerf import VoronoiRouter
             >>> router = VoronoiRouter(torch.nn.Linear(3, 2), torch.rand(4, 3), coords="first3", way="grouped")
             >>> optimizer = torch.optim.AdamW(router.parameters())
-            >>> router.freeze([0, 1, 2])
+            >>> router.freeze([0, 1, 2], optimizer=optimizer)
             >>> before = router.module.weight.detach().clone()
             >>> router(torch.rand(64, 3)).square().mean().backward()
             >>> optimizer.step()
             >>> (router.module.weight == before).all(dim=2).all(dim=1)
             tensor([ True,  True,  True, False])
         """
+        check_optimizer(optimizer, self.module, "freeze")
         self._set_frozen(self.frozen | self._mask("freeze", cells))
+        if optimizer is not None:
+            keep_frozen(optimizer)
+        elif self.frozen_cells is not None:
+            self._doubts.append(FrozenRows(self.module, self.frozen_cells))
 
     def unfreeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
         """Lets frozen cells learn again, with the optimiser's moments that they had; takes what `freeze` takes."""
@@ -337,6 +352,7 @@ class VoronoiRouter(nn.Module):
         return torch.zeros(k, dtype=torch.bool, device=device).index_fill(0, given.long(), True)
 
     def _set_frozen(self, frozen: Tensor | None) -> None:
+        self._trust_frozen()
         self.frozen_cells = frozen if frozen is not None and bool(frozen.any()) else None
         freeze_cells(self.module, self.frozen_cells)
 
@@ -408,9 +424,9 @@ class VoronoiRouter(nn.Module):
 
     def _watch_optimizers(self, line: str) -> None:
         """Makes an optimiser with the state of other cells raise at its next step, with the ``line`` to write."""
-        if self._watch is not None:
-            self._watch.remove()
-        self._watch = watch_optimizers(self.module, line)
+        for watch in self._watches:
+            watch.remove()
+        self._watches = watch_optimizers(self.module, line)
 
     def load_state_dict(
         self,
@@ -464,6 +480,7 @@ class VoronoiRouter(nn.Module):
                 renew_cells(self.module, torch.zeros(diagram.num_cells, dtype=torch.int64))
                 self._set_frozen(None)
                 self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
+        self._trust_frozen()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # Calls ------------------------------------------------------------------------------------------------------------
@@ -539,6 +556,8 @@ class VoronoiRouter(nn.Module):
         """
         diagram: Any = self._modules["diagram"]
         k, centres, frozen = diagram.num_cells, diagram._buffers["centres"], self._buffers["frozen_cells"]
+        if self._doubts:
+            self._ask_doubts()
         if k == 1:
             return {"frozen": frozen}
         d, drawn = centres.shape[1], self.assignment == "stochastic" and self.training
@@ -554,6 +573,7 @@ class VoronoiRouter(nn.Module):
     def _places_of(self, method: str, positions: Tensor) -> dict[str, Any]:
         """The same for a call of a method at positions [..., d]; methods that share positions share their cells."""
         if self.methods:
+            self._ask_doubts()
             return {"frozen": self.frozen_cells, "cells": self._group(method, positions).cells}
         return self.places(positions if positions.dim() == 2 else positions.flatten(0, -2))
 
@@ -672,6 +692,7 @@ class VoronoiRouter(nn.Module):
     def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
         refuse_transforms()
+        self._ask_doubts()
         called, like = getattr(self.module, method), kind_of(method, self.module.training, args, kwargs, coords)
         layered = method == "forward" and self._table is not None
         if layered and (each := each_direction(args, kwargs)) is not None:
@@ -683,6 +704,15 @@ class VoronoiRouter(nn.Module):
         call.like = like
         grouping = self._group(method, positions)
         return self._dispatch.evaluate(call, grouping, self._options, self.frozen_cells).restored(call.layout)
+
+    def _ask_doubts(self) -> None:
+        """Warns or raises, in the first training calls, where optimisers do not do what is expected of them."""
+        if torch.is_grad_enabled() and not torch.compiler.is_compiling():
+            self._doubts = [doubt for doubt in self._doubts if not doubt.is_over(self._dispatch.warn_once)]
+
+    def _trust_frozen(self) -> None:
+        """Frozen cells may be others from now on."""
+        self._doubts = [doubt for doubt in self._doubts if not isinstance(doubt, FrozenRows)]
 
     @property
     def _options(self) -> Options:
@@ -727,7 +757,7 @@ class VoronoiRouter(nn.Module):
         return grouping
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_watch": None, "_assigned": None}
+        return {**self.__dict__, "_watches": [], "_doubts": [], "_assigned": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -743,6 +773,7 @@ class VoronoiRouter(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:
         self._dispatch.forget()
         self._assigned = None
+        self._trust_frozen()
         super()._apply(fn, recurse)
         freeze_cells(self.module, self.frozen_cells)
         return self

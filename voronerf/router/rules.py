@@ -17,8 +17,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from voronerf.ops import grouped_linear
+from voronerf.ops._core.memory import on_huge_pages
 from voronerf.router.grouped import GroupedRun, PerCell, find, register, writes_in_place
-from voronerf.router.grouping import cells_of, empty_like
+from voronerf.router.grouping import cells_of
 from voronerf.router.layout import map_tensors, tensors_of
 from voronerf.router.transforms import transformed
 
@@ -271,7 +272,7 @@ class _LookUp(torch.autograd.Function):
         if torch.is_grad_enabled():  # the gradient has a gradient itself, which a buffer would lose
             return torch.zeros_like(table).index_add(0, index + ctx.first, gradient), None, None, None
         if not ctx.buffer:
-            ctx.buffer.append(empty_like(table).zero_())
+            ctx.buffer.append(on_huge_pages(torch.empty_like(table)).zero_())
         sums, rows = _as_moved(ctx.buffer[0][ctx.first :]), _as_moved(gradient.contiguous())
         if sums.is_complex():
             sums.scatter_add_(0, index, rows)

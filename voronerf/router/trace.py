@@ -1,17 +1,18 @@
 """One call of a module as a graph of functions.
 
 The number of samples is one that no other size is a multiple of. Every function that PyTorch's function modes see is
-recorded with the line that called it, and so is every custom function of autograd.
+recorded with the line that called it, and so is every custom function of autograd, which a profile function of this
+thread sees.
 """
 
 from __future__ import annotations
 
 import contextlib
 import operator
-import threading
+import sys
 from collections.abc import Iterator
-from typing import Any
-from unittest import mock
+from types import FrameType
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -23,7 +24,7 @@ from voronerf.router.double import Double
 from voronerf.router.grouped import METADATA, RANDOM, find, name_of, user_line, writes_in_place
 from voronerf.router.grouping import cell_parameters, owned_parameters, parts_of
 from voronerf.router.layout import Call, rebuild, tensors_of
-from voronerf.router.watch import LOCK, Inputs, lookup, reads_of
+from voronerf.router.watch import Inputs, lookup
 
 CONSTANTS, CELLS, SAMPLES = range(3)  # what a value depends on: the latter of these
 _PRIMES = (37, 31, 29, 23)  # numbers of samples of a trace, see `rows_for`
@@ -38,6 +39,16 @@ def differentiable(value: Tensor) -> Tensor:
 
 class Unfusable(Exception):
     """A module cannot be fused; the message says where, and what to write instead."""
+
+
+class _Begun(NamedTuple):
+    """A function that is being recorded."""
+
+    node: fx.Node
+    function: Any
+    args: Any
+    kwargs: Any
+    operands: list[Tensor]
 
 
 def rows_for(module: nn.Module, given: list[Tensor], primes: tuple[int, ...] = _PRIMES) -> int:
@@ -72,17 +83,16 @@ class Trace(TorchFunctionMode):
         self.n = self._new(self.rows)
         self.inputs = [self._new(tensor) for tensor in given]
         self.shared = [self._new(tensor, on=CONSTANTS) for tensor in call.shared()]
-        double, parts = Double(module), list(parts_of(module).values())
+        self.reads = set[tuple[int, str]]()
+        double, parts = Double(module, self.reads), list(parts_of(module).values())
         self.places = [source for source in inputs.sources if not isinstance(source, str)]
         for place, name in self.places:
             value, part = inputs.tensor(lookup(parts[place], name), given[0].device), double.parts[place]
-            if part is parts[place] and vars(part).get(name) is not value:
-                raise Unfusable(f"{name} of {type(part).__name__} is a number of a layer without parameters")
             (vars(part) if name in vars(part) else part._buffers)[name] = value
             self.shared.append(self._new(value, on=CONSTANTS))
-        with reads_of(double.parts) as reads, _custom_functions(self), self:
+        self.reads.clear()
+        with self._custom_functions(), self:
             result = double.run(call, given, single)
-        self.reads = reads
         self._part_from_gradients()
         self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
         self.outputs = [self._argument(tensor) for tensor in tensors_of(result)]
@@ -121,12 +131,50 @@ class Trace(TorchFunctionMode):
         return value
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return self.record(func, args, kwargs or {})
-
-    def record(self, func: Any, args: Any, kwargs: Any) -> Any:
         """Calls a function and records it."""
         if self._running or func in METADATA:
-            return func(*args, **kwargs)
+            return func(*args, **(kwargs or {}))
+        begun = self._begin(func, args, kwargs or {})
+        self._running = True  # what it calls itself is part of it
+        try:
+            result = begun.function(*begun.args, **begun.kwargs)
+        finally:
+            self._running = False
+        self._end(begun, result)
+        return result
+
+    @contextlib.contextmanager
+    def _custom_functions(self) -> Iterator[None]:
+        """Records the custom functions of autograd that this thread calls."""
+        code, calls = torch.autograd.Function.apply.__func__.__code__, dict[FrameType, _Begun]()  # type: ignore[attr-defined]
+        before: Any = sys.getprofile()
+        in_c = before is not None and not callable(before)  # such as cProfile's, which has its own way to go on
+        if in_c and not hasattr(before, "enable"):
+            yield
+            return
+
+        def see(frame: FrameType, event: str, value: Any) -> None:
+            if frame.f_code is not code:
+                return
+            if event == "call" and not self._running:
+                own, self._running = frame.f_locals, True
+                calls[frame] = self._begin(own["cls"].apply, own["args"], own["kwargs"])
+            elif event == "return" and frame in calls:
+                self._end(calls.pop(frame), value)
+                self._running = False
+
+        if in_c:
+            before.disable()
+        sys.setprofile(see)
+        try:
+            yield
+        finally:
+            sys.setprofile(None if in_c else before)
+            if in_c:
+                before.enable()
+
+    def _begin(self, func: Any, args: Any, kwargs: Any) -> _Begun:
+        """Records a function that is about to be called, and how to call it."""
         self._line = line = user_line()
         operands = tensors_of((args, kwargs))
         if func is torch.Tensor.type_as:
@@ -134,13 +182,14 @@ class Trace(TorchFunctionMode):
         if func is torch.autograd.grad:  # again of one run, where a loop over cells has a graph for each call
             kwargs = {**kwargs, "retain_graph": True}
         node = self.graph.call_function(func, *map_aggregate((args, kwargs), self._argument))
-        node.meta["inplace"] = inplace = writes_in_place(func) or bool(kwargs.get("inplace"))
+        node.meta["inplace"] = writes_in_place(func) or bool(kwargs.get("inplace"))
         node.meta["line"], node.meta["grad"] = line, torch.is_grad_enabled()
-        self._running = True  # what it calls itself is part of it
-        try:
-            result = func(*args, **kwargs)
-        finally:
-            self._running = False
+        return _Begun(node, func, args, kwargs, operands)
+
+    def _end(self, begun: _Begun, result: Any) -> None:
+        """Records what a function has returned."""
+        node, func, _, kwargs, operands = begun
+        inplace, line = node.meta["inplace"], node.meta["line"]
         found = operands[:1] if inplace else tensors_of(result)
         used = node.all_input_nodes
         idle = func is F.dropout and not (kwargs["training"] and kwargs["p"])
@@ -157,7 +206,7 @@ class Trace(TorchFunctionMode):
         alone = func in _LIKE and not any(size and size % self.rows == 0 for size in found[0].shape)
         if not used or alone or not found or (not inplace and any(result is tensor for tensor in operands)):
             self.graph.erase_node(node)
-            return result
+            return
         nodes, on = [node], max(value.meta["on"] for value in used)
         if not inplace and not isinstance(result, Tensor):
             nodes = [self.graph.call_function(operator.getitem, (node, i)) for i in range(len(found))]
@@ -165,7 +214,6 @@ class Trace(TorchFunctionMode):
         for value, tensor in zip(nodes, found, strict=True):
             self._new(tensor, value, on)
         node.meta["on"] = on
-        return result
 
     def _part_from_gradients(self) -> None:
         """Makes what a gradient is taken by a tensor between runs, from which what follows is computed."""
@@ -181,19 +229,3 @@ class Trace(TorchFunctionMode):
                     for user in [user for user in source.users if user is not new]:
                         user.replace_input_with(source, new)
                     new.meta.update(source.meta, results=[new], inplace=False, grad=True, line=node.meta["line"])
-
-
-@contextlib.contextmanager
-def _custom_functions(trace: Trace) -> Iterator[None]:
-    """Shows a trace the custom functions of this thread, which no mode sees."""
-    here = threading.get_ident()
-    with LOCK:
-        # Below ``Function``, whose own ``apply`` a module may have bound when it was imported.
-        base = torch.autograd.function._SingleLevelFunction
-
-        def apply(cls: Any, *args: Any, **kwargs: Any) -> Any:
-            function = super(base, cls).apply
-            return function(*args, **kwargs) if threading.get_ident() != here else trace.record(function, args, kwargs)
-
-        with mock.patch.object(base, "apply", classmethod(apply)):
-            yield

@@ -6,10 +6,7 @@ A trace holds their values. Each call compares them with what they are then, so 
 
 from __future__ import annotations
 
-import contextlib
 import operator
-import threading
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from numbers import Number
 from typing import Any
@@ -25,7 +22,6 @@ Source = str | tuple[int, str]
 NUMBERS = (torch.float64, torch.float32, torch.int64)
 """Dtypes of inputs: a number rounds nothing, decides no dtype beside integers, and may be an index."""
 
-LOCK = threading.RLock()  # one thread at a time changes classes of torch while it traces
 _OWN = frozenset(vars(nn.Module())) - {"training"}
 _HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 _MISSING: Any = object()
@@ -52,25 +48,6 @@ def lookup(part: nn.Module, name: str) -> Any:
     """An attribute or a buffer of a part of a module, without properties and the class."""
     own = vars(part)
     return own[name] if name in own else part._buffers.get(name, _MISSING)
-
-
-@contextlib.contextmanager
-def reads_of(parts: Sequence[nn.Module]) -> Iterator[set[tuple[int, str]]]:
-    """Collects (place, name) of all attributes that this thread reads of some modules."""
-    here, places, found = threading.get_ident(), {id(part): i for i, part in enumerate(parts)}, set[tuple[int, str]]()
-
-    def noted(self: nn.Module, name: str) -> Any:
-        if id(self) in places and threading.get_ident() == here:
-            found.add((places[id(self)], name))
-        return object.__getattribute__(self, name)
-
-    with LOCK:
-        kind: Any = nn.Module
-        kind.__getattribute__ = noted
-        try:
-            yield found
-        finally:
-            del kind.__getattribute__
 
 
 @dataclass
@@ -124,7 +101,7 @@ class Watch:
             self._holders.append((source, value, held))
 
     def changed(self) -> list[Source]:
-        """What is not as it was."""
+        """The sources whose values have changed."""
         now = [registry.get(name, _MISSING) for registry, name in self._dicts]
         found = list[Source]()
         if not all(map(operator.is_, now, self._values)):

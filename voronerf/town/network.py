@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -54,4 +53,4 @@ def is_shown(name: str) -> bool:
 
 def config_of(checkpoint: Checkpoint) -> TrainConfig:
     """The settings in a checkpoint."""
-    return TrainConfig.from_json(json.dumps(checkpoint.values["config"]), checkpoint.source)
+    return TrainConfig.from_values(checkpoint.values["config"], checkpoint.source)

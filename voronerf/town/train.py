@@ -32,6 +32,7 @@ from voronerf.app.train.checkpoint import (
     save_checkpoint,
 )
 from voronerf.app.train.defaults import resolve
+from voronerf.app.train.loop import make_split
 from voronerf.app.train.resume import snapshot
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Perspective, RenderOutput, StepOutput
@@ -98,14 +99,14 @@ class Town:
         """Exchanges the bounds of occupied space between ranks."""
         bounds = torch.zeros_like(self.bounds)
         for number, state in self.states.items():
-            bounds[number] = self.members[number].place.bounds(sampler_of(state).grid)
+            bounds[number] = self.members[number].place.bounds(grid_of(state))
         self.bounds = self.group.total(bounds)
 
 
-def sampler_of(state: State) -> Occupancy:
-    """The sampler of a territory, which skips what is empty."""
-    assert isinstance(state.sampler, Occupancy)
-    return state.sampler
+def grid_of(state: State) -> OccupancyGrid:
+    """Which space of a territory is empty; `check_territories` rejects settings without a grid."""
+    assert state.sampler.grid is not None
+    return state.sampler.grid
 
 
 def check_territories(config: TrainConfig, count: int, ranks: int) -> None:
@@ -160,13 +161,13 @@ def build_town(
             obstacle = obstacle or "its activations are not a sigmoid and a scaled softplus"
         if obstacle is not None:
             raise ConfigError(f"--field {config.field} cannot be trained in territories: {obstacle}")
-        sampler = sampler_of(state)
         if contraction is None:
+            sampler, grid = state.sampler, grid_of(state)
             state.renderer.sampler = Occupancy(
-                sampler.grid,
+                grid,
                 sampler.samples,
                 space=sampler.space,
-                empty=place.outside(sampler.grid),
+                empty=place.outside(grid),
                 backend=sampler.backend,
             )
         members[number] = Territory(place, state.renderer, state.draws)
@@ -236,13 +237,9 @@ def train(
 
 def _prepare(state: State) -> Batch:
     """What comes before the loss of a step: splits, empty space, rays."""
-    strategy, optimizer = state.strategy, state.optimizer
-    if strategy.splits or len(strategy.reservoir) >= (strategy.planned.children if strategy.planned else 0):
-        done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
-        if done is not None:
-            state.begin_stage(done)
-            if not strategy.inherit:
-                optimizer.drop_averages()
+    optimizer = state.optimizer
+    if state.strategy.has_samples():
+        make_split(state)
     optimizer.set_learning_rate(state.learning_rate())
     state.sampler.step_pre_backward(state.renderer.field, state.step, state.generator)
     state.renderer.train()
@@ -279,10 +276,7 @@ def save(town: Town) -> None:
     if group.any(failure is not None):
         raise failure or RankLost("another rank could not write the checkpoint")
     own = {
-        number: [
-            {k: v.cpu() for k, v in each.state_dict().items()}
-            for each in (state.router.diagram, sampler_of(state).grid)
-        ]
+        number: [{k: v.cpu() for k, v in each.state_dict().items()} for each in (state.router.diagram, grid_of(state))]
         for number, state in town.states.items()
     }
     found = {number: told for each in group.gather(own) for number, told in each.items()}
@@ -378,8 +372,7 @@ def summary_of(town: Town) -> dict[str, Any]:
     """What ``summary.json`` says of a training, on all ranks alike; scores are added to it."""
     own = torch.zeros(5, dtype=torch.float64)
     for state in town.states.values():
-        left = len(state.strategy.plan) - state.strategy.splits
-        counts = state.parameter_count, left, state.skipped, state.rays_done, state.router.num_cells
+        counts = state.parameter_count, state.strategy.left, state.skipped, state.rays_done, state.router.num_cells
         own += torch.tensor(counts, dtype=torch.float64)
     told = town.group.total(own)
     parameters, left, skipped, rays, cells = map(int, told.tolist())

@@ -20,7 +20,7 @@ from scene_files import write_blender
 
 from voronerf.app.cli import main
 from voronerf.app.cli.display import TrainingDisplay
-from voronerf.app.cli.main import COMMANDS
+from voronerf.app.cli.program import COMMANDS
 from voronerf.app.export import space
 from voronerf.app.render.paths import CameraPath, write_camera_path
 from voronerf.app.scenes import builtin_scene
@@ -339,7 +339,7 @@ def test_signals_leave_a_usable_checkpoint(tmp_path, monkeypatch, capsys):
         steps.append(summary["steps"])
 
     endless = TINY.replace("--steps 16", "--steps 100000 --checkpoint-every 0.2")
-    command = [sys.executable, "-m", "voronerf.app.cli.main", *words("train --data builtin --out", tmp_path, endless)]
+    command = [sys.executable, "-m", "voronerf", *words("train --data builtin --out", tmp_path, endless)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     deadline = time.monotonic() + 600
     while not last.exists():

@@ -18,8 +18,8 @@ from cli_commands import TINY, words
 from scene_files import write_blender
 
 from voronerf.app.cli import main
-from voronerf.app.cli.main import COMMANDS, TRAININGS
 from voronerf.app.cli.parsing import parse
+from voronerf.app.cli.program import COMMANDS, TRAININGS
 from voronerf.app.render.paths import CameraPath, write_camera_path
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import ConfigError

@@ -12,7 +12,7 @@ from cli_commands import TINY, words
 
 from voronerf import __version__
 from voronerf.app.cli import main
-from voronerf.app.cli.main import COMMANDS
+from voronerf.app.cli.program import COMMANDS
 from voronerf.app.train.config import TrainConfig
 
 
@@ -92,10 +92,10 @@ def test_none_stands_for_the_default(tmp_path):
 def test_ctrl_c_while_the_program_is_loaded_leaves_no_traceback():
     code = (
         "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "  # it may be ignored here
-        "sys.argv = ['/bin/voronerf', '--version']; import voronerf; {}"
+        "sys.argv = ['voronerf', '--version']; from voronerf.app.cli import _prepare, main; {}"
     )
-    stop = "os.kill(os.getpid(), signal.SIGINT)"
-    main = "from voronerf.app.cli import main; main(); print(signal.getsignal(2) is signal.default_int_handler)"
+    stop = "_prepare(); os.kill(os.getpid(), signal.SIGINT)"
+    main = "main(); print(signal.getsignal(2) is signal.default_int_handler)"
     loading, started = (
         subprocess.run([sys.executable, "-c", code.format(then)], capture_output=True, text=True)
         for then in (stop, main)

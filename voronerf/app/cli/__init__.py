@@ -1,5 +1,48 @@
-"""The command line, ``voronerf train | eval | ...``: a file for each command, and their table in ``main``."""
+"""The command line, ``voronerf train | eval | ...``: a file for each command, and their table in ``program``.
 
-from voronerf.app.cli.main import main
+What a process decides for itself is set here, before torch is loaded, and not by the library.
+"""
 
-__all__ = ["main"]
+import contextlib
+import ctypes
+import gc
+import os
+import signal
+import sys
+
+
+def main(args: list[str] | None = None) -> int:
+    """Loads the program and runs one command, see :func:`voronerf.app.cli.program.run`."""
+    if sys.modules.get("torch") is None:
+        _prepare()
+    try:
+        from voronerf.app.cli.program import run
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        line = "voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch"
+        print(f"voronerf: error: {line}", file=sys.stderr)
+        return 1
+    return run(args)
+
+
+def _prepare() -> None:
+    """Sets how threads wait, and what holds while the program is loaded."""
+    # OpenMP's threads spin for milliseconds by default while they wait for each other, on cores that others may need:
+    # beside ten busy processes a step of training takes twenty times as long. Read when torch loads its runtime.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # They spin for some ten microseconds before that: to sleep and wake takes as long, many times in a step.
+    if os.environ["OMP_WAIT_POLICY"] == "passive":
+        os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    # The C library keeps freed memory, so that the next step does not wait for the same pages again: glibc's
+    # M_MMAP_THRESHOLD, which takes no more than this, and M_TRIM_THRESHOLD.
+    with contextlib.suppress(AttributeError, TypeError):  # another C library
+        limit = ctypes.CDLL(None).mallopt
+        limit(-3, 1 << 25)
+        limit(-1, 1 << 30)
+    # Garbage is collected again when the command runs: while torch is loaded there is none, and to look for it takes a
+    # tenth of the time.
+    gc.disable()
+    # Ctrl-C ends the program without a traceback while it is loaded.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)

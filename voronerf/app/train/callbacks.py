@@ -70,7 +70,7 @@ class Checkpoints(Callback):
 
     def after_split(self, state: State, done: SplitDone) -> None:
         """Writes the samples that decided a split, and says what it made."""
-        kept, stage = io.BytesIO(), state.stages[-1]  # benchmarks/balance.py reads them
+        kept, stage = io.BytesIO(), state.stages[-1]  # benchmarks/paper/balance.py reads them
         np.savez(kept, points=done.points.cpu().numpy(), importance=done.importance.cpu().numpy())
         write_bytes(self.out / "samples" / f"level-{state.strategy.splits}.npz", kept.getvalue())
         when = f"at {state.seconds:.0f} s, step {state.step}"
@@ -193,9 +193,8 @@ class Scores(Callback):
         """Scores the test views of a finished training, and writes the summary."""
         if state.fraction >= 1:
             state.clear_stop()
-            left = len(state.strategy.plan) - state.strategy.splits
-            if left:
-                state.report(f"Run ended before {left} of {len(state.strategy.plan)} planned splits.")
+            if left := state.strategy.left:
+                state.report(f"Run ended before {left} of {state.strategy.splits + left} planned splits.")
             self._evaluate(state, last=True)
         now = self.metrics[-1] if self.metrics else {}
         self.summary = {
@@ -206,7 +205,7 @@ class Scores(Callback):
             "rays_per_second": state.rays_done / max(state.seconds, 1e-9),
             "parameters": state.parameter_count,
             "cells": state.router.num_cells,
-            "splits_left": len(state.strategy.plan) - state.strategy.splits,
+            "splits_left": state.strategy.left,
             "skipped_steps": state.skipped,
             "width": state.config.width,
             "stages": [asdict(stage) for stage in state.stages],

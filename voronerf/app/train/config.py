@@ -243,6 +243,18 @@ class TrainConfig(
         """
         try:
             values = parse_json(text)
+        except ValueError as error:
+            raise ConfigError(f"{source}: not a configuration of this version: {error}") from None
+        return TrainConfig.from_values(values, source)
+
+    @staticmethod
+    def from_values(values: Any, source: str = "config.json") -> TrainConfig:
+        """Reads what :meth:`to_values` gave, from JSON.
+
+        Raises:
+            ConfigError: For values that are not a configuration, or one of another version; names ``source``.
+        """
+        try:
             if isinstance(values, dict):
                 values = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
                 paths = {name: values.get(name) for name in PATHS}

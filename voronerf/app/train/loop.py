@@ -81,7 +81,7 @@ def train(
         started = clock()
         if strategy.is_due(state.fraction, state.step):
             with one_thread():
-                _split(state, callbacks)
+                make_split(state, callbacks)
         optimizer.set_learning_rate(state.learning_rate())
         if not state.router.training:
             state.renderer.train()
@@ -103,7 +103,7 @@ def train(
         state.add_seconds(clock() - started)
 
 
-def _split(state: State, callbacks: Sequence[Callback]) -> None:
+def make_split(state: State, callbacks: Sequence[Callback] = ()) -> None:
     """Makes a split that is due, if there are enough samples for it."""
     strategy, optimizer = state.strategy, state.optimizer
     done = strategy.step_pre_backward(optimizer, state.fraction, state.step)

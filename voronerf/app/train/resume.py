@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -17,7 +16,7 @@ from voronerf.app.train.schema import check_types
 from voronerf.app.train.state import Stage, State
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.adam import parameter_groups
-from voronerf.nerf.samplers import SAMPLERS, Occupancy
+from voronerf.nerf.samplers import SAMPLERS
 from voronerf.router import VoronoiRouter
 
 
@@ -46,8 +45,8 @@ def snapshot(state: State) -> Checkpoint:
     groups: dict[str, Mapping[str, Any]] = {group(name): r.state_dict() for name, r in state.routers.items()}
     groups |= {"optimizer": optimizer_tensors(state.optimizer), "strategy": state.strategy.state_dict()}
     groups |= {"generator": {"state": state.generator.get_state(), "draws": state.draws.get_state()}}
-    if isinstance(state.sampler, Occupancy):
-        groups["occupancy"] = state.sampler.grid.state_dict()
+    if (grid := state.sampler.grid) is not None:
+        groups["occupancy"] = grid.state_dict()
     if state.scaler.is_enabled():
         groups["scaler"] = state.scaler.state_dict()
     tensors = {
@@ -90,8 +89,8 @@ def load(state: State, checkpoint: Checkpoint) -> None:
             raise ValueError(f"no moments of the optimiser after {stored.step} steps")
         load_optimizer_tensors(state.optimizer, checkpoint.group("optimizer"))
         state.scaler.load_state_dict({name: value.item() for name, value in checkpoint.group("scaler").items()})
-        if isinstance(state.sampler, Occupancy):
-            state.sampler.grid.load_state_dict(checkpoint.group("occupancy"))
+        if (grid := state.sampler.grid) is not None:
+            grid.load_state_dict(checkpoint.group("occupancy"))
         state.strategy.load_state_dict(checkpoint.group("strategy"))
         generators = checkpoint.group("generator")
         state.generator.set_state(generators["state"])
@@ -131,7 +130,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
             raise ValueError(f"{source}: step, times and stages must be counts, {came}")
     except ValueError as error:
         raise CheckpointError(str(error)) from None
-    config = TrainConfig.from_json(json.dumps(stored.config), source)
+    config = TrainConfig.from_values(stored.config, source)
     least = int(config.rays or 0)
     most = int(least * config.field_type.ray_growth)
     if not least <= stored.rays <= most:

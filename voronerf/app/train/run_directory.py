@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import shlex
 from collections.abc import Iterator
@@ -125,7 +124,7 @@ def stored_config(run: Path) -> TrainConfig | None:
 
 def read_config(path: Path) -> TrainConfig:
     """The settings in a file, for a training of another person; without directory and --allow-outside."""
-    config = TrainConfig.from_json(json.dumps(read_json(path)), str(path))
+    config = TrainConfig.from_values(read_json(path), str(path))
     for name, value in vars(config).items():  # they are defaults, which the help prints
         if not "".join(map(str, value if isinstance(value, tuple) else (value,))).isprintable():
             raise ConfigError(f"{path}: {name} must be printable text, got {value!r:.60}")

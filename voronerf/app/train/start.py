@@ -6,14 +6,12 @@ r rays of a batch.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import cast
 
 import torch
 
 from voronerf.app.train.build import make_grid, make_routers
 from voronerf.app.train.state import State
 from voronerf.nerf.loss import Batch, RenderOutput
-from voronerf.nerf.samplers import Occupancy
 from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.step import StepOutput
 
@@ -47,7 +45,9 @@ def judge_start(state: State, made: StepOutput) -> None:
     config = state.config
     for name, router in make_routers(replace(config, seed=config.seed + STRIDE * draw)).items():
         state.routers[name].load_state_dict(router.state_dict())
-    cast(Occupancy, state.sampler).grid = make_grid(config, state.scene, state.device)
+    sampler = state.sampler
+    assert sampler.grid is not None
+    sampler.grid.load_state_dict(make_grid(config, state.scene, state.device).state_dict())
     state.optimizer.state.clear()
     state.strategy.forget()
     state.begin_again()
@@ -61,7 +61,7 @@ def steps_to_judgement(state: State) -> int:
 
 
 def _judged_at(state: State) -> int:
-    return state.began + state.sampler.settling_steps + JUDGED if isinstance(state.sampler, Occupancy) else 0
+    return 0 if state.sampler.grid is None else state.began + state.sampler.settling_steps + JUDGED
 
 
 def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:

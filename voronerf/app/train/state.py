@@ -19,9 +19,9 @@ from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.renderer import Renderer
-from voronerf.nerf.samplers import Occupancy, Sampler
+from voronerf.nerf.samplers import Sampler
 from voronerf.nerf.schedule import learning_rate, next_rays
-from voronerf.nerf.split import SplitDone, SplitStrategy
+from voronerf.nerf.split import SplitDone, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.ops import Guard
 from voronerf.ops._core import backends
@@ -86,7 +86,7 @@ class State:
     renderer: Renderer
     ray_loss: RayLoss
     optimizer: Adam
-    strategy: SplitStrategy
+    strategy: Strategy
     batches: RayBatches
     generator: torch.Generator
     draws: torch.Generator
@@ -111,7 +111,7 @@ class State:
             self.batches,
             self.ray_loss,
             self.optimizer,
-            strategy=self.strategy,
+            strategy=self.strategy,  # type: ignore[arg-type]
             guard=self.guard,
             generator=self.draws,
             autocast=HALVES.get(self.config.precision),
@@ -200,7 +200,7 @@ class State:
     def read_output(self, made: StepOutput) -> None:
         """Reads loss, guard and number of samples of a step, which waits for the device; finds the rays of the next."""
         self.loss, self.skipped_in_a_row = float(made.loss), int(self.guard.in_a_row)
-        if isinstance(self.sampler, Occupancy) and (self.step - self.began) % schedule.GROUP == 0:
+        if self.sampler.grid is not None and (self.step - self.began) % schedule.GROUP == 0:
             self.rays = next_rays(
                 self.rays,
                 made.samples,

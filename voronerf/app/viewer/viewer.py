@@ -253,7 +253,7 @@ def view_run(run: Run, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
     """The viewer of a trained run; `Viewer.serve` renders for it.
 
     Args:
-        run: As `voronerf.open_run` opens it.
+        run: As `voronerf.app.open_run` opens it.
         host: Address to listen at.
         port: To listen at; 0 is any that is free.
 

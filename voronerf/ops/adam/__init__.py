@@ -78,7 +78,7 @@ def adam(
         return
     loss = None if loss is None else loss.detach()
     run = backends.resolve(_OP, backend=backend, device=parameters[0].device, dtype=torch.float32)
-    run(rules, [gradient.contiguous() for gradient in gradients], parameters, means, squares, guard, loss)
+    run(rules, parameters, [gradient.contiguous() for gradient in gradients], means, squares, guard, loss)
 
 
 @torch.no_grad()

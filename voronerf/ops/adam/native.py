@@ -13,8 +13,8 @@ from voronerf.ops.adam.reference import Guard, Rule
 
 def adam(
     rules: Sequence[Rule],
-    gradients: Sequence[Tensor],
     parameters: Sequence[Tensor],
+    gradients: Sequence[Tensor],
     means: Sequence[Tensor],
     squares: Sequence[Tensor],
     guard: Guard | None,

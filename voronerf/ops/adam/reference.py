@@ -65,8 +65,8 @@ class Guard(NamedTuple):
 @torch.no_grad()
 def adam(
     rules: Sequence[Rule],
-    gradients: Sequence[Tensor],
     parameters: Sequence[Tensor],
+    gradients: Sequence[Tensor],
     means: Sequence[Tensor],
     squares: Sequence[Tensor],
     guard: Guard | None,
@@ -79,19 +79,18 @@ def adam(
         left_out = guard.found != 0
         if guard.scale is not None:
             gradients = [gradient / guard.scale for gradient in gradients]
-    for rule, gradient, *tensors in zip(rules, gradients, parameters, means, squares, strict=True):
+    for rule, parameter, gradient, mean, square in zip(rules, parameters, gradients, means, squares, strict=True):
         first, second = rule.betas
         step = rule.step.double() + 1
         root = (1 - second**step).sqrt()
         given = rule.learning_rate
         given = given if isinstance(given, Tensor) else float(given)
         rate, epsilon = (given * root / (1 - first**step)).float(), (float(rule.epsilon) * root).float()
-        parameter, mean, square = tensors
         new_mean = first * mean + (1 - first) * gradient
         new_square = second * square + (1 - second) * gradient.square()
         moved = parameter - rate * (new_mean / (new_square.sqrt() + epsilon))
         moves = ~left_out if rule.every else (gradient != 0) & ~left_out
-        for tensor, new in zip(tensors, (moved, new_mean, new_square), strict=True):
+        for tensor, new in ((parameter, moved), (mean, new_mean), (square, new_square)):
             tensor.copy_(torch.where(moves, new, tensor))
         rule.step.add_(~left_out)
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.custom_op import in_float32
 from voronerf.ops._core.declare import declared
+from voronerf.ops._core.memory import on_huge_pages
 from voronerf.ops.frequency_encode import reference
 
 _OP = declared("frequency_encode")
@@ -33,7 +34,7 @@ frequency_encode = in_float32(_forward)
 
 def encode(out: Tensor, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> None:
     """Fills ``out`` with the frequency encoding or, with variances, the integrated one."""
-    native.on_huge_pages(out)
+    on_huge_pages(out)
     native.compiled.encode(_taken(out.shape[1], x, variances, octaves, include_input), out, *_where(x, octaves))
 
 

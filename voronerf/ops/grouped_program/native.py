@@ -18,6 +18,7 @@ from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import asked_for
 from voronerf.ops._core.layers import MLP
+from voronerf.ops._core.memory import on_huge_pages
 from voronerf.ops._core.program import Program, gradient
 from voronerf.ops.grouped_program.lowering import Lowered, compiled_runs, lower
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
@@ -136,7 +137,7 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
         outputs=outputs, output_types=[given.input_types[0]] * len(outputs), sums=sums
     )
     for result in (*outputs, *sums, *keeps):
-        native.on_huge_pages(result)
+        on_huge_pages(result)
     native.compiled.grouped_program(lowered.program, given, results, native.cpu())
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.grids import HashGrid
+from voronerf.ops._core.memory import on_huge_pages
 from voronerf.ops.hash_encode.autograd import HashDerivatives, Hashed
 
 
@@ -27,7 +28,7 @@ def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor 
 def _encode(given: Hashed) -> Iterator[Tensor]:
     out = given.result()
     yield out
-    native.on_huge_pages(out)
+    on_huge_pages(out)
     native.compiled.hash_encode(_inputs(given), compiled_grid(given.grid), out, native.machine(out))
 
 
@@ -35,7 +36,7 @@ def _encode(given: Hashed) -> Iterator[Tensor]:
 def _backward(gradient: Tensor, given: Hashed, to_positions: bool, to_table: bool) -> Iterator[list[Tensor]]:
     of_positions, of_table = results = given.gradients(to_positions, to_table)
     yield results
-    native.on_huge_pages(of_table)
+    on_huge_pages(of_table)
     if to_table:
         native.refuse_where_deterministic("hash_encode", given.positions)
     native.compiled.hash_encode_backward(

@@ -49,8 +49,8 @@ def march_rays(
     """Stratified samples of rays without those in empty cells of a grid, packed for ``composite``.
 
     Each ray is cut into ``samples`` strata between its near and its far end, with one sample in each, as in
-    ``rendering.stratified_depths``. A sample is kept if its cell of the grid is occupied. Space outside the box is
-    empty. If every cell is occupied, the result is the stratified one.
+    ``voronerf.nerf.sampling.stratified_depths``. A sample is kept if its cell of the grid is occupied. Space outside
+    the box is empty. If every cell is occupied, the result is the stratified one.
 
     With a ``contraction``, rays and their samples are still those of the world, and the grid, its box and the positions
     are of the contracted space (Barron et al. 2022, "Mip-NeRF 360", equation 10; or Mildenhall et al. 2020, "NeRF",

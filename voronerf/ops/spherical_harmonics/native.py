@@ -13,6 +13,7 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.custom_op import in_float32
 from voronerf.ops._core.declare import declared
+from voronerf.ops._core.memory import on_huge_pages
 from voronerf.ops.spherical_harmonics import reference
 
 _OP = declared("spherical_harmonics")
@@ -20,7 +21,7 @@ _OP = declared("spherical_harmonics")
 
 @_OP.custom_op("spherical_harmonics_native")
 def _forward(given: Any, out: Tensor) -> None:
-    native.on_huge_pages(out)
+    on_huge_pages(out)
     native.compiled.spherical_harmonics(given.directions, out, given.n, given.degree, native.machine(out))
 
 

@@ -13,13 +13,11 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import mmap
 import os
 import sys
 import warnings
-import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,6 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import backends
-from voronerf.ops._core.active import active
 from voronerf.ops._core.backends import BackendUnavailable
 
 _REMEDY = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
@@ -77,13 +74,6 @@ compiled.name_dtypes(DTYPES)
 
 ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
-# Results of at least this many bytes are put on huge pages; for smaller ones the allocator usually has warm memory.
-_LARGE = 1 << 22
-# Those of at least _REUSED bytes, which glibc maps for each call and gives back after it, find the memory of earlier
-# ones, of which _KEPT bytes are kept. This memory is our own: glibc's thresholds are those of the whole process, and an
-# aligned block of its heap does not fit where an equal one lay (one result of 66 MB after another took 250 MB).
-_REUSED, _KEPT = 1 << 25, 1 << 29
-_unused: list[mmap.mmap] = []
 LEAST_GAIN = 1.25
 """Of bfloat16 products over float32 ones, for networks to use them: rounding and pairing operands costs some."""
 _bfloat16_gain = compiled.bfloat16_gain()
@@ -144,36 +134,6 @@ def machine(tensor: Tensor) -> compiled.Cpu | compiled.Cuda:
 def aligned(tensor: Tensor) -> Tensor:
     """A tensor whose memory begins at a multiple of 16 bytes, as CUDA kernels want what they read in pieces."""
     return tensor.clone() if on_cuda(tensor) and tensor.data_ptr() % 16 else tensor
-
-
-def on_huge_pages(result: Tensor) -> None:
-    """Gives a result that has just been allocated, where it is large, huge pages, if the system has them, or the memory
-    of an earlier result that is gone."""
-    if result.nbytes < _LARGE or result.device.type != "cpu" or active.recording is not None:
-        return
-    if result.nbytes < _REUSED or sys.platform != "linux":
-        compiled.advise_huge_pages(result, result.nbytes)
-        return
-    size = result.nbytes
-    for block in _unused.copy():
-        if size <= len(block) <= size + size // 4:
-            with suppress(ValueError):  # another thread has taken it
-                _unused.remove(block)
-                break
-    else:
-        block = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        with suppress(OSError):  # a kernel without huge pages
-            block.madvise(mmap.MADV_HUGEPAGE)
-    held = (ctypes.c_char * size).from_buffer(block)  # which lives as long as a tensor of this memory
-    weakref.finalize(held, _keep, block).atexit = False
-    memory = torch.frombuffer(held, dtype=result.dtype).untyped_storage()
-    result.set_(memory, 0, result.shape, result.stride())
-
-
-def _keep(block: mmap.mmap) -> None:
-    _unused.append(block)
-    while sum(map(len, _unused)) > _KEPT:
-        _unused.pop(0)
 
 
 def refuse_where_deterministic(op: str, tensor: Tensor) -> None:

@@ -70,7 +70,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
 TRAININGS = ("train", "train-territories")
 
 
-def main(args: list[str] | None = None) -> int:
+def run(args: list[str] | None = None) -> int:
     """Runs one command.
 
     Args:
@@ -81,7 +81,7 @@ def main(args: list[str] | None = None) -> int:
         Errors are one line on stderr; with VORONERF_TRACEBACK=1 they are shown whole.
     """
     args = sys.argv[1:] if args is None else args
-    if not gc.isenabled():  # see voronerf/__init__.py
+    if not gc.isenabled():  # see voronerf/app/cli/__init__.py
         gc.freeze()
         gc.enable()
         if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
@@ -196,7 +196,3 @@ def _show_thread_error(args: threading.ExceptHookArgs) -> None:
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     Console(stderr=True, soft_wrap=True).print(f"voronerf: {one_line(str(message))}", highlight=False, markup=False)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
