@@ -105,6 +105,7 @@ FIELDS = {
     "siren": Field(fields.Siren),
     "siren laplacian": Field(fields.Siren, evaluate=laplacian, most=MIDDLE),
     "sdf eikonal": Field(fields.SignedDistance, evaluate=normals, most=MIDDLE),
+    "isdf": Field(functools.partial(fields.SignedDistance, 256), evaluate=normals, most=MIDDLE, most_cells=16),
     "nerfacto table": Field(fields.HashTable),
     "hashnerf 2^14": Field(fields.HashEmbedder),
     "hashnerf 2^19": Field(functools.partial(fields.HashEmbedder, 1 << 19, 4), most_cells=16),

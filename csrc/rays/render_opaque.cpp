@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "common/common.h"
+#include "common/flush_denormals.h"
 #include "common/parallel.h"
 #include "geometry/locate_cell.h"
 #include "geometry/nearest_centre.h"
@@ -255,6 +256,7 @@ bool render_opaque_cpu(const Program& program, const ProgramInputs& network, con
   }
   std::atomic<bool> sound{true};
   parallel(team, [&](int thread) {
+    const FlushDenormals flush;  // in networks
     if (!pools[static_cast<size_t>(thread)]->run(items, thread)) sound = false;
   });
   return sound;

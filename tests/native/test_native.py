@@ -12,7 +12,7 @@ import torch
 from helpers import refuses
 from torch import Tensor
 
-from voronerf import cell_sort, locate_cell, nearest_centre
+from voronerf import cell_sort, locate_cell, nearest_centre, ops
 from voronerf.ops._core import backends
 from voronerf.ops.cell_sort.reference import cell_sort as reference_sort
 from voronerf.ops.locate_cell.reference import locate_cell as reference_locate
@@ -314,3 +314,18 @@ def test_a_driver_older_than_the_toolkit_is_refused(monkeypatch):
         monkeypatch.setattr(_native, "_driver_major", lambda driver=driver: driver)
         said = _native.missing(torch.device("cuda"))
         assert said is None if reason is None else said.startswith(reason)
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("threads", [1, 2])
+def test_numbers_below_the_normal_range_are_zero_in_kernels_alone(threads: int) -> None:
+    """They cost some hundred cycles each. The caller's threads, which torch uses too, are as before."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        rows = torch.full((100_000, 1), 1e-20)
+        offsets, weight = torch.tensor([0, 100_000], dtype=torch.int32), torch.full((1, 1, 1), 1e-20)
+        assert not ops.grouped_linear(rows, offsets, weight, backend="native").any()
+        assert bool((rows * 1e-20).all())
+    finally:
+        torch.set_num_threads(before)

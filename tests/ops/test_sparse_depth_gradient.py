@@ -77,6 +77,29 @@ def test_equals_autograd_through_a_slow_loop(device, backend, others, skipped, s
     assert bool(gradient.any())
 
 
+def test_what_is_not_finite_stays_in_its_ray(device, backend):
+    """A weight that is NaN is lost with its ray's gradient where it counts; an infinite density lets nothing through."""
+    need("sparse_depth_gradient", backend, device, torch.float32)
+    counts = (12, 12, 12, 12)
+    given = [tensor.clone() for tensor in case(counts)]
+    density, depths, deltas, weights, offsets, distances = given
+    near = (depths - distances.repeat_interleave(12)).abs() <= NEARBY * distances.repeat_interleave(12) + deltas
+    weights[near] += 0.1
+    fine, rule = learnt(given, device, factor=0.25, activated=True, backend=backend), {"factor": 0.25}
+    weights[:12][~near[:12]] = torch.nan  # of the first ray, where they do not count
+    density[12:24] = torch.inf
+    _, gradient = learnt(given, device, **rule, activated=True, backend=backend)
+    torch.testing.assert_close(gradient[:12], fine[1][:12])
+    assert bool(gradient[12:24].isfinite().all())
+    torch.testing.assert_close(gradient[24:], fine[1][24:])
+    weights[24:36][near[24:36]] = torch.nan
+    density[36:] = torch.nan
+    loss, gradient = learnt(given, device, **rule, activated=True, backend=backend)
+    assert bool(loss.isnan()) and not bool(gradient[24:36].any())
+    assert bool(gradient[36:][near[36:]].isnan().all())
+    torch.testing.assert_close(gradient[:12], fine[1][:12])
+
+
 def test_a_ray_whose_point_gets_no_light_has_no_gradient(device, backend):
     need("sparse_depth_gradient", backend, device, torch.float32)
     density, depths, deltas, weights, offsets, distances = case((6, 6, 6))

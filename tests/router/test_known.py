@@ -274,6 +274,19 @@ def test_one_graph_for_any_number_of_samples() -> None:
         assert torch.equal(compiled(rows(n)), router(rows(n)))
 
 
+def test_a_known_call_is_exported_for_any_number_of_samples() -> None:
+    router = routed(net())
+    sizes = {0: torch.export.Dim("n", max=2**31 - 1)}
+    with pytest.raises(
+        RuntimeError, match=r"torch.export needs a forward that is fused whole and has run once.*not called"
+    ):
+        torch.export.export(router, (rows(64),), dynamic_shapes=((sizes,),))
+    router(rows(64))
+    exported = torch.export.export(router, (rows(64),), dynamic_shapes=((sizes,),)).module()
+    for n in (64, 65, 700):
+        assert torch.equal(exported(rows(n)), router(rows(n)))
+
+
 def test_other_calls_break_a_graph_as_before() -> None:
     router = routed(nn.utils.parametrizations.weight_norm(nn.Linear(3, 4)))
     expected = router(rows(64))

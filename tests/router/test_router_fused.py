@@ -122,6 +122,89 @@ def test_a_step_of_the_program(name: str) -> None:
         torch.testing.assert_close(a, b if a.shape == b.shape else b.expand_as(a), rtol=2e-3, atol=2e-4)
 
 
+class FourierKAN(nn.Module):
+    """A KAN of sines and cosines: parameters in products and sums, and no layer."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.coefficients = nn.Parameter(torch.randn(2, outputs, inputs, 3) / 3)
+        self.bias = nn.Parameter(torch.zeros(1, outputs))
+
+    def forward(self, x: Tensor) -> Tensor:
+        angle = torch.arange(1, 4) * x[:, None, :, None]
+        y = torch.sum(torch.cos(angle) * self.coefficients[0:1], (-2, -1))
+        y += torch.sum(torch.sin(angle) * self.coefficients[1:2], (-2, -1))
+        y += self.bias
+        return y
+
+
+class Convolved(nn.Module):
+    """Convolutions of one place, over samples or behind each, and one that covers all places of a sample."""
+
+    def __init__(self, form: str) -> None:
+        super().__init__()
+        self.form, sides = form, {"lines": (3, 1), "covers": (3, 1, 1)}.get(form, (1,))
+        make = {1: nn.Conv1d, 2: nn.Conv2d, 3: nn.Conv3d}[len(sides)]
+        self.a = make(1 if form == "covers" else 3, 8, sides if len(sides) > 1 else 1)
+        self.b = nn.Conv1d(8, 2, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.form == "covers":
+            return self.b(F.relu(self.a(x[:, None, :, None, None]))[..., 0, 0]).squeeze(-1)
+        if self.form == "lines":
+            return self.b(F.relu(self.a(x[:, :, None, None].expand(-1, -1, 3, 1))).flatten(2)).squeeze(-1)
+        if self.form == "over samples":
+            return self.b(torch.tanh(self.a(x.t()[None])))[0].t()
+        return self.b(torch.tanh(self.a(x[:, :, None]))).squeeze(-1)
+
+
+class Recurrent(nn.Module):
+    """A GRU's cell from its first state, zeros, and from another."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cell, self.out = nn.GRUCell(3, 4), nn.Linear(4, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.out(self.cell(x, self.cell(x)))
+
+
+class Masked(nn.Module):
+    """A number in the place of what a mask of entries, or one of samples, chooses."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b = nn.Linear(3, 8), nn.Linear(8, 2)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.a(x) * 1.0
+        y[y < -0.1] = 0.5
+        y[x[:, 0] > 0.2] = -0.25
+        return self.b(y)
+
+
+MODULES: dict[str, Callable[[], nn.Module]] = {
+    "Fourier KAN": lambda: nn.Sequential(FourierKAN(3, 4), FourierKAN(4, 2)),
+    **{
+        f"convolution, {form}": lambda form=form: Convolved(form)
+        for form in ("over samples", "behind", "covers", "lines")
+    },
+    "GRUCell": Recurrent,
+    "x[mask] = number": Masked,
+}
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_that_is_one_program(name: str) -> None:
+    torch.manual_seed(0)
+    x = uniform((90,)).requires_grad_()
+    found, expected, router = both(MODULES[name], x)
+    assert router.explain() == "forward: fused"
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    for a, b in zip(derivatives(found, x, router), derivatives(expected, x, router), strict=True):
+        torch.testing.assert_close(a, b if a.shape == b.shape else b.expand_as(a), rtol=2e-3, atol=2e-4)
+
+
 class Exponential(torch.autograd.Function):
     """torch-ngp's ``trunc_exp``."""
 
@@ -223,3 +306,42 @@ def test_a_path_that_an_argument_chooses_is_refused() -> None:
     router = VoronoiRouter(Chooses(), torch.randn(4, 3), coords="first3", fuse=True)
     with pytest.raises(ValueError, match=r"the truth of a tensor is read \(.* if t > 0 .*depends on values"):
         router(uniform((90,)), torch.tensor([[0.2]]))
+
+
+class Product(torch.autograd.Function):
+    """faster-KAN: a function of samples and parameters with a backward of its own."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, grid: Tensor) -> Tensor:
+        ctx.save_for_backward(x, grid)
+        return x * grid
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, Tensor]:
+        x, grid = ctx.saved_tensors
+        return g * grid, (g * x).sum(0)
+
+
+class Gridded(Around):
+    def forward(self, x: Tensor) -> Tensor:
+        return self.b(Product.apply(self.a(x), self.gain))
+
+
+class Assigned(Around):
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.a(x) * 1.0
+        y[x[:, 0] > 0] = y[x[:, 0] > 0] ** 2
+        return self.b(y)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (Gridded, r"Product.apply \(.* is a custom function that takes parameters of cells; write it with functions"),
+        (Assigned, r"__getitem__ \(.* which has no row for each of 37 samples.*as torch.where does"),
+    ],
+)
+def test_what_cannot_be_fused_is_said(make: Any, message: str) -> None:
+    router = VoronoiRouter(make(lambda net, h: h), torch.randn(4, 3), coords="first3", fuse=True)
+    with pytest.raises(ValueError, match=message):
+        router(uniform((90,)))

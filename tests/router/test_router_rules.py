@@ -124,6 +124,24 @@ def real(tensor: Tensor) -> Tensor:
     return torch.view_as_real(tensor) if tensor.is_complex() else tensor
 
 
+@pytest.mark.parametrize("fuse", [True, False])
+def test_complex_layers_stay_complex_under_autocast(fuse: bool) -> None:
+    """Torch's autocast leaves them as they are; real layers before them are rounded, fused ones at their ends."""
+    generator = torch.Generator().manual_seed(3)
+    centres = torch.rand(5, 3, generator=generator) * 2 - 1
+    torch.manual_seed(0)
+    way = {"fuse": True, "way": "fused"} if fuse else {"way": "grouped"}
+    router = perturb(VoronoiRouter(Gabor(), centres, coords="first3", **way), generator)
+    x = uniform((300,)).requires_grad_()
+    expected = router(x)
+    (slope,) = torch.autograd.grad(expected.sum(), x)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = router(x)
+    assert found.dtype == torch.float32 and ("fused in runs" if fuse else "grouped") in router.explain()
+    torch.testing.assert_close(found, expected, rtol=0.1, atol=0.1)
+    torch.testing.assert_close(torch.autograd.grad(found.sum(), x)[0].norm(), slope.norm(), rtol=0.1, atol=0.1)
+
+
 @pytest.mark.parametrize("n", [60, 6000])  # look-ups of few samples have a way of their own
 @pytest.mark.parametrize("name", MODULES)
 def test_results_and_gradients_are_those_of_the_loop(name: str, n: int) -> None:

@@ -157,8 +157,11 @@ def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
     parents = router.subdivide(2, points=x, weights=torch.rand(90, generator=generator), cells=[1])
     assert parents.tolist() == [0, 1, 1, 2, 3] and router.diagram.depth == 2
     torch.testing.assert_close(router(x), before)
-    with pytest.raises(ValueError, match="a number of children needs points and weights"):
+    with pytest.raises(ValueError, match="a number of children needs points, and no parents"):
         router.subdivide(4)
+    other = router_of(Sine(), generator, k=1)
+    other.subdivide(4, points=x)  # all weigh the same
+    assert other.num_cells == 4
     with pytest.raises(TypeError, match="must be a VoronoiDiagram or a number of children, got float"):
         router.subdivide(2.0)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="points must come with a number of children"):
@@ -331,8 +334,24 @@ def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
             wrapped(x).square().sum().backward()
         for parameter, gradient in zip(router.parameters(), wanted, strict=True):
             torch.testing.assert_close(parameter.grad, gradient)
+        router.subdivide(2, points=x[:, :3])
+        with pytest.raises(RuntimeError, match="made for the parameters of before subdivide; wrap the router again"):
+            wrapped(x)
+        nn.parallel.DistributedDataParallel(router)(x).sum().backward()
     finally:
         torch.distributed.destroy_process_group()
+
+
+def test_an_average_of_weights_is_split_with_its_router(generator: torch.Generator) -> None:
+    """As the page of recipes says: ``AveragedModel`` holds a copy of the router, with a diagram of its own."""
+    router, x = router_of(SkipNet(), generator), uniform(generator, 40, 15)
+    router(x)
+    average = torch.optim.swa_utils.AveragedModel(router, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.5))
+    average.update_parameters(router)
+    parents = router.subdivide(2, points=uniform(generator, 200, 3))
+    average.module.subdivide(router.diagram, parents)
+    average.update_parameters(router)
+    torch.testing.assert_close(average(x), router(x))
 
 
 # Decisions ------------------------------------------------------------------------------------------------------------

@@ -143,11 +143,11 @@ def finer_diagram(
 ) -> tuple[VoronoiDiagram, Tensor]:
     """The diagram that ``VoronoiRouter.subdivide`` was asked for, and the parents of its cells.
 
-    With a number of children for ``finer`` come points [m, d], their weights [m] and options of :func:`split_diagram`;
-    a diagram has parents int64 [new cells], or None for those that hold the new centres.
+    With a number of children for ``finer`` come points [m, d], their weights [m] or None for 1 each, and options of
+    :func:`split_diagram`; a diagram has parents int64 [new cells], or None for those that hold the new centres.
 
     Raises:
-        ValueError: For parents that do not fit, or points and weights that are missing or too many.
+        ValueError: For parents that do not fit, or points that are missing or too many.
         TypeError: When ``finer`` is neither a diagram nor a number, or ``parents`` are not int64.
     """
     if not isinstance(finer, VoronoiDiagram):
@@ -156,11 +156,9 @@ def finer_diagram(
                 "VoronoiRouter.subdivide: diagram must be a VoronoiDiagram or a number of children, got "
                 f"{type(finer).__name__}"
             )
-        if points is None or weights is None or parents is not None:
-            raise ValueError(
-                "VoronoiRouter.subdivide: a number of children needs points and weights, the samples and their "
-                "importance, and no parents"
-            )
+        if points is None or parents is not None:
+            raise ValueError("VoronoiRouter.subdivide: a number of children needs points, and no parents")
+        weights = points.new_ones(points.shape[:-1]) if weights is None else weights
         generator = split["generator"]
         if generator is not None and generator.device.type != "cpu":
             seed = torch.randint(2**62, (), generator=generator, device=generator.device)

@@ -118,9 +118,15 @@ class Fused:
         nodes = [node for node in trace.graph.nodes if node in needed and node.op == "call_function"]
         self._weights = [node for node in nodes if node.meta["on"] != SAMPLES]
         self._between = [node for node in nodes if node.meta["on"] == SAMPLES]
+        for node in self._between:
+            if _is_custom(node) and any(source.meta["on"] == CELLS for source in node.all_input_nodes):
+                raise Unfusable(
+                    f"{name_of(node.target)}{node.meta['line']} is a custom function that takes parameters of cells; "
+                    "write it with functions of PyTorch"
+                )
         self._writes = any(node.meta.get("inplace") for node in self._between)
         self._runs = self._cut()
-        if not any(step.op == "linear" for run in self._runs.values() for step in run.program.steps):
+        if not any(run.parameters for run in self._runs.values()):
             first = next(iter(self._why.values()), "nothing that is returned comes from a layer")
             raise Unfusable(f"no layer can be part of a run: {first}")
         self._sorted = any(_meets_cells(node) for node in self._between)
@@ -185,8 +191,8 @@ class Fused:
                 values[id(value)] = source
             return value
 
-        if getattr(node.target, "__name__", "") == "apply":
-            raise NotAStep("a custom function")
+        if _is_custom(node):
+            raise NotAStep("a custom function, whose backward is its own; write it with functions of PyTorch")
         if node.target in (torch.autograd.grad, differentiable):
             raise NotAStep("a gradient")
         if any(source.meta.get("value") is None for source in node.all_input_nodes):
@@ -225,7 +231,7 @@ class Fused:
             node = waiting.pop()
             if node in needed or node in self._made:
                 continue
-            if node in self._ready or self._only_moves(node):
+            if node in self._ready or self._only_moves(node) or self._constant(node):
                 needed.add(node)
                 self._ready.setdefault(node, self._at(node) if node.meta["on"] == SAMPLES else 0)
                 waiting += node.all_input_nodes
@@ -260,6 +266,20 @@ class Fused:
         lowering = self._lowering
         numbers = lowering.order(self._entries[node].codes)[1].tolist()
         return all(lowering.columns[i][0] in lowering.sources for i in numbers)
+
+    def _constant(self, node: fx.Node) -> bool:
+        """Whether a value is made of no tensor and the same for all samples, as ``zeros``: a program without inputs."""
+        if any(isinstance(source.meta["value"], Tensor) for source in node.all_input_nodes):
+            return False
+        lowering = self._lowering
+        numbers = lowering.order(self._entries[node].codes)[1].tolist()
+        waiting = {lowering.columns[i][0] for i in numbers}
+        while waiting:
+            step = lowering.builder.steps[waiting.pop()]
+            if step.op == "input":
+                return False
+            waiting |= {c.index for c in step.operands if c.of == VALUE}
+        return True
 
     def _cut(self) -> dict[int, Run]:
         """The steps in runs, by their level."""
@@ -474,6 +494,11 @@ def _flat(value: Tensor, n: int) -> Tensor:
         at = next(d for d, size in enumerate(value.shape) if size == n)
         value = value.movedim(at, 0)
     return value.reshape(n, -1) if n else value.reshape(0, max(value.shape[1:].numel(), 1))
+
+
+def _is_custom(node: fx.Node) -> bool:
+    """Whether it is a ``torch.autograd.Function`` of the module's."""
+    return getattr(node.target, "__name__", "") == "apply"
 
 
 def _sample_dimension(shape: torch.Size, rows: int) -> int:

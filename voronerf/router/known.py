@@ -32,7 +32,7 @@ def kind_of(method: str, training: bool, args: Sequence[Any], kwargs: dict[str, 
     device = None
     for value in (*args, *kwargs.values(), coords):
         of = type(value)
-        if of is Tensor or of is nn.Parameter:
+        if of is Tensor or of is nn.Parameter or (isinstance(value, Tensor) and torch.compiler.is_exporting()):
             device = value.device
             kind += (value.shape[1:], value.dtype, device, value.layout, value.requires_grad)
         elif of in _VALUES:
@@ -97,7 +97,7 @@ class Known:
         if coords is None and type(router.coords) is str:  # as when the kind was found
             positions, d = given[self._tensors[0]], router._d
             positions = positions if positions.shape[-1] == d else positions[..., :d]
-            if router._unseen:
+            if router._unseen and not torch.compiler.is_compiling():
                 router._look_at(positions, args, kwargs, coords)
         else:
             positions = router._positions(args, kwargs, coords)

@@ -29,6 +29,7 @@ _MOVERS = frozenset(
     """
     view _unsafe_view reshape expand permute transpose t unsqueeze squeeze slice select cat stack split split_with_sizes
     unbind clone contiguous alias repeat flip roll lift_fresh index index_select narrow expand_copy detach unfold
+    unsafe_split unsafe_split_with_sizes unsafe_chunk
     """.split()  # noqa: SIM905
 )
 _FUNCTIONS: dict[str, Callable[..., list[tuple[str, float, float]]]] = {
@@ -136,6 +137,27 @@ def _layer_norm(x: Tensor, shape: Sequence[int], weight: Any, bias: Any, eps: fl
     return y if bias is None else y + bias, mean, scale
 
 
+def _convolution(x: Tensor, weight: Tensor, bias: Any, *rule: Any) -> Tensor:
+    """A kernel of one place, at every place [n, c, ...]; or one that covers all places, which leaves one."""
+    (stride, padding, dilation, turned, _, groups), size, more = rule, weight.shape[2:], x.shape[2:]
+    whole = size == more and set(dilation) == {1}
+    if turned or groups != 1 or any(padding) or not (whole or set(size) == {1}):
+        raise NotAStep("a convolution of several places")
+    if whole:
+        return F.linear(x.flatten(1), weight.flatten(1), bias).reshape(len(x), -1, *[1] * len(size))
+    if set(stride) != {1}:
+        raise NotAStep("a convolution that leaves out places")
+    return F.linear(x.movedim(1, -1), weight.flatten(1), bias).movedim(-1, 1)
+
+
+def _written(x: Tensor, indices: Sequence[Any], value: Tensor, accumulate: bool = False) -> Tensor:
+    """``x[mask] = number``."""
+    mask = indices[0]
+    if len(indices) != 1 or mask.dtype != torch.bool or value.numel() != 1 or accumulate:
+        raise NotAStep("a write at places that depend on values, unless x[mask] = number; write it with torch.where")
+    return torch.where(mask.reshape(*mask.shape, *[1] * (x.dim() - mask.dim())), value, x)
+
+
 def _products(x: Tensor, y: Tensor) -> Tensor:
     """Small matrices of samples with each other, [n, i, j] and [n, j, k]."""
     if math.prod(x.shape[1:]) * y.shape[2] > _SMALL:
@@ -169,6 +191,8 @@ _WRITTEN_OUT: dict[str, Callable[..., Any]] = {
     "bitwise_or": lambda x, y: ~(~x & ~y),
     "logical_or": lambda x, y: ~(~x & ~y),
     "linalg_cross": lambda x, y, dim=-1: x.roll(-1, dim) * y.roll(1, dim) - x.roll(1, dim) * y.roll(-1, dim),
+    "convolution": _convolution,
+    "index_put": _written,
     "mv": lambda x, y: torch.mm(x, y.unsqueeze(1)).squeeze(1),
 }
 """Functions of ATen as others."""
@@ -310,7 +334,10 @@ class Lowering:
             def own(value: Tensor) -> Tensor:
                 copied = value.detach().clone()
                 copied = copied.float() if copied.dtype in (torch.float16, torch.bfloat16) else copied
-                mode.keep(copied, known(value))
+                entries = known(value)
+                if entries is not None and 0 in entries.codes.stride():  # a copy of what is expanded is no more
+                    entries = Entries(entries.codes.contiguous(), entries.of)
+                mode.keep(copied, entries)
                 mode.originals[id(copied)] = value
                 return copied
 
@@ -578,6 +605,8 @@ class _Recording(TorchDispatchMode):
         else:
             x, weight = args[:2]
         of_x, of_weight = self.entries(x), self.entries(weight)
+        if of_x is None and x.shape[0] == self.lowering.rows:  # zeros of a first state, say
+            of_x = self.of_samples(x, None)
         if of_x is None or of_x.of is not None:  # W x^T
             if name != "mm" or of_weight is None or of_weight.of is not None:
                 raise NotAStep("a product of parameters with samples")

@@ -176,6 +176,7 @@ class VoronoiRouter(nn.Module):
         self._dispatch = Dispatch()
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
         self._unseen = True  # no large batch has shown whether the centres fit the positions
+        self._resized = False  # parameters have other sizes than where they were wrapped, perhaps
         self.register_buffer("frozen_cells", None, persistent=False)
         self._table = Table(self.module) if isinstance(module, LayeredField) else None
 
@@ -384,15 +385,14 @@ class VoronoiRouter(nn.Module):
             inherit: False draws new parameters for the children of every cell that is split, with moments of zero: the
                 ablation that shows ghosting.
             points: [m, d], samples in scene units, if ``diagram`` is a number of children.
-            weights: [m], the importance of the samples, by which the new cells are balanced.
+            weights: [m], the importance of the samples, by which the new cells are balanced; None for 1 each.
             **split: Further options of ``split_diagram``, such as cells, centres, min_samples.
 
         Returns:
             int64 [new cells], the parents.
 
         Raises:
-            ValueError: If ``parents`` does not fit, ``points`` or ``weights`` are missing, or the module cannot draw
-                new parameters.
+            ValueError: If ``parents`` does not fit, ``points`` are missing, or the module cannot draw new parameters.
             TypeError: If ``diagram`` is neither a diagram nor a number, or ``parents`` are not int64.
 
         Examples:
@@ -414,6 +414,7 @@ class VoronoiRouter(nn.Module):
         fresh = None if inherit else draw_parameters(plain_cell(self.module, 0), len(new), self.generator)
         renew_cells(self.module, parents, fresh, new)
         self.diagram, self._unseen = copy.deepcopy(finer).to(self.diagram.centres.device), True
+        self._resized = True
         if self.frozen_cells is not None:
             self._set_frozen(self.frozen_cells[parents.to(self.frozen_cells.device)])
         if optimizer is not None:
@@ -673,6 +674,8 @@ class VoronoiRouter(nn.Module):
 
     def _route(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """One call of a method of the module; one that is not known breaks a graph of ``torch.compile``."""
+        if self._resized and not torch.compiler.is_compiling():
+            self._check_wrapper()
         known: Table | Known | None = self._given if method == "forward" else None
         if known is None and self.fuse:
             module: Any = self._modules["module"]
@@ -680,9 +683,27 @@ class VoronoiRouter(nn.Module):
             known = None if kind is None else self._dispatch.find(kind, self.num_cells)
         if known is not None and (results := known.run(self, args, kwargs, coords)) is not None:
             return results
+        if torch.compiler.is_exporting():
+            raise RuntimeError(
+                f"VoronoiRouter: torch.export needs a {method} that is fused whole and has run once; make the router "
+                f"with fuse=True, and call it beforehand, with gradients on or off as in the export; {self.explain()}"
+            )
         compiling = torch.compiler.is_compiling() or "torch._dynamo" in sys.modules
         run = self._route_uncompiled if compiling else self._route_as_it_is
         return run(method, *args, coords=coords, **kwargs)
+
+    def _check_wrapper(self) -> None:
+        """Raises RuntimeError in a call of a ``DistributedDataParallel`` that has been made for other sizes."""
+        wrapper: Any = nn.parallel.DistributedDataParallel._active_ddp_module
+        if wrapper is None:
+            return
+        expected = wrapper._get_ddp_logging_data()["total_parameter_size_bytes"]
+        if expected != sum(p.numel() * p.element_size() for p in wrapper._module_parameters if p.requires_grad):
+            raise RuntimeError(
+                "VoronoiRouter: DistributedDataParallel has been made for the parameters of before subdivide; wrap the "
+                "router again, on all ranks"
+            )
+        self._resized = False
 
     @property
     def _given(self) -> Table | None:

@@ -83,7 +83,8 @@ def _product(run: GroupedRun, x: Tensor, m: int, weight: Tensor, bias: Tensor | 
     real, imaginary = weight.real, weight.imag
     weight = torch.cat([torch.cat([real, -imaginary], 2), torch.cat([imaginary, real], 2)], 1)
     bias = None if bias is None else torch.cat([bias.real, bias.imag], 1)
-    y = grouped_linear(torch.cat([x.real, x.imag], 1), offsets, weight, bias, backend=backend)
+    with torch.autocast(x.device.type, enabled=False):  # which leaves complex numbers as they are
+        y = grouped_linear(torch.cat([x.real, x.imag], 1), offsets, weight, bias, backend=backend)
     return torch.complex(*y.chunk(2, 1))
 
 

@@ -7,6 +7,7 @@
 #include <string>
 
 #include "common/common.h"
+#include "common/flush_denormals.h"
 #include "common/parallel.h"
 #include "network/cpu/program_rows.h"
 #include "network/cpu/row_tasks.h"
@@ -404,6 +405,7 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
   if (summed) {
     float* const partial = memory + stride * threads;
     parallel_for(in.k, 1, threads, [&](int64_t cell) {
+      const FlushDenormals flush;
       const int64_t count = tasks.partials(cell);
       const bool empty = in.offsets[cell + 1] == in.offsets[cell];
       if (count > 0 || empty) rows.reduce(call, cell, partial + tasks.first_partial[cell] * table.partial, count);

@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "common/flush_denormals.h"
 #include "common/parallel.h"
 
 namespace voronerf {
@@ -67,6 +68,7 @@ void for_each_task(const RowTasks& tasks, float* memory, int64_t stride, int thr
   const int64_t count = static_cast<int64_t>(tasks.tasks.size());
   Items items(count, 1, threads);
   parallel(static_cast<int>(std::min<int64_t>(threads, count)), [&](int thread) {
+    const FlushDenormals flush;
     float* own = memory + thread * stride;
     int64_t packed = -1;
     for (int64_t i, end; items.take(thread, i, end);) {

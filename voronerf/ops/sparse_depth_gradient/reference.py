@@ -41,19 +41,25 @@ def sparse_depth_gradient(*given: Any) -> None:
     own = (ray >= 0) & (ray < s)
     ray = torch.where(own, ray, s)
     near = near_point(depths, deltas, torch.nn.functional.pad(distances, (0, 1), value=torch.nan)[ray])
-    there = weights * near
+    there = torch.where(near, weights, 0)
     # Sums along each ray are differences of sums along all of them, which float32 would round too much.
     optical, light = (_sums_along(values, ray, offsets) for values in (density * deltas, there))
     total = distances.new_zeros(s + 1).index_add(0, ray, there)
-    known = torch.where(total > 1e-3, -1 / total, 0)
-    slope = known[ray] * deltas * (torch.exp(-optical) * near - (total[ray] - light))
+    slope = -deltas / total[ray] * (torch.where(near, torch.exp(-optical), 0) - (total[ray] - light))
     if not activated:
         slope = slope * -density_scale * torch.expm1(-density / density_scale)  # of a softplus
     loss += factor * sparse_depth_loss(total[:s]).sum()
-    gradient[:, 3] += torch.where(own, factor * slope, 0)
+    gradient[:, 3] += torch.where(own & (total[ray] > 1e-3), factor * slope, 0)
 
 
 def _sums_along(values: Tensor, ray: Tensor, offsets: Tensor) -> Tensor:
-    """Running sums [m] of values [m] along each ray."""
-    before = torch.nn.functional.pad(values.double().cumsum(0), (1, 0))
-    return (before[1:] - before[offsets][ray]).to(values.dtype)
+    """Running sums [m] of values [m] along each ray; what is not finite stays in its own."""
+
+    def along(each: Tensor) -> Tensor:
+        before = torch.nn.functional.pad(each.double().cumsum(0), (1, 0))
+        return before[1:] - before[offsets][ray]
+
+    sums = along(values.where(values.isfinite(), 0))
+    for value, there in ((torch.inf, values == torch.inf), (torch.nan, values.isnan() | (values == -torch.inf))):
+        sums = torch.where(along(there) > 0, value, sums)
+    return sums.to(values.dtype)
