@@ -1,6 +1,7 @@
 """`voronerf process` on pictures of two walls with a pattern, and on models that have faults."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -121,9 +122,10 @@ def models(tmp_path, monkeypatch, pictures, **found):
         asked.append(name)
         if found[name] is None:
             return None
-        origins = found[name]
-        lost = int(lost_cameras(origins).sum())
-        return process.Model(tmp_path, name, [], len(origins) - lost, 0.5, camera_faults(origins))
+        origins, lost = found[name], lost_cameras(found[name])
+        names = [f"{number:02}.png" for number in lost.nonzero()[:, 0].tolist()]
+        kept = [None] * (len(origins) - len(names))
+        return process.Model(tmp_path, name, kept, dict.fromkeys(names, "far"), 0.5, camera_faults(origins))
 
     monkeypatch.setattr(process, "_match", lambda *_: None)
     monkeypatch.setattr(process, "_map", map_images)
@@ -157,6 +159,8 @@ def test_cameras_far_from_all_others_count_as_missing():
     assert camera_faults(origins) == []  # one is not all
     origins[20:32] *= 30 + torch.arange(12)[:, None] ** 2
     assert lost_cameras(origins).nonzero().flatten().tolist() == [7, *range(20, 32)]
+    together = circle(40) + 5000 * torch.arange(40)[:, None].ge(38)
+    assert lost_cameras(together).nonzero().flatten().tolist() == [38, 39]  # each is the other's neighbour
     assert "depths from 0.02 to 3.52e+04" in camera_faults(circle(), torch.tensor([[0.02, 5.0], [1.0, 3.52e4]]))[0]
     lenses = [colmap_lens("OPENCV", (736, 700, 400, 266, 0.1, 0, p1, 0.01)) for p1 in (0.02, -0.09)]
     assert [camera_faults(circle(), lenses=[(lens, 800)]) for lens in lenses] == [
@@ -174,6 +178,31 @@ def test_cameras_beside_a_burst_are_not_lost():
     assert not lost_cameras(path).any()
 
 
+def test_a_lost_camera_is_named_left_out_and_another_mapper_is_tried(tmp_path, pictures):
+    out, said = tmp_path / "out", []
+    process.process(pictures, out, max_features=300)
+    found = pycolmap.Reconstruction(out / "colmap/global/0")
+    images = {image.name: image for image in found.images.values()}
+    bare, far = images["03_a.png"], images["05_a.png"]
+    for point in bare.get_observation_point2D_idxs()[2:]:
+        found.delete_observation(bare.image_id, point)
+    frame = found.frames[far.frame_id]
+    turn = frame.rig_from_world.rotation
+    frame.rig_from_world = pycolmap.Rigid3d(turn, -turn.matrix() @ (3e4, 0, 0))
+    found.write_binary(out / "colmap/global/0")
+
+    for mapper, kept in (("global", COUNT - 2), ("auto", COUNT)):
+        shutil.rmtree(out / "sparse")
+        said.clear()
+        process.process(pictures, out, max_features=300, mapper=mapper, say=said.append)
+        line = next(line for line in said if line.startswith(f"global mapping: {COUNT - 2} of {COUNT} images"))
+        assert re.search(r"without the cameras of 03_a.png \(held by \d points\), 05_a.png \(far from", line)
+        names = {image.name for image in read_model(out / "sparse/0").images}
+        assert len(names) == kept and ("05_a.png" in names) == (mapper == "auto")
+        assert len(json.loads((out / "transforms.json").read_text())["frames"]) == kept
+        assert f"cameras of {kept} of {COUNT} images" in said[-1]
+
+
 def test_a_scene_says_what_is_wrong_with_its_cameras(tmp_path):
     poses = orbit_cameras(8, radius=4, elevation=20, width=12, height=10, focal=20).poses
     poses[:6, :3, 3] = poses[0, :3, 3] + 1e-6 * poses[:6, :3, 3]
@@ -182,6 +211,31 @@ def test_a_scene_says_what_is_wrong_with_its_cameras(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
     notes = load_scene(tmp_path).notes
     assert any(note.startswith("check the cameras: the cameras have collapsed") for note in notes)
+
+
+def test_a_lost_camera_does_not_give_a_scene_its_scale(tmp_path):
+    poses = orbit_cameras(17, radius=4, elevation=20, width=12, height=10, focal=20).poses
+    write_images(tmp_path, [(12, 10)] * 17)
+
+    def write(poses):
+        frames = [
+            {"file_path": f"images/{i:02}.jpg", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)
+        ]
+        (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
+
+    write(poses)
+    sound = load_scene(tmp_path)
+    poses[3, :3, 3] *= 8000
+    write(poses)
+    scene, kept = load_scene(tmp_path), load_scene(tmp_path, keep_far=True)
+    line = "1 of 17 cameras lie far from the others and are"
+    assert f"{line} left out (--keep-far keeps them): 03.jpg" in scene.notes
+    assert f"{line} kept, as asked: 03.jpg" in kept.notes and len(kept.train) + len(kept.test) == 17
+    assert "03" in sound.train.names and "03" not in scene.train.names + scene.test.names
+    assert scene.test.names == sound.test.names
+    assert not any("check the cameras" in note for note in scene.notes)
+    least = [float(each.train.cameras.origins.norm(dim=-1).median()) for each in (sound, scene, kept)]
+    assert abs(least[1] / least[0] - 1) < 0.1 and least[2] < 1e-3
 
 
 def test_a_video_is_taken_apart(tmp_path, monkeypatch):

@@ -32,7 +32,8 @@ def process(
         matching: Which images are compared: all with all, each with those next to it by name, or those that share
             their largest features (auto).
         camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.
-        mapper: How cameras are found; auto is global, and incremental too if that model has faults.
+        mapper: How cameras are found; auto is global, and incremental too if that model has faults or loses
+            cameras.
         max_features: Of an image.
         verbose: Show what COLMAP says.
     """

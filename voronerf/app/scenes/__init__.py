@@ -71,6 +71,7 @@ def load_scene(
     kind: str = "auto",
     normalise: bool = True,
     images: str = "auto",
+    keep_far: bool = False,
 ) -> Scene:
     """Loads a scene.
 
@@ -89,6 +90,8 @@ def load_scene(
             at distance 1; else the coordinates of the files are kept.
         images: of a folder: keep them in "memory"; on "disk", decoded once into a file of the cache (VORONERF_CACHE, or
             `voronerf` in the user's caches) that is mapped into memory; or "auto": on disk if they do not fit.
+        keep_far: keep photographs whose cameras lie far from the others; they are left out otherwise, since one such
+            camera would give the scene its scale.
 
     Raises:
         SceneError: the data cannot be used; one line that names the file and what is wrong with it.
@@ -140,6 +143,6 @@ def load_scene(
     if format != "auto" and format not in held:
         raise SceneError(f"{folder}: format must be {' or '.join(held)}, which it has, got {format}")
     chosen = held[0] if format == "auto" else format
-    scene = FORMATS[chosen].load(folder, Reading(downscale, allow_outside, kind, normalise, images))
+    scene = FORMATS[chosen].load(folder, Reading(downscale, allow_outside, kind, normalise, images, keep_far))
     others = tuple(f"--format {name} would read {FORMATS[name].sign}" for name in held if name != chosen)
     return replace(scene, notes=(*scene.notes, *others))

@@ -5,7 +5,8 @@ Its stages leave what they found in `OUT/colmap`, where a stopped process goes o
     features   `database.db`: the features of each image
     pairs      `few.db`: the largest features of each image, matched between all; `pairs.json`: those that share some
     matches    `database.db`: matches of those pairs
-    cameras    `global` and, if that model has faults, `incremental`: the better of both becomes `OUT/sparse/0`
+    cameras    `global` and, if that model has faults or loses cameras, `incremental`: the better of both becomes
+               `OUT/sparse/0`, without cameras that few points hold or that lie far from the others
 
 Matching the largest features first is the preemptive matching of Wu 2013, "Towards Linear-time Incremental Structure
 from Motion", section 4; the global mapper is that of Pan et al. 2024, "Global Structure-from-Motion Revisited".
@@ -31,7 +32,7 @@ import torch
 from PIL import Image
 
 from voronerf.app.files import write_text
-from voronerf.app.scenes.colmap import FILES, ColmapImage, depth_bounds, points_seen, read_model
+from voronerf.app.scenes.colmap import FILES, ColmapImage, ColmapModel, depth_bounds, points_seen, read_model
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import listed_images
 from voronerf.app.scenes.images import read_header, read_image
@@ -58,6 +59,10 @@ TRIED = 4
 SEQUENTIAL = 10
 #: Shares of the images with a camera: below the first a model is refused, below the second other mappers are tried.
 LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
+#: A camera is held by so many points that at least three images see. COLMAP asks for as many matches of two images.
+LEAST_HELD = 15
+#: Cameras that a line names.
+MOST_NAMED = 8
 #: Mean error of the points of a sound model, in pixels.
 LARGEST_ERROR = 2.0
 #: The global mapper places cameras by the longest tracks, until each image has so many; triangulation adds the others.
@@ -89,8 +94,8 @@ class Model:
 
     folder: Path  # of its files
     mapper: str  # "global" or "incremental"
-    images: list[ColmapImage]  # in the order of their names
-    placed: int  # images whose camera lies with others
+    images: list[ColmapImage]  # that have a sound camera, in the order of their names
+    lost: dict[str, str]  # names of the other images, and what is wrong with their cameras
     error: float  # mean distance of the points from where they were seen, in pixels
     faults: list[str]  # what is wrong with it, as parts of a line
 
@@ -120,7 +125,8 @@ def process(
         matching: which images are matched: "exhaustive", all with all; "sequential", with those next to them by name;
             "auto", those whose largest features match, and the next two by name.
         camera_model: COLMAP's name of the model of the lens.
-        mapper: "global", "incremental", or "auto": global, and incremental too if its model has faults.
+        mapper: "global", "incremental", or "auto": global, and incremental too if its model has faults or loses
+            cameras.
         max_features: of an image.
         verbose: show what COLMAP says.
         say: takes a line about each step.
@@ -160,15 +166,17 @@ def process(
     _match(stages, [path.name for path in files], settings, shared)
     models: list[Model] = []
     for name in ("global", "incremental"):
-        good = bool(models) and not models[0].faults and models[0].placed >= GOOD_SHARE * len(files)
+        good = bool(models) and not (models[0].faults or models[0].lost)
+        good = good and len(models[0].images) >= GOOD_SHARE * len(files)
         if mapper == name or (mapper == "auto" and not good):
             model = _map(stages, name)
             say(f"{name} mapping: {_described(model, len(files))}")
             models += [model] if model is not None else []
     if not models:
         raise SceneError(f"{source}: COLMAP finds no model: the images must overlap, be sharp and differ in place")
-    best = max(models, key=lambda model: (not model.faults, model.placed, -model.error))
-    faults = best.faults or ["less than half of the images have a camera"] * (best.placed < LEAST_SHARE * len(files))
+    best = max(models, key=lambda model: (not model.faults, len(model.images), -model.error))
+    few = len(best.images) < LEAST_SHARE * len(files)
+    faults = best.faults or ["less than half of the images have a camera"] * few
     if faults:
         raise SceneError(
             f"{out}: no sound model of {len(files)} images: {'; '.join(faults)}. Try --matching exhaustive, "
@@ -184,11 +192,8 @@ def process(
     ]
     with contextlib.suppress(SceneError):  # for a lens that only COLMAP has
         write_transforms(out / "transforms.json", shown)
-    part = _emptied(out / "sparse" / ".0")
-    for name in FILES:
-        shutil.copyfile(best.folder / f"{name}.bin", part / f"{name}.bin")
-    os.replace(part, out / "sparse" / "0")
-    say(f"wrote {out}: cameras of {best.placed} of {len(files)} images; voronerf train --data {out}")
+    _write_sound(pycolmap, best, out / "sparse" / "0")
+    say(f"wrote {out}: cameras of {len(best.images)} of {len(files)} images; voronerf train --data {out}")
 
 
 def _begin(out: Path, settings: Settings) -> Path:
@@ -428,22 +433,53 @@ def _map(stages: Stages, name: str) -> Model | None:
         return None
     largest = max(found, key=lambda path: len(read_model(path).images))
     model = read_model(largest)
+    lost = _lost(model)
+    images = [image for image in model.images if image.name not in lost]
     origins = torch.from_numpy(np.stack([image.pose[:3, 3] for image in model.images]))
-    bounds = [bound for image in model.images if (bound := depth_bounds(image, points_seen(image, model))) is not None]
-    lenses = ((image.camera.lens, image.camera.width) for image in model.images)
-    lost = int(lost_cameras(origins).sum())  # which count as images without a camera
-    faults = camera_faults(origins, torch.tensor(bounds), lenses)
+    bounds = [bound for image in images if (bound := depth_bounds(image, points_seen(image, model))) is not None]
+    faults = camera_faults(origins, torch.tensor(bounds), ((image.camera.lens, image.camera.width) for image in images))
     error = float(colmap.Reconstruction(largest).compute_mean_reprojection_error())
     if error > LARGEST_ERROR:
         faults.append(f"its points are off by {error:.2f} pixels")
-    return Model(largest, name, model.images, len(origins) - lost, error, faults)
+    return Model(largest, name, images, lost, error, faults)
+
+
+def _lost(model: ColmapModel) -> dict[str, str]:
+    """The images of a model whose cameras few points hold or that lie far from the others, and which of both it is."""
+    far = lost_cameras(torch.from_numpy(np.stack([image.pose[:3, 3] for image in model.images])))
+    lost = {}
+    for image, apart in zip(model.images, far.tolist()):
+        held = len(points_seen(image, model))
+        if apart:
+            lost[image.name] = "far from the others"
+        elif held < LEAST_HELD:
+            lost[image.name] = f"held by {held} points"
+    return lost
 
 
 def _described(model: Model | None, images: int) -> str:
     if model is None:
         return "no model"
     rest = "".join(f"; {fault}" for fault in model.faults)
-    return f"{model.placed} of {images} images, points off by {model.error:.2f} pixels{rest}"
+    if model.lost:
+        named = [f"{name} ({why})" for name, why in model.lost.items()]
+        more = [f"{len(named) - MOST_NAMED} more"] * (len(named) > MOST_NAMED)
+        rest += f"; without the cameras of {', '.join(named[:MOST_NAMED] + more)}"
+    return f"{len(model.images)} of {images} images, points off by {model.error:.2f} pixels{rest}"
+
+
+def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
+    """Writes the cameras, images and points of a model, without what is lost."""
+    found = colmap.Reconstruction(model.folder)
+    for image in list(found.images.values()):
+        if image.name in model.lost:
+            found.deregister_frame(image.frame_id)
+    part = _emptied(folder.with_name(f".{folder.name}"))
+    found.write_binary(part)
+    for path in part.iterdir():
+        if path.stem not in FILES:  # of rigs: each image has its pose
+            path.unlink()
+    os.replace(part, folder)
 
 
 def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
