@@ -96,16 +96,11 @@ def distinct_names(paths: list[Path], folder: Path) -> list[str]:
     return names
 
 
-def hold_out(count: int) -> Tensor:
-    """Every 8th of `count` images, from the first."""
-    return torch.arange(count) % HOLD_OUT == 0
-
-
 def photograph_scene(
     source: Path,
     folder: Path,
     views: Sequence[View],
-    held_out: Tensor,
+    held_out: Tensor | None,
     reading: Reading,
     *,
     factor: int,
@@ -118,7 +113,7 @@ def photograph_scene(
         source: the file to name in errors.
         folder: of the scene.
         views: in the order of their names.
-        held_out: bool [c], the test views.
+        held_out: bool [c], the test views; None for every 8th, from the first.
         reading: how the folder is read.
         factor: by which the files are still to be reduced.
         notes: what the loader has to say.
@@ -127,10 +122,11 @@ def photograph_scene(
     places = torch.stack([view.pose[:3, 3] for view in views])
     lost = lost_cameras(places) if len(views) > 2 else torch.zeros(len(views), dtype=torch.bool)
     notes = [*notes, *_far_notes(views, lost, reading.keep_far)]
-    if not reading.keep_far and bool(lost.any()):
-        views, held_out = [view for view, left_out in zip(views, lost.tolist()) if not left_out], held_out[~lost]
-        if not bool(held_out.any()):  # it was the only test view
-            held_out = hold_out(len(views))
+    if not reading.keep_far:
+        views = [view for view, left_out in zip(views, lost.tolist()) if not left_out]
+        held_out = None if held_out is None else held_out[~lost]
+    if held_out is None:
+        held_out = torch.arange(len(views)) % HOLD_OUT == 0
     if len(views) < 2 or not bool(held_out.any()) or bool(held_out.all()):
         raise SceneError(f"{source}: one image is too few, one is held out for testing")
     # Training views first, so that the images of either part are a slice and no copy.
