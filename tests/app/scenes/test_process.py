@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -267,12 +268,69 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
         ("text.mp4", "text.mp4: is no video in a container that is read"),
         ("list.mp4", "list.mp4: is no video in a container that is read"),
         ("images", "must have at least 3 images, got 2"),
+        ("", "must have at least 3 images, got 0; " + str(tmp_path / "images has 2")),
     ):
         refuses(reason, process.process, tmp_path / source, tmp_path / "out", error=SceneError)
     refuses("full: must not exist yet", process.process, tmp_path / "images", tmp_path / "full", error=SceneError)
     refuses("matching must be one of auto", process.process, tmp_path, tmp_path / "out", matching="all")
     refuses("max_features must be at least 100, got 5", process.process, tmp_path, tmp_path / "out", max_features=5)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_images_of_phones_become_jpeg(tmp_path, monkeypatch):
+    heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed")
+    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
+    (tmp_path / "phone").mkdir()
+    for number in range(3):
+        image = Image.new("RGB", (32, 20), (40 * number, 90, 30))
+        exif = image.getexif()
+        exif[0x0110] = "a phone"
+        heif.from_pillow(image).save(tmp_path / f"phone/{number}.HEIC", exif=exif.tobytes())
+    refuses("no model", process.process, tmp_path / "phone", tmp_path / "out", error=SceneError)
+    made = [Image.open(path) for path in sorted((tmp_path / "out/images").iterdir())]
+    assert [image.format for image in made] == ["JPEG"] * 3 and made[0].size == (32, 20)
+    assert made[0].getexif()[0x0110] == "a phone" and abs(made[2].getpixel((5, 5))[0] - 80) < 6
+    (tmp_path / "phone/3.heic").write_bytes(b"no image")
+    refuses("3.heic: cannot be read", process.process, tmp_path / "phone", tmp_path / "new", error=SceneError)
+
+
+def test_images_of_phones_are_named_where_they_cannot_be_read(tmp_path, monkeypatch):
+    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    write_images(tmp_path, [(12, 10)] * 3)
+    for number in range(2):
+        (tmp_path / f"images/{number}.heic").write_bytes(b"an image")
+    said = []
+    refuses("no model", process.process, tmp_path / "images", tmp_path / "out", say=said.append, error=SceneError)
+    assert said[0].endswith("images: 2 HEIC images are left out; pip install pillow-heif reads them")
+    assert len(list((tmp_path / "out/images").iterdir())) == 3
+
+
+def test_features_are_searched_in_smaller_images(tmp_path, pictures, monkeypatch):
+    sizes = []
+    monkeypatch.setattr(process, "_map", lambda *_: None)
+    for size in (None, 100):
+        out = tmp_path / str(size)
+        refuses("no model", process.process, pictures, out, max_features=300, size=size, error=SceneError)
+        with pycolmap.Database.open(out / "colmap/database.db") as opened:
+            sizes.append(min(len(opened.read_keypoints(image.image_id)) for image in opened.read_all_images()))
+    assert sizes[1] < 0.95 * sizes[0]
+    refuses(
+        "was begun with --size 100, not 90", process.process, pictures, out, max_features=300, size=90, error=SceneError
+    )
+    refuses("size must be at least 64, got 9", process.process, pictures, tmp_path / "new", size=9)
+
+
+def test_a_training_of_photographs_without_cameras_points_to_process(tmp_path):
+    write_images(tmp_path / "walk", [(12, 10)] * 2)
+    for folder in (tmp_path / "walk", tmp_path / "walk/images"):
+        refuses(f"voronerf process {tmp_path}/walk/images DIR finds the cameras", load_scene, folder, error=SceneError)
+    (tmp_path / "walk.MOV").touch()
+    refuses(f"voronerf process {tmp_path}/walk.MOV DIR makes one", load_scene, tmp_path / "walk.MOV", error=SceneError)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SceneError) as refused:
+        load_scene(tmp_path / "empty")
+    assert "process" not in str(refused.value)
 
 
 def test_an_image_that_cannot_be_read_is_one_line_and_leaves_nothing(tmp_path, pictures):

@@ -13,6 +13,7 @@ from voronerf.app.scenes.builtin import builtin_scene, city_scene
 from voronerf.app.scenes.builtin.city import city_of
 from voronerf.app.scenes.colmap import find_model, load_colmap
 from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.folders import HEIF, SUFFIXES
 from voronerf.app.scenes.llff import FILE, load_llff
 from voronerf.app.scenes.photographs import Reading
 from voronerf.app.scenes.scene import KINDS, Scene, Split
@@ -24,6 +25,10 @@ BUILTIN_SIZE = 100
 BUILTIN, CITY = "builtin", "builtin-city"  # or with a size, builtin:400, and with blocks, builtin-city:4x4
 CACHED = 100  # pixels a side, from which on the built-in scene is kept
 MOST_PIXELS = 1600  # a side of the built-in scene
+
+
+#: Of files that `voronerf process` may read.
+VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".mpg")
 
 
 class Format(NamedTuple):
@@ -60,6 +65,11 @@ def _computed(size: int) -> Scene:
 def is_builtin(source: str | Path | None) -> bool:
     """Whether a source names a scene that is computed, and no folder."""
     return str(source).partition(":")[0] in (BUILTIN, CITY)
+
+
+def has_images(folder: Path) -> bool:
+    """Whether a folder has images, with or without cameras."""
+    return any(path.suffix.lower() in (*SUFFIXES, *HEIF) for path in folder.iterdir())
 
 
 def load_scene(
@@ -131,14 +141,17 @@ def load_scene(
     if not folder.exists():
         raise SceneError(f"{folder}: there is no such folder")
     if not folder.is_dir():
-        raise SceneError(f"{folder}: is not a folder")
+        hint = f"; of a video, voronerf process {folder} DIR makes one" if folder.suffix.lower() in VIDEOS else ""
+        raise SceneError(f"{folder}: is not a folder{hint}")
     held = [name for name, each in FORMATS.items() if each.held(folder)]
     if "transforms" in held and find_model(folder) == folder / "colmap/sparse/0":
         held.remove("colmap")  # nerfstudio's, whose transforms.json was made of it and says more
         held.append("colmap")
     if not held:
+        none = f"{folder}: is not a scene, it has none of {', '.join(each.sign for each in FORMATS.values())}"
+        photographs = next((each for each in (folder, folder / "images") if each.is_dir() and has_images(each)), None)
         raise SceneError(
-            f"{folder}: is not a scene, it has none of {', '.join(each.sign for each in FORMATS.values())}"
+            none + (f"; voronerf process {photographs} DIR finds the cameras of its images" if photographs else "")
         )
     if format != "auto" and format not in held:
         raise SceneError(f"{folder}: format must be {' or '.join(held)}, which it has, got {format}")

@@ -15,6 +15,7 @@ from Motion", section 4; the global mapper is that of Pan et al. 2024, "Global S
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import itertools
 import json
 import os
@@ -29,13 +30,13 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 
 from voronerf.app.files import write_text
 from voronerf.app.scenes.colmap import FILES, ColmapImage, ColmapModel, depth_bounds, points_seen, read_model
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.folders import listed_images
-from voronerf.app.scenes.images import read_header, read_image
+from voronerf.app.scenes.folders import HEIF, listed_images
+from voronerf.app.scenes.images import UNREADABLE, read_header, read_image
 from voronerf.app.scenes.lenses import MODELS
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
 from voronerf.app.scenes.transforms import Shot, write_transforms
@@ -86,6 +87,7 @@ class Settings(NamedTuple):
     matching: str
     camera_model: str
     max_features: int
+    size: int | None = None
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,7 @@ def process(
     camera_model: str = "SIMPLE_RADIAL",
     mapper: str = "auto",
     max_features: int = 4096,
+    size: int | None = None,
     verbose: bool = False,
     say: Callable[[str], None] = print,
     progress: Progress = lambda stage, done, total: None,
@@ -119,7 +122,7 @@ def process(
     stage found, and a process with the same settings goes on there. `out/sparse/0` appears when all is done.
 
     Args:
-        source: a video, or a folder of PNG or JPEG images.
+        source: a video, or a folder of PNG, JPEG or, with pillow-heif, HEIC images.
         out: the folder to make. It must not exist, be empty, or be that of a process that was stopped.
         frames: of a video, evenly spread.
         matching: which images are matched: "exhaustive", all with all; "sequential", with those next to them by name;
@@ -128,6 +131,8 @@ def process(
         mapper: "global", "incremental", or "auto": global, and incremental too if its model has faults or loses
             cameras.
         max_features: of an image.
+        size: of an image's longer side in pixels, to which it is reduced where features are searched; None for COLMAP's
+            3,200.
         verbose: show what COLMAP says.
         say: takes a line about each step.
         progress: takes the name of a stage, how much of it is done and how much there is; 0 where that is not known.
@@ -142,6 +147,8 @@ def process(
             raise ValueError(f"process: {argument} must be one of {', '.join(known)}, got {value!r:.60}")
     if max_features < 100:
         raise ValueError(f"process: max_features must be at least 100, got {max_features}")
+    if size is not None and size < 64:
+        raise ValueError(f"process: size must be at least 64, got {size}")
     os.environ.setdefault("GLOG_logbuflevel", "-1")  # COLMAP reads it when it is loaded: its log is not held back
     try:
         import pycolmap
@@ -149,7 +156,7 @@ def process(
         raise ImportError("voronerf process needs pycolmap: pip install 'voronerf[colmap]'") from None
     if not source.exists():
         raise SceneError(f"{source}: there is no such video or folder")
-    settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features)
+    settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features, size)
     work = _begin(out, settings)
     log, level = pycolmap.logging, pycolmap.logging.Level
     log.minloglevel, log.logtostderr, log.alsologtostderr = level.INFO.value, False, verbose
@@ -158,7 +165,7 @@ def process(
     for other in (level.WARNING, level.ERROR):  # which are in that log, too
         log.set_log_destination(other, "")
     if not (images := out / "images").is_dir():
-        _gather(source, out, frames)
+        _gather(source, out, frames, say)
     files = listed_images(images)
     shared = len({read_header(path, 1).size for path in files}) == 1
     say(f"{len(files)} images with {'one camera' if shared else 'a camera each'}; {work} keeps what COLMAP finds")
@@ -218,25 +225,32 @@ def _begin(out: Path, settings: Settings) -> Path:
     return work
 
 
-def _gather(source: Path, out: Path, frames: int) -> None:
+def _gather(source: Path, out: Path, frames: int, say: Callable[[str], None]) -> None:
     """Copies the images of a folder, or takes those of a video, to `out/images`.
 
-    COLMAP's lists of pairs separate names by spaces: names have `_` in their place.
+    COLMAP's lists of pairs separate names by spaces: names have `_` in their place. HEIC images become JPEG.
     """
     part = _emptied(out / ".images")
     try:
         if source.is_dir():
-            for path in listed_images(source):
-                read_image(path, min(8, *read_header(path, 1).size))  # COLMAP would take one that is cut off
+            phone = sorted(path for path in source.iterdir() if path.suffix.lower() in HEIF and path.is_file())
+            for path in [*listed_images(source), *_readable(phone, source, say)]:
                 copy = part / "_".join(path.name.split())
+                copy = copy.with_suffix(".jpg") if path in phone else copy
                 if copy.exists():
                     raise SceneError(f"{path}: another image has this name with _ in the place of spaces")
-                shutil.copyfile(path, copy)
+                if path in phone:
+                    _convert_heif(path, copy)
+                else:
+                    read_image(path, min(8, *read_header(path, 1).size))  # COLMAP would take one that is cut off
+                    shutil.copyfile(path, copy)
         else:
             _take_frames(source, part, frames)
         count = len(listed_images(part))
         if count < LEAST_IMAGES:
-            raise SceneError(f"{source}: must have at least {LEAST_IMAGES} images, got {count}")
+            inside = source / "images"
+            hint = f"; {inside} has {len(listed_images(inside))}" if inside.is_dir() else ""
+            raise SceneError(f"{source}: must have at least {LEAST_IMAGES} images, got {count}{hint}")
     except BaseException:
         for made in (part, out / "colmap"):
             shutil.rmtree(made, ignore_errors=True)
@@ -244,6 +258,27 @@ def _gather(source: Path, out: Path, frames: int) -> None:
             out.rmdir()
         raise
     os.replace(part, out / "images")
+
+
+def _readable(phone: Sequence[Path], source: Path, say: Callable[[str], None]) -> Sequence[Path]:
+    """HEIC images, or none with a line about it where the package that reads them is missing."""
+    if phone and importlib.util.find_spec("pillow_heif") is None:
+        say(f"{source}: {len(phone)} HEIC images are left out; pip install pillow-heif reads them")
+        return ()
+    return phone
+
+
+def _convert_heif(path: Path, copy: Path) -> None:
+    """Writes a HEIC image as JPEG, upright, with what it says of its lens."""
+    import pillow_heif
+
+    try:
+        image = pillow_heif.open_heif(path).to_pillow()
+        exif = image.getexif()
+        exif[ExifTags.Base.Orientation] = 1  # it is read upright
+        image.convert("RGB").save(copy, quality=95, exif=exif)
+    except (*UNREADABLE, RuntimeError) as error:
+        raise SceneError(f"{path}: cannot be read: {error}") from None
 
 
 def _take_frames(video: Path, folder: Path, count: int) -> None:
@@ -297,6 +332,8 @@ def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: boo
     colmap, database = stages.colmap, stages.work / "database.db"
     extraction = colmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = settings.max_features
+    if settings.size is not None:
+        extraction.max_image_size = settings.size
     reader = colmap.ImageReaderOptions(camera_model=settings.camera_model)
 
     def extract(some: Sequence[str], where: Path = database) -> None:
@@ -324,6 +361,7 @@ def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: boo
     tried, some = stages.work / "tried.db", names[:: -(-len(names) // TRIED)]
     tried.unlink(missing_ok=True)
     extraction.sift.first_octave = 0
+    stages.progress("features", 0, len(names))
     with _told("features"):
         extract(some, tried)
     with colmap.Database.open(tried) as opened:
