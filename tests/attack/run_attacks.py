@@ -154,9 +154,7 @@ def metrics(rng: random.Random, run: Path, outside: Path) -> None:
 
 def links(rng: random.Random, run: Path, outside: Path) -> None:
     """A folder or a file that leads out of the run."""
-    there = run / rng.choice(
-        ("checkpoints", "images", "plots", "samples", "eval.json", "turntable.mp4", "metrics.jsonl")
-    )
+    there = run / rng.choice(("checkpoints", "images", "plots", "samples", "eval.json", "video.mp4", "metrics.jsonl"))
     if there.is_dir():
         shutil.rmtree(there)
     else:

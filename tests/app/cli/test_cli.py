@@ -76,8 +76,17 @@ def test_pictures_and_videos(run, tmp_path, options):
 
 
 def test_videos_along_a_path(run, tmp_path, fails):
-    succeeds("render", run, "--spiral --frames 2")
-    assert (run / "spiral.mp4").stat().st_size
+    succeeds("render", run, "--frames 2 --size 30x20")
+    assert next(imageio_ffmpeg.read_frames(str(run / "video.mp4")))["size"] == (30, 20)
+    for options, name in (("", "video"), ("--depth", "video_depth")):
+        succeeds("render", run, "--frames 3 --images", options)
+        pictures = [Image.open(path) for path in sorted((run / name).iterdir())]
+        assert [path.filename.rpartition("/")[2] for path in pictures] == [f"{n:05}.png" for n in range(3)]
+        colours = {len(picture.getcolors()) for picture in pictures}
+        assert min(colours) > 20 and {picture.size for picture in pictures} == {(16, 16)}
+    fails("video: must be a new or empty folder", "render", run, "--images")
+    fails("--size must be WIDTHxHEIGHT, such as 1280x720, at most 8192 each, got '30'", "render", run, "--size 30")
+    fails("--size must be WIDTHxHEIGHT", "render", run, "--size 9000x20")
     frames = orbit_cameras(3, radius=3, elevation=10, width=24, height=20, focal=25)
     file = tmp_path / "flight.json"
     write_camera_path(file, CameraPath(frames, fps=5))
@@ -86,7 +95,6 @@ def test_videos_along_a_path(run, tmp_path, fails):
         video = imageio_ffmpeg.read_frames(str(run / "flight.mp4"))
         described = next(video)
         assert (described["size"], described["fps"], len(list(video))) == (size, 5, 3)
-    fails("--spiral must be off with --path", "render", run, "--spiral --path", file)
     fails("flight.json", "render", run, "--path", tmp_path / "no" / "flight.json")
     fails("--fps must be 0.01 to 1000, got 0", "render", run, "--fps 0")
     file.write_text("{}")

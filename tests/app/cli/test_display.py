@@ -4,6 +4,7 @@ from types import SimpleNamespace
 import pytest
 
 from voronerf.app.cli.display import TrainingDisplay, console
+from voronerf.app.cli.process import StageDisplay
 from voronerf.app.train.callbacks import counted
 
 
@@ -44,6 +45,29 @@ def test_a_narrow_terminal_keeps_bar_time_and_psnr(width, absent, monkeypatch):
         console.print(display.progress.get_renderable())
     (line,) = shown.get().splitlines()
     assert len(line) <= width and "50 %" in line and "psnr 22.50 dB" in line and "-:--:--" in line and "━" * 12 in line
+
+
+def test_stages_of_a_process_fit_80_columns_and_say_the_time_left(monkeypatch):
+    monkeypatch.setattr(console, "_width", 80)
+    monkeypatch.setattr(console, "_height", 25)
+    display, now = StageDisplay(), [0.0]
+    display.progress.get_time = lambda: now[0]
+    display.show("features", 0, 500)
+    now[0] = 40.0  # of two parts of four large images
+    display.show("features", 8, 500)
+
+    def shown():
+        with console.capture() as captured:
+            console.print(display.progress.get_renderable())
+        return captured.get().splitlines()
+
+    (line,) = shown()
+    assert line.rstrip().endswith("8 of 500 0:41:00 left")
+    for stage in ("matches", "global mapping: retriangulation and refinement"):
+        display.show(stage, 0, 0)
+    lines = shown()
+    assert len(lines) == 3 and max(map(len, lines)) <= 80
+    assert lines[2].startswith("global mapping: retriangulation and refinement") and "left" not in lines[2]
 
 
 def test_one_is_no_plural():

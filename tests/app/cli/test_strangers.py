@@ -48,7 +48,7 @@ def test_files_that_are_links_are_replaced_and_not_followed(copied, tmp_path):
     mine = tmp_path / "mine"
     mine.write_text("mine")
     partial = f".{os.getpid()}-{threading.get_native_id()}.partial"
-    for name in ("eval.json", partial, f"images/{partial}", f".turntable.{os.getpid()}.mp4", "turntable.mp4"):
+    for name in ("eval.json", partial, f"images/{partial}", f".video.{os.getpid()}.mp4", "video.mp4"):
         (copied / name).unlink(missing_ok=True)
         (copied / name).symlink_to(mine)
     assert main(words("eval --views 1 --panels 1", copied)) == main(words("render --frames 1", copied)) == 0

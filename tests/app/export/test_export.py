@@ -1,6 +1,7 @@
 """Points, meshes and cells of runs whose field is a formula, loaded again."""
 
 import itertools
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -90,11 +91,28 @@ def test_a_mesh_of_an_unbounded_scene_is_what_the_cameras_see(run, tmp_path):
     distance = np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS)
     assert distance.mean() < 0.03 and distance.max() < 0.12  # no walls where space is unknown
     half = torch.tensor([[-1.0, -1, 0], [1.0, 1, 1]])
-    told = []
+    told, said = [], []
     track = lambda parts, name: told.append((name, len(parts))) or parts  # noqa: E731
-    cut = export_mesh(run, tmp_path / "half.ply", resolution=48, box=half, track=track)
+    cut = export_mesh(run, tmp_path / "half.ply", resolution=48, box=half, track=track, say=said.append)
     assert [name for name, count in told if count] == ["views", "fusing"]
+    assert re.fullmatch(r"\d\d% of the surfaces in the views lie outside of the box -1 -1 0 1 1 1 \(--crop .*", said[0])
     assert not cut.is_watertight and cut.vertices[:, 2].min() > -0.01
+
+
+def test_a_mesh_is_what_the_cameras_look_at_and_not_what_lies_around(run, tmp_path):
+    def with_sky(positions, directions, ray_index):  # which is 7 away, and in every picture
+        colour, density = shell(positions, directions, ray_index)
+        return colour, density + 300.0 * (positions.norm(dim=-1) > 2.2)
+
+    renderer = renderer_of({"field": with_sky}, samples=384, contraction=Contraction(torch.zeros(3), 1.2))
+    shown, said = replace(run, scene=replace(run.scene, box=None, far=20.0), renderer=renderer), []
+    mesh = export_mesh(shown, tmp_path / "ball.ply", resolution=48, say=said.append)
+    assert mesh.body_count == 1 and np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS).max() < 0.12
+    share, *corners = (float(number) for number in re.findall(r"-?\d+\.?\d*", said[0])[:7])
+    assert 30 < share < 95 and np.abs(np.abs(corners) - 1.2 * RADIUS).max() < 0.3  # no camera sees it from below
+    assert not said[0].startswith("0%") and len(said) == 1
+    export_mesh(run, tmp_path / "boxed.ply", resolution=16, say=said.append)
+    assert len(said) == 1  # all of a scene with a box is in it
 
 
 def test_points_have_colours_and_normals(run, tmp_path):
@@ -159,8 +177,8 @@ def test_what_is_refused(run, tmp_path, monkeypatch):
     refuses(rule, export_mesh, run, path, resolution=10**6, error=ConfigError)
     refuses("--faces must be at least 4, got 0", export_mesh, run, path, faces=0, error=ConfigError)
     unbounded = replace(run, scene=replace(run.scene, box=None))
+    refuses("--crop must be given", export_points, unbounded, path, error=ConfigError)
     for export in (export_points, export_mesh):
-        refuses("--crop must be given", export, unbounded, path, error=ConfigError)
         rule = "--crop must be x y z of a corner and of a larger one"
         refuses(rule, export, run, path, box=BOX.flip(0), error=ConfigError)
     empty = torch.tensor([[5.0, 5, 5], [6.0, 6, 6]])

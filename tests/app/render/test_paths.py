@@ -1,4 +1,4 @@
-"""Camera paths: the file, smooth ways through keyframes, spirals."""
+"""Camera paths: the file, smooth ways through keyframes, and where cameras were."""
 
 import json
 import math
@@ -7,7 +7,14 @@ import pytest
 import torch
 from helpers import read_json, refuses
 
-from voronerf.app.render.paths import CameraPath, read_camera_path, smooth_path, spiral_cameras, write_camera_path
+from voronerf.app.render.paths import (
+    CameraPath,
+    capture_path,
+    read_camera_path,
+    resized,
+    smooth_path,
+    write_camera_path,
+)
 from voronerf.nerf import Cameras, focus_point, orbit_cameras, turntable_cameras
 from voronerf.nerf.cameras import look_at
 
@@ -104,19 +111,63 @@ def test_smooth_paths_pass_their_keyframes_evenly(closed):
     refuses("keyframes and count must be at least 1, got 6 and 0", smooth_path, keyframes, 0)
 
 
-def test_a_spiral_around_an_object_stays_among_its_cameras():
-    cameras = [
-        orbit_cameras(8, radius=3, elevation=e, width=32, height=24, focal=40, centre=(1, 0, 0)) for e in (10, 50)
-    ]
-    seen = Cameras(*(torch.cat([getattr(c, name) for c in cameras]) for name in ("poses", "intrinsics")), 32, 24)
-    frames = spiral_cameras(seen, 40, near=1, far=5)
-    focus = focus_point(seen)
-    torch.testing.assert_close((frames.origins - focus).norm(dim=-1), torch.full((40,), 3.0), atol=1e-3, rtol=0)
-    pixels, depth = zip(*(frames.project(focus[None], index) for index in range(40)))
+def ring(degrees, radius=3.0, climb=20.0):
+    """Cameras at these angles around (1, 0, 0), some of them higher than others."""
+    angles = torch.tensor(degrees, dtype=torch.float32).deg2rad()
+    target = torch.tensor([1.0, 0, 0])
+    climbs = torch.where(torch.arange(len(angles)) % 2 == 0, climb, climb + 30).deg2rad()
+    around = torch.stack((angles.cos() * climbs.cos(), angles.sin() * climbs.cos(), climbs.sin()), -1)
+    poses = look_at(target + radius * around, target, torch.tensor([0.0, 0, 1]))
+    return Cameras(poses, torch.tensor([[40.0, 40, 16, 12]]).repeat(len(angles), 1), 32, 24)
+
+
+def test_a_path_around_something_is_as_far_and_as_high_as_the_cameras_near_it():
+    seen = ring(range(0, 360, 10))
+    far = torch.arange(36) >= 18  # on the other side twice as far
+    seen.poses[far, :3, 3] = 2 * (seen.origins[far] - torch.tensor([1.0, 0, 0])) + torch.tensor([1.0, 0, 0])
+    frames = capture_path(seen, 40, near=1, far=9)
+    offset = frames.origins - focus_point(seen)
+    reach = offset.norm(dim=-1)
+    assert 2.5 < reach[10] < 3.2 and 5.0 < reach[30] < 6.2  # in the middle of either side
+    assert reach.min() > 2.5 and reach.max() < 6.2 and (offset[:, 2] / reach).asin().rad2deg().sub(35).abs().max() < 5
+    pixels, depth = zip(*(frames.project(focus_point(seen)[None], index) for index in range(40)))
     torch.testing.assert_close(torch.cat(pixels), torch.tensor([[16.0, 12]]).expand(40, 2), atol=1e-2, rtol=0)
-    height = (frames.origins - focus)[:, 2] / 3
-    assert height.min().asin().rad2deg() >= 9.9 and height.max().asin().rad2deg() == pytest.approx(50, abs=0.5)
     assert min(torch.cat(depth)) > 0 and (frames.width, frames.height) == (32, 24)
+    moves = (frames.origins.roll(-1, 0) - frames.origins).norm(dim=-1)
+    assert moves.max() < 4 * moves.min()  # a round, without a jump
+
+
+def test_a_path_does_not_cross_a_gap_between_cameras():
+    frames = capture_path(ring(range(60, 301, 8)), 50, near=1, far=9)
+    angles = torch.atan2(frames.origins[:, 1], frames.origins[:, 0] - 1).rad2deg() % 360
+    assert angles.min() > 57 and angles.max() < 303 and angles.max() - angles.min() > 230
+    moves = (frames.origins.roll(-1, 0) - frames.origins).norm(dim=-1)
+    assert moves.max() < 0.8  # there and back, the last frame beside the first
+
+
+def test_a_path_of_cameras_that_look_outwards_goes_through_them_in_order():
+    angles = torch.arange(12) * torch.pi / 6
+    away = torch.stack((angles.cos(), angles.sin(), 0 * angles), -1)
+    poses = torch.cat([look_at(place[None], 2 * place, torch.tensor([0.0, 0, 1])) for place in away])
+    seen = Cameras(poses, torch.tensor([[40.0, 40, 16, 12]]).repeat(12, 1), 32, 24)
+    assert focus_point(seen) is None
+    frames = capture_path(seen, 48, near=1, far=9)
+    assert torch.cdist(frames.origins, seen.origins).amin(1).max() < 0.3
+    torch.testing.assert_close(frames.poses[[0, 47]], seen.poses[[0, 11]], atol=1e-5, rtol=0)
+    assert len(capture_path(seen, 1, near=1, far=9)) == 1
+
+
+def test_frames_have_the_size_of_most_images_or_another():
+    seen = ring(range(0, 360, 10))
+    upright = torch.arange(36) % 5 == 0
+    sizes = torch.where(upright[:, None], torch.tensor([24, 32]), torch.tensor([32, 24]))
+    seen = Cameras.of_images(seen.poses, seen.intrinsics, sizes)
+    assert (seen.width, seen.height) == (32, 32)
+    frames = capture_path(seen, 5, near=1, far=9)
+    assert (frames.width, frames.height) == (32, 24) and frames.intrinsics[0].tolist() == [40, 40, 16, 12]
+    wide = capture_path(seen, 5, near=1, far=9, size=(128, 72))  # what is above and below is cut off
+    assert (wide.width, wide.height) == (128, 72) and wide.intrinsics[0].tolist() == [160, 160, 64, 36]
+    assert resized(wide, (32, 24)).intrinsics[0].tolist() == pytest.approx([160 / 3, 160 / 3, 16, 12])
 
 
 @pytest.mark.parametrize("towards", [0.0, 4.0])  # parallel cameras, and ones that look at a point
@@ -126,7 +177,7 @@ def test_a_spiral_before_a_scene_looks_where_its_cameras_do(towards):
     target = torch.zeros(3) if towards else origins + torch.tensor([0.0, 4, 0])
     poses = look_at(origins, target, torch.tensor([0.0, 0, 1]))
     seen = Cameras(poses, torch.tensor([[40.0, 40, 16, 12]]).repeat(12, 1), 32, 24)
-    frames = spiral_cameras(seen, 30, near=2, far=1e6)
+    frames = capture_path(seen, 30, near=2, far=1e6)
     offset = frames.origins - torch.tensor([0.0, -4, 0])
     assert (offset.abs().amax(0) <= torch.tensor([0.51, 0.2, 0.31])).all() and offset[:, 0].abs().max() > 0.45
     assert frames.forward[:, 1].min() > 0.97
@@ -134,4 +185,4 @@ def test_a_spiral_before_a_scene_looks_where_its_cameras_do(towards):
     pixels = torch.cat([frames.project(middle, index)[0] for index in range(30)])
     torch.testing.assert_close(pixels, torch.tensor([[16.0, 12]]).expand(30, 2), atol=0.05, rtol=0)
     assert len(turntable_cameras(seen, 5)) == 5
-    refuses("count must be at least 1, got 0", spiral_cameras, seen, 0, near=1, far=2)
+    refuses("count must be at least 1, got 0", capture_path, seen, 0, near=1, far=2)

@@ -1,7 +1,9 @@
 """`voronerf process` on pictures of two walls with a pattern, and on models that have faults."""
 
 import json
+import re
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -121,9 +123,10 @@ def models(tmp_path, monkeypatch, pictures, **found):
         asked.append(name)
         if found[name] is None:
             return None
-        origins = found[name]
-        lost = int(lost_cameras(origins).sum())
-        return process.Model(tmp_path, name, [], len(origins) - lost, 0.5, camera_faults(origins))
+        origins, lost = found[name], lost_cameras(found[name])
+        names = [f"{number:02}.png" for number in lost.nonzero()[:, 0].tolist()]
+        kept = [None] * (len(origins) - len(names))
+        return process.Model(tmp_path, name, kept, dict.fromkeys(names, "far"), 0.5, camera_faults(origins))
 
     monkeypatch.setattr(process, "_match", lambda *_: None)
     monkeypatch.setattr(process, "_map", map_images)
@@ -157,6 +160,8 @@ def test_cameras_far_from_all_others_count_as_missing():
     assert camera_faults(origins) == []  # one is not all
     origins[20:32] *= 30 + torch.arange(12)[:, None] ** 2
     assert lost_cameras(origins).nonzero().flatten().tolist() == [7, *range(20, 32)]
+    together = circle(40) + 5000 * torch.arange(40)[:, None].ge(38)
+    assert lost_cameras(together).nonzero().flatten().tolist() == [38, 39]  # each is the other's neighbour
     assert "depths from 0.02 to 3.52e+04" in camera_faults(circle(), torch.tensor([[0.02, 5.0], [1.0, 3.52e4]]))[0]
     lenses = [colmap_lens("OPENCV", (736, 700, 400, 266, 0.1, 0, p1, 0.01)) for p1 in (0.02, -0.09)]
     assert [camera_faults(circle(), lenses=[(lens, 800)]) for lens in lenses] == [
@@ -174,6 +179,31 @@ def test_cameras_beside_a_burst_are_not_lost():
     assert not lost_cameras(path).any()
 
 
+def test_a_lost_camera_is_named_left_out_and_another_mapper_is_tried(tmp_path, pictures):
+    out, said = tmp_path / "out", []
+    process.process(pictures, out, max_features=300)
+    found = pycolmap.Reconstruction(out / "colmap/global/0")
+    images = {image.name: image for image in found.images.values()}
+    bare, far = images["03_a.png"], images["05_a.png"]
+    for point in bare.get_observation_point2D_idxs()[2:]:
+        found.delete_observation(bare.image_id, point)
+    frame = found.frames[far.frame_id]
+    turn = frame.rig_from_world.rotation
+    frame.rig_from_world = pycolmap.Rigid3d(turn, -turn.matrix() @ (3e4, 0, 0))
+    found.write_binary(out / "colmap/global/0")
+
+    for mapper, kept in (("global", COUNT - 2), ("auto", COUNT)):
+        shutil.rmtree(out / "sparse")
+        said.clear()
+        process.process(pictures, out, max_features=300, mapper=mapper, say=said.append)
+        line = next(line for line in said if line.startswith(f"global mapping: {COUNT - 2} of {COUNT} images"))
+        assert re.search(r"without the cameras of 03_a.png \(held by \d points\), 05_a.png \(far from", line)
+        names = {image.name for image in read_model(out / "sparse/0").images}
+        assert len(names) == kept and ("05_a.png" in names) == (mapper == "auto")
+        assert len(json.loads((out / "transforms.json").read_text())["frames"]) == kept
+        assert f"cameras of {kept} of {COUNT} images" in said[-1]
+
+
 def test_a_scene_says_what_is_wrong_with_its_cameras(tmp_path):
     poses = orbit_cameras(8, radius=4, elevation=20, width=12, height=10, focal=20).poses
     poses[:6, :3, 3] = poses[0, :3, 3] + 1e-6 * poses[:6, :3, 3]
@@ -182,6 +212,30 @@ def test_a_scene_says_what_is_wrong_with_its_cameras(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
     notes = load_scene(tmp_path).notes
     assert any(note.startswith("check the cameras: the cameras have collapsed") for note in notes)
+
+
+def test_a_lost_camera_does_not_give_a_scene_its_scale(tmp_path):
+    poses = orbit_cameras(17, radius=4, elevation=20, width=12, height=10, focal=20).poses
+    write_images(tmp_path, [(12, 10)] * 17)
+
+    def write(poses, numbers=range(17)):
+        frames = [
+            {"file_path": f"images/{i:02}.jpg", "transform_matrix": pose.tolist()} for i, pose in zip(numbers, poses)
+        ]
+        (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
+
+    write(torch.cat((poses[:3], poses[4:])), [*range(3), *range(4, 17)])
+    sound = load_scene(tmp_path)
+    poses[3, :3, 3] *= 8000
+    write(poses)
+    scene, kept = load_scene(tmp_path), load_scene(tmp_path, keep_far=True)
+    line = "1 of 17 cameras lie far from the others and are"
+    assert f"{line} left out (--keep-far keeps them): 03.jpg" in scene.notes
+    assert f"{line} kept, as asked: 03.jpg" in kept.notes and len(kept.train) + len(kept.test) == 17
+    assert not any("check the cameras" in note for note in scene.notes)
+    for ours, without in ((scene.train, sound.train), (scene.test, sound.test)):  # as if it was not there
+        assert ours.names == without.names and torch.equal(ours.cameras.poses, without.cameras.poses)
+    assert kept.train.cameras.origins.norm(dim=-1).median() < 1e-3
 
 
 def test_a_video_is_taken_apart(tmp_path, monkeypatch):
@@ -214,12 +268,69 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
         ("text.mp4", "text.mp4: is no video in a container that is read"),
         ("list.mp4", "list.mp4: is no video in a container that is read"),
         ("images", "must have at least 3 images, got 2"),
+        ("", "must have at least 3 images, got 0; " + str(tmp_path / "images has 2")),
     ):
         refuses(reason, process.process, tmp_path / source, tmp_path / "out", error=SceneError)
     refuses("full: must not exist yet", process.process, tmp_path / "images", tmp_path / "full", error=SceneError)
     refuses("matching must be one of auto", process.process, tmp_path, tmp_path / "out", matching="all")
     refuses("max_features must be at least 100, got 5", process.process, tmp_path, tmp_path / "out", max_features=5)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_images_of_phones_become_jpeg(tmp_path, monkeypatch):
+    heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed")
+    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
+    (tmp_path / "phone").mkdir()
+    for number in range(3):
+        image = Image.new("RGB", (32, 20), (40 * number, 90, 30))
+        exif = image.getexif()
+        exif[0x0110] = "a phone"
+        heif.from_pillow(image).save(tmp_path / f"phone/{number}.HEIC", exif=exif.tobytes())
+    refuses("no model", process.process, tmp_path / "phone", tmp_path / "out", error=SceneError)
+    made = [Image.open(path) for path in sorted((tmp_path / "out/images").iterdir())]
+    assert [image.format for image in made] == ["JPEG"] * 3 and made[0].size == (32, 20)
+    assert made[0].getexif()[0x0110] == "a phone" and abs(made[2].getpixel((5, 5))[0] - 80) < 6
+    (tmp_path / "phone/3.heic").write_bytes(b"no image")
+    refuses("3.heic: cannot be read", process.process, tmp_path / "phone", tmp_path / "new", error=SceneError)
+
+
+def test_images_of_phones_are_named_where_they_cannot_be_read(tmp_path, monkeypatch):
+    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    write_images(tmp_path, [(12, 10)] * 3)
+    for number in range(2):
+        (tmp_path / f"images/{number}.heic").write_bytes(b"an image")
+    said = []
+    refuses("no model", process.process, tmp_path / "images", tmp_path / "out", say=said.append, error=SceneError)
+    assert said[0].endswith("images: 2 HEIC images are left out; pip install pillow-heif reads them")
+    assert len(list((tmp_path / "out/images").iterdir())) == 3
+
+
+def test_features_are_searched_in_smaller_images(tmp_path, pictures, monkeypatch):
+    sizes = []
+    monkeypatch.setattr(process, "_map", lambda *_: None)
+    for size in (None, 100):
+        out = tmp_path / str(size)
+        refuses("no model", process.process, pictures, out, max_features=300, size=size, error=SceneError)
+        with pycolmap.Database.open(out / "colmap/database.db") as opened:
+            sizes.append(min(len(opened.read_keypoints(image.image_id)) for image in opened.read_all_images()))
+    assert sizes[1] < 0.95 * sizes[0]
+    refuses(
+        "was begun with --size 100, not 90", process.process, pictures, out, max_features=300, size=90, error=SceneError
+    )
+    refuses("size must be at least 64, got 9", process.process, pictures, tmp_path / "new", size=9)
+
+
+def test_a_training_of_photographs_without_cameras_points_to_process(tmp_path):
+    write_images(tmp_path / "walk", [(12, 10)] * 2)
+    for folder in (tmp_path / "walk", tmp_path / "walk/images"):
+        refuses(f"voronerf process {tmp_path}/walk/images DIR finds the cameras", load_scene, folder, error=SceneError)
+    (tmp_path / "walk.MOV").touch()
+    refuses(f"voronerf process {tmp_path}/walk.MOV DIR makes one", load_scene, tmp_path / "walk.MOV", error=SceneError)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SceneError) as refused:
+        load_scene(tmp_path / "empty")
+    assert "process" not in str(refused.value)
 
 
 def test_an_image_that_cannot_be_read_is_one_line_and_leaves_nothing(tmp_path, pictures):

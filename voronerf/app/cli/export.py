@@ -40,7 +40,8 @@ def export(
         resolution: Cubes of the mesh along the longest side of the box; default 256, or what fits into memory.
         faces: Triangles of the mesh at the most.
         crop: What is exported, x y z of the lowest and of the highest corner, or "saved" for the viewer's crop; default
-            the scene's box, or that around the sphere of a contraction.
+            the scene's box; of other scenes, what the cameras look at for the mesh, and for points and cells the box
+            around the sphere of the contraction.
         coordinates: Positions are those of the scene as it is rendered, or those of its files: in metres, if the
             capture is in metres.
         opening: How the run is opened.
@@ -64,7 +65,7 @@ def export(
         say(f"wrote {points}: {len(cloud.vertices):,} points")
     if mesh is not None:
         surface = mesh_files.export_mesh(
-            opened, mesh, resolution=resolution, faces=faces, box=box, to_files=to_files, track=tracked
+            opened, mesh, resolution=resolution, faces=faces, box=box, to_files=to_files, track=tracked, say=say
         )
         # An edge of one triangle is the end of a surface.
         end = "open" if np.bincount(surface.edges_unique_inverse).min() == 1 else "closed"

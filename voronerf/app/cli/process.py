@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
 from pathlib import Path
 from typing import Literal
 
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn
+from rich.table import Column
+from rich.text import Text
 
 from voronerf.app.cli.display import console, say
 from voronerf.app.cli.opening import check_counts
@@ -21,22 +24,25 @@ def process(
     camera_model: str = "SIMPLE_RADIAL",
     mapper: Literal["auto", "global", "incremental"] = "auto",
     max_features: int = 4096,
+    size: int | None = None,
     verbose: bool = False,
 ) -> int:
     """Make a scene of a video or of images: COLMAP finds the cameras. A stopped one goes on with the same command.
 
     Args:
-        source: A video, or a folder of PNG or JPEG images.
+        source: A video, or a folder of PNG, JPEG or, with pillow-heif, HEIC images.
         out: The folder to make; it gets images, sparse/0, transforms.json and colmap, which keeps every stage.
         frames: Frames taken of a video, evenly spread.
         matching: Which images are compared: all with all, each with those next to it by name, or those that share
             their largest features (auto).
         camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.
-        mapper: How cameras are found; auto is global, and incremental too if that model has faults.
+        mapper: How cameras are found; auto is global, and incremental too if that model has faults or loses
+            cameras.
         max_features: Of an image.
+        size: Pixels of an image's longer side, to which it is reduced where features are searched; default 3200.
         verbose: Show what COLMAP says.
     """
-    check_counts(frames=frames, max_features=max_features)
+    check_counts(frames=frames, max_features=max_features, size=size)
     display = StageDisplay()
     with display.progress:
         make_scene(
@@ -47,11 +53,31 @@ def process(
             camera_model=camera_model,
             mapper=mapper,
             max_features=max_features,
+            size=size,
             verbose=verbose,
             say=say,
             progress=display.show,
         )
     return 0
+
+
+#: Width of a bar beside the longest name of a stage, in 80 columns.
+BAR = 10
+
+
+class TimeLeft(ProgressColumn):
+    """The time that is left of a stage, from what it has done since it began; else the time that it has taken.
+
+    The column of rich knows the last 30 seconds alone, in which few images may be done.
+    """
+
+    def render(self, task: Task) -> Text:
+        """The text of the column."""
+        taken = task.finished_time if task.finished else task.elapsed
+        if task.finished or not task.total or not task.completed or not taken:
+            return Text(f"{timedelta(seconds=round(taken or 0))}", style="progress.elapsed")
+        left = timedelta(seconds=round(taken * (task.total / task.completed - 1)))
+        return Text(f"{left} left", style="progress.remaining")
 
 
 class StageDisplay:
@@ -62,11 +88,10 @@ class StageDisplay:
 
     def __init__(self) -> None:
         self.progress = Progress(
-            TextColumn("[bold]{task.description:<10}"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.fields[count]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            TextColumn("[bold]{task.description:<10}", table_column=Column(no_wrap=True, overflow="ellipsis")),
+            BarColumn(bar_width=BAR),
+            TextColumn("{task.fields[count]}", table_column=Column(no_wrap=True)),
+            TimeLeft(table_column=Column(no_wrap=True)),
             console=console,
             disable=not console.is_terminal,
             refresh_per_second=4,

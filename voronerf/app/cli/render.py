@@ -1,14 +1,15 @@
-"""``voronerf render``: a video of a trained run."""
+"""``voronerf render``: a video of a trained run, or its frames."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 from voronerf.app.cli.display import say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
-from voronerf.app.export.video import export_video
-from voronerf.app.render.paths import read_camera_path
+from voronerf.app.export.video import check_folder, export_video
+from voronerf.app.render.paths import LONGEST_SIDE, read_camera_path
 from voronerf.app.render.video import check_video
 from voronerf.app.train.config import ConfigError
 
@@ -18,39 +19,59 @@ def render(
     /,
     out: Path | None = None,
     path: Path | None = None,
-    spiral: bool = False,
     frames: int = 60,
     fps: float | None = None,
+    size: str | None = None,
+    images: bool = False,
+    depth: bool = False,
     crop: Crop = None,
     opening: Opening = AS_IN_TRAINING,
 ) -> int:
-    """Render a video of a trained run: a turntable, a spiral, or a camera path.
+    """Render a video of a trained run: a turntable of an object, else where its cameras were, or a camera path.
 
     Args:
         run: The run directory.
-        out: The video file, .mp4; default turntable.mp4, spiral.mp4 or the name of the path in the run directory.
+        out: The video file, .mp4, or with --images a new folder; default video, or the name of the path, in the run
+            directory.
         path: Camera path in nerfstudio's format, such as the viewer saves; it has the frames and their size.
-        spiral: Go where the training cameras are: up and down around an object, or a small spiral before a scene that
-            was taken from one side, for which it is the default.
-        frames: Frames of a turntable or a spiral.
+        frames: Frames of a video without a path.
         fps: Frames per second; default 24, or those of the path.
+        size: Width and height of the frames, such as 1280x720; default those of the training images, or of the path.
+        images: Write the frames as PNG images into a folder.
+        depth: Show how far away things are, near ones in yellow.
         crop: Show a box only, x y z of its lowest and of its highest corner, or "saved" for the viewer's.
         opening: How the run is opened.
     """
     check_counts(frames=frames)
     if fps is not None and not 0.01 <= fps <= 1000:
         raise ConfigError(f"--fps must be 0.01 to 1000, got {fps:g}")
-    if path is not None and spiral:
-        raise ConfigError("--spiral must be off with --path, which has the frames")
+    sides = None if size is None else _sides(size)
     flight = None if path is None else read_camera_path(path)
     if flight is not None:
         flight = replace(flight, frames=flight.frames.downscaled(opening.downscale or 1))
     opened = opening.open_without_images(run)
-    spiral = spiral or opened.scene.kind == "forward"
-    name = path.stem if path is not None else "spiral" if spiral else "turntable"
-    out = out or run / f"{name}.mp4"
-    check_video(out)
-    box = crop_box(opened, crop)
-    export_video(opened, out, flight=flight, spiral=spiral, frames=frames, fps=fps, box=box, track=tracked)
+    name = ("video" if path is None else path.stem) + "_depth" * depth
+    out = out or run / (name if images else f"{name}.mp4")
+    (check_folder if images else check_video)(out)
+    export_video(
+        opened,
+        out,
+        flight=flight,
+        frames=frames,
+        fps=fps,
+        size=sides,
+        images=images,
+        depth=depth,
+        box=crop_box(opened, crop),
+        track=tracked,
+    )
     say(f"wrote {out}")
     return 0
+
+
+def _sides(size: str) -> tuple[int, int]:
+    """Width and height of "1280x720"."""
+    found = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", size)
+    if not found or max(sides := (int(found[1]), int(found[2]))) > LONGEST_SIDE:
+        raise ConfigError(f"--size must be WIDTHxHEIGHT, such as 1280x720, at most {LONGEST_SIDE} each, got {size!r}")
+    return sides

@@ -55,9 +55,12 @@ def picture_of_error(colour: Tensor, truth: Tensor) -> Tensor:
     return mapped((colour - truth).abs().mean(-1) / ERROR_SCALE, "inferno")
 
 
-def picture_of_depth(depth: Tensor, opacity: Tensor) -> Tensor:
-    """Depth [h, w] from near (yellow) to far (dark blue), fading to white with the opacity."""
-    solid = depth[opacity > SOLID]
+def picture_of_depth(depth: Tensor, opacity: Tensor, among: Tensor | None = None) -> Tensor:
+    """Depth [h, w] from near (yellow) to far (dark blue), fading to white with the opacity.
+
+    The colours range from the least to the greatest of the depths ``among`` [n], by default those of the picture.
+    """
+    solid = depth[opacity > SOLID] if among is None else among
     solid = solid[:: 1 + solid.numel() // 2**20]  # torch takes no quantile of more than 2^24
     low, high = (solid.quantile(0.01), solid.quantile(0.99)) if solid.numel() else (depth.min(), depth.max())
     near_to_far = (depth - low) / (high - low).clamp_min(1e-6)

@@ -9,6 +9,7 @@ pixel shows are filled.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from voronerf.app.export.space import (
 )
 from voronerf.app.run import Run
 from voronerf.app.train.config import ConfigError
+from voronerf.nerf.cameras import Cameras, focus_point
 from voronerf.ops._core.checks import available_memory
 
 SUFFIXES = (".ply", ".glb", ".obj")
@@ -43,6 +45,9 @@ REACH = 8
 BLOCK, BLOCKS = 8, 256
 #: Bytes of memory that a node takes at the most, in marching cubes.
 NODE = 16
+#: What cameras look at lies in this share of their pictures. The share of its points that may be outliers, at either
+#: end of the box; how much longer the box is than what lies between; and how many points tell it.
+SHARED, OUTLIERS, LONGER, POINTS = 0.5, 0.02, 1.2, 100_000
 #: Triangles of the smallest part that is kept, as a share of the largest part's.
 SMALLEST = 0.02
 #: Colours count by this power of the cosine between a view's direction and the normal.
@@ -58,25 +63,27 @@ def export_mesh(
     box: Tensor | None = None,
     to_files: bool = False,
     track: Track = in_silence,
+    say: Callable[[str], None] = lambda line: None,
 ) -> Any:
     """Writes the surface of a run as .ply, .glb or .obj, and returns it as a ``trimesh.Trimesh``.
 
     Each vertex has the colour that the training views show there. The mesh of a scene with a box is closed: what is
     behind a surface in every view counts as solid. That of an unbounded scene ends where the box ends, and where no
-    camera looks. Parts with few triangles beside the largest are left out.
+    camera looks; what the box leaves out is said. Parts with few triangles beside the largest are left out.
 
     Args:
         run: The run.
         path: File to write, .ply, .glb or .obj.
         resolution: Cubes along the longest side of the box; default 256, or what fits into memory.
         faces: Triangles at the most.
-        box: [2, 3], what is exported; default the scene's, or that around the sphere of the contraction.
+        box: [2, 3], what is exported; default the scene's, or that of what the cameras look at: :func:`looked_at`.
         to_files: Positions are those of the scene's files, rather than the scene's.
         track: Shows progress: yields the items of a sequence, and is given its name.
+        say: Takes a line about what a box leaves out.
 
     Raises:
-        ConfigError: A resolution that does not fit into memory, fewer than 4 faces, no box, or views that show no
-            surface in it.
+        ConfigError: A resolution that does not fit into memory, fewer than 4 faces, or views that show no surface
+            in the box.
         ImportError: trimesh, scikit-image, scipy or fast-simplification is missing.
         ValueError: Another suffix.
         OSError: The file cannot be written.
@@ -89,12 +96,46 @@ def export_mesh(
     """
     path = Path(path)
     check_export(path, SUFFIXES)
-    mesh = placed(run, _surface(run, resolution, faces, box, track), to_files)
+    mesh = placed(run, _surface(run, resolution, faces, box, track, say), to_files)
     write_geometry(path, mesh)
     return mesh
 
 
-def _surface(run: Run, resolution: int | None, faces: int, box: Tensor | None, track: Track) -> Any:
+def looked_at(views: list[View]) -> Tensor | None:
+    """The box [2, 3] of what cameras look at: of the points that views show, those that lie in the pictures of half of
+    the views, and nearer to what these look at than half of the cameras. None where there are none.
+    """
+    cameras = Cameras.joined([view.camera for view in views])
+    points = torch.cat([view.surface.reshape(-1, 3) for view in views])
+    points = points[points.isfinite().all(-1)]
+    points = points[:: len(points) // POINTS + 1]
+    shared = torch.zeros(len(points))
+    for view in views:
+        shared += _in_picture(points, view)[1]
+    kept = shared >= SHARED * len(views)
+    focus = focus_point(cameras)
+    if focus is not None:
+        kept &= (points - focus).norm(dim=-1) < (cameras.origins - focus).norm(dim=-1).median()
+    if not kept.any():
+        return None
+    low, high = torch.quantile(points[kept], points.new_tensor((OUTLIERS, 1 - OUTLIERS)), dim=0)
+    middle, half = (low + high) / 2, LONGER * (high - low).clamp_min(1e-6) / 2
+    return torch.stack((middle - half, middle + half))
+
+
+def _left_out(views: list[View], box: Tensor) -> str:
+    """A line about the surfaces that lie outside of a box."""
+    points = torch.cat([view.surface.reshape(-1, 3) for view in views])
+    points = points[points.isfinite().all(-1)]
+    inside = ((points >= box[0]) & (points <= box[1])).all(-1)
+    corners = " ".join(f"{x:.3g}" for x in box.flatten().tolist())
+    share = 1 - float(inside.float().mean()) if len(points) else 0.0
+    return f"{share:.0%} of the surfaces in the views lie outside of the box {corners} (--crop takes another)"
+
+
+def _surface(
+    run: Run, resolution: int | None, faces: int, box: Tensor | None, track: Track, say: Callable[[str], None]
+) -> Any:
     import trimesh
     from scipy.ndimage import minimum_filter
     from skimage.measure import marching_cubes
@@ -102,19 +143,27 @@ def _surface(run: Run, resolution: int | None, faces: int, box: Tensor | None, t
     if faces < 4:
         raise ConfigError(f"--faces must be at least 4, got {faces}")
     closed = run.scene.box is not None and box is None
-    low, high = box_of(run, box)
+    cameras = run.scene.train.cameras
+    cameras = cameras.downscaled(-(-max(cameras.width, cameras.height) // LONGEST))
+    if box is not None or closed:
+        box = box_of(run, box)
+        _resolution(box[1] - box[0], resolution)
+    views = views_of(run, cameras, track)
+    box = looked_at(views) if box is None else box
+    empty = ConfigError(f"{run.path}: the training views show no surface in the box")
+    if box is None:
+        raise empty
+    if not closed:
+        say(_left_out(views, box))
+    low, high = box
     extent = high - low
     side = float(extent.max()) / _resolution(extent, resolution)
     blocks = (extent / side / BLOCK).long() + 1
-    cameras = run.scene.train.cameras
-    cameras = cameras.downscaled(-(-max(cameras.width, cameras.height) // LONGEST))
-    views = views_of(run, cameras, track)
     value, seen = _fused(low, side, blocks, views, closed, track)
     shape = tuple(slice(count) for count in ((extent / side).round().long().clamp_min(1) + 1).tolist())
     distance = value[shape].numpy()
     if closed:
         distance = np.pad(distance, 1, constant_values=1)
-    empty = ConfigError(f"{run.path}: the training views show no surface in the box")
     if not distance.min() < 0 < distance.max():
         raise empty
     vertices, triangles, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
@@ -201,12 +250,18 @@ def _distance(points: Tensor, views: list[View], reach: float) -> tuple[Tensor, 
     return torch.where(count > 0, total / count.clamp_min(1), torch.where(inside > 0, -1.0, 1.0)), count > 0
 
 
-def _gap(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
-    """Where a view has points in its picture [n, 2], and how far behind them the surface is [n]; NaN outside of it."""
+def _in_picture(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
+    """Where a view has points [n, 3] in its picture, [n, 2], and which of them lie in it, bool [n]."""
     height, width = view.colour.shape[:2]
     pixels, depth = view.camera.project(points, 0)
     limit = pixels.new_tensor((width, height))
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < limit)).all(-1)
+    return pixels, (depth > 0) & ((pixels >= 0) & (pixels < limit)).all(-1)
+
+
+def _gap(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
+    """Where a view has points in its picture [n, 2], and how far behind them the surface is [n]; NaN outside of it."""
+    width = view.colour.shape[1]
+    pixels, inside = _in_picture(points, view)
     x, y = torch.where(inside[:, None], pixels, 0).long().unbind(-1)
     gap = view.distance.view(-1)[y * width + x] - (points - view.camera.origins[0]).norm(dim=-1)
     return pixels, torch.where(inside, gap, torch.nan)

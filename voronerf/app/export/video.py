@@ -1,17 +1,23 @@
-"""A trained run as a video."""
+"""A trained run as a video, or as its frames."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
-from voronerf.app.evaluate.panels import picture_of_colour
+from voronerf.app.evaluate.panels import SOLID, picture_of_colour, picture_of_depth, save_picture
 from voronerf.app.export.space import Track, in_silence
-from voronerf.app.render.paths import CameraPath, spiral_cameras
+from voronerf.app.render.paths import CameraPath, capture_path, resized
 from voronerf.app.render.video import write_video
 from voronerf.app.run import Run
-from voronerf.nerf.cameras import turntable_cameras
+from voronerf.app.scenes import Scene
+from voronerf.nerf.cameras import Cameras, turntable_cameras
+
+#: Frames that tell the range of depths of a video.
+RANGE_FRAMES = 4
 
 
 def export_video(
@@ -19,44 +25,92 @@ def export_video(
     path: Path | str,
     *,
     flight: CameraPath | None = None,
-    spiral: bool = False,
     frames: int = 60,
     fps: float | None = None,
+    size: tuple[int, int] | None = None,
+    images: bool = False,
+    depth: bool = False,
     box: Tensor | None = None,
     track: Track = in_silence,
 ) -> None:
-    """Renders a video along a camera path, a spiral, or a turntable.
+    """Renders a video, or its frames as images, along a camera path or where the training cameras were.
 
     Args:
         run: The run.
-        path: File to write, .mp4.
-        flight: The frames and their rate; None for a spiral or a turntable.
-        spiral: Go where the training cameras are; a scene that was taken from one side is never turned.
-        frames: Of a spiral or a turntable.
+        path: File to write, .mp4; for images a folder, new or empty.
+        flight: The frames and their rate; None for :func:`video_cameras`.
+        frames: How many there are without a flight.
         fps: Frames a second; None for those of the flight, else 24.
+        size: (width, height) of the frames; None for those of the flight, else of the training images.
+        images: Write a PNG of each frame, 00000.png and so on.
+        depth: Show how far away things are, from near (yellow) to far (dark blue), rather than their colours.
         box: [2, 3], what is shown; None for everything.
         track: Shows progress: yields the items of a sequence, and is given its name.
 
     Raises:
         ConfigError: An empty box.
         ImportError: imageio-ffmpeg is missing.
-        ValueError: Another suffix.
-        OSError: The file cannot be written.
+        ValueError: Another suffix, or a folder that is not empty.
+        OSError: A file cannot be written.
 
     Examples:
         >>> from voronerf.app import Run
         >>> from voronerf.app.export import export_video
         >>> def turn(run: Run) -> None:
-        ...     export_video(run, "turntable.mp4", frames=96)
+        ...     export_video(run, "video.mp4", frames=96)
     """
-    scene = run.scene
+    path = Path(path)
+    if images:
+        check_folder(path)
     shown = run if box is None else run.cropped(box)
     if flight is not None:
-        cameras, fps = flight.frames, fps or flight.fps
-    elif spiral or scene.kind == "forward":
-        cameras = spiral_cameras(scene.train.cameras, frames, near=scene.near, far=scene.far)
+        cameras, fps = flight.frames if size is None else resized(flight.frames, size), fps or flight.fps
     else:
-        cameras = turntable_cameras(scene.train.cameras, frames)
+        cameras = video_cameras(run.scene, frames, size)
     numbers = track(range(len(cameras)), "rendering")
-    pictures = (picture_of_colour(shown.render(cameras, number, heaviest=False).colour) for number in numbers)
-    write_video(Path(path), pictures, fps or 24)
+    pictures = _depths(shown, cameras, numbers) if depth else _colours(shown, cameras, numbers)
+    if not images:
+        write_video(path, pictures, fps or 24)
+        return
+    for number, picture in enumerate(pictures):
+        save_picture(path / f"{number:05d}.png", picture)
+
+
+def video_cameras(scene: Scene, count: int, size: tuple[int, int] | None = None) -> Cameras:
+    """The cameras of a video: a turntable of an object, else a path that stays where the training cameras were.
+
+    Args:
+        scene: Whose training cameras they are like.
+        count: Frames.
+        size: (width, height) of the frames; None for those of the training images.
+    """
+    seen = scene.train.cameras
+    if scene.kind == "object":
+        cameras = turntable_cameras(seen, count)
+        return cameras if size is None else resized(cameras, size)
+    return capture_path(seen, count, near=scene.near, far=scene.far, size=size)
+
+
+def check_folder(folder: Path) -> None:
+    """Raises ValueError for what is no folder that images can be written into, which is new or empty."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder}: must be a new or empty folder for the images")
+
+
+def _colours(run: Run, cameras: Cameras, numbers: Iterable[int]) -> Iterator[Tensor]:
+    for number in numbers:
+        yield picture_of_colour(run.render(cameras, number, heaviest=False).colour)
+
+
+def _depths(run: Run, cameras: Cameras, numbers: Iterable[int]) -> Iterator[Tensor]:
+    """Pictures of depth, or of disparity where rays are sampled by it, on one scale for all frames."""
+
+    def measured(number: int) -> tuple[Tensor, Tensor]:
+        image = run.render(cameras, number, heaviest=False)
+        far = run.scene.spacing == "disparity"
+        return -1 / image.depth.clamp_min(1e-6) if far else image.depth, image.opacity
+
+    some = torch.linspace(0, len(cameras) - 1, min(RANGE_FRAMES, len(cameras))).round().long().tolist()
+    solid = torch.cat([value[opacity > SOLID] for value, opacity in map(measured, some)])
+    for number in numbers:
+        yield picture_of_depth(*measured(number), among=solid)

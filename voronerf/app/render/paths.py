@@ -1,4 +1,4 @@
-"""Camera paths: spirals, smooth paths through keyframes, and nerfstudio's file format.
+"""Camera paths: where the cameras of a capture were, smooth ones through keyframes, and nerfstudio's file format.
 
 c cameras, f frames. Poses and pixels as in :mod:`voronerf.nerf.cameras`.
 
@@ -29,7 +29,12 @@ FARTHEST = 1e9
 #: By which the product of a rotation and its transpose may differ from 1.
 ORTHONORMAL = 2e-3
 #: Above this length of their mean direction, cameras look one way rather than around or about something.
-ONE_WAY = 0.8
+ONE_WAY = 0.95
+#: Angles around what cameras look at, in radians: a gap between cameras that no path crosses, and how far those lie, in
+#: standard deviations, whose distance and height a path has.
+GAP, WINDOW = math.radians(60), math.radians(25)
+#: Frames of a path from one of the cameras to the next.
+BETWEEN = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,58 +170,104 @@ def smooth_path(keyframes: Cameras, count: int, *, closed: bool = False) -> Came
     return Cameras(poses.float(), intrinsics, keyframes.width, keyframes.height)
 
 
-def spiral_cameras(cameras: Cameras, count: int, *, near: float, far: float) -> Cameras:
-    """Two turns that stay where the given cameras are, and end where they began.
+def capture_path(
+    cameras: Cameras, count: int, *, near: float, far: float, size: tuple[int, int] | None = None
+) -> Cameras:
+    """A path that stays where the given cameras were, so that it shows what they have seen.
 
-    Around cameras that look one way, it is the spiral of LLFF (Mildenhall et al. 2019): it has their extent, and looks
-    at what they look at. Otherwise it goes around their focus at their mean distance, up and down between their
-    elevations.
+    Cameras that look one way have the spiral of LLFF (Mildenhall et al. 2019): of their extent, it looks at what they
+    look at. Those around something have a turn around it, at the mean distance and height of the cameras that are near;
+    if they leave a gap, the path goes to its one side and back, without crossing it. Cameras that look outwards have a
+    smooth path through some of them, in their order.
 
     Args:
-        cameras: such as those of the training views; size and focal length are theirs.
+        cameras: such as those of the training views; the focal length is their mean.
         count: frames.
         near: where the scene begins along a ray.
         far: where it ends; both say what parallel cameras look at.
+        size: (width, height) of the frames; None for the one that most of the cameras have.
 
     Raises:
         ValueError: no frame.
 
     Examples:
         >>> from voronerf.nerf import orbit_cameras
-        >>> from voronerf.app.render.paths import spiral_cameras
+        >>> from voronerf.app.render.paths import capture_path
         >>> seen = orbit_cameras(8, radius=2.0, elevation=20.0, width=64, height=64, focal=70.0)
-        >>> frames = spiral_cameras(seen, 60, near=1.0, far=3.0)
+        >>> frames = capture_path(seen, 60, near=1.0, far=3.0)
         >>> bool((frames.origins.norm(dim=-1) - 2).abs().max() < 1e-4)
         True
     """
     if count < 1:
-        raise ValueError(f"spiral_cameras: count must be at least 1, got {count}")
+        raise ValueError(f"capture_path: count must be at least 1, got {count}")
+    focus, forward = focus_point(cameras), cameras.forward.double().mean(0)
+    alike = like_most(cameras)
+    if forward.norm() > ONE_WAY:
+        poses = _spiral(cameras, count, focus, near, far)
+    elif focus is not None:
+        poses = _around(cameras, count, focus.double())
+    else:
+        some = torch.linspace(0, len(cameras) - 1, min(max(count // BETWEEN, 2), len(cameras))).round().long()
+        poses = smooth_path(cameras[some], count).poses
+    focal = float(alike.intrinsics[:, :2].mean())
+    intrinsics = cameras.intrinsics.new_tensor((focal, focal, alike.width / 2, alike.height / 2)).repeat(count, 1)
+    frames = Cameras(poses.float(), intrinsics, alike.width, alike.height)
+    return frames if size is None else resized(frames, size)
+
+
+def like_most(cameras: Cameras) -> Cameras:
+    """Those of the cameras whose images have the commonest size, without their lenses."""
+    sizes = [cameras.size(index) for index in range(len(cameras))]
+    width, height = max(sizes, key=sizes.count)
+    own = torch.tensor([size == (width, height) for size in sizes], device=cameras.poses.device)
+    return Cameras(cameras.poses[own], cameras.intrinsics[own], width, height)
+
+
+def resized(cameras: Cameras, size: tuple[int, int]) -> Cameras:
+    """Cameras without lenses for pictures of another (width, height), which show no more than theirs at either side."""
+    scale = max(size[0] / cameras.width, size[1] / cameras.height)
+    intrinsics = scale * cameras.intrinsics
+    intrinsics[:, 2] += (size[0] - scale * cameras.width) / 2
+    intrinsics[:, 3] += (size[1] - scale * cameras.height) / 2
+    return Cameras(cameras.poses, intrinsics, *size)
+
+
+def _spiral(cameras: Cameras, count: int, focus: Tensor | None, near: float, far: float) -> Tensor:
+    """Poses of two turns before a scene, which end where they began."""
     poses = cameras.poses.double()
     angles = torch.arange(count, dtype=torch.float64, device=poses.device) * (4 * math.pi / count)
     centre, forward = poses[:, :3, 3].mean(0), -poses[:, :3, 2].mean(0)
-    focus = focus_point(cameras)
-    if focus is None or forward.norm() > ONE_WAY:
-        mean = look_at((centre - forward)[None], centre, poses[:, :3, 1].mean(0))[0]
-        mean[:3, 3] = centre
-        extent = torch.quantile(((poses[:, :3, 3] - centre) @ mean[:3, :3]).abs(), 0.9, dim=0)
-        depth = 1 / (0.25 / near + 0.75 / far)
-        if focus is not None:
-            depth = float((focus.double() - centre) @ -mean[:3, 2])
-        swing = torch.stack((angles.cos(), -angles.sin(), -(angles / 2).sin()), dim=-1) * extent
-        target, up = centre - depth * mean[:3, 2], mean[:3, 1]
-        origins = centre + swing @ mean[:3, :3].T
+    mean = look_at((centre - forward)[None], centre, poses[:, :3, 1].mean(0))[0]
+    mean[:3, 3] = centre
+    extent = torch.quantile(((poses[:, :3, 3] - centre) @ mean[:3, :3]).abs(), 0.9, dim=0)
+    depth = 1 / (0.25 / near + 0.75 / far)
+    if focus is not None:
+        depth = float((focus.double() - centre) @ -mean[:3, 2])
+    swing = torch.stack((angles.cos(), -angles.sin(), -(angles / 2).sin()), dim=-1) * extent
+    return look_at(centre + swing @ mean[:3, :3].T, centre - depth * mean[:3, 2], mean[:3, 1])
+
+
+def _around(cameras: Cameras, count: int, focus: Tensor) -> Tensor:
+    """Poses of a turn around a focus, or of a way to and fro in the part of it that has cameras."""
+    up = cameras.poses[:, :3, 1].double().mean(0)
+    up = torch.nn.functional.normalize(up, dim=0) if up.norm() > 0.1 else up.new_tensor((0.0, 0.0, 1.0))
+    axes = look_at(up[None], torch.zeros_like(up), torch.ones_like(up))[0, :3, :3]  # its third column is up
+    local = (cameras.origins.double() - focus) @ axes
+    bearing, reach = torch.atan2(local[:, 1], local[:, 0]), local[:, :2].norm(dim=-1)
+    sorted_bearings = bearing.sort().values
+    gaps = torch.cat((sorted_bearings.diff(), sorted_bearings[:1] + 2 * math.pi - sorted_bearings[-1:]))
+    widest = int(gaps.argmax())
+    at = torch.arange(count, dtype=torch.float64, device=up.device) / count
+    if gaps[widest] < GAP:
+        angles = 2 * math.pi * at
     else:
-        target, up = focus.double(), poses.new_tensor((0.0, 0.0, 1.0))
-        offset = poses[:, :3, 3] - target
-        radius = offset.norm(dim=-1)
-        climbs = (offset[:, 2] / radius.clamp_min(1e-9)).clamp(-0.95, 0.95).asin()
-        low, high = torch.quantile(climbs, climbs.new_tensor((0.1, 0.9)))
-        climb = (low + high) / 2 + (high - low) / 2 * (angles / 2).sin()
-        around = torch.stack((angles.cos() * climb.cos(), angles.sin() * climb.cos(), climb.sin()), dim=-1)
-        origins = target + radius.mean() * around
-    focal = float(cameras.intrinsics[:, :2].mean())
-    intrinsics = cameras.intrinsics.new_tensor((focal, focal, cameras.width / 2, cameras.height / 2)).repeat(count, 1)
-    return Cameras(look_at(origins, target, up).float(), intrinsics, cameras.width, cameras.height)
+        width = 2 * math.pi - gaps[widest]
+        angles = sorted_bearings[(widest + 1) % len(gaps)] + width * (1 - (2 * math.pi * at).cos()) / 2
+    apart = torch.remainder(angles[:, None] - bearing + math.pi, 2 * math.pi) - math.pi
+    shares = torch.softmax(-(apart / WINDOW).square() / 2, dim=-1)
+    reach, height = shares @ reach, shares @ local[:, 2]
+    origins = focus + torch.stack((reach * angles.cos(), reach * angles.sin(), height), dim=-1) @ axes.T
+    return look_at(origins, focus, up)
 
 
 def _read_cameras(entries: Any, key: str, size: tuple[int, int], where: str) -> Cameras:

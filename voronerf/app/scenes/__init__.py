@@ -13,6 +13,7 @@ from voronerf.app.scenes.builtin import builtin_scene, city_scene
 from voronerf.app.scenes.builtin.city import city_of
 from voronerf.app.scenes.colmap import find_model, load_colmap
 from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.folders import HEIF, SUFFIXES
 from voronerf.app.scenes.llff import FILE, load_llff
 from voronerf.app.scenes.photographs import Reading
 from voronerf.app.scenes.scene import KINDS, Scene, Split
@@ -24,6 +25,10 @@ BUILTIN_SIZE = 100
 BUILTIN, CITY = "builtin", "builtin-city"  # or with a size, builtin:400, and with blocks, builtin-city:4x4
 CACHED = 100  # pixels a side, from which on the built-in scene is kept
 MOST_PIXELS = 1600  # a side of the built-in scene
+
+
+#: Of files that `voronerf process` may read.
+VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".mpg")
 
 
 class Format(NamedTuple):
@@ -62,6 +67,11 @@ def is_builtin(source: str | Path | None) -> bool:
     return str(source).partition(":")[0] in (BUILTIN, CITY)
 
 
+def has_images(folder: Path) -> bool:
+    """Whether a folder has images, with or without cameras."""
+    return any(path.suffix.lower() in (*SUFFIXES, *HEIF) for path in folder.iterdir())
+
+
 def load_scene(
     source: str | Path,
     *,
@@ -71,6 +81,7 @@ def load_scene(
     kind: str = "auto",
     normalise: bool = True,
     images: str = "auto",
+    keep_far: bool = False,
 ) -> Scene:
     """Loads a scene.
 
@@ -89,6 +100,8 @@ def load_scene(
             at distance 1; else the coordinates of the files are kept.
         images: of a folder: keep them in "memory"; on "disk", decoded once into a file of the cache (VORONERF_CACHE, or
             `voronerf` in the user's caches) that is mapped into memory; or "auto": on disk if they do not fit.
+        keep_far: keep photographs whose cameras lie far from the others; they are left out otherwise, since one such
+            camera would give the scene its scale.
 
     Raises:
         SceneError: the data cannot be used; one line that names the file and what is wrong with it.
@@ -128,18 +141,21 @@ def load_scene(
     if not folder.exists():
         raise SceneError(f"{folder}: there is no such folder")
     if not folder.is_dir():
-        raise SceneError(f"{folder}: is not a folder")
+        hint = f"; of a video, voronerf process {folder} DIR makes one" if folder.suffix.lower() in VIDEOS else ""
+        raise SceneError(f"{folder}: is not a folder{hint}")
     held = [name for name, each in FORMATS.items() if each.held(folder)]
     if "transforms" in held and find_model(folder) == folder / "colmap/sparse/0":
         held.remove("colmap")  # nerfstudio's, whose transforms.json was made of it and says more
         held.append("colmap")
     if not held:
+        none = f"{folder}: is not a scene, it has none of {', '.join(each.sign for each in FORMATS.values())}"
+        photographs = next((each for each in (folder, folder / "images") if each.is_dir() and has_images(each)), None)
         raise SceneError(
-            f"{folder}: is not a scene, it has none of {', '.join(each.sign for each in FORMATS.values())}"
+            none + (f"; voronerf process {photographs} DIR finds the cameras of its images" if photographs else "")
         )
     if format != "auto" and format not in held:
         raise SceneError(f"{folder}: format must be {' or '.join(held)}, which it has, got {format}")
     chosen = held[0] if format == "auto" else format
-    scene = FORMATS[chosen].load(folder, Reading(downscale, allow_outside, kind, normalise, images))
+    scene = FORMATS[chosen].load(folder, Reading(downscale, allow_outside, kind, normalise, images, keep_far))
     others = tuple(f"--format {name} would read {FORMATS[name].sign}" for name in held if name != chosen)
     return replace(scene, notes=(*scene.notes, *others))

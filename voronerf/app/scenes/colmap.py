@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import choose_images, named_images, stay_inside
 from voronerf.app.scenes.lenses import MODELS, Lens, colmap_lens
-from voronerf.app.scenes.photographs import Reading, View, hold_out, photograph_scene
+from voronerf.app.scenes.photographs import Reading, View, photograph_scene
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.transforms import LARGEST, LONGEST
 
@@ -289,8 +289,7 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
     about = [f"COLMAP model {place.relative_to(folder)} of {len(views)} images, {' and '.join(models)}", *chosen.notes]
     if (folder / "sparse" / "1").is_dir():
         about.append("other models in sparse are not read")
-    held_out = hold_out(len(views))
-    return photograph_scene(model.path, folder, views, held_out, reading, factor=chosen.factor, notes=about)
+    return photograph_scene(model.path, folder, views, None, reading, factor=chosen.factor, notes=about)
 
 
 def points_seen(image: ColmapImage, model: ColmapModel) -> Array:

@@ -15,6 +15,8 @@ from voronerf.app.scenes.photographs import least_factor
 log = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+#: Images of phones, of which `voronerf process` makes JPEG.
+HEIF = (".heic", ".heif")
 
 
 class ImageFolder(NamedTuple):

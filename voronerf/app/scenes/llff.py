@@ -14,7 +14,7 @@ import torch
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import choose_images, listed_images, stay_inside
 from voronerf.app.scenes.lenses import PERSPECTIVE, Lens
-from voronerf.app.scenes.photographs import Reading, View, hold_out, photograph_scene
+from voronerf.app.scenes.photographs import Reading, View, photograph_scene
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.transforms import LARGEST, ORTHONORMAL
 
@@ -50,8 +50,7 @@ def load_llff(folder: Path, reading: Reading) -> Scene:
         lens = Lens((focal, focal, width / 2, height / 2), (0.0,) * 8, PERSPECTIVE)
         views.append(View(file, torch.from_numpy(pose), lens, (width, height), bounds=(float(near), float(far))))
     about = (f"LLFF's {FILE} of {len(views)} images", *chosen.notes)
-    held_out = hold_out(len(views))
-    return photograph_scene(path, folder, views, held_out, reading, factor=chosen.factor, notes=about)
+    return photograph_scene(path, folder, views, None, reading, factor=chosen.factor, notes=about)
 
 
 def _read(path: Path) -> np.ndarray:

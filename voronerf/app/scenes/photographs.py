@@ -39,6 +39,8 @@ FAR = 4.0
 LEAST_NEAR = 0.02
 # Of the bounds of the views: things may be a little nearer than the nearest point, and farther than the farthest.
 NEARER, FARTHER = 0.75, 1.5
+# Cameras that a line names.
+MOST_NAMED = 8
 # Mean of the viewing directions, a unit vector each, from which on they count as one direction.
 PARALLEL = 0.95
 KIND_LINES = {
@@ -71,6 +73,7 @@ class Reading:
     kind: str = "auto"
     normalise: bool = True
     images: str = "auto"
+    keep_far: bool = False
 
 
 def least_factor(longest: float) -> int:
@@ -93,16 +96,11 @@ def distinct_names(paths: list[Path], folder: Path) -> list[str]:
     return names
 
 
-def hold_out(count: int) -> Tensor:
-    """Every 8th of `count` images, from the first."""
-    return torch.arange(count) % HOLD_OUT == 0
-
-
 def photograph_scene(
     source: Path,
     folder: Path,
     views: Sequence[View],
-    held_out: Tensor,
+    held_out: Tensor | None,
     reading: Reading,
     *,
     factor: int,
@@ -115,12 +113,20 @@ def photograph_scene(
         source: the file to name in errors.
         folder: of the scene.
         views: in the order of their names.
-        held_out: bool [c], the test views.
+        held_out: bool [c], the test views; None for every 8th, from the first.
         reading: how the folder is read.
         factor: by which the files are still to be reduced.
         notes: what the loader has to say.
         transform: float64 [4, 4], from the original coordinates to those of the poses.
     """
+    places = torch.stack([view.pose[:3, 3] for view in views])
+    lost = lost_cameras(places) if len(views) > 2 else torch.zeros(len(views), dtype=torch.bool)
+    notes = [*notes, *_far_notes(views, lost, reading.keep_far)]
+    if not reading.keep_far:
+        views = [view for view, left_out in zip(views, lost.tolist()) if not left_out]
+        held_out = None if held_out is None else held_out[~lost]
+    if held_out is None:
+        held_out = torch.arange(len(views)) % HOLD_OUT == 0
     if len(views) < 2 or not bool(held_out.any()) or bool(held_out.all()):
         raise SceneError(f"{source}: one image is too few, one is held out for testing")
     # Training views first, so that the images of either part are a slice and no copy.
@@ -164,9 +170,7 @@ def photograph_scene(
         for part in (slice(count), slice(count, None))
     ]
     parts[0] = replace(parts[0], sparse_depth=find_depths(parts[0], views[:count], frame))
-    faults = camera_faults(poses[:, :3, 3], bounds, ((view.lens, view.size[0]) for view in views))
-    if lost := int(lost_cameras(poses[:, :3, 3]).sum()):
-        faults.append(f"{lost} of {len(poses)} lie far from all others")
+    faults = camera_faults(places, bounds, ((view.lens, view.size[0]) for view in views))
     notes = [*notes, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
     if reading.downscale is None and factor > 1:
         size = f"{cameras.width} x {cameras.height}"
@@ -186,6 +190,18 @@ def photograph_scene(
         to_scene,
         tuple(notes),
     )
+
+
+def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
+    """A line about the views whose cameras lie far from the others, bool [c]: one would give the scene its scale."""
+    names = [view.path.name for view, apart in zip(views, far.tolist()) if apart]
+    if not names:
+        return []
+    if len(names) > MOST_NAMED:
+        names[MOST_NAMED:] = [f"{len(names) - MOST_NAMED} more"]
+    which = f"{int(far.sum())} of {len(views)} cameras lie far from the others"
+    done = "and are kept, as asked" if kept else "and are left out (--keep-far keeps them)"
+    return [f"{which} {done}: {', '.join(names)}"]
 
 
 def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDepth | None:

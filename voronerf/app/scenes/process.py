@@ -5,7 +5,8 @@ Its stages leave what they found in `OUT/colmap`, where a stopped process goes o
     features   `database.db`: the features of each image
     pairs      `few.db`: the largest features of each image, matched between all; `pairs.json`: those that share some
     matches    `database.db`: matches of those pairs
-    cameras    `global` and, if that model has faults, `incremental`: the better of both becomes `OUT/sparse/0`
+    cameras    `global` and, if that model has faults or loses cameras, `incremental`: the better of both becomes
+               `OUT/sparse/0`, without cameras that few points hold or that lie far from the others
 
 Matching the largest features first is the preemptive matching of Wu 2013, "Towards Linear-time Incremental Structure
 from Motion", section 4; the global mapper is that of Pan et al. 2024, "Global Structure-from-Motion Revisited".
@@ -14,6 +15,7 @@ from Motion", section 4; the global mapper is that of Pan et al. 2024, "Global S
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import itertools
 import json
 import os
@@ -28,13 +30,13 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 
 from voronerf.app.files import write_text
-from voronerf.app.scenes.colmap import FILES, ColmapImage, depth_bounds, points_seen, read_model
+from voronerf.app.scenes.colmap import FILES, ColmapImage, ColmapModel, depth_bounds, points_seen, read_model
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.folders import listed_images
-from voronerf.app.scenes.images import read_header, read_image
+from voronerf.app.scenes.folders import HEIF, listed_images
+from voronerf.app.scenes.images import UNREADABLE, read_header, read_image
 from voronerf.app.scenes.lenses import MODELS
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
 from voronerf.app.scenes.transforms import Shot, write_transforms
@@ -58,6 +60,10 @@ TRIED = 4
 SEQUENTIAL = 10
 #: Shares of the images with a camera: below the first a model is refused, below the second other mappers are tried.
 LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
+#: A camera is held by so many points that at least three images see. COLMAP asks for as many matches of two images.
+LEAST_HELD = 15
+#: Cameras that a line names.
+MOST_NAMED = 8
 #: Mean error of the points of a sound model, in pixels.
 LARGEST_ERROR = 2.0
 #: The global mapper places cameras by the longest tracks, until each image has so many; triangulation adds the others.
@@ -81,6 +87,7 @@ class Settings(NamedTuple):
     matching: str
     camera_model: str
     max_features: int
+    size: int | None = None
 
 
 @dataclass(frozen=True)
@@ -89,8 +96,8 @@ class Model:
 
     folder: Path  # of its files
     mapper: str  # "global" or "incremental"
-    images: list[ColmapImage]  # in the order of their names
-    placed: int  # images whose camera lies with others
+    images: list[ColmapImage]  # that have a sound camera, in the order of their names
+    lost: dict[str, str]  # names of the other images, and what is wrong with their cameras
     error: float  # mean distance of the points from where they were seen, in pixels
     faults: list[str]  # what is wrong with it, as parts of a line
 
@@ -104,6 +111,7 @@ def process(
     camera_model: str = "SIMPLE_RADIAL",
     mapper: str = "auto",
     max_features: int = 4096,
+    size: int | None = None,
     verbose: bool = False,
     say: Callable[[str], None] = print,
     progress: Progress = lambda stage, done, total: None,
@@ -114,14 +122,17 @@ def process(
     stage found, and a process with the same settings goes on there. `out/sparse/0` appears when all is done.
 
     Args:
-        source: a video, or a folder of PNG or JPEG images.
+        source: a video, or a folder of PNG, JPEG or, with pillow-heif, HEIC images.
         out: the folder to make. It must not exist, be empty, or be that of a process that was stopped.
         frames: of a video, evenly spread.
         matching: which images are matched: "exhaustive", all with all; "sequential", with those next to them by name;
             "auto", those whose largest features match, and the next two by name.
         camera_model: COLMAP's name of the model of the lens.
-        mapper: "global", "incremental", or "auto": global, and incremental too if its model has faults.
+        mapper: "global", "incremental", or "auto": global, and incremental too if its model has faults or loses
+            cameras.
         max_features: of an image.
+        size: of an image's longer side in pixels, to which it is reduced where features are searched; None for COLMAP's
+            3,200.
         verbose: show what COLMAP says.
         say: takes a line about each step.
         progress: takes the name of a stage, how much of it is done and how much there is; 0 where that is not known.
@@ -136,6 +147,8 @@ def process(
             raise ValueError(f"process: {argument} must be one of {', '.join(known)}, got {value!r:.60}")
     if max_features < 100:
         raise ValueError(f"process: max_features must be at least 100, got {max_features}")
+    if size is not None and size < 64:
+        raise ValueError(f"process: size must be at least 64, got {size}")
     os.environ.setdefault("GLOG_logbuflevel", "-1")  # COLMAP reads it when it is loaded: its log is not held back
     try:
         import pycolmap
@@ -143,7 +156,7 @@ def process(
         raise ImportError("voronerf process needs pycolmap: pip install 'voronerf[colmap]'") from None
     if not source.exists():
         raise SceneError(f"{source}: there is no such video or folder")
-    settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features)
+    settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features, size)
     work = _begin(out, settings)
     log, level = pycolmap.logging, pycolmap.logging.Level
     log.minloglevel, log.logtostderr, log.alsologtostderr = level.INFO.value, False, verbose
@@ -152,7 +165,7 @@ def process(
     for other in (level.WARNING, level.ERROR):  # which are in that log, too
         log.set_log_destination(other, "")
     if not (images := out / "images").is_dir():
-        _gather(source, out, frames)
+        _gather(source, out, frames, say)
     files = listed_images(images)
     shared = len({read_header(path, 1).size for path in files}) == 1
     say(f"{len(files)} images with {'one camera' if shared else 'a camera each'}; {work} keeps what COLMAP finds")
@@ -160,15 +173,17 @@ def process(
     _match(stages, [path.name for path in files], settings, shared)
     models: list[Model] = []
     for name in ("global", "incremental"):
-        good = bool(models) and not models[0].faults and models[0].placed >= GOOD_SHARE * len(files)
+        good = bool(models) and not (models[0].faults or models[0].lost)
+        good = good and len(models[0].images) >= GOOD_SHARE * len(files)
         if mapper == name or (mapper == "auto" and not good):
             model = _map(stages, name)
             say(f"{name} mapping: {_described(model, len(files))}")
             models += [model] if model is not None else []
     if not models:
         raise SceneError(f"{source}: COLMAP finds no model: the images must overlap, be sharp and differ in place")
-    best = max(models, key=lambda model: (not model.faults, model.placed, -model.error))
-    faults = best.faults or ["less than half of the images have a camera"] * (best.placed < LEAST_SHARE * len(files))
+    best = max(models, key=lambda model: (not model.faults, len(model.images), -model.error))
+    few = len(best.images) < LEAST_SHARE * len(files)
+    faults = best.faults or ["less than half of the images have a camera"] * few
     if faults:
         raise SceneError(
             f"{out}: no sound model of {len(files)} images: {'; '.join(faults)}. Try --matching exhaustive, "
@@ -184,11 +199,8 @@ def process(
     ]
     with contextlib.suppress(SceneError):  # for a lens that only COLMAP has
         write_transforms(out / "transforms.json", shown)
-    part = _emptied(out / "sparse" / ".0")
-    for name in FILES:
-        shutil.copyfile(best.folder / f"{name}.bin", part / f"{name}.bin")
-    os.replace(part, out / "sparse" / "0")
-    say(f"wrote {out}: cameras of {best.placed} of {len(files)} images; voronerf train --data {out}")
+    _write_sound(pycolmap, best, out / "sparse" / "0")
+    say(f"wrote {out}: cameras of {len(best.images)} of {len(files)} images; voronerf train --data {out}")
 
 
 def _begin(out: Path, settings: Settings) -> Path:
@@ -213,25 +225,32 @@ def _begin(out: Path, settings: Settings) -> Path:
     return work
 
 
-def _gather(source: Path, out: Path, frames: int) -> None:
+def _gather(source: Path, out: Path, frames: int, say: Callable[[str], None]) -> None:
     """Copies the images of a folder, or takes those of a video, to `out/images`.
 
-    COLMAP's lists of pairs separate names by spaces: names have `_` in their place.
+    COLMAP's lists of pairs separate names by spaces: names have `_` in their place. HEIC images become JPEG.
     """
     part = _emptied(out / ".images")
     try:
         if source.is_dir():
-            for path in listed_images(source):
-                read_image(path, min(8, *read_header(path, 1).size))  # COLMAP would take one that is cut off
+            phone = sorted(path for path in source.iterdir() if path.suffix.lower() in HEIF and path.is_file())
+            for path in [*listed_images(source), *_readable(phone, source, say)]:
                 copy = part / "_".join(path.name.split())
+                copy = copy.with_suffix(".jpg") if path in phone else copy
                 if copy.exists():
                     raise SceneError(f"{path}: another image has this name with _ in the place of spaces")
-                shutil.copyfile(path, copy)
+                if path in phone:
+                    _convert_heif(path, copy)
+                else:
+                    read_image(path, min(8, *read_header(path, 1).size))  # COLMAP would take one that is cut off
+                    shutil.copyfile(path, copy)
         else:
             _take_frames(source, part, frames)
         count = len(listed_images(part))
         if count < LEAST_IMAGES:
-            raise SceneError(f"{source}: must have at least {LEAST_IMAGES} images, got {count}")
+            inside = source / "images"
+            hint = f"; {inside} has {len(listed_images(inside))}" if inside.is_dir() else ""
+            raise SceneError(f"{source}: must have at least {LEAST_IMAGES} images, got {count}{hint}")
     except BaseException:
         for made in (part, out / "colmap"):
             shutil.rmtree(made, ignore_errors=True)
@@ -239,6 +258,27 @@ def _gather(source: Path, out: Path, frames: int) -> None:
             out.rmdir()
         raise
     os.replace(part, out / "images")
+
+
+def _readable(phone: Sequence[Path], source: Path, say: Callable[[str], None]) -> Sequence[Path]:
+    """HEIC images, or none with a line about it where the package that reads them is missing."""
+    if phone and importlib.util.find_spec("pillow_heif") is None:
+        say(f"{source}: {len(phone)} HEIC images are left out; pip install pillow-heif reads them")
+        return ()
+    return phone
+
+
+def _convert_heif(path: Path, copy: Path) -> None:
+    """Writes a HEIC image as JPEG, upright, with what it says of its lens."""
+    import pillow_heif
+
+    try:
+        image = pillow_heif.open_heif(path).to_pillow()
+        exif = image.getexif()
+        exif[ExifTags.Base.Orientation] = 1  # it is read upright
+        image.convert("RGB").save(copy, quality=95, exif=exif)
+    except (*UNREADABLE, RuntimeError) as error:
+        raise SceneError(f"{path}: cannot be read: {error}") from None
 
 
 def _take_frames(video: Path, folder: Path, count: int) -> None:
@@ -292,6 +332,8 @@ def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: boo
     colmap, database = stages.colmap, stages.work / "database.db"
     extraction = colmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = settings.max_features
+    if settings.size is not None:
+        extraction.max_image_size = settings.size
     reader = colmap.ImageReaderOptions(camera_model=settings.camera_model)
 
     def extract(some: Sequence[str], where: Path = database) -> None:
@@ -319,6 +361,7 @@ def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: boo
     tried, some = stages.work / "tried.db", names[:: -(-len(names) // TRIED)]
     tried.unlink(missing_ok=True)
     extraction.sift.first_octave = 0
+    stages.progress("features", 0, len(names))
     with _told("features"):
         extract(some, tried)
     with colmap.Database.open(tried) as opened:
@@ -428,22 +471,53 @@ def _map(stages: Stages, name: str) -> Model | None:
         return None
     largest = max(found, key=lambda path: len(read_model(path).images))
     model = read_model(largest)
+    lost = _lost(model)
+    images = [image for image in model.images if image.name not in lost]
     origins = torch.from_numpy(np.stack([image.pose[:3, 3] for image in model.images]))
-    bounds = [bound for image in model.images if (bound := depth_bounds(image, points_seen(image, model))) is not None]
-    lenses = ((image.camera.lens, image.camera.width) for image in model.images)
-    lost = int(lost_cameras(origins).sum())  # which count as images without a camera
-    faults = camera_faults(origins, torch.tensor(bounds), lenses)
+    bounds = [bound for image in images if (bound := depth_bounds(image, points_seen(image, model))) is not None]
+    faults = camera_faults(origins, torch.tensor(bounds), ((image.camera.lens, image.camera.width) for image in images))
     error = float(colmap.Reconstruction(largest).compute_mean_reprojection_error())
     if error > LARGEST_ERROR:
         faults.append(f"its points are off by {error:.2f} pixels")
-    return Model(largest, name, model.images, len(origins) - lost, error, faults)
+    return Model(largest, name, images, lost, error, faults)
+
+
+def _lost(model: ColmapModel) -> dict[str, str]:
+    """The images of a model whose cameras few points hold or that lie far from the others, and which of both it is."""
+    far = lost_cameras(torch.from_numpy(np.stack([image.pose[:3, 3] for image in model.images])))
+    lost = {}
+    for image, apart in zip(model.images, far.tolist()):
+        held = len(points_seen(image, model))
+        if apart:
+            lost[image.name] = "far from the others"
+        elif held < LEAST_HELD:
+            lost[image.name] = f"held by {held} points"
+    return lost
 
 
 def _described(model: Model | None, images: int) -> str:
     if model is None:
         return "no model"
     rest = "".join(f"; {fault}" for fault in model.faults)
-    return f"{model.placed} of {images} images, points off by {model.error:.2f} pixels{rest}"
+    if model.lost:
+        named = [f"{name} ({why})" for name, why in model.lost.items()]
+        more = [f"{len(named) - MOST_NAMED} more"] * (len(named) > MOST_NAMED)
+        rest += f"; without the cameras of {', '.join(named[:MOST_NAMED] + more)}"
+    return f"{len(model.images)} of {images} images, points off by {model.error:.2f} pixels{rest}"
+
+
+def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
+    """Writes the cameras, images and points of a model, without what is lost."""
+    found = colmap.Reconstruction(model.folder)
+    for image in list(found.images.values()):
+        if image.name in model.lost:
+            found.deregister_frame(image.frame_id)
+    part = _emptied(folder.with_name(f".{folder.name}"))
+    found.write_binary(part)
+    for path in part.iterdir():
+        if path.stem not in FILES:  # of rigs: each image has its pose
+            path.unlink()
+    os.replace(part, folder)
 
 
 def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:

@@ -16,6 +16,11 @@ from voronerf.app.scenes.lenses import Lens
 #: than this share of the distances between all cameras. The first alone would call all lost that stand beside a burst;
 #: bursts of up to 57 % of the cameras leave the second, and so do 42 % that are lost.
 LOST, EXTENT = 8.0, 1 / 3
+#: Cameras that are lost together are neighbours of each other. So lost are also those that are this many times as far
+#: from the middle of all as this share of the cameras is at the most.
+APART, MOST = 10.0, 0.8
+#: Where one camera or at most this share is lost, the others are judged alone. More may be those that a collapse left.
+FEW = 0.1
 #: So many cameras tell the distances between all.
 MOST_CAMERAS = 1000
 #: Cameras have collapsed if their median distance to the nearest other one, times their number, is below this share of
@@ -31,10 +36,12 @@ ASPECT, BENT, TILTED = 0.05, 1.0, 0.05
 
 
 def lost_cameras(origins: Tensor) -> Tensor:
-    """Which cameras [c, 3] lie far away from all others, bool [c]."""
+    """Which cameras [c, 3] lie far away from the others, bool [c]."""
     nearest, some = _nearest(origins), origins[:: len(origins) // MOST_CAMERAS + 1]
     apart = torch.pdist(some)
-    return (nearest > LOST * nearest.median()) & (nearest > apart.sort().values[int(EXTENT * len(apart))])
+    alone = (nearest > LOST * nearest.median()) & (nearest > apart.sort().values[int(EXTENT * len(apart))])
+    distance = (origins - origins.median(0).values).norm(dim=-1)
+    return alone | (distance > APART * distance.sort().values[int(MOST * (len(distance) - 1))])
 
 
 def camera_faults(
@@ -49,6 +56,8 @@ def camera_faults(
     """
     faults = []
     if len(origins) >= 3:
+        lost = lost_cameras(origins)
+        origins = origins[~lost] if int(lost.sum()) <= max(1, FEW * len(lost)) else origins
         near = float(_nearest(origins).median())
         extent = float((origins - origins.mean(0)).norm(dim=-1).mean())
         if near * len(origins) < COLLAPSED * extent:

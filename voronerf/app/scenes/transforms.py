@@ -22,7 +22,7 @@ from voronerf.app.files import leads_outside, read_json, write_text
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import read_header
 from voronerf.app.scenes.lenses import COEFFICIENTS, FISHEYE, FOV, PERSPECTIVE, Lens
-from voronerf.app.scenes.photographs import Reading, View, hold_out, least_factor, photograph_scene
+from voronerf.app.scenes.photographs import Reading, View, least_factor, photograph_scene
 from voronerf.app.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -210,7 +210,7 @@ def load_transforms(folder: Path, reading: Reading) -> Scene:
     if len(frames) < 2:
         raise SceneError(f"{path}: one image is too few, one is held out for testing")
     declared = _declared_split(path, entries, frames)
-    frames, held_out = (frames, hold_out(len(frames))) if declared is None else declared
+    frames, held_out = (frames, None) if declared is None else declared
     return capture_scene(folder, entries, frames, held_out, reading)
 
 
@@ -258,7 +258,7 @@ def has_lens(frames: Sequence[Frame]) -> bool:
 
 
 def capture_scene(
-    folder: Path, entries: dict[str, Any], frames: Sequence[Frame], held_out: Tensor, reading: Reading
+    folder: Path, entries: dict[str, Any], frames: Sequence[Frame], held_out: Tensor | None, reading: Reading
 ) -> Scene:
     """Makes the scene of a capture from its frames, see `load_transforms`."""
     path = frames[0].source

@@ -56,6 +56,9 @@ class SceneSettings:
     what does not fit into memory."""
     allow_outside: bool = False
     """Also read images that lie outside of the scene folder, which it may name by .., an absolute path or a link."""
+    keep_far: bool = False
+    """Keep photographs whose cameras lie far from the others. They are left out otherwise: one lost camera would give
+    the scene its scale."""
 
 
 @dataclass(frozen=True)
