@@ -52,3 +52,15 @@ def test_a_struct_with_other_members_is_refused_at_once():
 def test_what_is_no_shape_is_refused():
     with pytest.raises(AssertionError, match="a tensor is written as dtypes and a shape, got 'floating n'"):
         Shaped.parse("floating n")
+
+
+def test_arguments_are_bound_as_python_binds_them():
+    cells = torch.zeros(1, dtype=torch.int32)
+    assert torch.equal(cell_sort(k=3, cells=cells)[1], cell_sort(cells, 3)[1])
+    for args, options, message in [
+        ((cells, 3), {"k": 3}, r"cell_sort\(\) got multiple values for argument 'k'"),
+        ((cells,), {"count": 3}, r"cell_sort\(\) got an unexpected keyword argument 'count'"),
+        ((cells, 3, "native"), {}, r"cell_sort\(\) takes 2 positional arguments but 3 were given"),
+    ]:
+        with pytest.raises(TypeError, match=message):
+            cell_sort(*args, **options)

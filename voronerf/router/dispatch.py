@@ -89,7 +89,7 @@ class CallPlan:
         return min(n, measured_samples(self.ways)).bit_length() // 2, k
 
     def changed(self, constants: dict[str, Any]) -> list[Source]:
-        """What is not as it was when the module was traced: arguments, attributes and buffers."""
+        """The arguments, attributes and buffers that have changed since the module was traced."""
         fused = self.fused
         if fused is None:
             return []

@@ -411,7 +411,7 @@ _MANY = 4  # cells, of which one that has nearly all samples is suspicious
 
 @torch.no_grad()
 def doubt_of(rule: Any, source: Tensor | None, positions: Tensor, counts: Tensor, centres: Tensor) -> str:
-    """Why what a rule has taken from the first tensor, positions [n, d], may be something else; or an empty text.
+    """Why the positions [n, d] that a rule took from the first tensor may not be positions; or an empty text.
 
     ``counts``, [k], are the samples in each cell.
     """

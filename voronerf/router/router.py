@@ -534,7 +534,7 @@ class VoronoiRouter(nn.Module):
         return found
 
     def _look_at(self, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> None:
-        """Warns, at the first large batch of a training, where positions may be something else."""
+        """Warns, at the first large batch of a training, if what was taken for positions may not be positions."""
         few = positions.numel() < _LARGE * positions.shape[-1]
         if few or not torch.is_grad_enabled() or torch.compiler.is_compiling():
             return

@@ -28,11 +28,12 @@ an instance of it.
 from __future__ import annotations
 
 import collections
+import functools
 import inspect
 import re
 import types
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -45,6 +46,8 @@ from voronerf.ops._core.custom_op import Op, Structs, make_op
 from voronerf.ops._core.derivatives import register_derivatives
 
 F = TypeVar("F", bound=Callable[..., Any])
+Check = Callable[[checks.Checked, dict[str, Any]], None]
+"""Checks one of the values of a call, by the names of its arguments."""
 _DECLARED: dict[str, Declaration] = {}
 _DTYPES = {"floating": FLOATING, "same": LIKE_FIRST, "wide": LIKE_FIRST}
 
@@ -124,30 +127,64 @@ class Argument(NamedTuple):
     optional: bool
     rule: Any
 
-    def lines(self, op: str, detach: bool, bind: bool) -> Iterator[str]:
-        """The check of its value, as Python."""
-        name, kind, rule, place = self.name, self.kind, self.rule, f"'{op}', '{self.name}', {self.name}"
+    def check(self, op: str, detach: bool, bind: bool) -> Check:
+        """What checks its value in a call, and puts it right.
+
+        Args:
+            op: Named in errors.
+            detach: Whether it has no gradients.
+            bind: Whether shapes speak of it.
+        """
+        name, kind, rule = self.name, self.kind, self.rule
         if kind is Tensor:
-            entries = "".join(f", {entry!r}" for entry in rule.shape)
-            if rule.otherwise:
-                question = f"{rule.condition} is not None" if rule.condition else f"{name}.dim() == {len(rule.shape)}"
-                entries = f", *({rule.shape!r} if {question} else {rule.otherwise!r})"
-            if rule.either:
-                yield f"check_tensor({place})"
-            dtypes = "wide" if rule.wide else f"{name}_dtypes"
-            yield f"given.tensor('{name}', {name}, {dtypes}{entries})"
-            if detach and (not rule.dtypes or {*rule.dtypes} & {*FLOATING}):
-                yield f"if {name}.requires_grad: {name} = {name}.detach()"
-        elif kind is int:
-            yield f"check_integer({place}, {rule[0]}, {rule[1]})"
-            if bind:
-                yield f"given.sizes['{name}'] = {name}"
+            return self._check_tensor(op, detach and (not rule.dtypes or bool({*rule.dtypes} & {*FLOATING})))
+        if kind is int:
+
+            def check(given: checks.Checked, values: dict[str, Any]) -> None:
+                checks.check_integer(op, name, values[name], *rule)
+                if bind:
+                    given.sizes[name] = values[name]
+
         elif kind is float:
-            yield f"{name}_rule({place})"
-            yield f"{name} = float({name})"
-        elif isinstance(kind, type):
-            kinds = {bool: f"check_flag({place})", str: f"check_choice({place}, {name}_rule)"}
-            yield kinds.get(kind, f"check_kind({place}, {name}_kind)")
+
+            def check(given: checks.Checked, values: dict[str, Any]) -> None:
+                rule(op, name, values[name])
+                values[name] = float(values[name])
+
+        elif kind is bool:
+
+            def check(given: checks.Checked, values: dict[str, Any]) -> None:
+                checks.check_flag(op, name, values[name])
+
+        elif kind is str:
+
+            def check(given: checks.Checked, values: dict[str, Any]) -> None:
+                checks.check_choice(op, name, values[name], rule)
+
+        else:
+
+            def check(given: checks.Checked, values: dict[str, Any]) -> None:
+                if isinstance(kind, type):
+                    checks.check_kind(op, name, values[name], kind)
+
+        return check
+
+    def _check_tensor(self, op: str, detach: bool) -> Check:
+        name, (dtypes, first, wide, condition, second), either = self.name, self.rule, self.rule.either
+
+        def check(given: checks.Checked, values: dict[str, Any]) -> None:
+            tensor, shape = values[name], first
+            if either:
+                checks.check_tensor(op, name, tensor)
+                shape = first if tensor.dim() == len(first) else second
+            elif condition and values[condition] is None:
+                shape = second
+            own = [torch.promote_types(given.first_float().dtype, torch.float32)] if wide else dtypes
+            given.tensor(name, tensor, own, *shape)
+            if detach and tensor.requires_grad:
+                values[name] = tensor.detach()
+
+        return check
 
 
 class Declaration:
@@ -236,58 +273,38 @@ class Declaration:
         return f"{first} if given.{result.condition} is not None else {second}" if result.condition else first
 
     def public(self, function: Callable[..., Any]) -> Any:
-        """The public function, from its `source`."""
-        parameters = inspect.signature(function).parameters.values()
-        head = [_parameter(each.name, each.empty).replace(kind=each.kind, default=each.default) for each in parameters]
-        self.source = f"def {self.name}{inspect.Signature(head)}:\n" + "".join(f"    {line}\n" for line in self._body())
-        scope: dict[str, Any] = {
-            **{
-                f"check_{name}": getattr(checks, f"check_{name}")
-                for name in ("choice", "count", "flag", "integer", "kind", "tensor")
-            },
-            **{f"{each.name}_rule": each.rule for each in self.arguments},
-            **{f"{each.name}_kind": each.kind for each in self.arguments},
-            **{f"{each.name}_dtypes": each.rule.dtypes for each in self._tensors()},
-            "Checked": checks.Checked,
-            "resolve": self._resolve,
-            "Inputs": self.Inputs,
-            "prepare": self._prepare,
-            "pack": self._pack,
-            "promote_types": torch.promote_types,
-            "float32": torch.float32,
-        }
-        exec(compile(self.source, f"<declaration of {self.name}>", "exec"), scope)
-        made = scope[self.name]
-        made.__doc__, made.__module__, made.__wrapped__ = function.__doc__, function.__module__, function
-        made.__annotations__ = function.__annotations__
-        return made
+        """The public function: it checks its arguments, chooses a backend and calls its implementation."""
+        op, parameters = self.name, inspect.signature(function).parameters
+        defaults = {name: each.default for name, each in parameters.items() if each.default is not each.empty}
+        ordered, positional = (
+            dict.fromkeys(parameters),
+            sum(each.kind is not each.KEYWORD_ONLY for each in parameters.values()),
+        )
+        names, sizes = [each.name for each in self.arguments], {e for each in self._tensors() for e in each.rule.shape}
+        every = [(e.name, e.optional, e.check(op, e.name not in self.smooth, e.name in sizes)) for e in self.arguments]
+        prepare, pack, resolve, smooth, small = self._prepare, self._pack, self._resolve, bool(self.smooth), self._small
 
-    def _body(self) -> Iterator[str]:
-        names = ", ".join(each.name for each in self.arguments)
-        sizes = {entry for each in self._tensors() for entry in each.rule.shape}
-        checked: list[Argument] = []
-        yield f"given = Checked('{self.name}')"
-        for each in self.arguments:
-            if each.kind is Tensor and each.rule.wide and not any(other.rule.wide for other in checked):
-                yield "wide = [promote_types(given.first_float().dtype, float32)]"
-            checked += [each] if each.kind is Tensor else []
-            lines = each.lines(self.name, each.name not in self.smooth, each.name in sizes)
-            if each.optional:
-                yield f"if {each.name} is not None:"
-            yield from (f"    {line}" if each.optional else line for line in lines)
-        if self.smooth:
-            yield "given.no_inference()"
-        for name in self._small:
-            yield f"check_count('{self.name}', '{name}', {name}.numel())"
-        yield from self._run(names)
+        @functools.wraps(function)
+        def public(*args: Any, **options: Any) -> Any:
+            named = {**dict(zip(ordered, args)), **options}
+            values, twice = {**defaults, **named}, len(named) < len(args) + len(options)
+            if twice or len(args) > positional or values.keys() != ordered.keys():
+                function(*args, **options)  # which has no body, and says what is wrong
+            given = checks.Checked(op)
+            for name, optional, check in every:
+                if not optional or values[name] is not None:
+                    check(given, values)
+            if smooth:
+                given.no_inference()
+            for name in small:
+                checks.check_count(op, name, values[name].numel())
+            flat = [values[name] for name in names]
+            if prepare is not None:
+                flat = prepare(self.Inputs(*flat))
+            run = resolve(op, backend=values["backend"], device=flat[0].device, dtype=flat[0].dtype)
+            return run(*flat) if pack is None else pack(run(*flat))
 
-    def _run(self, names: str) -> Iterator[str]:
-        """The call of the implementation, as Python."""
-        if self._prepare is not None:
-            yield f"{names}, = prepare(Inputs({names}))"
-        first = self.arguments[0].name
-        yield f"run = resolve('{self.name}', backend=backend, device={first}.device, dtype={first}.dtype)"
-        yield f"return run({names})" if self._pack is None else f"return pack(run({names}))"
+        return public
 
     def plain(self, fill: Callable[..., None]) -> Callable[..., Any]:
         """An implementation that is no custom op, as nothing traces or differentiates it: `custom_op`, but for that."""

@@ -1,0 +1,80 @@
+"""Samplers and rules of splits of one's own take the place of the library's: nothing asks for their class."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from voronerf import NeRF, OccupancyGrid, VoronoiRouter
+from voronerf.app.scenes import builtin_scene
+from voronerf.app.train import Checkpoints, TrainConfig, build, load, run, snapshot
+from voronerf.nerf import Batch, Occupancy, RayLoss, Rays, Renderer, Sampler, Strategy
+
+
+class Borrowed(Sampler):
+    """A sampler of its own class that has a grid."""
+
+    def __init__(self, other):
+        super().__init__(other.samples, space=other.space)
+        self.other, self.seen = other, 0
+
+    @property
+    def grid(self):
+        return self.other.grid
+
+    def sample(self, rays, near, far, *, jitter=False, generator=None):
+        return self.other.sample(rays, near, far, jitter=jitter, generator=generator)
+
+    def see(self, field, rays, near, far, **options):
+        self.seen += 1
+        return self.other.see(field, rays, near, far, **options)
+
+
+class Never(Strategy):
+    """Counts what a training asks."""
+
+    def __init__(self):
+        self.steps = 0
+
+    def step_post_backward(self, output):
+        self.steps += 1
+        assert output.weights.shape == output.density.shape
+
+    def state_dict(self):
+        return {"steps": torch.tensor(self.steps)}
+
+    def load_state_dict(self, state):
+        self.steps = int(state["steps"])
+
+
+@pytest.mark.native
+def test_a_sampler_with_a_grid_is_fused_and_walks_pictures() -> None:
+    torch.manual_seed(0)
+    box = torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]])
+    grid = OccupancyGrid(box, 8, threshold=0.1)
+    grid.occupied[4:] = False
+    occupancy = Occupancy(grid, 16)
+    router = VoronoiRouter(NeRF(width=16, depth=2), torch.zeros(1, 3))
+    rays = Rays(torch.tensor([[-0.5, 0, -2.0], [0.5, 0, -2]]), torch.tensor([[0.0, 0, 1], [0, 0, 1]]))
+    batch = Batch(rays, torch.ones(2), torch.full((2,), 3.0), torch.rand(2, 3))
+    losses = [RayLoss(Renderer({"field": router}, sampler)) for sampler in (occupancy, Borrowed(occupancy))]
+    assert [loss.why_not_fused() for loss in losses] == [None, None]
+    assert losses[1].explain().startswith("samples: Borrowed, 16 a ray\nloss: networks, colours, loss and gradients in")
+    found = [loss(batch, torch.Generator().manual_seed(1)) for loss in losses]
+    assert torch.equal(found[0].loss, found[1].loss) and 0 < len(found[0].weights) < 32
+    pictures = [loss.renderer.see(rays, batch.near, batch.far) for loss in losses]
+    assert torch.equal(pictures[0].colour, pictures[1].colour) and losses[1].renderer.sampler.seen == 1
+    assert losses[1].renderer.occupancy is grid
+
+
+@pytest.mark.native
+def test_a_training_asks_no_more_of_a_rule_than_strategy_names(tmp_path) -> None:
+    scene, config = builtin_scene(16, train_views=4, test_views=2), TrainConfig(steps=12, cells=(), width=8, rays=64)
+    state = build(config, scene)
+    state.strategy = state.training_step.strategy = Never()
+    run(state, [Checkpoints(tmp_path)])
+    assert state.strategy.steps == state.step == 12 and state.strategy.left == 0
+    again = build(config, scene)
+    again.strategy = Never()
+    load(again, snapshot(state))
+    assert again.strategy.steps == 12
