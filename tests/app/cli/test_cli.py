@@ -131,7 +131,12 @@ def test_exports_of_a_run(run, tmp_path, capsys, fails, monkeypatch):
 def test_info_names_every_backend(capsys):
     succeeds("info")
     output = capsys.readouterr().out
-    for word in ("torch", "reference", "native", "warp", "nearest_centre", "grouped_mlp", "resample"):
+    for word in ("torch", "native", "warp", "extra export", "voronerf info --ops"):
+        assert word in output
+    assert "nearest_centre" not in output and len(output.splitlines()) <= 40  # a screen
+    succeeds("info --ops")
+    output = capsys.readouterr().out
+    for word in ("reference", "native", "warp", "nearest_centre", "grouped_mlp", "resample"):
         assert word in output
 
 

@@ -18,6 +18,7 @@ from voronerf.app.evaluate.panels import contact_sheet, picture_of_cells, pictur
 from voronerf.app.render.video import check_video, write_video
 from voronerf.app.run import Run, open_run
 from voronerf.app.scenes import load_scene
+from voronerf.app.train.callbacks import counted
 from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.run_directory import choose_directory
 from voronerf.nerf.cameras import Cameras, orbit_cameras
@@ -61,7 +62,8 @@ def demo(out: Path | None = None, budget: float = 35.0) -> int:
     here = shlex.quote(str(run))
     at = " ".join(f"{x:g}" for x in TOP)
     say(
-        f"{score} on {scores['views']} views it has not seen, {scores['cells']} cells, {scores['steps']:,} steps: {run}"
+        f"{score} on {scores['views']} views it has not seen, {counted(scores['cells'], 'cell')}, "
+        f"{scores['steps']:,} steps: {run}"
     )
     say(f"wrote {run / 'turn.png'} and {run / 'turn.mp4'}: the scene, and in colour which cell each point belongs to")
     say(f"wrote {run / 'placed.png'}: {program} place {here} {here} --at {at} --scale {SCALE:g}, without training")
@@ -92,6 +94,6 @@ def frames(run: Run, cameras: Cameras, numbers: Iterable[int], score: str) -> It
         yield contact_sheet(
             {
                 f"{cameras.width} x {cameras.height}, {score}": picture_of_colour(image.colour),
-                f"its {run.diagram.num_cells} cells": picture_of_cells(cells, image.opacity, image.colour),
+                f"its {counted(run.diagram.num_cells, 'cell')}": picture_of_cells(cells, image.opacity, image.colour),
             }
         )

@@ -13,6 +13,7 @@ from voronerf.app.export import cells as cell_files
 from voronerf.app.export import mesh as mesh_files
 from voronerf.app.export import points as point_files
 from voronerf.app.export.space import check_export
+from voronerf.app.train.callbacks import counted
 from voronerf.app.train.config import ConfigError
 
 
@@ -74,5 +75,5 @@ def export(
     if cells is not None:
         with busy("cells"):
             scene = cell_files.export_cells(opened, cells, box=box, to_files=to_files)
-        say(f"wrote {cells}: {len(scene.geometry)} of {opened.diagram.num_cells} cells")
+        say(f"wrote {cells}: {len(scene.geometry)} of {counted(opened.diagram.num_cells, 'cell')}")
     return 0

@@ -35,16 +35,20 @@ EXTRAS = {
 }
 
 
-def info(run: Path | None = None, /) -> int:
+def info(run: Path | None = None, /, *, ops: bool = False) -> int:
     """Show what this installation can use: build, instruction set, extras, backends, and why something is missing.
 
     Args:
         run: A run directory: show instead how a step of its training is computed, and why not in a faster way.
+        ops: Show instead where each implementation of each operation runs, and for which dtypes.
     """
     if run is not None:
         opened = open_run(run)
         for line in RayLoss(opened.renderer).explain().splitlines():
             say(line)
+        return 0
+    if ops:
+        _show_ops()
         return 0
     for name, value in backends.describe().items():
         values = value if isinstance(value, dict) else {"": value}
@@ -54,6 +58,12 @@ def info(run: Path | None = None, /) -> int:
     for name, extra in EXTRAS.items():
         text = f"{extra.adds}: {_state(name, extra.modules)}"
         console.print(f"{f'extra {name}':26} {text}", highlight=False, markup=False)
+    say("voronerf info --ops: where each operation runs, and for which dtypes")
+    return 0
+
+
+def _show_ops() -> None:
+    """Prints the table of backends."""
     rows = {(row.op, row.backend): row for row in backends.table()}
     missing = dict.fromkeys(row.reason for row in rows.values() if row.dtypes and row.reason)
     numbers = {reason: number for number, reason in enumerate(missing, 1)}
@@ -68,7 +78,6 @@ def info(run: Path | None = None, /) -> int:
     console.print(table)
     for reason, number in numbers.items():
         console.print(f"[{number}] {reason}", highlight=False, markup=False)
-    return 0
 
 
 def _state(name: str, modules: Sequence[str]) -> str:
