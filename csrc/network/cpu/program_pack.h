@@ -41,8 +41,8 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
 
 VN_INLINE int64_t padded(int64_t width) { return (width + kGranule - 1) / kGranule * kGranule; }
 
-// A product's operand along `depth`, with bfloat16 in pairs: as many steps.
-VN_INLINE int64_t steps_of(int64_t depth) { return VN_HALF ? (depth + 1) / 2 : depth; }
+// A product's operand along `depth`, with bfloat16 in pairs, for tile registers as many as fill them: as many steps.
+VN_INLINE int64_t steps_of(int64_t depth) { return VN_HALF == 2 ? pairs_of(depth) : VN_HALF ? (depth + 1) / 2 : depth; }
 
 // The matrix as it lies in memory: outputs of the product next to each other (`turned`), or its depth.
 struct Matrix {
@@ -82,11 +82,11 @@ struct Matrix {
     const int64_t columns = all - first < kPanel ? all - first : kPanel;
     float* const panel = to + first * depth;
     if (m.turned) {
-      for (int64_t k = 0; k < m.depth; k += 2) {
-        for (int64_t c = 0; c < columns; c += kGranule) {
+      for (int64_t k = 0; k < 2 * depth; k += 2) {
+        for (int64_t c = 0; c < columns; c += kLanes) {
           const int64_t count = m.outputs - first - c;
           const float* from = m.from + k * m.stride + first + c;
-          const F32 even = load_some(from, count);
+          const F32 even = k < m.depth ? load_some(from, count) : splat(0.0f);
           const F32 odd = k + 1 < m.depth ? load_some(from + m.stride, count) : splat(0.0f);
           store(panel + k / 2 * columns + c, interleave(even, odd));
         }

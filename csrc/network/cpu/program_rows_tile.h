@@ -52,7 +52,7 @@ VN_INLINE void widen_row(const uint16_t* from, int64_t width, float* to) {
 
 // To the nearest, ties to even; NaN stays NaN.
 VN_INLINE void round_row(const float* from, int64_t width, uint16_t* to) {
-#if VN_HALF
+#if VN_HALF && VN_ISA == 2
   for (int64_t c = 0; c < width; c += kLanes) {
     const int64_t count = smaller(kLanes, width - c);
     const __m256i rounded = (__m256i)_mm512_cvtneps_pbh(load_some(from + c, count));
@@ -68,10 +68,10 @@ VN_INLINE void round_row(const float* from, int64_t width, uint16_t* to) {
 #endif
 }
 
-#if VN_HALF
-
 // The stride of rows of pairs: whole vectors, which may be written.
-VN_INLINE int64_t pairs_of(int64_t width) { return (width + 2 * kLanes - 1) / (2 * kLanes) * kLanes; }
+VN_INLINE int64_t pairs_of(int64_t width) { return (width + 31) / 32 * 16; }
+
+#if VN_HALF
 
 // Columns as pairs, the last one filled up with 0.
 VN_INLINE void narrow_rows(const Rows& x, int64_t width, int64_t rows, float* to, int64_t stride) {

@@ -3,10 +3,14 @@
 
 #include "encoding/hash_encode_isa.h"
 #include "encoding/spherical_harmonics_tile.h"
-#include "network/cpu/few_outputs_tile.h"
 #include "network/cpu/functions_tile.h"
 #include "network/cpu/program_pack.h"
 #include "network/cpu/program_rows_tile.h"
+#if VN_HALF == 2
+#include "network/cpu/gemm_tiles.h"
+#else
+#include "network/cpu/few_outputs_tile.h"
+#endif
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
@@ -83,7 +87,13 @@ struct ProgramTile {
   void run() const {
     for (int32_t i = 0; i < call.code.step_count; ++i) {
       const ProgramStep& step = call.code.steps[i];
-      run_step(step, call.code.operands + step.first, at(step.slot, step.memory, step.stride));
+      float* const to = at(step.slot, step.memory, step.stride);
+      run_step(step, call.code.operands + step.first, to);
+#if VN_HALF == 2
+      if (step.pairs >= 0 && step.op != ProgramOp::linear) {
+        narrow_rows({to, step.stride, false}, step.width, rows, slot(step.pairs), pairs_of(step.width));
+      }
+#endif
     }
   }
 
@@ -224,35 +234,51 @@ struct ProgramTile {
       const Rows x = operand(operands[i]);
       sources[i] = {x.data, x.stride, steps_of(operands[i].width)};
     }
-    float* pairs = nullptr;
-    int64_t pairs_stride = 0;
+    float* const pairs = step.pairs < 0 ? nullptr : slot(step.pairs);
+    const int64_t pairs_stride = pairs_of(step.width);
+    bool slope_in_pairs = false;
 #if VN_HALF
-    sources[0].stride = pairs_of(step.depth);  // of pairs there is one source
-    if (operands[0].pairs >= 0) {
-      sources[0].data = slot(operands[0].pairs);
-    } else {
-      narrow_rows(operand(operands[0]), step.depth, rows, scratch(0), sources[0].stride);
-      sources[0].data = scratch(0);
-    }
-    if (step.pairs >= 0) {
-      pairs = slot(step.pairs);
-      pairs_stride = pairs_of(step.width);
+    const Rows x = in_pairs(operands[0], scratch(0));
+    sources[0].data = x.data;  // of pairs there is one source
+    sources[0].stride = x.stride;
+#endif
+#if VN_HALF == 2
+    if (slopes && operands[step.taken - 1].pairs >= 0) {
+      slope = slot(operands[step.taken - 1].pairs);
+      slope_in_pairs = true;
     }
 #endif
+#if VN_HALF < 2
     if (step.order > 0) {
       const auto product = step.order == 1 ? few_outputs<1> : few_outputs<4>;
       return product(sources, count, weights, depth, add.data, step.finish == ProgramFinish::relu, rows, to);
     }
+#endif
     float* const c = pairs == nullptr || step.floats ? to : nullptr;
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       const int64_t columns = smaller(kPanel, step.stride - first);
+      const auto from = [=](float* at, bool of_pairs) { return at == nullptr ? at : at + (of_pairs ? first / 2 : first); };
       const float* start = add.data == kZeros ? kZeros : add.data + first;
-      multiply<false>({sources, count, weights + first * depth, columns, start, add.stride,
-                       c == nullptr ? c : c + first, step.stride, finish, slope == nullptr ? nullptr : slope + first,
-                       pairs == nullptr ? pairs : pairs + first / 2, pairs_stride},
-                      rows, columns);
+      const float* by = slope == nullptr ? nullptr : slope + (slope_in_pairs ? first / 2 : first);
+      const Product product{sources, count,  weights + first * depth, columns,      start,         add.stride, from(c, false),
+                            step.stride, finish, by, from(pairs, true), pairs_stride, slope_in_pairs};
+#if VN_HALF == 2
+      multiply_tiles(product, rows, columns);
+#else
+      multiply<false>(product, rows, columns);
+#endif
     }
   }
+
+#if VN_HALF
+  // An operand of a product as pairs: those there are, or made in `free`.
+  Rows in_pairs(const ProgramOperand& of, float* free) const {
+    const int64_t stride = pairs_of(of.width);
+    if (of.pairs >= 0) return {slot(of.pairs), stride, false};
+    narrow_rows(operand(of), of.width, rows, free, stride);
+    return {free, stride, false};
+  }
+#endif
 
   void total(const ProgramStep& step, const Rows& x, float* to) const {
     const int64_t group = step.number;
@@ -389,6 +415,19 @@ struct ProgramTile {
   void outer(const ProgramStep& step, const ProgramOperand* operands) const {
     float* const to = partial + step.number;
     const ProgramOperand &of_a = operands[step.order ? 0 : 1], &of_b = operands[step.order ? 1 : 0];
+#if VN_HALF == 2
+    const int64_t depth = pairs_of(rows);
+    const Source source{scratch(0), depth, depth}, other{scratch(1), padded(of_b.width), depth};
+    pairs_of_rows(of_a, [&](int64_t row, int64_t column, const F32* v) {
+      F32 turned[kLanes];
+      for (int i = 0; i < kLanes; ++i) turned[i] = v[i];
+      transpose(turned);
+      for (int i = 0; i < kLanes; ++i) store(scratch(0) + (column + i) * depth + row / 2, turned[i]);
+    });
+    pairs_of_rows(of_b, [&](int64_t row, int64_t column, const F32* v) {
+      for (int i = 0; i < kLanes; ++i) store(scratch(1) + (row / 2 + i) * other.stride + column, v[i]);
+    });
+#else
     const Rows a = operand(of_a), b = operand(of_b);
     Source source{a.data, a.stride, rows}, other{b.data, b.stride, rows};
 #if VN_HALF
@@ -397,13 +436,52 @@ struct ProgramTile {
     interleave_columns(a, source.stride, rows, scratch(0));
     interleave_columns(b, other.stride, rows, scratch(1));
 #endif
+#endif
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       float* c = to + first;
-      multiply<true>({&source, 1, other.data + first, other.stride, fill ? kZeros : c, fill ? 0 : step.stride, c,
-                      step.stride, Finish::none, nullptr, nullptr, 0},
-                     of_a.width, smaller(kPanel, step.stride - first));
+      const Product product{&source, 1, other.data + first, other.stride, fill ? kZeros : c, fill ? 0 : step.stride,
+                            c, step.stride, Finish::none, nullptr, nullptr, 0, false};
+      const int64_t columns = smaller(kPanel, step.stride - first);
+#if VN_HALF == 2
+      multiply_tiles(product, of_a.width, columns);
+#else
+      multiply<true>(product, of_a.width, columns);
+#endif
     }
   }
+
+#if VN_HALF == 2
+  // body(row, column, v) for 2 kLanes rows and kLanes columns at a time: v[i] are the pairs of rows row + 2 i and its
+  // neighbour. Behind the last row there are zeros.
+  template <typename Body>
+  VN_INLINE void pairs_of_rows_at(const ProgramTile& tile, const ProgramOperand& of, const Body& body) {
+    const Rows x = of.pairs >= 0 ? Rows{tile.slot(of.pairs), pairs_of(of.width), false} : tile.operand(of);
+    const int64_t columns = padded(of.width), end = 2 * pairs_of(tile.rows);
+    for (int64_t row = 0; row < end; row += 2 * kLanes) {
+      for (int64_t column = 0; column < columns; column += 2 * kLanes) {
+        F32 low[kLanes], high[kLanes];
+        for (int64_t i = 0; i < kLanes; ++i) {
+          const auto at = [&](int64_t number, int64_t c) {
+            return number < tile.rows ? x.vector(x, number, c) : splat(0.0f);
+          };
+          const int64_t even = row + 2 * i, odd = even + 1;
+          if (of.pairs >= 0) {
+            zip_halves(at(even, column / 2), at(odd, column / 2), low[i], high[i]);
+          } else {
+            low[i] = interleave(at(even, column), at(odd, column));
+            if (column + kLanes < columns) high[i] = interleave(at(even, column + kLanes), at(odd, column + kLanes));
+          }
+        }
+        body(row, column, low);
+        if (column + kLanes < columns) body(row, column + kLanes, high);
+      }
+    }
+  }
+  template <typename Body>
+  void pairs_of_rows(const ProgramOperand& of, const Body& body) const {
+    pairs_of_rows_at(*this, of, body);
+  }
+#endif
 };
 
 [[maybe_unused]] void run_tiles(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed,
