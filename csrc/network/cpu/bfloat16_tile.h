@@ -89,11 +89,6 @@ VN_INLINE F32 widened(F32 pairs, int half) {
   return made;
 }
 
-VN_INLINE void zip_halves(F32 even, F32 odd, F32& low, F32& high) {
-  low = interleave(widened(even, 0), widened(odd, 0));
-  high = interleave(widened(even, 1), widened(odd, 1));
-}
-
 #endif
 
 // `width` floats -> pairs, the last filled up with 0. Whole vectors are written: 16 pairs at a time.

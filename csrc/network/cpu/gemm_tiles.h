@@ -16,147 +16,224 @@ inline namespace tiles_of_pairs {
 namespace {
 
 constexpr int64_t kBlock = 2 * kTileRows, kStep = 16;  // rows and columns of a block, pairs of a register
+constexpr int64_t kFloat = sizeof(float);
+
+template <int N>
+struct Register {
+  static constexpr int kNumber = N;
+};
 
 // For blocks of up to so many rows: registers 0 to 3 are sums, 4 and 5 A, 6 and 7 B.
 VN_INLINE void shape_for(int64_t rows) {
   TileShapes shapes;
   for (int i = 0; i < 8; ++i) {
-    const int64_t own = i > 5 ? kTileRows : rows - (i < 4 ? i / 2 : i % 2) * kTileRows;
+    const int64_t own = i > 5 ? kTileRows : rows - i % 2 * kTileRows;
     shapes.bytes[i] = kTileBytes;
     shapes.rows[i] = static_cast<uint8_t>(own > kTileRows ? kTileRows : own < 1 ? 1 : own);
   }
   shape_tiles(shapes);
 }
 
-template <int R, int C>
-VN_INLINE void block_products(const Product& p, int64_t row, int64_t column, float* to, int64_t to_stride) {
-  constexpr int64_t kFloat = sizeof(float);
-  if (p.start == kZeros) {
-    tile_zero<0>();
-    if (C > 1) tile_zero<1>();
-    if (R > 1) tile_zero<2>();
-    if (R > 1 && C > 1) tile_zero<3>();
-  } else {
-    const float* const start = p.start + row * p.start_stride + column;
-    const int64_t stride = p.start_stride * kFloat;
-    tile_load<0>(start, stride);
-    if (C > 1) tile_load<1>(start + kTileRows, stride);
-    if (R > 1) tile_load<2>(start + kTileRows * p.start_stride, stride);
-    if (R > 1 && C > 1) tile_load<3>(start + kTileRows * p.start_stride + kTileRows, stride);
-  }
-  const Source& source = *p.sources;
-  const float *a = source.data + row * source.stride, *b = p.b + column;
-  const int64_t a_stride = source.stride * kFloat, b_stride = p.b_stride * kFloat;
-  for (int64_t k = 0; k < source.depth; k += kStep, a += kStep, b += kStep * p.b_stride) {
-    tile_load<6>(b, b_stride);
-    tile_load<4>(a, a_stride);
-    tile_products<0, 4, 6>();
-    if (R > 1) {
-      tile_load<5>(a + kTileRows * source.stride, a_stride);
-      tile_products<2, 5, 6>();
-    }
-    if (C > 1) {
-      tile_load<7>(b + kTileRows, b_stride);
-      tile_products<1, 4, 7>();
-      if (R > 1) tile_products<3, 5, 7>();
-    }
-  }
-  tile_store<0>(to, to_stride * kFloat);
-  if (C > 1) tile_store<1>(to + kTileRows, to_stride * kFloat);
-  if (R > 1) tile_store<2>(to + kTileRows * to_stride, to_stride * kFloat);
-  if (R > 1 && C > 1) tile_store<3>(to + kTileRows * to_stride + kTileRows, to_stride * kFloat);
-}
-
-// A block whose sums are in memory, [rows][kBlock].
-struct Sums {
-  const float* data;
-  int64_t row, column, rows, columns;
+// Blocks of the same size: rows and columns [from, end), `row_step` and `column_step` of each.
+struct Blocks {
+  int64_t row, row_end, row_step, column, column_end, column_step;
 };
-
-// Columns [column, column + kLanes) of a row of sums, behind the last of which there are zeros.
-VN_INLINE F32 sum_of(const Sums& sums, int64_t row, int64_t column) {
-  return column < sums.columns ? load(sums.data + row * kBlock + column) : splat(0.0f);
-}
+// A block whose sums lie at `sums`, in rows of kBlock.
+struct Block {
+  int64_t row, column, rows;
+  const float* sums;
+};
+enum class Slope { none, relu, floats, pairs };
 
 // Where a slope is 0 or less, the result is 0.
 VN_INLINE F32 by_slope(F32 slope, F32 sum) { return slope <= splat(0.0f) ? splat(0.0f) : sum; }
 
-// `finished(row, column, low, high)` of two neighbouring vectors of sums makes them what they are to be.
-template <typename Finished>
-VN_INLINE void store_sums(const Product& p, const Sums& sums, const Finished& finished) {
-  float* const c = p.c == nullptr ? nullptr : p.c + sums.row * p.c_stride + sums.column;
-  float* const pairs = p.pairs == nullptr ? nullptr : p.pairs + sums.row * p.pairs_stride + sums.column / 2;
-  for (int64_t row = 0; row < sums.rows; ++row) {
+VN_INLINE F32 joined_by_slope(F32 slopes, F32 low, F32 high) {
+#if VN_ISA == 2
+  // Of the slopes' bits, as integers, those of what is above 0 are above 0, and those of NaN with a sign the largest.
+  const __m512i slope = (__m512i)slopes;
+  const __mmask32 above = _mm512_cmpgt_epi16_mask(slope, _mm512_setzero_si512());
+  const __mmask32 none = _mm512_cmpgt_epu16_mask(slope, _mm512_set1_epi16(static_cast<int16_t>(0xff80)));
+  return (F32)_mm512_maskz_mov_epi16(above | none, (__m512i)joined(low, high));
+#else
+  return joined(by_slope(widened(slopes, 0), low), by_slope(widened(slopes, 1), high));
+#endif
+}
+
+// Makes rows [begin, end) of a block what they are to be, two neighbouring vectors at a time. Behind the last column
+// there are zeros.
+template <Slope S, bool kFloats, bool kPairs, bool kWhole>
+VN_INLINE void finish(const Product& p, const Block& block, int64_t begin, int64_t end) {
+  const int64_t columns = kWhole ? kBlock : kTileRows, c_stride = p.c_stride, pairs_stride = p.pairs_stride;
+  const float* from = block.sums + begin * kBlock;
+  float* c = kFloats ? p.c + (block.row + begin) * c_stride + block.column : nullptr;
+  float* pairs = kPairs ? p.pairs + (block.row + begin) * pairs_stride + block.column / 2 : nullptr;
+  const float* slope = S == Slope::floats  ? p.slope + (block.row + begin) * c_stride + block.column
+                       : S == Slope::pairs ? p.slope + (block.row + begin) * pairs_stride + block.column / 2
+                                           : nullptr;
+  const F32 zero = splat(0.0f);
+  for (int64_t row = begin; row < end; ++row, from += kBlock) {
     for (int64_t column = 0; column < kBlock; column += 2 * kLanes) {
-      F32 low = sum_of(sums, row, column), high = sum_of(sums, row, column + kLanes);
-      finished(row, column, low, high);
-      if (pairs != nullptr) store(pairs + row * p.pairs_stride + column / 2, joined(low, high));
-      if (c == nullptr) continue;
-      if (column < sums.columns) store(c + row * p.c_stride + column, low);
-      if (column + kLanes < sums.columns) store(c + row * p.c_stride + column + kLanes, high);
+      const bool both = kWhole || column + kLanes < columns;
+      if (!kWhole && column >= columns) {
+        if (kPairs) store(pairs + column / 2, zero);
+        continue;
+      }
+      F32 low = load(from + column), high = both ? load(from + column + kLanes) : zero;
+      if (S == Slope::relu) {  // NaN passes
+        low = max(zero, low);
+        high = max(zero, high);
+      } else if (S == Slope::floats) {
+        low = by_slope(load(slope + column), low);
+        if (both) high = by_slope(load(slope + column + kLanes), high);
+      } else if (S == Slope::pairs) {
+        const F32 values = load(slope + column / 2);
+        if (kFloats) {
+          low = by_slope(widened(values, 0), low);
+          high = by_slope(widened(values, 1), high);
+        } else {
+          store(pairs + column / 2, joined_by_slope(values, low, high));
+          continue;
+        }
+      }
+      if (kPairs) store(pairs + column / 2, joined(low, high));
+      if (kFloats) store(c + column, low);
+      if (kFloats && both) store(c + column + kLanes, high);
     }
+    if (kFloats) c += c_stride;
+    if (kPairs) pairs += pairs_stride;
+    if (S != Slope::none && S != Slope::relu) slope += S == Slope::pairs ? pairs_stride : c_stride;
   }
 }
 
-VN_INLINE void finish(const Product& p, const Sums& sums) {
-  const F32 zero = splat(0.0f);
-  if (p.finish == Finish::none) {
-    store_sums(p, sums, [](int64_t, int64_t, F32&, F32&) {});
-  } else if (p.finish == Finish::relu) {  // NaN passes
-    store_sums(p, sums, [=](int64_t, int64_t, F32& low, F32& high) {
-      low = max(zero, low);
-      high = max(zero, high);
-    });
-  } else if (p.slope_in_pairs) {
-    const float* const slope = p.slope + sums.row * p.pairs_stride + sums.column / 2;
-    store_sums(p, sums, [&](int64_t row, int64_t column, F32& low, F32& high) {
-      const F32 both = load(slope + row * p.pairs_stride + column / 2);
-      low = by_slope(widened(both, 0), low);
-      high = by_slope(widened(both, 1), high);
-    });
+// Blocks of R by C registers. While the products of a block's first step run, the sums of the block before are stored:
+// where they belong, if they are only floats; else in memory, to be finished while the products of the last step run.
+template <int R, int C, Slope S, bool kFloats, bool kPairs>
+__attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& blocks) {
+  constexpr bool kFinish = S != Slope::none || kPairs;
+  alignas(64) float memory[kBlock * kBlock];
+  const Source& source = *p.sources;
+  const int64_t a_next = kTileRows * source.stride, a_stride = source.stride * kFloat;
+  const int64_t b_step = kStep * p.b_stride, b_stride = p.b_stride * kFloat;
+  const int64_t start_next = kTileRows * p.start_stride, start_stride = p.start_stride * kFloat;
+  const int64_t to_row = kFinish ? kBlock : p.c_stride, to_next = kTileRows * to_row, to_stride = to_row * kFloat;
+  const int64_t depth = source.depth;
+  float* to = memory;
+  bool others = false;
+  Block before{0, 0, blocks.row_step, memory};
+  const auto store = [&](auto q) {
+    constexpr int kQ = decltype(q)::kNumber, kRow = kQ % 2, kColumn = kQ / 2;
+    tile_store<kQ>(to + kRow * to_next + kColumn * kTileRows, to_stride);
+  };
+  const auto finish_quarter = [&](int64_t q) {
+    if (kFinish && others) finish<S, kFloats, kPairs, C == 2>(p, before, before.rows * q / 4, before.rows * (q + 1) / 4);
+  };
+  for (int64_t row = blocks.row; row < blocks.row_end; row += blocks.row_step) {
+    for (int64_t column = blocks.column; column < blocks.column_end; column += blocks.column_step) {
+      const float *a = source.data + row * source.stride, *b = p.b + column;
+      const float* const start = p.start + row * p.start_stride + column;
+      const auto begin = [&](auto q) {
+        constexpr int kQ = decltype(q)::kNumber, kRow = kQ % 2, kColumn = kQ / 2;
+        if (others) store(q);
+        tile_load<kQ>(start + kRow * start_next + kColumn * kTileRows, start_stride);
+      };
+      const auto products = [&](const auto& begins, const auto& then) {
+        tile_load<6>(b, b_stride);
+        tile_load<4>(a, a_stride);
+        begins(Register<0>{});
+        tile_products<0, 4, 6>();
+        then(0);
+        if constexpr (R > 1) {
+          tile_load<5>(a + a_next, a_stride);
+          begins(Register<1>{});
+          tile_products<1, 5, 6>();
+        }
+        then(1);
+        if constexpr (C > 1) {
+          tile_load<7>(b + kTileRows, b_stride);
+          begins(Register<2>{});
+          tile_products<2, 4, 7>();
+        }
+        then(2);
+        if constexpr (R > 1 && C > 1) {
+          begins(Register<3>{});
+          tile_products<3, 5, 7>();
+        }
+        then(3);
+      };
+      const auto nothing = [](auto) {};
+      products(begin, nothing);
+      if (depth > kStep) {
+        for (int64_t k = 2 * kStep; k < depth; k += kStep) {
+          a += kStep;
+          b += b_step;
+          products(nothing, nothing);
+        }
+        a += kStep;
+        b += b_step;
+        products(nothing, finish_quarter);
+      } else {
+        for (int q = 0; q < 4; ++q) finish_quarter(q);
+      }
+      others = true;
+      before.row = row;
+      before.column = column;
+      if (!kFinish) to = p.c + row * p.c_stride + column;
+    }
+  }
+  store(Register<0>{});
+  if constexpr (R > 1) store(Register<1>{});
+  if constexpr (C > 1) store(Register<2>{});
+  if constexpr (R > 1 && C > 1) store(Register<3>{});
+  if (kFinish) finish<S, kFloats, kPairs, C == 2>(p, before, 0, before.rows);
+}
+
+template <Slope S, bool kFloats, bool kPairs>
+VN_INLINE void multiply_shapes(const Product& p, int64_t rows, int64_t columns) {
+  const auto strip = [&](int64_t row, int64_t end, int64_t step) {
+    const int64_t whole = columns / kBlock * kBlock;
+    const Blocks wide{row, end, step, 0, whole, kBlock}, narrow{row, end, step, whole, columns, kTileRows};
+    if (whole > 0) {
+      step > kTileRows ? multiply_blocks<2, 2, S, kFloats, kPairs>(p, wide)
+                       : multiply_blocks<1, 2, S, kFloats, kPairs>(p, wide);
+    }
+    if (whole < columns) {
+      step > kTileRows ? multiply_blocks<2, 1, S, kFloats, kPairs>(p, narrow)
+                       : multiply_blocks<1, 1, S, kFloats, kPairs>(p, narrow);
+    }
+  };
+  const int64_t whole = rows / kBlock * kBlock;
+  if (whole > 0) strip(0, whole, kBlock);
+  if (whole == rows) return;
+  shape_for(rows - whole);
+  strip(whole, rows, rows - whole);
+  shape_for(kBlock);
+}
+
+template <Slope S>
+VN_INLINE void multiply_to(const Product& p, int64_t rows, int64_t columns) {
+  if (p.pairs == nullptr) {
+    multiply_shapes<S, true, false>(p, rows, columns);
+  } else if (p.c == nullptr) {
+    multiply_shapes<S, false, true>(p, rows, columns);
   } else {
-    const float* const slope = p.slope + sums.row * p.c_stride + sums.column;
-    store_sums(p, sums, [&](int64_t row, int64_t column, F32& low, F32& high) {
-      const float* const from = slope + row * p.c_stride + column;
-      if (column < sums.columns) low = by_slope(load(from), low);
-      if (column + kLanes < sums.columns) high = by_slope(load(from + kLanes), high);
-    });
+    multiply_shapes<S, true, true>(p, rows, columns);
   }
 }
 
 }  // namespace
 
 // C [rows][columns], columns a multiple of 16; the shapes of the registers are those of whole blocks, before and after.
-VN_INLINE void multiply_tiles(const Product& p, int64_t rows, int64_t columns) {
-  alignas(64) float memory[2][kBlock * kBlock];
-  const bool direct = p.finish == Finish::none && p.pairs == nullptr;
-  Sums before{};
-  int turn = 0;
-  for (int64_t row = 0; row < rows; row += kBlock) {
-    const int64_t some = rows - row < kBlock ? rows - row : kBlock;
-    if (some < kBlock) shape_for(some);
-    for (int64_t column = 0; column < columns; column += kBlock, turn ^= 1) {
-      const int64_t wide = columns - column < kBlock ? columns - column : kBlock;
-      float* const to = direct ? p.c + row * p.c_stride + column : memory[turn];
-      const int64_t to_stride = direct ? p.c_stride : kBlock;
-      if (some > kTileRows) {
-        if (wide > kTileRows) {
-          block_products<2, 2>(p, row, column, to, to_stride);
-        } else {
-          block_products<2, 1>(p, row, column, to, to_stride);
-        }
-      } else if (wide > kTileRows) {
-        block_products<1, 2>(p, row, column, to, to_stride);
-      } else {
-        block_products<1, 1>(p, row, column, to, to_stride);
-      }
-      if (direct) continue;
-      if (before.rows > 0) finish(p, before);
-      before = {memory[turn], row, column, some, wide};
-    }
-    if (some < kBlock) shape_for(kBlock);
+static void multiply_tiles(const Product& p, int64_t rows, int64_t columns) {
+  if (p.finish == Finish::none) {
+    multiply_to<Slope::none>(p, rows, columns);
+  } else if (p.finish == Finish::relu) {
+    multiply_to<Slope::relu>(p, rows, columns);
+  } else if (p.slope_in_pairs) {
+    multiply_to<Slope::pairs>(p, rows, columns);
+  } else {
+    multiply_to<Slope::floats>(p, rows, columns);
   }
-  if (before.rows > 0) finish(p, before);
 }
 
 }  // namespace tiles_of_pairs

@@ -90,11 +90,17 @@ struct ProgramTile {
       float* const to = at(step.slot, step.memory, step.stride);
       run_step(step, call.code.operands + step.first, to);
 #if VN_HALF == 2
-      if (step.pairs >= 0 && step.op != ProgramOp::linear) {
+      if (step.pairs >= 0 && narrows(step)) {
         narrow_rows({to, step.stride, false}, step.width, rows, slot(step.pairs), pairs_of(step.width));
       }
 #endif
     }
+  }
+
+  // Whether a step leaves it to others to make pairs of its value.
+  static bool narrows(const ProgramStep& step) {
+    const bool waves = step.op == ProgramOp::encode && step.order == 0 && step.encoding == ProgramEncoding::frequency;
+    return step.op != ProgramOp::linear && !waves;
   }
 
   void run_step(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
@@ -144,7 +150,7 @@ struct ProgramTile {
       case ProgramOp::outer:
         return outer(step, operands);
       case ProgramOp::columns:
-        return columns(step, operand(operands[0]));
+        return columns(step, operands[0]);
     }
   }
 
@@ -355,8 +361,10 @@ struct ProgramTile {
     }
     const Columns columns = waves(step, operands[0]);
     const float* const table = packed + pack(step.number).at;
-    encode(x.data, x.stride, table, rows, columns, to, step.stride);
-    if (step.encoding == ProgramEncoding::integrated) {
+    const bool integrated = step.encoding == ProgramEncoding::integrated;
+    float* const pairs = step.pairs < 0 || integrated ? nullptr : slot(step.pairs);
+    encode(x.data, x.stride, table, rows, columns, to, step.stride, pairs, pairs_of(step.width), step.floats);
+    if (integrated) {
       blur(x.data + columns.d, x.stride, table, rows, to, step.stride);
     }
   }
@@ -396,8 +404,12 @@ struct ProgramTile {
 
   // Sums --------------------------------------------------------------------------------------------------------------
 
-  void columns(const ProgramStep& step, const Rows& g) const {
+  void columns(const ProgramStep& step, const ProgramOperand& of) const {
     float* const to = partial + step.number;
+#if VN_HALF == 2
+    if (of.pairs >= 0) return add_pairs(in_pairs(of, nullptr), step.stride, rows, fill, to);
+#endif
+    const Rows g = operand(of);
     for (int64_t c = 0; c < step.stride; c += kLanes) {
       // Four sums, or every addition waits for the one before.
       F32 sums[4] = {fill ? splat(0.0f) : load(to + c), splat(0.0f), splat(0.0f), splat(0.0f)};
@@ -418,15 +430,8 @@ struct ProgramTile {
 #if VN_HALF == 2
     const int64_t depth = pairs_of(rows);
     const Source source{scratch(0), depth, depth}, other{scratch(1), padded(of_b.width), depth};
-    pairs_of_rows(of_a, [&](int64_t row, int64_t column, const F32* v) {
-      F32 turned[kLanes];
-      for (int i = 0; i < kLanes; ++i) turned[i] = v[i];
-      transpose(turned);
-      for (int i = 0; i < kLanes; ++i) store(scratch(0) + (column + i) * depth + row / 2, turned[i]);
-    });
-    pairs_of_rows(of_b, [&](int64_t row, int64_t column, const F32* v) {
-      for (int i = 0; i < kLanes; ++i) store(scratch(1) + (row / 2 + i) * other.stride + column, v[i]);
-    });
+    turn_pairs(in_pairs(of_a, scratch(2)), padded(of_a.width), rows, scratch(0), depth);
+    zip_pairs(in_pairs(of_b, scratch(2)), other.stride, rows, scratch(1));
 #else
     const Rows a = operand(of_a), b = operand(of_b);
     Source source{a.data, a.stride, rows}, other{b.data, b.stride, rows};
@@ -450,38 +455,6 @@ struct ProgramTile {
     }
   }
 
-#if VN_HALF == 2
-  // body(row, column, v) for 2 kLanes rows and kLanes columns at a time: v[i] are the pairs of rows row + 2 i and its
-  // neighbour. Behind the last row there are zeros.
-  template <typename Body>
-  VN_INLINE void pairs_of_rows_at(const ProgramTile& tile, const ProgramOperand& of, const Body& body) {
-    const Rows x = of.pairs >= 0 ? Rows{tile.slot(of.pairs), pairs_of(of.width), false} : tile.operand(of);
-    const int64_t columns = padded(of.width), end = 2 * pairs_of(tile.rows);
-    for (int64_t row = 0; row < end; row += 2 * kLanes) {
-      for (int64_t column = 0; column < columns; column += 2 * kLanes) {
-        F32 low[kLanes], high[kLanes];
-        for (int64_t i = 0; i < kLanes; ++i) {
-          const auto at = [&](int64_t number, int64_t c) {
-            return number < tile.rows ? x.vector(x, number, c) : splat(0.0f);
-          };
-          const int64_t even = row + 2 * i, odd = even + 1;
-          if (of.pairs >= 0) {
-            zip_halves(at(even, column / 2), at(odd, column / 2), low[i], high[i]);
-          } else {
-            low[i] = interleave(at(even, column), at(odd, column));
-            if (column + kLanes < columns) high[i] = interleave(at(even, column + kLanes), at(odd, column + kLanes));
-          }
-        }
-        body(row, column, low);
-        if (column + kLanes < columns) body(row, column + kLanes, high);
-      }
-    }
-  }
-  template <typename Body>
-  void pairs_of_rows(const ProgramOperand& of, const Body& body) const {
-    pairs_of_rows_at(*this, of, body);
-  }
-#endif
 };
 
 [[maybe_unused]] void run_tiles(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed,

@@ -144,7 +144,8 @@ class _Lowering:
                 if c.of == VALUE:
                     self.readers.setdefault(c.index, []).append((step, place))
         self.scratch_width = self._scratch()
-        self.scratch = self.slots.take(2 * self.scratch_width) if self.scratch_width else 0
+        parts = 3 if self.tiles else 2
+        self.scratch = self.slots.take(parts * self.scratch_width) if self.scratch_width else 0
 
     # What there is to do ----------------------------------------------------------------------------------------------
 
@@ -183,7 +184,7 @@ class _Lowering:
         return alone and g.start == 0 and g.width == step.width and not g.spread
 
     def _scratch(self) -> int:
-        """Columns of each of the two parts of memory that a step may use."""
+        """Columns of each part of the memory that a step may use."""
         widths = [0]
         for step in self.work:
             if step.op == "encode" and step.name in ("spherical", "hash"):
@@ -211,7 +212,7 @@ class _Lowering:
 
     def operand(self, c: Columns, place: int = 0, *, product: bool = False) -> Any:
         """One operand's record; ``product``: what reads pairs where there are some: x of a linear step, and in tile
-        registers its slope and both operands of an outer product."""
+        registers its slope and the operands of sums."""
         given: dict[str, Any] = dict.fromkeys(("memory", "input", "pairs"), _NONE)
         given |= {"start": c.start, "width": c.width, "place": place, "spread": c.spread}
         if c.of == PARAMETER:
@@ -366,7 +367,7 @@ class _Lowering:
             product = reader.op == "linear" and place == 0
             if self.tiles:
                 slope = reader.op == "linear" and reader.name == "relu_slope" and place == len(reader.operands) - 1
-                product = product or slope or reader.op == "outer"
+                product = product or slope or reader.op in ("outer", "columns")
             return product and _all_of(reader.operands[place], step.width)
 
         return [takes(reader, place) for reader, place in self.readers.get(step.out, [])]
@@ -404,6 +405,9 @@ class _Lowering:
             features = raw if first else raw // 2
             given["number"] = self.pack("waves", 0, int(first), width, 3 * width, (size, features))
             given["depth"] = size
+        if self.tiles and not order and step.name == "frequency" and any(as_pairs := self._as_pairs(step)):
+            value.pairs = self.slots.take(_padded(step.width, 2 * _GRANULE) // 2)
+            value.floats = value.memory != _NONE or not all(as_pairs)
         self.emit("encode", records, value, **given)
 
     def _input_of(self, x: Columns) -> int:
@@ -441,7 +445,8 @@ class _Lowering:
         size, stride = shape[0] * (shape[1] if len(shape) > 1 else 1), _padded(step.width)
         self.partial += stride
         self.sums.append((step.out, "vector", at, 1, size, start, step.width, stride, size))
-        self.emit("columns", [self.operand(step.operands[0])], number=at, stride=stride, width=step.width)
+        records = [self.operand(step.operands[0], product=self.tiles)]
+        self.emit("columns", records, number=at, stride=stride, width=step.width)
 
     def finished(self) -> Lowered:
         """The compiled program."""
