@@ -15,7 +15,7 @@ VN_NAMES(ProgramFunction, VN_FUNCTIONS(VN_NAME));
 #undef VN_NAME
 VN_NAMES(ProgramPackKind, "matrix", "turned", "vector", "few", "few_turned", "waves");
 VN_NAMES(ProgramSumKind, "none", "inputs_outputs", "outputs_inputs", "vector");
-VN_NAMES(ProgramLayout, "floats", "pairs", "tiles");
+VN_NAMES(ProgramLayout, "floats", "pairs", "tiles", "parts");
 VN_NAMES(ProgramPrecision, "float32", "tf32", "bfloat16", "float16");
 VN_STRUCT(ProgramPack, kind, parameter, o, i, start, width, at);
 VN_STRUCT(ProgramOperand, parameter, spread, slot, stride, memory, input, pairs, start, width, place);

@@ -42,9 +42,9 @@ struct ProgramScatter {
   int32_t input, parameter, grid, memory, sum;
 };
 
-// What packs and slots are laid out for: products of floats, of pairs of bfloat16, or of pairs in tile registers, whose
-// tiles are multiples of 32 rows.
-enum class ProgramLayout : int { floats, pairs, tiles };
+// What packs and slots are laid out for: products of floats, of pairs of bfloat16, of pairs in tile registers, whose
+// tiles are multiples of 32 rows; or there of floats in two parts each, as high x high + high x low + low x high.
+enum class ProgramLayout : int { floats, pairs, tiles, parts };
 
 // As Python describes a program.
 struct ProgramTable {

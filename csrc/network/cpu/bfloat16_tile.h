@@ -91,11 +91,44 @@ VN_INLINE F32 widened(F32 pairs, int half) {
 
 #endif
 
+// The first and the second value of each pair.
+VN_INLINE F32 lower_of(F32 pairs) {
+  I32 bits;
+  __builtin_memcpy(&bits, &pairs, sizeof bits);
+#if VN_ISA == 2
+  return (F32)_mm512_maskz_slli_epi32(0xffff, bits, 16);
+#else
+  bits = bits << 16;
+  __builtin_memcpy(&pairs, &bits, sizeof bits);
+  return pairs;
+#endif
+}
+VN_INLINE F32 upper_of(F32 pairs) {
+  I32 bits;
+  __builtin_memcpy(&bits, &pairs, sizeof bits);
+#if VN_ISA == 2
+  return (F32)_mm512_and_si512(bits, _mm512_set1_epi32(static_cast<int32_t>(0xffff0000)));
+#else
+  bits = bits & splat(static_cast<int32_t>(0xffff0000));
+  __builtin_memcpy(&pairs, &bits, sizeof bits);
+  return pairs;
+#endif
+}
+
+// What rounding to pairs has left of two vectors, as pairs.
+VN_INLINE F32 left_of(F32 low, F32 high, F32 pairs) {
+  return joined(low - widened(pairs, 0), high - widened(pairs, 1));
+}
+
 // `width` floats -> pairs, the last filled up with 0. Whole vectors are written: 16 pairs at a time.
-VN_INLINE void narrow_row(const float* from, int64_t width, float* to) {
+// `left`: in this place, if not null, what rounding has left.
+VN_INLINE void narrow_row(const float* from, int64_t width, float* to, float* left = nullptr) {
   for (int64_t i = 0; i < width; i += 32) {
     for (int64_t v = i; v < i + 32; v += 2 * kLanes) {
-      store(to + v / 2, joined(load_some(from + v, width - v), load_some(from + v + kLanes, width - v - kLanes)));
+      const F32 low = load_some(from + v, width - v), high = load_some(from + v + kLanes, width - v - kLanes);
+      const F32 pairs = joined(low, high);
+      store(to + v / 2, pairs);
+      if (left != nullptr) store(left + v / 2, left_of(low, high, pairs));
     }
   }
 }

@@ -59,6 +59,9 @@ struct Product {
   float* pairs;
   int64_t pairs_stride;
   bool slope_in_pairs;  // in tile registers: [rows][pairs_stride]
+  // In tile registers, of products in parts: what rounding has left of A, B and C lies so many floats behind their
+  // pairs. 0: it does not count.
+  int64_t a_left, b_left, pairs_left;
 };
 
 // A row to start from: nothing.

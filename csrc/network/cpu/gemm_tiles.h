@@ -44,6 +44,7 @@ struct Block {
   const float* sums;
 };
 enum class Slope { none, relu, floats, pairs };
+enum class Pairs { none, rounded, parts };
 
 // Where a slope is 0 or less, the result is 0.
 VN_INLINE F32 by_slope(F32 slope, F32 sum) { return slope <= splat(0.0f) ? splat(0.0f) : sum; }
@@ -62,8 +63,9 @@ VN_INLINE F32 joined_by_slope(F32 slopes, F32 low, F32 high) {
 
 // Makes rows [begin, end) of a block what they are to be, two neighbouring vectors at a time. Behind the last column
 // there are zeros.
-template <Slope S, bool kFloats, bool kPairs, bool kWhole>
+template <Slope S, bool kFloats, Pairs P, bool kWhole>
 VN_INLINE void finish(const Product& p, const Block& block, int64_t begin, int64_t end) {
+  constexpr bool kPairs = P != Pairs::none, kLeft = P == Pairs::parts;
   const int64_t columns = kWhole ? kBlock : kTileRows, c_stride = p.c_stride, pairs_stride = p.pairs_stride;
   const float* from = block.sums + begin * kBlock;
   float* c = kFloats ? p.c + (block.row + begin) * c_stride + block.column : nullptr;
@@ -77,6 +79,7 @@ VN_INLINE void finish(const Product& p, const Block& block, int64_t begin, int64
       const bool both = kWhole || column + kLanes < columns;
       if (!kWhole && column >= columns) {
         if (kPairs) store(pairs + column / 2, zero);
+        if (kLeft) store(pairs + p.pairs_left + column / 2, zero);
         continue;
       }
       F32 low = load(from + column), high = both ? load(from + column + kLanes) : zero;
@@ -88,7 +91,7 @@ VN_INLINE void finish(const Product& p, const Block& block, int64_t begin, int64
         if (both) high = by_slope(load(slope + column + kLanes), high);
       } else if (S == Slope::pairs) {
         const F32 values = load(slope + column / 2);
-        if (kFloats) {
+        if (kFloats || kLeft) {
           low = by_slope(widened(values, 0), low);
           high = by_slope(widened(values, 1), high);
         } else {
@@ -96,7 +99,11 @@ VN_INLINE void finish(const Product& p, const Block& block, int64_t begin, int64
           continue;
         }
       }
-      if (kPairs) store(pairs + column / 2, joined(low, high));
+      if (kPairs) {
+        const F32 rounded = joined(low, high);
+        store(pairs + column / 2, rounded);
+        if (kLeft) store(pairs + p.pairs_left + column / 2, left_of(low, high, rounded));
+      }
       if (kFloats) store(c + column, low);
       if (kFloats && both) store(c + column + kLanes, high);
     }
@@ -108,16 +115,16 @@ VN_INLINE void finish(const Product& p, const Block& block, int64_t begin, int64
 
 // Blocks of R by C registers. While the products of a block's first step run, the sums of the block before are stored:
 // where they belong, if they are only floats; else in memory, to be finished while the products of the last step run.
-template <int R, int C, Slope S, bool kFloats, bool kPairs>
+template <int R, int C, Slope S, bool kFloats, Pairs P>
 __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& blocks) {
-  constexpr bool kFinish = S != Slope::none || kPairs;
+  constexpr bool kFinish = S != Slope::none || P != Pairs::none;
   alignas(64) float memory[kBlock * kBlock];
   const Source& source = *p.sources;
   const int64_t a_next = kTileRows * source.stride, a_stride = source.stride * kFloat;
   const int64_t b_step = kStep * p.b_stride, b_stride = p.b_stride * kFloat;
   const int64_t start_next = kTileRows * p.start_stride, start_stride = p.start_stride * kFloat;
   const int64_t to_row = kFinish ? kBlock : p.c_stride, to_next = kTileRows * to_row, to_stride = to_row * kFloat;
-  const int64_t depth = source.depth;
+  const int64_t steps = (p.a_left > 0 ? 3 : 1) * source.depth / kStep;
   float* to = memory;
   bool others = false;
   Block before{0, 0, blocks.row_step, memory};
@@ -126,7 +133,7 @@ __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& b
     tile_store<kQ>(to + kRow * to_next + kColumn * kTileRows, to_stride);
   };
   const auto finish_quarter = [&](int64_t q) {
-    if (kFinish && others) finish<S, kFloats, kPairs, C == 2>(p, before, before.rows * q / 4, before.rows * (q + 1) / 4);
+    if (kFinish && others) finish<S, kFloats, P, C == 2>(p, before, before.rows * q / 4, before.rows * (q + 1) / 4);
   };
   for (int64_t row = blocks.row; row < blocks.row_end; row += blocks.row_step) {
     for (int64_t column = blocks.column; column < blocks.column_end; column += blocks.column_step) {
@@ -163,18 +170,18 @@ __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& b
       };
       const auto nothing = [](auto) {};
       products(begin, nothing);
-      if (depth > kStep) {
-        for (int64_t k = 2 * kStep; k < depth; k += kStep) {
-          a += kStep;
-          b += b_step;
-          products(nothing, nothing);
-        }
+      for (int64_t step = 1, k = kStep; step < steps; ++step, k += kStep) {
         a += kStep;
         b += b_step;
-        products(nothing, finish_quarter);
-      } else {
-        for (int q = 0; q < 4; ++q) finish_quarter(q);
+        if (k == source.depth) {  // of products in parts: high x low, then low x high
+          const bool last = step + source.depth / kStep == steps;
+          a = source.data + row * source.stride + (last ? p.a_left : 0);
+          b = p.b + column + (last ? 0 : p.b_left);
+          k = 0;
+        }
+        step + 1 < steps ? products(nothing, nothing) : products(nothing, finish_quarter);
       }
+      for (int q = 0; steps == 1 && q < 4; ++q) finish_quarter(q);
       others = true;
       before.row = row;
       before.column = column;
@@ -185,21 +192,21 @@ __attribute__((noinline)) void multiply_blocks(const Product& p, const Blocks& b
   if constexpr (R > 1) store(Register<1>{});
   if constexpr (C > 1) store(Register<2>{});
   if constexpr (R > 1 && C > 1) store(Register<3>{});
-  if (kFinish) finish<S, kFloats, kPairs, C == 2>(p, before, 0, before.rows);
+  if (kFinish) finish<S, kFloats, P, C == 2>(p, before, 0, before.rows);
 }
 
-template <Slope S, bool kFloats, bool kPairs>
+template <Slope S, bool kFloats, Pairs P>
 VN_INLINE void multiply_shapes(const Product& p, int64_t rows, int64_t columns) {
   const auto strip = [&](int64_t row, int64_t end, int64_t step) {
     const int64_t whole = columns / kBlock * kBlock;
     const Blocks wide{row, end, step, 0, whole, kBlock}, narrow{row, end, step, whole, columns, kTileRows};
     if (whole > 0) {
-      step > kTileRows ? multiply_blocks<2, 2, S, kFloats, kPairs>(p, wide)
-                       : multiply_blocks<1, 2, S, kFloats, kPairs>(p, wide);
+      step > kTileRows ? multiply_blocks<2, 2, S, kFloats, P>(p, wide)
+                       : multiply_blocks<1, 2, S, kFloats, P>(p, wide);
     }
     if (whole < columns) {
-      step > kTileRows ? multiply_blocks<2, 1, S, kFloats, kPairs>(p, narrow)
-                       : multiply_blocks<1, 1, S, kFloats, kPairs>(p, narrow);
+      step > kTileRows ? multiply_blocks<2, 1, S, kFloats, P>(p, narrow)
+                       : multiply_blocks<1, 1, S, kFloats, P>(p, narrow);
     }
   };
   const int64_t whole = rows / kBlock * kBlock;
@@ -212,12 +219,13 @@ VN_INLINE void multiply_shapes(const Product& p, int64_t rows, int64_t columns) 
 
 template <Slope S>
 VN_INLINE void multiply_to(const Product& p, int64_t rows, int64_t columns) {
-  if (p.pairs == nullptr) {
-    multiply_shapes<S, true, false>(p, rows, columns);
-  } else if (p.c == nullptr) {
-    multiply_shapes<S, false, true>(p, rows, columns);
+  if (p.pairs == nullptr) return multiply_shapes<S, true, Pairs::none>(p, rows, columns);
+  if (p.pairs_left == 0) {
+    p.c == nullptr ? multiply_shapes<S, false, Pairs::rounded>(p, rows, columns)
+                   : multiply_shapes<S, true, Pairs::rounded>(p, rows, columns);
   } else {
-    multiply_shapes<S, true, true>(p, rows, columns);
+    p.c == nullptr ? multiply_shapes<S, false, Pairs::parts>(p, rows, columns)
+                   : multiply_shapes<S, true, Pairs::parts>(p, rows, columns);
   }
 }
 

@@ -28,6 +28,7 @@ struct ProgramCall {
   const int32_t *order, *ray_index;
   int64_t n;     // rows of inputs
   int64_t tile;  // rows, at most
+  bool parts;    // in tile registers: pairs are followed by what rounding has left of the values
 };
 
 // Makes a cell's parameters ready; `first`: nothing was before. `free`: the thread's slots.

@@ -73,9 +73,11 @@ VN_INLINE int64_t pairs_of(int64_t width) { return (width + 31) / 32 * 16; }
 
 #if VN_HALF
 
-// Columns as pairs, the last one filled up with 0.
-VN_INLINE void narrow_rows(const Rows& x, int64_t width, int64_t rows, float* to, int64_t stride) {
-  for (int64_t row = 0; row < rows; ++row) narrow_row(x.data + row * x.stride, width, to + row * stride);
+// Columns as pairs, the last one filled up with 0; so many floats behind them, if not 0, what rounding has left.
+VN_INLINE void narrow_rows(const Rows& x, int64_t width, int64_t rows, float* to, int64_t stride, int64_t left = 0) {
+  for (int64_t row = 0; row < rows; ++row, to += stride) {
+    narrow_row(x.data + row * x.stride, width, to, left == 0 ? nullptr : to + left);
+  }
 }
 
 // `columns`, a multiple of 16, as pairs of neighbouring rows, [(rows + 1) / 2][columns], the last filled up with 0.
@@ -94,17 +96,33 @@ VN_INLINE void interleave_columns(const Rows& x, int64_t columns, int64_t rows, 
 
 constexpr int64_t kTurned = 32;  // rows that become 16 pairs
 
-// Rows of pairs in a slot behind the last one, up to a multiple of 32: 0.
-VN_INLINE void clear_behind(const Rows& x, int64_t rows) {
-  float* const data = const_cast<float*>(x.data);
-  for (int64_t row = rows; row % kTurned != 0; ++row) {
-    for (int64_t i = 0; i < x.stride; i += kLanes) store(data + row * x.stride + i, splat(0.0f));
+// bfloat16 as pairs, filled up with 0.
+VN_INLINE void copy_pairs(const uint16_t* from, int64_t width, float* to) {
+  for (int64_t i = 0; i < pairs_of(width); i += kLanes, to += kLanes, from += 2 * kLanes) {
+    const int64_t count = smaller(2 * kLanes, width - 2 * i);
+    F32 pairs = splat(0.0f);
+    if (count == 2 * kLanes) {
+      __builtin_memcpy(&pairs, from, sizeof pairs);
+    } else if (count > 0) {
+      __builtin_memcpy(&pairs, from, 2 * count);
+    }
+    store(to, pairs);
   }
 }
 
+// Columns of the rows of pairs in a slot behind the last one, up to a multiple of 32: 0.
+VN_INLINE void clear_behind(const Rows& x, int64_t columns, int64_t rows) {
+  float* const data = const_cast<float*>(x.data);
+  for (int64_t row = rows; row % kTurned != 0; ++row) {
+    for (int64_t i = 0; i < pairs_of(columns); i += kLanes) store(data + row * x.stride + i, splat(0.0f));
+  }
+}
+
+VN_INLINE Rows behind(const Rows& x, int64_t floats) { return {x.data + floats, x.stride, x.spread}; }
+
 // Rows of pairs -> pairs of neighbouring rows, [columns][stride], columns a multiple of 16.
 VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* to, int64_t stride) {
-  clear_behind(x, rows);
+  clear_behind(x, columns, rows);
 #if VN_ISA == 2
   // Eight columns at a time. Lane l of the i-th vector holds those of pair i + 4 l, so what is turned within lanes is
   // in order: half as many shuffles as turning whole vectors takes.
@@ -151,7 +169,7 @@ VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* t
 
 // Rows of pairs -> pairs of neighbouring rows, [all pairs][columns], columns a multiple of 16.
 VN_INLINE void zip_pairs(const Rows& x, int64_t columns, int64_t rows, float* to) {
-  clear_behind(x, rows);
+  clear_behind(x, columns, rows);
   for (int64_t row = 0; row < 2 * pairs_of(rows); row += 2, to += columns) {
     const float *even = x.data + row * x.stride, *odd = even + x.stride;
 #if VN_ISA == 2

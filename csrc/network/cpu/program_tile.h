@@ -91,16 +91,26 @@ struct ProgramTile {
       run_step(step, call.code.operands + step.first, to);
 #if VN_HALF == 2
       if (step.pairs >= 0 && narrows(step)) {
-        narrow_rows({to, step.stride, false}, step.width, rows, slot(step.pairs), pairs_of(step.width));
+        narrow_rows(made(step, to), step.width, rows, slot(step.pairs), stride_of(step.width), left_of(step.width));
       }
 #endif
     }
   }
 
+  // What a step has made, or left where it is.
+  Rows made(const ProgramStep& step, const float* to) const {
+    if (step.op != ProgramOp::input || !step.in_place || !call.in_place[step.number]) return {to, step.stride, false};
+    return {static_cast<const float*>(call.inputs[step.number]) + begin * step.width, step.width, false};
+  }
+
   // Whether a step leaves it to others to make pairs of its value.
-  static bool narrows(const ProgramStep& step) {
+  bool narrows(const ProgramStep& step) const {
+    if (step.op == ProgramOp::input) return !narrowed_as_read(step);
     const bool waves = step.op == ProgramOp::encode && step.order == 0 && step.encoding == ProgramEncoding::frequency;
-    return step.op != ProgramOp::linear && !waves;
+    return step.op != ProgramOp::linear && (!waves || call.parts);
+  }
+  bool narrowed_as_read(const ProgramStep& step) const {
+    return step.pairs >= 0 && !call.turned[step.number] && !call.parts;
   }
 
   void run_step(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
@@ -157,13 +167,26 @@ struct ProgramTile {
   void input(const ProgramStep& step, float* to) const {
     const int32_t number = step.number;
     const int64_t stride = step.stride, width = step.width;
-    if (step.in_place && call.in_place[number]) return;
-    if (step.points && call.looked_up) return;
-    if (call.turned[number]) return turn(static_cast<const float*>(call.inputs[number]), step, to);
     const auto row_of = [&](int64_t row) {
       const int64_t sample = place(row);
       return call.rays[number] ? call.ray_index[sample] : sample;
     };
+#if VN_HALF == 2
+    if (narrowed_as_read(step)) {
+      float* pairs = slot(step.pairs);
+      for (int64_t row = 0; row < rows; ++row, pairs += pairs_of(width)) {
+        if (call.input_types[number] == TableType::bfloat16) {
+          copy_pairs(static_cast<const uint16_t*>(call.inputs[number]) + row_of(row) * width, width, pairs);
+        } else {
+          narrow_row(static_cast<const float*>(call.inputs[number]) + row_of(row) * width, width, pairs);
+        }
+      }
+      if (!step.floats) return;
+    }
+#endif
+    if (step.in_place && call.in_place[number]) return;
+    if (step.points && call.looked_up) return;
+    if (call.turned[number]) return turn(static_cast<const float*>(call.inputs[number]), step, to);
     if (call.input_types[number] == TableType::bfloat16) {
       const auto* from = static_cast<const uint16_t*>(call.inputs[number]);
       for (int64_t row = 0; row < rows; ++row) widen_row(from + row_of(row) * width, width, to + row * stride);
@@ -233,7 +256,7 @@ struct ProgramTile {
                           : step.finish == ProgramFinish::relu ? Finish::relu
                                                                : Finish::relu_slope;
     const float* const weights = packed + pack(step.number).at;
-    const int64_t depth = steps_of(step.depth);
+    const int64_t depth = steps_of(step.depth), panels = call.parts ? 2 : 1;
     constexpr int32_t kMostSources = 8;
     Source sources[kMostSources];
     for (int32_t i = 0; i < count; ++i) {
@@ -241,7 +264,7 @@ struct ProgramTile {
       sources[i] = {x.data, x.stride, steps_of(operands[i].width)};
     }
     float* const pairs = step.pairs < 0 ? nullptr : slot(step.pairs);
-    const int64_t pairs_stride = pairs_of(step.width);
+    const int64_t pairs_stride = stride_of(step.width), pairs_left = left_of(step.width);
     bool slope_in_pairs = false;
 #if VN_HALF
     const Rows x = in_pairs(operands[0], scratch(0));
@@ -266,8 +289,9 @@ struct ProgramTile {
       const auto from = [=](float* at, bool of_pairs) { return at == nullptr ? at : at + (of_pairs ? first / 2 : first); };
       const float* start = add.data == kZeros ? kZeros : add.data + first;
       const float* by = slope == nullptr ? nullptr : slope + (slope_in_pairs ? first / 2 : first);
-      const Product product{sources, count,  weights + first * depth, columns,      start,         add.stride, from(c, false),
-                            step.stride, finish, by, from(pairs, true), pairs_stride, slope_in_pairs};
+      const Product product{sources, count,  weights + panels * first * depth, columns,      start,         add.stride, from(c, false),
+                            step.stride, finish, by, from(pairs, true), pairs_stride, slope_in_pairs,
+                            left_of(step.depth), call.parts ? depth * columns : 0, pairs_left};
 #if VN_HALF == 2
       multiply_tiles(product, rows, columns);
 #else
@@ -276,12 +300,16 @@ struct ProgramTile {
     }
   }
 
+  // Of rows of pairs, and in parts of what rounding has left, which lies behind them: the stride, and how far.
+  int64_t stride_of(int64_t width) const { return (call.parts ? 2 : 1) * pairs_of(width); }
+  int64_t left_of(int64_t width) const { return call.parts ? pairs_of(width) : 0; }
+
 #if VN_HALF
   // An operand of a product as pairs: those there are, or made in `free`.
   Rows in_pairs(const ProgramOperand& of, float* free) const {
-    const int64_t stride = pairs_of(of.width);
+    const int64_t stride = stride_of(of.width);
     if (of.pairs >= 0) return {slot(of.pairs), stride, false};
-    narrow_rows(operand(of), of.width, rows, free, stride);
+    narrow_rows(operand(of), of.width, rows, free, stride, left_of(of.width));
     return {free, stride, false};
   }
 #endif
@@ -362,8 +390,8 @@ struct ProgramTile {
     const Columns columns = waves(step, operands[0]);
     const float* const table = packed + pack(step.number).at;
     const bool integrated = step.encoding == ProgramEncoding::integrated;
-    float* const pairs = step.pairs < 0 || integrated ? nullptr : slot(step.pairs);
-    encode(x.data, x.stride, table, rows, columns, to, step.stride, pairs, pairs_of(step.width), step.floats);
+    float* const pairs = step.pairs < 0 || narrows(step) ? nullptr : slot(step.pairs);
+    encode(x.data, x.stride, table, rows, columns, to, step.stride, pairs, pairs_of(step.width), pairs == nullptr || step.floats);
     if (integrated) {
       blur(x.data + columns.d, x.stride, table, rows, to, step.stride);
     }
@@ -430,9 +458,15 @@ struct ProgramTile {
 #if VN_HALF == 2
     const int64_t depth = pairs_of(rows);
     const Source source{scratch(0), depth, depth}, other{scratch(1), padded(of_b.width), depth};
-    turn_pairs(in_pairs(of_a, scratch(2)), padded(of_a.width), rows, scratch(0), depth);
-    zip_pairs(in_pairs(of_b, scratch(2)), other.stride, rows, scratch(1));
+    const int64_t width = padded(of_a.width), a_left = call.parts ? width * depth : 0, b_left = depth * other.stride;
+    const Rows a = in_pairs(of_a, scratch(2));
+    turn_pairs(a, width, rows, scratch(0), depth);
+    if (call.parts) turn_pairs(behind(a, left_of(of_a.width)), width, rows, scratch(0) + a_left, depth);
+    const Rows b = in_pairs(of_b, scratch(2));
+    zip_pairs(b, other.stride, rows, scratch(1));
+    if (call.parts) zip_pairs(behind(b, left_of(of_b.width)), other.stride, rows, scratch(1) + b_left);
 #else
+    constexpr int64_t a_left = 0, b_left = 0;
     const Rows a = operand(of_a), b = operand(of_b);
     Source source{a.data, a.stride, rows}, other{b.data, b.stride, rows};
 #if VN_HALF
@@ -445,7 +479,7 @@ struct ProgramTile {
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       float* c = to + first;
       const Product product{&source, 1, other.data + first, other.stride, fill ? kZeros : c, fill ? 0 : step.stride,
-                            c, step.stride, Finish::none, nullptr, nullptr, 0, false};
+                            c, step.stride, Finish::none, nullptr, nullptr, 0, false, a_left, b_left, 0};
       const int64_t columns = smaller(kPanel, step.stride - first);
 #if VN_HALF == 2
       multiply_tiles(product, of_a.width, columns);

@@ -76,7 +76,8 @@ def lower(text: str, layout: str = "floats", cuda: bool = False) -> Lowered:
 
     Args:
         text: of the program.
-        layout: what products take: "floats", "pairs" of bfloat16, or pairs in "tiles" (tile registers).
+        layout: what products take: "floats", "pairs" of bfloat16, pairs in "tiles" (tile registers), or there floats
+            in two "parts" each.
         cuda: for CUDA, whose products have one source.
     """
     return _Lowering(merged(Program.parse(text)), layout, joins=layout == "floats" and not cuda).lowered()
@@ -125,7 +126,7 @@ class _Lowering:
 
     def __init__(self, program: Program, layout: str, joins: bool) -> None:
         self.program, self.layout = program, layout
-        self.half, self.tiles = layout != "floats", layout == "tiles"
+        self.half, self.tiles, self.parts = layout != "floats", layout in ("tiles", "parts"), layout == "parts"
         self.compiled = native.compiled
         self.slots, self.values = _Slots(), dict[int, _Value]()
         self.packs: dict[tuple[Any, ...], tuple[int, int]] = {}  # their number, and where they are
@@ -190,10 +191,14 @@ class _Lowering:
             if step.op == "encode" and step.name in ("spherical", "hash"):
                 widths.append(_GRANULE)
             if self.half and step.op == "linear":
-                widths.append(_padded(step.operands[0].width, 2 * _GRANULE) // 2)
+                widths.append(self.pairs_of(step.operands[0].width))
             if self.half and step.op == "outer":
-                widths.append(max(_padded(c.width, 2 * _GRANULE) for c in step.operands) // 2)
+                widths.append(max(self.pairs_of(c.width) for c in step.operands))
         return _padded(max(widths))
+
+    def pairs_of(self, width: int) -> int:
+        """Floats of a row of pairs, and in parts of what rounding has left of them."""
+        return _padded(width, 2 * _GRANULE) // 2 * (2 if self.parts else 1)
 
     # Records ----------------------------------------------------------------------------------------------------------
 
@@ -274,7 +279,7 @@ class _Lowering:
         if known.slot != _NONE:
             self.slots.give(known.stride, known.slot)
         if known.pairs != _NONE:
-            self.slots.give(_padded(known.width, 2 * _GRANULE) // 2, known.pairs)
+            self.slots.give(self.pairs_of(known.width), known.pairs)
 
     def make(self, step: Step, dying: set[int], entrywise: Iterable[Columns] = (), stride: int = 0) -> _Value:
         """Where a step's value is to be: in the place of an operand that is read entry by entry and not needed any
@@ -319,6 +324,8 @@ class _Lowering:
             value.input = number
         hashed = [reader.op == "scatter" or (reader.name == "hash" and not reader.numbers[2]) for reader, _ in readers]
         points = bool(readers) and all(hashed)
+        if self.tiles and any(as_pairs := self._as_pairs(step)):
+            value.pairs, value.floats = self.slots.take(self.pairs_of(step.width)), not all(as_pairs)
         self.emit("input", value=value, number=number, points=points, in_place=value.input != _NONE)
 
     def _within(self, step: Step, stride: int) -> bool:
@@ -343,7 +350,7 @@ class _Lowering:
         order = 0 if not few else 1 if step.width == 1 else _FEW
         kind, width = ("turned", step.width) if transposed else ("matrix", depth)
         kind = f"few{'_turned' * transposed}" if few else kind
-        deep = _padded(depth, unit) // 2 if self.tiles else -(-depth // 2) if self.half else depth
+        deep = self.pairs_of(depth) if self.tiles else -(-depth // 2) if self.half else depth
         number = self.pack(kind, matrix, start, width, deep * (order or _padded(step.width)), (o, i))
         by_pairs = [at < count or (self.tiles and relu_slope and c is step.operands[-1]) for at, c in enumerate(step.operands)]
         records = [self.operand(c, product=paired) for c, paired in zip(step.operands, by_pairs)]
@@ -356,7 +363,7 @@ class _Lowering:
             filled = step.width % _GRANULE == 0 or all(c.of == PARAMETER for c in added)
         if narrow and filled:
             floats = value.memory != _NONE or not all(as_pairs)
-            value.pairs, value.floats = self.slots.take(_padded(step.width, 2 * _GRANULE) // 2), floats
+            value.pairs, value.floats = self.slots.take(self.pairs_of(step.width)), floats
         finish = step.name or "none"
         self.emit("linear", records, value, order=order, number=number, depth=depth, sources=count, finish=finish)
 
@@ -367,7 +374,7 @@ class _Lowering:
             product = reader.op == "linear" and place == 0
             if self.tiles:
                 slope = reader.op == "linear" and reader.name == "relu_slope" and place == len(reader.operands) - 1
-                product = product or slope or reader.op in ("outer", "columns")
+                product = product or slope or reader.op in ("outer", "columns")[: 1 if self.parts else 2]
             return product and _all_of(reader.operands[place], step.width)
 
         return [takes(reader, place) for reader, place in self.readers.get(step.out, [])]
@@ -406,7 +413,7 @@ class _Lowering:
             given["number"] = self.pack("waves", 0, int(first), width, 3 * width, (size, features))
             given["depth"] = size
         if self.tiles and not order and step.name == "frequency" and any(as_pairs := self._as_pairs(step)):
-            value.pairs = self.slots.take(_padded(step.width, 2 * _GRANULE) // 2)
+            value.pairs = self.slots.take(self.pairs_of(step.width))
             value.floats = value.memory != _NONE or not all(as_pairs)
         self.emit("encode", records, value, **given)
 
@@ -445,7 +452,7 @@ class _Lowering:
         size, stride = shape[0] * (shape[1] if len(shape) > 1 else 1), _padded(step.width)
         self.partial += stride
         self.sums.append((step.out, "vector", at, 1, size, start, step.width, stride, size))
-        records = [self.operand(step.operands[0], product=self.tiles)]
+        records = [self.operand(step.operands[0], product=self.tiles and not self.parts)]
         self.emit("columns", records, number=at, stride=stride, width=step.width)
 
     def finished(self) -> Lowered:

@@ -242,14 +242,22 @@ def _columns_lie_together(x: Tensor, n: int) -> bool:
 _NAMES = {torch.float32: "float32", torch.bfloat16: "bfloat16", torch.float16: "float16"}
 
 
-_LAYOUTS = {"avx512_bf16": "pairs", "amx": "tiles"}
+_LAYOUTS = {
+    ("avx512_bf16", "bfloat16"): "pairs",
+    ("avx512_bf16", "bf16"): "pairs",
+    ("amx", "bfloat16"): "tiles",
+    ("amx", "bf16"): "tiles",
+    ("amx", "tf32"): "parts",
+}
 
 
 def _layout(products: str, tensor: Tensor) -> str:
-    """What values are laid out for: bfloat16 products where they are asked for, and the processor has them."""
-    if products != "bfloat16" or native.on_cuda(tensor):
+    """What values are laid out for: bfloat16 products where they are asked for, and the processor has them; for float32
+    as ``torch.set_float32_matmul_precision`` says, of which "high" are products in parts."""
+    if native.on_cuda(tensor):
         return "floats"
-    return _LAYOUTS.get(native.cpu().isa, "floats")
+    asked = torch.backends.mkldnn.matmul.fp32_precision if products == "float32" else products
+    return _LAYOUTS.get((native.cpu().isa, asked), "floats")
 
 
 def _keep(ctx: Any, inputs: tuple[Rows, How], output: list[Tensor]) -> None:
