@@ -78,7 +78,7 @@ def device(request: pytest.FixtureRequest) -> torch.device:
     return torch.device(request.param)
 
 
-@pytest.fixture(params=["portable", "neon", "avx2", "avx512", "avx512_bf16"])
+@pytest.fixture(params=["portable", "neon", "avx2", "avx512", "avx512_bf16", "amx"])
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
     """Native CPU kernels with each instruction set that this processor has."""
     native = pytest.importorskip("voronerf.ops._core.native")

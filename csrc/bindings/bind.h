@@ -42,7 +42,7 @@ struct Cuda {
   int device;
   std::uintptr_t stream;
 };
-VN_NAMES(Isa, "portable", "neon", "avx2", "avx512", "avx512_bf16");
+VN_NAMES(Isa, "portable", "neon", "avx2", "avx512", "avx512_bf16", "amx");
 VN_STRUCT(Cpu, isa, threads);
 VN_STRUCT(Cuda, device, stream);
 

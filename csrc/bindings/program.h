@@ -15,6 +15,7 @@ VN_NAMES(ProgramFunction, VN_FUNCTIONS(VN_NAME));
 #undef VN_NAME
 VN_NAMES(ProgramPackKind, "matrix", "turned", "vector", "few", "few_turned", "waves");
 VN_NAMES(ProgramSumKind, "none", "inputs_outputs", "outputs_inputs", "vector");
+VN_NAMES(ProgramLayout, "floats", "pairs", "tiles", "parts");
 VN_NAMES(ProgramPrecision, "float32", "tf32", "bfloat16", "float16");
 VN_STRUCT(ProgramPack, kind, parameter, o, i, start, width, at);
 VN_STRUCT(ProgramOperand, parameter, spread, slot, stride, memory, input, pairs, start, width, place);
@@ -26,7 +27,7 @@ VN_STRUCT(ProgramOutput, width, ray, memory);
 VN_STRUCT(ProgramLookup, input, parameter, grid, memory);
 VN_STRUCT(ProgramScatter, input, parameter, grid, memory, sum);
 VN_STRUCT(ProgramTable, packs, steps, operands, sums, inputs, outputs, memories, lookups, scatters, grids, sum_tensors,
-          parameters, tile, columns, packed, partial, scratch, scratch_width, half);
+          parameters, tile, columns, packed, partial, scratch, scratch_width, layout);
 VN_STRUCT(ProgramInputs, inputs, input_types, turned, parameters, parameter_types, strides, offsets, order, ray_index,
           n, r, k, kept, ready, gradients, caller, ray_name);
 VN_STRUCT(ProgramResults, outputs, output_types, sums);

@@ -1,11 +1,38 @@
 #include "common/isa.h"
 
+#if VN_HAS_TILES
+#include <cpuid.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+#endif
+
 namespace voronerf {
+
+namespace {
+
+#if VN_HAS_TILES
+// Whether the processor has tile registers and products of bfloat16 in them, and Linux lets this process use them: it
+// is asked once, for all threads, and a child process inherits the answer.
+bool tiles_allowed() {
+  constexpr unsigned kFeatures = 7, kBfloat16 = 1u << 22, kTiles = 1u << 24;
+  constexpr long kAskFor = 0x1023, kTileData = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  if (__get_cpuid_count(kFeatures, 0, &a, &b, &c, &d) == 0 || (d & kBfloat16) == 0 || (d & kTiles) == 0) return false;
+  static const bool allowed = syscall(SYS_arch_prctl, kAskFor, kTileData) == 0;
+  return allowed;
+}
+#endif
+
+}  // namespace
 
 bool isa_supported(Isa isa) {
 #if defined(__x86_64__)
   __builtin_cpu_init();
   switch (isa) {
+#if VN_HAS_TILES
+    case Isa::amx:
+      return isa_supported(Isa::avx512_bf16) && tiles_allowed();
+#endif
 #if VN_HAS_HALF
     case Isa::avx512_bf16:
       return __builtin_cpu_supports("avx512bf16") && isa_supported(Isa::avx512);

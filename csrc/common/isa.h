@@ -4,8 +4,9 @@
 
 namespace voronerf {
 
-// avx512_bf16 is avx512 whose networks multiply pairs of bfloat16 where they may; the others multiply floats.
-enum class Isa : int { portable = 0, neon, avx2, avx512, avx512_bf16 };
+// avx512_bf16 is avx512 whose networks multiply pairs of bfloat16 where they may, amx one that does so in tile
+// registers; the others multiply floats.
+enum class Isa : int { portable = 0, neon, avx2, avx512, avx512_bf16, amx };
 
 // Whether this build has it, and this processor and its operating system can run it.
 bool isa_supported(Isa isa);
@@ -20,6 +21,13 @@ bool isa_supported(Isa isa);
 #define VN_HAS_HALF 0
 #endif
 
+// Whether it has them in tile registers, for which Linux is to be asked.
+#if VN_HAS_HALF && defined(__linux__) && defined(__LP64__)
+#define VN_HAS_TILES 1
+#else
+#define VN_HAS_TILES 0
+#endif
+
 // The paths that exist in a build: those of its architecture, and the portable one.
 #define VN_DECLARE_IN(isa, declaration) \
   namespace isa {                       \
@@ -30,6 +38,7 @@ bool isa_supported(Isa isa);
   switch (isa) {                         \
     case ::voronerf::Isa::avx512:        \
     case ::voronerf::Isa::avx512_bf16:   \
+    case ::voronerf::Isa::amx:           \
       return ::voronerf::avx512::call;   \
     case ::voronerf::Isa::avx2:          \
       return ::voronerf::avx2::call;     \

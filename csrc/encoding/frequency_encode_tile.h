@@ -83,7 +83,7 @@ struct Lanes {
 // lanes are raw.
 template <int R, int V, bool kRaw>
 VN_INLINE void encode_block(const float* x, int64_t x_stride, int64_t row, const Lanes* lanes, float* out,
-                            int64_t stride, float* pairs) {
+                            int64_t stride, float* pairs, int64_t pairs_stride) {
   F32 value[R * V], angle[R * V], phase[R * V];
   for (int i = 0; i < R * V; ++i) {
     value[i] = permute(load(x + (row + i / V) * x_stride), lanes[i % V].index) * lanes[i % V].scale;
@@ -97,24 +97,19 @@ VN_INLINE void encode_block(const float* x, int64_t x_stride, int64_t row, const
   }
 #if VN_HALF
   for (int r = 0; pairs != nullptr && r < R; ++r) {
-    float* to = pairs + (row + r) * stride / 2;
-    if constexpr (V == 2) {
-      store(to, joined(value[2 * r], value[2 * r + 1]));
-    } else {
-      _mm512_mask_storeu_ps(to, 0xff, joined(value[r], splat(0.0f)));
-    }
+    store(pairs + (row + r) * pairs_stride, joined(value[V * r], V == 2 ? value[2 * r + 1] : splat(0.0f)));
   }
 #else
-  static_cast<void>(pairs);
+  static_cast<void>(pairs), static_cast<void>(pairs_stride);
 #endif
 }
 
 template <int R, int V, bool kRaw>
 VN_INLINE void encode_strip(const float* x, int64_t x_stride, int64_t rows, const Lanes* lanes, float* out,
-                            int64_t stride, float* pairs) {
+                            int64_t stride, float* pairs, int64_t pairs_stride) {
   int64_t row = 0;
-  for (; row + R <= rows; row += R) encode_block<R, V, kRaw>(x, x_stride, row, lanes, out, stride, pairs);
-  for (; row < rows; ++row) encode_block<1, V, kRaw>(x, x_stride, row, lanes, out, stride, pairs);
+  for (; row + R <= rows; row += R) encode_block<R, V, kRaw>(x, x_stride, row, lanes, out, stride, pairs, pairs_stride);
+  for (; row < rows; ++row) encode_block<1, V, kRaw>(x, x_stride, row, lanes, out, stride, pairs, pairs_stride);
 }
 
 // Any number of features.
@@ -140,9 +135,9 @@ VN_INLINE bool all_small(const float* x, int64_t count, float largest) {
 }
 
 // Rows x, `x_stride` floats apart and with kLanes readable floats from every row's start -> out [rows][stride]; with
-// bfloat16 operands also `pairs` [rows][stride / 2], if not null, and then out only where it is `kept`.
+// bfloat16 operands also `pairs` [rows][pairs_stride], whole vectors, if not null, and then out only where it is `kept`.
 void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns, float* out,
-            int64_t stride, float* pairs = nullptr, bool kept = true) {
+            int64_t stride, float* pairs = nullptr, int64_t pairs_stride = 0, bool kept = true) {
   const int64_t d = columns.d;
   const bool waves = columns.octaves > 0;
   const float largest = waves ? kLargestAngle / table[stride + columns.width() - 1] : 0.0f;
@@ -157,7 +152,8 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
 #if VN_HALF
     for (; pairs != nullptr && column + 2 * kLanes <= stride; column += 2 * kLanes) {
       const Lanes both[] = {{table, stride, column, columns}, {table, stride, column + kLanes, columns}};
-      encode_strip<2, 2, true>(x, x_stride, rows, both, kept ? out + column : nullptr, stride, pairs + column / 2);
+      encode_strip<2, 2, true>(x, x_stride, rows, both, kept ? out + column : nullptr, stride, pairs + column / 2,
+                               pairs_stride);
     }
 #endif
     for (; column < stride; column += kLanes) {
@@ -165,10 +161,13 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
       float* to = kept ? out + column : nullptr;
       float* paired = pairs == nullptr ? nullptr : pairs + column / 2;
       if (column < columns.first()) {
-        encode_strip<kRegisters / 8, 1, true>(x, x_stride, rows, &one, to, stride, paired);
+        encode_strip<kRegisters / 8, 1, true>(x, x_stride, rows, &one, to, stride, paired, pairs_stride);
       } else {
-        encode_strip<kRegisters / 8, 1, false>(x, x_stride, rows, &one, to, stride, paired);
+        encode_strip<kRegisters / 8, 1, false>(x, x_stride, rows, &one, to, stride, paired, pairs_stride);
       }
+    }
+    for (column = (stride + 2 * kLanes - 1) / 2 / kLanes * kLanes; column < pairs_stride; column += kLanes) {
+      for (int64_t row = 0; row < rows; ++row) store(pairs + row * pairs_stride + column, splat(0.0f));
     }
     return;
   }
@@ -183,7 +182,9 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
     for (int64_t f = 0; f < columns.first(); ++f) to[f] = from[f];
   }
 #if VN_HALF
-  if (pairs != nullptr) narrow(out, stride, columns.width(), rows, pairs);
+  for (int64_t row = 0; pairs != nullptr && row < rows; ++row) {
+    narrow_row(out + row * stride, columns.width(), pairs + row * pairs_stride);
+  }
 #endif
 }
 

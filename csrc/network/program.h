@@ -42,6 +42,10 @@ struct ProgramScatter {
   int32_t input, parameter, grid, memory, sum;
 };
 
+// What packs and slots are laid out for: products of floats, of pairs of bfloat16, of pairs in tile registers, whose
+// tiles are multiples of 32 rows; or there of floats in two parts each, as high x high + high x low + low x high.
+enum class ProgramLayout : int { floats, pairs, tiles, parts };
+
 // As Python describes a program.
 struct ProgramTable {
   std::vector<ProgramPack> packs;
@@ -57,7 +61,7 @@ struct ProgramTable {
   int32_t sum_tensors;  // how many, those of scatters included
   int32_t parameters;   // how many
   int32_t tile, columns, packed, partial, scratch, scratch_width;
-  bool half;  // products of bfloat16 pairs: packs and slots are laid out for them
+  ProgramLayout layout;
 };
 
 // A program that is ready to run.

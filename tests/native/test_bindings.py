@@ -61,4 +61,4 @@ def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch
     b = Builder()
     program = b.program([b.apply("cube", b.input(3))])
     with pytest.raises(TypeError, match="ProgramStep: function is no ProgramFunction"):
-        lowering.lower(program.text, False)
+        lowering.lower(program.text)

@@ -200,7 +200,7 @@ def test_any_imbalance(counts: list[int]) -> None:
         {
             "o": [1, 3, 4, 5, 16, 17, 33, 48, 63, 64, 65, 90, 130],
             "i": [1, 3, 4, 5, 63, 90],
-            "isa": ["portable", "neon", "avx2", "avx512", "avx512_bf16"],
+            "isa": ["portable", "neon", "avx2", "avx512", "avx512_bf16", "amx"],
         }
     ),
     indirect=["isa"],

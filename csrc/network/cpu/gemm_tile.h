@@ -19,18 +19,20 @@
 #include "network/cpu/bfloat16_tile.h"
 
 #ifndef VN_HALF
-#error "define VN_HALF: 0 for float32 operands, 1 for a pair of bfloat16 instead of each float"
+#error "define VN_HALF: 0 for float32 operands, 1 for a pair of bfloat16 instead of each float, 2 for tile registers"
 #endif
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
-#if VN_HALF
+#if VN_HALF == 1
 inline namespace pairs {
+#elif VN_HALF == 2
+inline namespace tiles_of_pairs {
 #endif
 
 // Columns of a packed panel of B, which a column of blocks reads in a straight line: 16 of 64 would lie in a quarter of
 // the sets of the first-level cache, where C's columns are too.
-constexpr int64_t kPanel = VN_ISA == 2 ? 64 : 16;
+constexpr int64_t kPanel = VN_ISA == 2 || VN_HALF == 2 ? 64 : 16;
 
 // One source of a concatenated A: `depth` values of k, in rows of `stride` floats.
 struct Source {
@@ -52,22 +54,30 @@ struct Product {
   int64_t c_stride;
   Finish finish;
   const float* slope;  // relu_slope: C is 0 where slope <= 0, [rows][c_stride]
-  // bfloat16 operands, columns a multiple of 32, finish none or relu: C as pairs as well, [rows][pairs_stride], and c
-  // may be null.
+  // bfloat16 operands: C as pairs as well, [rows][pairs_stride], and c may be null; but in tile registers for columns
+  // that are a multiple of 32, and no slope.
   float* pairs;
   int64_t pairs_stride;
+  bool slope_in_pairs;  // in tile registers: [rows][pairs_stride]
+  // In tile registers, of products in parts: what rounding has left of A, B and C lies so many floats behind their
+  // pairs. 0: it does not count.
+  int64_t a_left, b_left, pairs_left;
 };
 
 // A row to start from: nothing.
 alignas(64) constexpr float kZeros[kPanel] = {};
 
+#if VN_HALF < 2
 // C [rows][columns], columns a multiple of 16 and at most kPanel; compiled once for all who multiply (gemm_blocks.h).
 template <bool Transposed>
 void multiply(const Product& p, int64_t rows, int64_t columns);
+#endif
 
 #if VN_HALF
 }
 #endif
+
+#if VN_HALF < 2
 namespace {
 
 // The step along k: one product, or with bfloat16 operands the two of a pair.
@@ -80,5 +90,6 @@ VN_INLINE F32 multiply_add(F32 a, F32 b, F32 sum) {
 }
 
 }  // namespace
+#endif
 }  // namespace VN_ISA_NAMESPACE
 }  // namespace voronerf

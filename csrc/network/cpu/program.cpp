@@ -17,10 +17,22 @@ namespace voronerf {
 namespace {
 
 constexpr RowLimits kRows{96, 1024}, kSumRows{384, 4096};
-constexpr int64_t kTaskUnit = 48;  // tasks are whole tiles or halves of one
+constexpr int64_t kTaskUnit = 48, kTileUnit = 96;  // tasks are whole tiles or halves of one
 constexpr int64_t kSlack = 128;    // floats behind the slots that vectors may read and write
 
 int64_t aligned(int64_t floats) { return ceil_div<int64_t>(floats, kGranule) * kGranule; }
+
+#if VN_HAS_TILES
+#define VN_FOR_TILES(isa, call)                  \
+  if (isa == Isa::amx) return avx512::call;      \
+  return portable::call;
+#else
+#define VN_FOR_TILES(isa, call) return portable::call;
+#endif
+
+bool in_tiles(const ProgramTable& table) {
+  return table.layout == ProgramLayout::tiles || table.layout == ProgramLayout::parts;
+}
 
 // Whether values leave 0 to end - 1.
 bool leaves(const int32_t* values, int64_t n, int64_t end) {
@@ -190,7 +202,7 @@ ProgramCode code_of(const ProgramTable& table) {
 ProgramRows::ProgramRows(const Program& program, const ProgramInputs& in, Isa isa)
     : table_(program.table),
       isa_(isa),
-      tile_(std::min<int64_t>(table_.tile, tile_rows())),
+      tile_(in_tiles(table_) ? table_.tile : std::min<int64_t>(table_.tile, tile_rows())),
       rays_(new bool[table_.inputs.size()]),
       turned_(new bool[table_.inputs.size()]) {
   for (size_t i = 0; i < table_.inputs.size(); ++i) {
@@ -233,13 +245,17 @@ ProgramCall ProgramRows::call(const ProgramInputs& in, const ProgramResults& res
   call.ray_index = in.ray_index;
   call.n = in.n;
   call.tile = tile_;
+  call.parts = table_.layout == ProgramLayout::parts;
   return call;
 }
 
 void ProgramRows::pack(const ProgramCall& call, int64_t cell, bool first, float* own) const {
   float* const tiles = own + aligned(table_.packed);
+  if (in_tiles(table_)) {
+    VN_FOR_TILES(isa_, program_tiles_pack(call, cell, first, own, tiles))
+  }
 #if VN_HAS_HALF
-  if (table_.half) return avx512::program_half_pack(call, cell, first, own, tiles);
+  if (table_.layout == ProgramLayout::pairs) return avx512::program_half_pack(call, cell, first, own, tiles);
 #endif
   VN_FOR_ISA(isa_, program_pack(call, cell, first, own, tiles))
 }
@@ -247,8 +263,13 @@ void ProgramRows::pack(const ProgramCall& call, int64_t cell, bool first, float*
 void ProgramRows::run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, float* own,
                       float* partial) const {
   float* const tiles = own + aligned(table_.packed);
+  if (in_tiles(table_)) {
+    VN_FOR_TILES(isa_, program_tiles_run(call, cell, begin, end, own, tiles, partial))
+  }
 #if VN_HAS_HALF
-  if (table_.half) return avx512::program_half_run(call, cell, begin, end, own, tiles, partial);
+  if (table_.layout == ProgramLayout::pairs) {
+    return avx512::program_half_run(call, cell, begin, end, own, tiles, partial);
+  }
 #endif
   VN_FOR_ISA(isa_, program_run(call, cell, begin, end, own, tiles, partial))
 }
@@ -298,7 +319,8 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
 
   // The memory of the call: threads, partials, memories of n rows, and points in the order of the cells.
   const bool summed = !table.sums.empty();
-  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, summed ? kSumRows : kRows, kTaskUnit, table.partial);
+  const int64_t unit = in_tiles(table) ? kTileUnit : kTaskUnit;
+  const RowTasks tasks = split_rows(in.offsets, in.k, in.n, summed ? kSumRows : kRows, unit, table.partial);
   const int64_t own_partial = rows.workspace(), stride = aligned(own_partial + table.partial);
   const int64_t partials = summed ? tasks.first_partial[in.k] : 0;
   int64_t floats = stride * threads + aligned(partials * table.partial);

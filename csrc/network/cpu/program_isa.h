@@ -28,6 +28,7 @@ struct ProgramCall {
   const int32_t *order, *ray_index;
   int64_t n;     // rows of inputs
   int64_t tile;  // rows, at most
+  bool parts;    // in tile registers: pairs are followed by what rounding has left of the values
 };
 
 // Makes a cell's parameters ready; `first`: nothing was before. `free`: the thread's slots.
@@ -45,6 +46,17 @@ void program_half_run(const ProgramCall& call, int64_t cell, int64_t begin, int6
                       float* tiles, float* partial);
 }  // namespace avx512
 #endif
+
+// The same in tile registers; on the portable path in their double.
+#define VN_DECLARE_TILES                                                                                             \
+  void program_tiles_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free);            \
+  void program_tiles_run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed, \
+                         float* tiles, float* partial);
+VN_DECLARE_IN(portable, VN_DECLARE_TILES)
+#if VN_HAS_TILES
+VN_DECLARE_IN(avx512, VN_DECLARE_TILES)
+#endif
+#undef VN_DECLARE_TILES
 
 // The sums of a cell, from `count` partials in their order, the first of which is changed.
 VN_DECLARE_FOR_ISA(void program_reduce(const ProgramCall& call, int64_t cell, float* partials, int64_t count))

@@ -41,8 +41,8 @@ VN_INLINE void transpose_four(const float* from, int64_t from_stride, int64_t co
 
 VN_INLINE int64_t padded(int64_t width) { return (width + kGranule - 1) / kGranule * kGranule; }
 
-// A product's operand along `depth`, with bfloat16 in pairs: as many steps.
-VN_INLINE int64_t steps_of(int64_t depth) { return VN_HALF ? (depth + 1) / 2 : depth; }
+// A product's operand along `depth`, with bfloat16 in pairs, for tile registers as many as fill them: as many steps.
+VN_INLINE int64_t steps_of(int64_t depth) { return VN_HALF == 2 ? pairs_of(depth) : VN_HALF ? (depth + 1) / 2 : depth; }
 
 // The matrix as it lies in memory: outputs of the product next to each other (`turned`), or its depth.
 struct Matrix {
@@ -74,21 +74,25 @@ struct Matrix {
 
 #if VN_HALF
 
-// -> panels [pairs of depth][<= kPanel outputs, padded with 0]. Rows are narrowed four at a time into `free`, then
-// transposed, a pair being as wide as a float.
-[[maybe_unused]] void pack_panels(const Matrix& m, float* to, float* free) {
+// -> panels [pairs of depth][<= kPanel outputs, padded with 0]; in `parts` each is followed by one of what rounding has
+// left. Rows are narrowed four at a time into `free`, then transposed, a pair being as wide as a float.
+[[maybe_unused]] void pack_panels(const Matrix& m, float* to, float* free, bool parts) {
   const int64_t all = padded(m.outputs), depth = steps_of(m.depth);
   for (int64_t first = 0; first < all; first += kPanel) {
-    const int64_t columns = all - first < kPanel ? all - first : kPanel;
-    float* const panel = to + first * depth;
+    const int64_t columns = all - first < kPanel ? all - first : kPanel, left = depth * columns;
+    float* const panel = to + (parts ? 2 : 1) * first * depth;
     if (m.turned) {
-      for (int64_t k = 0; k < m.depth; k += 2) {
-        for (int64_t c = 0; c < columns; c += kGranule) {
+      for (int64_t k = 0; k < 2 * depth; k += 2) {
+        for (int64_t c = 0; c < columns; c += kLanes) {
           const int64_t count = m.outputs - first - c;
           const float* from = m.from + k * m.stride + first + c;
-          const F32 even = load_some(from, count);
+          const F32 even = k < m.depth ? load_some(from, count) : splat(0.0f);
           const F32 odd = k + 1 < m.depth ? load_some(from + m.stride, count) : splat(0.0f);
-          store(panel + k / 2 * columns + c, interleave(even, odd));
+          const F32 high = interleave(even, odd);
+          store(panel + k / 2 * columns + c, high);
+          if (parts) {
+            store(panel + left + k / 2 * columns + c, interleave(even - lower_of(high), odd - upper_of(high)));
+          }
         }
       }
       continue;
@@ -97,14 +101,15 @@ struct Matrix {
     for (int64_t column = 0; column < columns; column += 4) {
       for (int64_t row = 0; row < 4; ++row) {
         const int64_t o = first + column + row;
-        float* const pairs = free + row * stride;
+        float *const pairs = free + row * stride, *const rest = pairs + 4 * stride;
         if (o < m.outputs) {
-          narrow_row(m.from + o * m.stride, m.depth, pairs);
+          narrow_row(m.from + o * m.stride, m.depth, pairs, parts ? rest : nullptr);
         } else {
-          for (int64_t k = 0; k < depth; ++k) pairs[k] = 0.0f;
+          for (int64_t k = 0; k < depth; ++k) pairs[k] = rest[k] = 0.0f;
         }
       }
       transpose_four(free, stride, depth, panel + column, columns);
+      if (parts) transpose_four(free + 4 * stride, stride, depth, panel + left + column, columns);
     }
   }
 }
@@ -112,7 +117,7 @@ struct Matrix {
 #else
 
 // -> panels [depth][<= kPanel outputs, padded with 0].
-[[maybe_unused]] void pack_panels(const Matrix& m, float* to, float*) {
+[[maybe_unused]] void pack_panels(const Matrix& m, float* to, float*, bool) {
   const int64_t all = padded(m.outputs);
   for (int64_t first = 0; first < all; first += kPanel) {
     const int64_t columns = all - first < kPanel ? all - first : kPanel;
@@ -162,7 +167,7 @@ struct Matrix {
     if (few) {
       pack_few(matrix, to);
     } else {
-      pack_panels(matrix, to, free);
+      pack_panels(matrix, to, free, call.parts);
     }
   }
 }

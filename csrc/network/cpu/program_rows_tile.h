@@ -52,7 +52,7 @@ VN_INLINE void widen_row(const uint16_t* from, int64_t width, float* to) {
 
 // To the nearest, ties to even; NaN stays NaN.
 VN_INLINE void round_row(const float* from, int64_t width, uint16_t* to) {
-#if VN_HALF
+#if VN_HALF && VN_ISA == 2
   for (int64_t c = 0; c < width; c += kLanes) {
     const int64_t count = smaller(kLanes, width - c);
     const __m256i rounded = (__m256i)_mm512_cvtneps_pbh(load_some(from + c, count));
@@ -68,14 +68,16 @@ VN_INLINE void round_row(const float* from, int64_t width, uint16_t* to) {
 #endif
 }
 
+// The stride of rows of pairs: whole vectors, which may be written.
+VN_INLINE int64_t pairs_of(int64_t width) { return (width + 31) / 32 * 16; }
+
 #if VN_HALF
 
-// The stride of rows of pairs: whole vectors, which may be written.
-VN_INLINE int64_t pairs_of(int64_t width) { return (width + 2 * kLanes - 1) / (2 * kLanes) * kLanes; }
-
-// Columns as pairs, the last one filled up with 0.
-VN_INLINE void narrow_rows(const Rows& x, int64_t width, int64_t rows, float* to, int64_t stride) {
-  for (int64_t row = 0; row < rows; ++row) narrow_row(x.data + row * x.stride, width, to + row * stride);
+// Columns as pairs, the last one filled up with 0; so many floats behind them, if not 0, what rounding has left.
+VN_INLINE void narrow_rows(const Rows& x, int64_t width, int64_t rows, float* to, int64_t stride, int64_t left = 0) {
+  for (int64_t row = 0; row < rows; ++row, to += stride) {
+    narrow_row(x.data + row * x.stride, width, to, left == 0 ? nullptr : to + left);
+  }
 }
 
 // `columns`, a multiple of 16, as pairs of neighbouring rows, [(rows + 1) / 2][columns], the last filled up with 0.
@@ -85,6 +87,122 @@ VN_INLINE void interleave_columns(const Rows& x, int64_t columns, int64_t rows, 
     for (int64_t i = 0; i < columns; i += kLanes) {
       store(to + i, interleave(load(from + i), row + 1 < rows ? load(from + x.stride + i) : splat(0.0f)));
     }
+  }
+}
+
+#endif
+
+#if VN_HALF == 2
+
+constexpr int64_t kTurned = 32;  // rows that become 16 pairs
+
+// bfloat16 as pairs, filled up with 0.
+VN_INLINE void copy_pairs(const uint16_t* from, int64_t width, float* to) {
+  for (int64_t i = 0; i < pairs_of(width); i += kLanes, to += kLanes, from += 2 * kLanes) {
+    const int64_t count = smaller(2 * kLanes, width - 2 * i);
+    F32 pairs = splat(0.0f);
+    if (count == 2 * kLanes) {
+      __builtin_memcpy(&pairs, from, sizeof pairs);
+    } else if (count > 0) {
+      __builtin_memcpy(&pairs, from, 2 * count);
+    }
+    store(to, pairs);
+  }
+}
+
+// Columns of the rows of pairs in a slot behind the last one, up to a multiple of 32: 0.
+VN_INLINE void clear_behind(const Rows& x, int64_t columns, int64_t rows) {
+  float* const data = const_cast<float*>(x.data);
+  for (int64_t row = rows; row % kTurned != 0; ++row) {
+    for (int64_t i = 0; i < pairs_of(columns); i += kLanes) store(data + row * x.stride + i, splat(0.0f));
+  }
+}
+
+VN_INLINE Rows behind(const Rows& x, int64_t floats) { return {x.data + floats, x.stride, x.spread}; }
+
+// Rows of pairs -> pairs of neighbouring rows, [columns][stride], columns a multiple of 16.
+VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* to, int64_t stride) {
+  clear_behind(x, columns, rows);
+#if VN_ISA == 2
+  // Eight columns at a time. Lane l of the i-th vector holds those of pair i + 4 l, so what is turned within lanes is
+  // in order: half as many shuffles as turning whole vectors takes.
+  for (int64_t row = 0; row < rows; row += kTurned) {
+    for (int64_t column = 0; column < columns; column += 8) {
+      const float* const from = x.data + row * x.stride + column / 2;
+      float* const turned = to + column * stride + row / 2;
+      const auto lanes = [&](int64_t first) {
+        const auto lane = [&](int64_t l) {
+          return _mm_loadu_si128(reinterpret_cast<const __m128i*>(from + (first + 8 * l) * x.stride));
+        };
+        const __m512i low = _mm512_inserti32x4(_mm512_castsi128_si512(lane(0)), lane(1), 1);
+        return _mm512_inserti32x4(_mm512_inserti32x4(low, lane(2), 2), lane(3), 3);
+      };
+      __m512i left[4], right[4];  // the first four columns, and the others
+      for (int64_t i = 0; i < 4; ++i) {
+        const __m512i even = lanes(2 * i), odd = lanes(2 * i + 1);
+        left[i] = _mm512_unpacklo_epi16(even, odd);
+        right[i] = _mm512_unpackhi_epi16(even, odd);
+      }
+      const auto turn = [&](const __m512i* v, float* out) {
+        const __m512i a = _mm512_maskz_unpacklo_epi32(0xffff, v[0], v[1]);
+        const __m512i b = _mm512_maskz_unpackhi_epi32(0xffff, v[0], v[1]);
+        const __m512i c = _mm512_maskz_unpacklo_epi32(0xffff, v[2], v[3]);
+        const __m512i d = _mm512_maskz_unpackhi_epi32(0xffff, v[2], v[3]);
+        store(out, (F32)_mm512_maskz_unpacklo_epi64(0xff, a, c));
+        store(out + stride, (F32)_mm512_maskz_unpackhi_epi64(0xff, a, c));
+        store(out + 2 * stride, (F32)_mm512_maskz_unpacklo_epi64(0xff, b, d));
+        store(out + 3 * stride, (F32)_mm512_maskz_unpackhi_epi64(0xff, b, d));
+      };
+      turn(left, turned);
+      turn(right, turned + 4 * stride);
+    }
+  }
+#else
+  for (int64_t column = 0; column < columns; ++column) {
+    auto* const turned = reinterpret_cast<uint16_t*>(to + column * stride);
+    for (int64_t row = 0; row < 2 * stride; ++row) {
+      __builtin_memcpy(turned + row, reinterpret_cast<const uint16_t*>(x.data + row * x.stride) + column, 2);
+    }
+  }
+#endif
+}
+
+// Rows of pairs -> pairs of neighbouring rows, [all pairs][columns], columns a multiple of 16.
+VN_INLINE void zip_pairs(const Rows& x, int64_t columns, int64_t rows, float* to) {
+  clear_behind(x, columns, rows);
+  for (int64_t row = 0; row < 2 * pairs_of(rows); row += 2, to += columns) {
+    const float *even = x.data + row * x.stride, *odd = even + x.stride;
+#if VN_ISA == 2
+    for (int64_t column = 0; column < columns; column += 2 * kLanes) {
+      F32 low, high;
+      zip_halves(load(even + column / 2), load(odd + column / 2), low, high);
+      store(to + column, low);
+      if (column + kLanes < columns) store(to + column + kLanes, high);
+    }
+#else
+    for (int64_t column = 0; column < columns; ++column) {
+      auto* const pair = reinterpret_cast<uint16_t*>(to + column);
+      __builtin_memcpy(pair, reinterpret_cast<const uint16_t*>(even) + column, 2);
+      __builtin_memcpy(pair + 1, reinterpret_cast<const uint16_t*>(odd) + column, 2);
+    }
+#endif
+  }
+}
+
+// to [columns] += the sums over rows of pairs, or = if `first`.
+VN_INLINE void add_pairs(const Rows& x, int64_t columns, int64_t rows, bool first, float* to) {
+  for (int64_t column = 0; column < columns; column += 2 * kLanes) {
+    const bool both = column + kLanes < columns;
+    F32 sums[4];  // two of each half, or every addition waits for the one before
+    for (F32& sum : sums) sum = splat(0.0f);
+    for (int64_t row = 0; row < rows; ++row) {
+      const F32 values = load(x.data + row * x.stride + column / 2);
+      sums[row % 2] = sums[row % 2] + widened(values, 0);
+      sums[2 + row % 2] = sums[2 + row % 2] + widened(values, 1);
+    }
+    const F32 low = sums[0] + sums[1], high = sums[2] + sums[3];
+    store(to + column, first ? low : low + load(to + column));
+    if (both) store(to + column + kLanes, first ? high : high + load(to + column + kLanes));
   }
 }
 

@@ -3,10 +3,14 @@
 
 #include "encoding/hash_encode_isa.h"
 #include "encoding/spherical_harmonics_tile.h"
-#include "network/cpu/few_outputs_tile.h"
 #include "network/cpu/functions_tile.h"
 #include "network/cpu/program_pack.h"
 #include "network/cpu/program_rows_tile.h"
+#if VN_HALF == 2
+#include "network/cpu/gemm_tiles.h"
+#else
+#include "network/cpu/few_outputs_tile.h"
+#endif
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
@@ -83,8 +87,30 @@ struct ProgramTile {
   void run() const {
     for (int32_t i = 0; i < call.code.step_count; ++i) {
       const ProgramStep& step = call.code.steps[i];
-      run_step(step, call.code.operands + step.first, at(step.slot, step.memory, step.stride));
+      float* const to = at(step.slot, step.memory, step.stride);
+      run_step(step, call.code.operands + step.first, to);
+#if VN_HALF == 2
+      if (step.pairs >= 0 && narrows(step)) {
+        narrow_rows(made(step, to), step.width, rows, slot(step.pairs), stride_of(step.width), left_of(step.width));
+      }
+#endif
     }
+  }
+
+  // What a step has made, or left where it is.
+  Rows made(const ProgramStep& step, const float* to) const {
+    if (step.op != ProgramOp::input || !step.in_place || !call.in_place[step.number]) return {to, step.stride, false};
+    return {static_cast<const float*>(call.inputs[step.number]) + begin * step.width, step.width, false};
+  }
+
+  // Whether a step leaves it to others to make pairs of its value.
+  bool narrows(const ProgramStep& step) const {
+    if (step.op == ProgramOp::input) return !narrowed_as_read(step);
+    const bool waves = step.op == ProgramOp::encode && step.order == 0 && step.encoding == ProgramEncoding::frequency;
+    return step.op != ProgramOp::linear && (!waves || call.parts);
+  }
+  bool narrowed_as_read(const ProgramStep& step) const {
+    return step.pairs >= 0 && !call.turned[step.number] && !call.parts;
   }
 
   void run_step(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
@@ -134,20 +160,33 @@ struct ProgramTile {
       case ProgramOp::outer:
         return outer(step, operands);
       case ProgramOp::columns:
-        return columns(step, operand(operands[0]));
+        return columns(step, operands[0]);
     }
   }
 
   void input(const ProgramStep& step, float* to) const {
     const int32_t number = step.number;
     const int64_t stride = step.stride, width = step.width;
-    if (step.in_place && call.in_place[number]) return;
-    if (step.points && call.looked_up) return;
-    if (call.turned[number]) return turn(static_cast<const float*>(call.inputs[number]), step, to);
     const auto row_of = [&](int64_t row) {
       const int64_t sample = place(row);
       return call.rays[number] ? call.ray_index[sample] : sample;
     };
+#if VN_HALF == 2
+    if (narrowed_as_read(step)) {
+      float* pairs = slot(step.pairs);
+      for (int64_t row = 0; row < rows; ++row, pairs += pairs_of(width)) {
+        if (call.input_types[number] == TableType::bfloat16) {
+          copy_pairs(static_cast<const uint16_t*>(call.inputs[number]) + row_of(row) * width, width, pairs);
+        } else {
+          narrow_row(static_cast<const float*>(call.inputs[number]) + row_of(row) * width, width, pairs);
+        }
+      }
+      if (!step.floats) return;
+    }
+#endif
+    if (step.in_place && call.in_place[number]) return;
+    if (step.points && call.looked_up) return;
+    if (call.turned[number]) return turn(static_cast<const float*>(call.inputs[number]), step, to);
     if (call.input_types[number] == TableType::bfloat16) {
       const auto* from = static_cast<const uint16_t*>(call.inputs[number]);
       for (int64_t row = 0; row < rows; ++row) widen_row(from + row_of(row) * width, width, to + row * stride);
@@ -217,42 +256,63 @@ struct ProgramTile {
                           : step.finish == ProgramFinish::relu ? Finish::relu
                                                                : Finish::relu_slope;
     const float* const weights = packed + pack(step.number).at;
-    const int64_t depth = steps_of(step.depth);
+    const int64_t depth = steps_of(step.depth), panels = call.parts ? 2 : 1;
     constexpr int32_t kMostSources = 8;
     Source sources[kMostSources];
     for (int32_t i = 0; i < count; ++i) {
       const Rows x = operand(operands[i]);
       sources[i] = {x.data, x.stride, steps_of(operands[i].width)};
     }
-    float* pairs = nullptr;
-    int64_t pairs_stride = 0;
+    float* const pairs = step.pairs < 0 ? nullptr : slot(step.pairs);
+    const int64_t pairs_stride = stride_of(step.width), pairs_left = left_of(step.width);
+    bool slope_in_pairs = false;
 #if VN_HALF
-    sources[0].stride = pairs_of(step.depth);  // of pairs there is one source
-    if (operands[0].pairs >= 0) {
-      sources[0].data = slot(operands[0].pairs);
-    } else {
-      narrow_rows(operand(operands[0]), step.depth, rows, scratch(0), sources[0].stride);
-      sources[0].data = scratch(0);
-    }
-    if (step.pairs >= 0) {
-      pairs = slot(step.pairs);
-      pairs_stride = pairs_of(step.width);
+    const Rows x = in_pairs(operands[0], scratch(0));
+    sources[0].data = x.data;  // of pairs there is one source
+    sources[0].stride = x.stride;
+#endif
+#if VN_HALF == 2
+    if (slopes && operands[step.taken - 1].pairs >= 0) {
+      slope = slot(operands[step.taken - 1].pairs);
+      slope_in_pairs = true;
     }
 #endif
+#if VN_HALF < 2
     if (step.order > 0) {
       const auto product = step.order == 1 ? few_outputs<1> : few_outputs<4>;
       return product(sources, count, weights, depth, add.data, step.finish == ProgramFinish::relu, rows, to);
     }
+#endif
     float* const c = pairs == nullptr || step.floats ? to : nullptr;
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       const int64_t columns = smaller(kPanel, step.stride - first);
+      const auto from = [=](float* at, bool of_pairs) { return at == nullptr ? at : at + (of_pairs ? first / 2 : first); };
       const float* start = add.data == kZeros ? kZeros : add.data + first;
-      multiply<false>({sources, count, weights + first * depth, columns, start, add.stride,
-                       c == nullptr ? c : c + first, step.stride, finish, slope == nullptr ? nullptr : slope + first,
-                       pairs == nullptr ? pairs : pairs + first / 2, pairs_stride},
-                      rows, columns);
+      const float* by = slope == nullptr ? nullptr : slope + (slope_in_pairs ? first / 2 : first);
+      const Product product{sources, count,  weights + panels * first * depth, columns,      start,         add.stride, from(c, false),
+                            step.stride, finish, by, from(pairs, true), pairs_stride, slope_in_pairs,
+                            left_of(step.depth), call.parts ? depth * columns : 0, pairs_left};
+#if VN_HALF == 2
+      multiply_tiles(product, rows, columns);
+#else
+      multiply<false>(product, rows, columns);
+#endif
     }
   }
+
+  // Of rows of pairs, and in parts of what rounding has left, which lies behind them: the stride, and how far.
+  int64_t stride_of(int64_t width) const { return (call.parts ? 2 : 1) * pairs_of(width); }
+  int64_t left_of(int64_t width) const { return call.parts ? pairs_of(width) : 0; }
+
+#if VN_HALF
+  // An operand of a product as pairs: those there are, or made in `free`.
+  Rows in_pairs(const ProgramOperand& of, float* free) const {
+    const int64_t stride = stride_of(of.width);
+    if (of.pairs >= 0) return {slot(of.pairs), stride, false};
+    narrow_rows(operand(of), of.width, rows, free, stride, left_of(of.width));
+    return {free, stride, false};
+  }
+#endif
 
   void total(const ProgramStep& step, const Rows& x, float* to) const {
     const int64_t group = step.number;
@@ -329,8 +389,10 @@ struct ProgramTile {
     }
     const Columns columns = waves(step, operands[0]);
     const float* const table = packed + pack(step.number).at;
-    encode(x.data, x.stride, table, rows, columns, to, step.stride);
-    if (step.encoding == ProgramEncoding::integrated) {
+    const bool integrated = step.encoding == ProgramEncoding::integrated;
+    float* const pairs = step.pairs < 0 || narrows(step) ? nullptr : slot(step.pairs);
+    encode(x.data, x.stride, table, rows, columns, to, step.stride, pairs, pairs_of(step.width), pairs == nullptr || step.floats);
+    if (integrated) {
       blur(x.data + columns.d, x.stride, table, rows, to, step.stride);
     }
   }
@@ -370,8 +432,12 @@ struct ProgramTile {
 
   // Sums --------------------------------------------------------------------------------------------------------------
 
-  void columns(const ProgramStep& step, const Rows& g) const {
+  void columns(const ProgramStep& step, const ProgramOperand& of) const {
     float* const to = partial + step.number;
+#if VN_HALF == 2
+    if (of.pairs >= 0) return add_pairs(in_pairs(of, nullptr), step.stride, rows, fill, to);
+#endif
+    const Rows g = operand(of);
     for (int64_t c = 0; c < step.stride; c += kLanes) {
       // Four sums, or every addition waits for the one before.
       F32 sums[4] = {fill ? splat(0.0f) : load(to + c), splat(0.0f), splat(0.0f), splat(0.0f)};
@@ -389,6 +455,18 @@ struct ProgramTile {
   void outer(const ProgramStep& step, const ProgramOperand* operands) const {
     float* const to = partial + step.number;
     const ProgramOperand &of_a = operands[step.order ? 0 : 1], &of_b = operands[step.order ? 1 : 0];
+#if VN_HALF == 2
+    const int64_t depth = pairs_of(rows);
+    const Source source{scratch(0), depth, depth}, other{scratch(1), padded(of_b.width), depth};
+    const int64_t width = padded(of_a.width), a_left = call.parts ? width * depth : 0, b_left = depth * other.stride;
+    const Rows a = in_pairs(of_a, scratch(2));
+    turn_pairs(a, width, rows, scratch(0), depth);
+    if (call.parts) turn_pairs(behind(a, left_of(of_a.width)), width, rows, scratch(0) + a_left, depth);
+    const Rows b = in_pairs(of_b, scratch(2));
+    zip_pairs(b, other.stride, rows, scratch(1));
+    if (call.parts) zip_pairs(behind(b, left_of(of_b.width)), other.stride, rows, scratch(1) + b_left);
+#else
+    constexpr int64_t a_left = 0, b_left = 0;
     const Rows a = operand(of_a), b = operand(of_b);
     Source source{a.data, a.stride, rows}, other{b.data, b.stride, rows};
 #if VN_HALF
@@ -397,13 +475,20 @@ struct ProgramTile {
     interleave_columns(a, source.stride, rows, scratch(0));
     interleave_columns(b, other.stride, rows, scratch(1));
 #endif
+#endif
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       float* c = to + first;
-      multiply<true>({&source, 1, other.data + first, other.stride, fill ? kZeros : c, fill ? 0 : step.stride, c,
-                      step.stride, Finish::none, nullptr, nullptr, 0},
-                     of_a.width, smaller(kPanel, step.stride - first));
+      const Product product{&source, 1, other.data + first, other.stride, fill ? kZeros : c, fill ? 0 : step.stride,
+                            c, step.stride, Finish::none, nullptr, nullptr, 0, false, a_left, b_left, 0};
+      const int64_t columns = smaller(kPanel, step.stride - first);
+#if VN_HALF == 2
+      multiply_tiles(product, of_a.width, columns);
+#else
+      multiply<true>(product, of_a.width, columns);
+#endif
     }
   }
+
 };
 
 [[maybe_unused]] void run_tiles(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed,

@@ -28,6 +28,7 @@ _ORDERS = 3  # of derivatives that the compiled module has
 _FLOATS = 96 << 10  # of the values of a tile: they share the second cache level with the weights
 _ROWS = (24, 96)  # of a tile, whole blocks of the products (gemm_tile.h)
 _WHOLE = 48  # rows of a tile where harmonics write whole vectors of rows
+_TILE = 32  # rows of a block of products in tile registers
 _GRANULE = 16
 _FEW = 4  # outputs of a layer that has a product of its own (few_outputs_tile.h)
 _MOST_SOURCES = 8  # of a product (program_tile.h)
@@ -70,15 +71,16 @@ def compiled_runs(text: str) -> bool:
 
 
 @functools.lru_cache(maxsize=1024)
-def lower(text: str, half: bool, cuda: bool = False) -> Lowered:
+def lower(text: str, layout: str = "floats", cuda: bool = False) -> Lowered:
     """The records of a program, given by its text.
 
     Args:
         text: of the program.
-        half: for products of pairs of bfloat16, instead of float32.
+        layout: what products take: "floats", "pairs" of bfloat16, pairs in "tiles" (tile registers), or there floats
+            in two "parts" each.
         cuda: for CUDA, whose products have one source.
     """
-    return _Lowering(merged(Program.parse(text)), half, joins=not (half or cuda)).lowered()
+    return _Lowering(merged(Program.parse(text)), layout, joins=layout == "floats" and not cuda).lowered()
 
 
 def _padded(width: int, to: int = _GRANULE) -> int:
@@ -122,8 +124,9 @@ class _Value:
 class _Lowering:
     """Records on their way."""
 
-    def __init__(self, program: Program, half: bool, joins: bool) -> None:
-        self.program, self.half = program, half
+    def __init__(self, program: Program, layout: str, joins: bool) -> None:
+        self.program, self.layout = program, layout
+        self.half, self.tiles, self.parts = layout != "floats", layout in ("tiles", "parts"), layout == "parts"
         self.compiled = native.compiled
         self.slots, self.values = _Slots(), dict[int, _Value]()
         self.packs: dict[tuple[Any, ...], tuple[int, int]] = {}  # their number, and where they are
@@ -142,7 +145,8 @@ class _Lowering:
                 if c.of == VALUE:
                     self.readers.setdefault(c.index, []).append((step, place))
         self.scratch_width = self._scratch()
-        self.scratch = self.slots.take(2 * self.scratch_width) if self.scratch_width else 0
+        parts = 3 if self.tiles else 2
+        self.scratch = self.slots.take(parts * self.scratch_width) if self.scratch_width else 0
 
     # What there is to do ----------------------------------------------------------------------------------------------
 
@@ -181,16 +185,20 @@ class _Lowering:
         return alone and g.start == 0 and g.width == step.width and not g.spread
 
     def _scratch(self) -> int:
-        """Columns of each of the two parts of memory that a step may use."""
+        """Columns of each part of the memory that a step may use."""
         widths = [0]
         for step in self.work:
             if step.op == "encode" and step.name in ("spherical", "hash"):
                 widths.append(_GRANULE)
             if self.half and step.op == "linear":
-                widths.append(_padded(step.operands[0].width, 2 * _GRANULE) // 2)
+                widths.append(self.pairs_of(step.operands[0].width))
             if self.half and step.op == "outer":
-                widths.append(max(_padded(c.width, 2 * _GRANULE) for c in step.operands) // 2)
+                widths.append(max(self.pairs_of(c.width) for c in step.operands))
         return _padded(max(widths))
+
+    def pairs_of(self, width: int) -> int:
+        """Floats of a row of pairs, and in parts of what rounding has left of them."""
+        return _padded(width, 2 * _GRANULE) // 2 * (2 if self.parts else 1)
 
     # Records ----------------------------------------------------------------------------------------------------------
 
@@ -208,7 +216,8 @@ class _Lowering:
         return (shape[0], shape[1]) if len(shape) == 2 else (1, shape[0])
 
     def operand(self, c: Columns, place: int = 0, *, product: bool = False) -> Any:
-        """One operand's record; ``product``: x of a linear step, or what an outer product reads entry by entry."""
+        """One operand's record; ``product``: what reads pairs where there are some: x of a linear step, and in tile
+        registers its slope and the operands of sums."""
         given: dict[str, Any] = dict.fromkeys(("memory", "input", "pairs"), _NONE)
         given |= {"start": c.start, "width": c.width, "place": place, "spread": c.spread}
         if c.of == PARAMETER:
@@ -270,7 +279,7 @@ class _Lowering:
         if known.slot != _NONE:
             self.slots.give(known.stride, known.slot)
         if known.pairs != _NONE:
-            self.slots.give(_padded(known.width, 2 * _GRANULE) // 2, known.pairs)
+            self.slots.give(self.pairs_of(known.width), known.pairs)
 
     def make(self, step: Step, dying: set[int], entrywise: Iterable[Columns] = (), stride: int = 0) -> _Value:
         """Where a step's value is to be: in the place of an operand that is read entry by entry and not needed any
@@ -315,6 +324,8 @@ class _Lowering:
             value.input = number
         hashed = [reader.op == "scatter" or (reader.name == "hash" and not reader.numbers[2]) for reader, _ in readers]
         points = bool(readers) and all(hashed)
+        if self.tiles and any(as_pairs := self._as_pairs(step)):
+            value.pairs, value.floats = self.slots.take(self.pairs_of(step.width)), not all(as_pairs)
         self.emit("input", value=value, number=number, points=points, in_place=value.input != _NONE)
 
     def _within(self, step: Step, stride: int) -> bool:
@@ -334,23 +345,39 @@ class _Lowering:
         count, relu_slope = _sources(step), step.name == "relu_slope"
         sources, added = step.operands[:count], step.operands[count : len(step.operands) - relu_slope]
         depth, unit = sum(c.width for c in sources), 2 * _GRANULE if self.half else _GRANULE
-        few = step.width <= _FEW and not relu_slope and all(c.width % unit == 0 for c in sources)
+        few = step.width <= _FEW and not relu_slope and all(c.width % unit == 0 for c in sources) and not self.tiles
         few = few and all(c.of == PARAMETER for c in added)
         order = 0 if not few else 1 if step.width == 1 else _FEW
         kind, width = ("turned", step.width) if transposed else ("matrix", depth)
         kind = f"few{'_turned' * transposed}" if few else kind
-        deep = -(-depth // 2) if self.half else depth
+        deep = self.pairs_of(depth) if self.tiles else -(-depth // 2) if self.half else depth
         number = self.pack(kind, matrix, start, width, deep * (order or _padded(step.width)), (o, i))
-        records = [self.operand(c, product=at < count) for at, c in enumerate(step.operands)]
+        by_pairs = [at < count or (self.tiles and relu_slope and c is step.operands[-1]) for at, c in enumerate(step.operands)]
+        records = [self.operand(c, product=paired) for c, paired in zip(step.operands, by_pairs)]
         entrywise = [c for c in step.operands[count:] if all(c[:2] != x[:2] for x in sources)]
         value = self.make(step, dying, entrywise)
-        readers = self.readers.get(step.out, [])
-        as_pairs = [r.op == "linear" and not p and _all_of(r.operands[0], step.width) for r, p in readers]
-        narrow = self.half and any(as_pairs) and not few and not relu_slope
-        if narrow and value.stride % (2 * _GRANULE) == 0 and step.width % 2 == 0 and value.memory == _NONE:
-            value.pairs, value.floats = self.slots.take(_padded(step.width, 2 * _GRANULE) // 2), not all(as_pairs)
+        as_pairs = self._as_pairs(step)
+        narrow = self.half and any(as_pairs) and not few and not (relu_slope and not self.tiles)
+        filled = value.stride % (2 * _GRANULE) == 0 and step.width % 2 == 0 and value.memory == _NONE
+        if self.tiles:  # what is added fills up rows with what may be infinite
+            filled = step.width % _GRANULE == 0 or all(c.of == PARAMETER for c in added)
+        if narrow and filled:
+            floats = value.memory != _NONE or not all(as_pairs)
+            value.pairs, value.floats = self.slots.take(self.pairs_of(step.width)), floats
         finish = step.name or "none"
         self.emit("linear", records, value, order=order, number=number, depth=depth, sources=count, finish=finish)
+
+    def _as_pairs(self, step: Step) -> list[bool]:
+        """Of each reader of a value, whether it takes pairs."""
+
+        def takes(reader: Step, place: int) -> bool:
+            product = reader.op == "linear" and place == 0
+            if self.tiles:
+                slope = reader.op == "linear" and reader.name == "relu_slope" and place == len(reader.operands) - 1
+                product = product or slope or reader.op in ("outer", "columns")[: 1 if self.parts else 2]
+            return product and _all_of(reader.operands[place], step.width)
+
+        return [takes(reader, place) for reader, place in self.readers.get(step.out, [])]
 
     def _function(self, step: Step, dying: set[int]) -> None:
         records = [self.operand(c) for c in step.operands]
@@ -385,6 +412,9 @@ class _Lowering:
             features = raw if first else raw // 2
             given["number"] = self.pack("waves", 0, int(first), width, 3 * width, (size, features))
             given["depth"] = size
+        if self.tiles and not order and step.name == "frequency" and any(as_pairs := self._as_pairs(step)):
+            value.pairs = self.slots.take(self.pairs_of(step.width))
+            value.floats = value.memory != _NONE or not all(as_pairs)
         self.emit("encode", records, value, **given)
 
     def _input_of(self, x: Columns) -> int:
@@ -414,7 +444,7 @@ class _Lowering:
         kind = "outputs_inputs" if by_outputs else "inputs_outputs"
         self.sums.append((step.out, kind, at, o, shape[1], start, i, stride, shape[0] * shape[1]))
         broadcast = 0 if by_outputs else 1
-        records = [self.operand(c, product=place == broadcast) for place, c in enumerate(step.operands)]
+        records = [self.operand(c, product=self.tiles or place == broadcast) for place, c in enumerate(step.operands)]
         self.emit("outer", records, number=at, stride=stride, order=int(by_outputs))
 
     def _columns(self, step: Step, dying: set[int]) -> None:
@@ -422,7 +452,8 @@ class _Lowering:
         size, stride = shape[0] * (shape[1] if len(shape) > 1 else 1), _padded(step.width)
         self.partial += stride
         self.sums.append((step.out, "vector", at, 1, size, start, step.width, stride, size))
-        self.emit("columns", [self.operand(step.operands[0])], number=at, stride=stride, width=step.width)
+        records = [self.operand(step.operands[0], product=self.tiles and not self.parts)]
+        self.emit("columns", records, number=at, stride=stride, width=step.width)
 
     def finished(self) -> Lowered:
         """The compiled program."""
@@ -447,6 +478,8 @@ class _Lowering:
         ]
         whole = any(step.op == "encode" and step.name == "spherical" for step in self.work)
         fewest, most = (_WHOLE if whole else _ROWS[0]), _ROWS[1]
+        if self.tiles:
+            fewest = most if whole else _TILE
         fitting = _FLOATS // max(self.slots.size, 1) // fewest * fewest
         table = compiled.ProgramTable(
             packs=[compiled.ProgramPack(*key, at) for key, (_, at) in self.packs.items()],
@@ -467,7 +500,7 @@ class _Lowering:
             partial=self.partial,
             scratch=self.scratch,
             scratch_width=self.scratch_width,
-            half=self.half,
+            layout=self.layout,
         )
         return Lowered(
             compiled.make_program(table),

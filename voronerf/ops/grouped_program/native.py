@@ -119,7 +119,7 @@ def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
     float32: dict[str, Any] = {"dtype": torch.float32, "device": first.device}
     counts = program.cells_of_sums(parameters, k)
     sums = [new((count, *shape), **float32) for count, shape in zip(counts, program.sums)]
-    lowered = lower(program.text, _half(how.products, first)) if compiled_runs(program.text) else None
+    lowered = lower(program.text, _layout(how.products, first)) if compiled_runs(program.text) else None
     keeps = [new((n, width), **float32) for width in lowered.widths] if how.keep and lowered else []
     yield [*outputs, *sums, *keeps]
     if lowered is None:
@@ -160,7 +160,7 @@ def _run_on_cuda(
     results = native.compiled.ProgramResults(
         outputs=made, output_types=[_NAMES[result.dtype] for result in made], sums=sums
     )
-    lowered, code = lower(program.text, False, True).program, _code(program.text, offsets.device)
+    lowered, code = lower(program.text, cuda=True).program, _code(program.text, offsets.device)
     machine = native.compiled.Cuda(*native.stream(offsets))
     size = native.compiled.grouped_program_workspace(lowered, given.n, given.r, given.k, machine)
     workspace = torch.empty(size, dtype=torch.uint8, device=offsets.device)
@@ -176,7 +176,7 @@ def _run_on_cuda(
 @functools.lru_cache(maxsize=1024)
 def _code(text: str, device: torch.device) -> Tensor:
     """The records of a program on a device, copied there once."""
-    program = lower(text, False, True).program
+    program = lower(text, cuda=True).program
     code = torch.empty(native.compiled.program_code_bytes(program), dtype=torch.uint8)
     native.compiled.program_code(program, code)
     return code.to(device)
@@ -243,9 +243,22 @@ def _columns_lie_together(x: Tensor, n: int) -> bool:
 _NAMES = {torch.float32: "float32", torch.bfloat16: "bfloat16", torch.float16: "float16"}
 
 
-def _half(products: str, tensor: Tensor) -> bool:
-    """Whether products take pairs of bfloat16: where they are asked for, and the processor has them."""
-    return products == "bfloat16" and not native.on_cuda(tensor) and native.cpu().isa == "avx512_bf16"
+_LAYOUTS = {
+    ("avx512_bf16", "bfloat16"): "pairs",
+    ("avx512_bf16", "bf16"): "pairs",
+    ("amx", "bfloat16"): "tiles",
+    ("amx", "bf16"): "tiles",
+    ("amx", "tf32"): "parts",
+}
+
+
+def _layout(products: str, tensor: Tensor) -> str:
+    """What values are laid out for: bfloat16 products where they are asked for, and the processor has them; for float32
+    as ``torch.set_float32_matmul_precision`` says, of which "high" are products in parts."""
+    if native.on_cuda(tensor):
+        return "floats"
+    asked = torch.backends.mkldnn.matmul.fp32_precision if products == "float32" else products
+    return _LAYOUTS.get((native.cpu().isa, asked), "floats")
 
 
 def _keep(ctx: Any, inputs: tuple[Rows, How], output: list[Tensor]) -> None:
@@ -314,7 +327,7 @@ def _gradient(text: str, count: int, split: int, wanted: tuple[bool, ...], given
     own = gradient(program, wanted[:count], wanted[count:], given[:split], given[split:])
     sifts = not own.outputs and all(i < count for i in own.rays)
     keeps = bool(program.grids) and compiled_runs(own.text) and compiled_runs(text)
-    keeps = keeps and lower(own.text, False).lookups == lower(text, False).lookups
+    keeps = keeps and lower(own.text).lookups == lower(text).lookups
     return _Gradient(own.text, len(own.outputs), sifts, keeps)
 
 

@@ -49,7 +49,7 @@ def render_opaque(*flat: Any) -> RaysSeen:
         composed: RaysSeen = partial(reference.render_opaque, backend="native")(*given._replace(network=narrow))
         return composed
     rows = taken.rows(torch.zeros(k + 1, dtype=torch.int32))
-    lowered = lower(program_of(rows, taken.how).text, False)
+    lowered = lower(program_of(rows, taken.how).text)
     child_offsets, child, depth = network["child_offsets"], network["child"], network["depth"]
     if k == 1:
         centres = child_offsets = child = None

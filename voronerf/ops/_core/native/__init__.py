@@ -227,7 +227,7 @@ def _bfloat16_products() -> str:
     """What bfloat16 is multiplied in on the CPU, and why."""
     if _bfloat16_gain == 0:
         return "in float32: this processor, or this build, has none"
-    used = "in bfloat16" if _isa == "avx512_bf16" else "in float32"
+    used = "in bfloat16" if _isa in ("avx512_bf16", "amx") else "in float32"
     return f"{used}: bfloat16 makes {_bfloat16_gain:.2g} x the operations of float32"
 
 

@@ -1,0 +1,112 @@
+// The five instructions of AMX that products of bfloat16 take, on eight registers of up to 16 rows of 64 bytes; and on
+// the portable path a double of each, with which every machine tests what is made of them.
+//
+//   shape_tiles    rows and bytes a row of each register; all become 0
+//   tile_load      rows `stride` bytes apart
+//   tile_store     likewise
+//   tile_zero
+//   tile_products  C[m][n] += sum over k of A[m][2k] B[k][2n] + A[m][2k+1] B[k][2n+1]: rows of C and A, columns of C and
+//                  B in pairs. Sums are float32, rounded to the nearest; what is below its smallest normal number is 0.
+//
+// The shape belongs to the thread, which releases it before it does something else: only then has the kernel nothing
+// to save where threads change.
+#pragma once
+
+#include "common/memory_tile.h"
+
+namespace voronerf {
+namespace VN_ISA_NAMESPACE {
+namespace {
+
+constexpr int64_t kTileRows = 16, kTileBytes = 64;
+
+struct alignas(64) TileShapes {
+  uint8_t palette = 1, start = 0, none[14] = {};
+  uint16_t bytes[16] = {};
+  uint8_t rows[16] = {};
+};
+
+#if VN_ISA == 2
+
+VN_INLINE void shape_tiles(const TileShapes& shapes) { asm volatile("ldtilecfg %0" ::"m"(shapes)); }
+VN_INLINE void release_tiles() { asm volatile("tilerelease"); }
+template <int T>
+VN_INLINE void tile_zero() {
+  asm volatile("tilezero %%tmm%c0" ::"i"(T));
+}
+template <int T>
+VN_INLINE void tile_load(const void* from, int64_t stride) {
+  asm volatile("tileloadd (%0,%1,1), %%tmm%c2" ::"r"(from), "r"(stride), "i"(T) : "memory");
+}
+template <int T>
+VN_INLINE void tile_store(void* to, int64_t stride) {
+  asm volatile("tilestored %%tmm%c2, (%0,%1,1)" ::"r"(to), "r"(stride), "i"(T) : "memory");
+}
+template <int C, int A, int B>
+VN_INLINE void tile_products() {
+  asm volatile("tdpbf16ps %%tmm%c2, %%tmm%c1, %%tmm%c0" ::"i"(C), "i"(A), "i"(B));
+}
+
+#else
+
+struct Tile {
+  int64_t rows, bytes;
+  unsigned char data[kTileRows][kTileBytes];
+};
+// Of the calling thread.
+inline Tile* tiles() {
+  static thread_local Tile registers[8];
+  return registers;
+}
+
+VN_INLINE void shape_tiles(const TileShapes& shapes) {
+  for (int i = 0; i < 8; ++i) tiles()[i] = {shapes.rows[i], shapes.bytes[i], {}};
+}
+VN_INLINE void release_tiles() { shape_tiles({}); }
+template <int T>
+VN_INLINE void tile_zero() {
+  tiles()[T] = {tiles()[T].rows, tiles()[T].bytes, {}};
+}
+template <int T>
+VN_INLINE void tile_load(const void* from, int64_t stride) {
+  Tile& tile = tiles()[T];
+  const auto* row = static_cast<const unsigned char*>(from);
+  for (int64_t i = 0; i < tile.rows; ++i, row += stride) __builtin_memcpy(tile.data[i], row, tile.bytes);
+}
+template <int T>
+VN_INLINE void tile_store(void* to, int64_t stride) {
+  const Tile& tile = tiles()[T];
+  auto* row = static_cast<unsigned char*>(to);
+  for (int64_t i = 0; i < tile.rows; ++i, row += stride) __builtin_memcpy(row, tile.data[i], tile.bytes);
+}
+template <int C, int A, int B>
+VN_INLINE void tile_products() {
+  Tile& c = tiles()[C];
+  const Tile &a = tiles()[A], &b = tiles()[B];
+  const auto at = [](const Tile& tile, int64_t row, int64_t i) {  // bfloat16 is the upper half of a float
+    uint16_t half;
+    __builtin_memcpy(&half, tile.data[row] + 2 * i, sizeof half);
+    const uint32_t bits = static_cast<uint32_t>(half) << 16;
+    float value;
+    __builtin_memcpy(&value, &bits, sizeof value);
+    return value;
+  };
+  for (int64_t m = 0; m < c.rows; ++m) {
+    for (int64_t n = 0; n < c.bytes / 4; ++n) {
+      float even = 0.0f, odd = 0.0f, sum;
+      for (int64_t k = 0; k < a.bytes / 4; ++k) {
+        even += at(a, m, 2 * k) * at(b, k, 2 * n);
+        odd += at(a, m, 2 * k + 1) * at(b, k, 2 * n + 1);
+      }
+      __builtin_memcpy(&sum, c.data[m] + 4 * n, sizeof sum);
+      sum += even + odd;
+      __builtin_memcpy(c.data[m] + 4 * n, &sum, sizeof sum);
+    }
+  }
+}
+
+#endif
+
+}  // namespace
+}  // namespace VN_ISA_NAMESPACE
+}  // namespace voronerf
