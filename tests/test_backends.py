@@ -92,7 +92,7 @@ def test_describe_names_the_parts() -> None:
 @pytest.mark.native
 def test_describe_records_the_build() -> None:
     native = backends.describe()["native"]
-    assert native["instruction set"] in ("portable", "neon", "avx2", "avx512", "avx512_bf16")
+    assert native["instruction set"] in ("portable", "neon", "avx2", "avx512", "avx512_bf16", "amx")
     assert native["bfloat16 products"].startswith("in ")
     assert native["compiler"]
     assert native["cuda"].startswith("built with")

@@ -26,7 +26,9 @@ void stream(Isa isa, const float* from, float* to, int64_t floats){VN_FOR_ISA(is
 
 int64_t multiply_adds(Peak kind, Isa isa, int64_t turns, float* sink) {
 #if VN_HAS_HALF
-  if (kind == Peak::bfloat16) return avx512::peak_bfloat16(turns, sink);
+  if (kind == Peak::bfloat16) {
+    return isa == Isa::amx ? avx512::peak_tiles(turns, sink) : avx512::peak_bfloat16(turns, sink);
+  }
 #else
   (void)kind;
 #endif
@@ -115,7 +117,7 @@ double bfloat16_gain() {
 
 double measure_peak(Peak kind, Isa isa, int threads) {
   if (!isa_supported(isa)) throw std::invalid_argument("measure_peak: isa must be one that this processor supports");
-  if (kind == Peak::bfloat16 && isa != Isa::avx512_bf16) {
+  if (kind == Peak::bfloat16 && isa != Isa::avx512_bf16 && isa != Isa::amx) {
     throw std::invalid_argument("measure_peak: kind must be one that the instruction set has, got bfloat16");
   }
   return kind == Peak::copy ? measure_copy(isa, threads) : measure_multiply_adds(kind, isa, threads);

@@ -16,7 +16,7 @@ double measure_peak(Peak kind, Isa isa, int threads);
 
 // How many times as many operations a second one thread makes in bfloat16 products as in float32 ones, in half a
 // millisecond; 0 where the processor or the build has none. It is 2 on AMD's Zen 4 and 5 and 0.5 on Intel's Emerald
-// Rapids, whose fast products are those of AMX.
+// Rapids, whose fast products are those in tile registers (Isa::amx).
 double bfloat16_gain();
 
 }  // namespace voronerf

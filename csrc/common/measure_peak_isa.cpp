@@ -3,6 +3,7 @@
 #include "common/measure_peak_isa.h"
 
 #include "common/memory_tile.h"
+#include "network/cpu/tile_registers.h"
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
@@ -36,6 +37,22 @@ __attribute__((target("avx512bf16"))) int64_t peak_bfloat16(int64_t turns, float
 #pragma GCC unroll 24
   for (int i = 0; i < kSums; ++i) store(sink, sums[i] + load(sink));
   return 4 * kLanes * kSums;
+}
+
+int64_t peak_tiles(int64_t turns, float* sink) {
+  TileShapes shapes;
+  for (int i = 0; i < 8; ++i) shapes.rows[i] = kTileRows, shapes.bytes[i] = kTileBytes;
+  shape_tiles(shapes);
+  for (int64_t turn = 0; turn < turns; ++turn) {
+    tile_products<0, 4, 6>();
+    tile_products<1, 5, 6>();
+    tile_products<2, 4, 7>();
+    tile_products<3, 5, 7>();
+  }
+  tile_store<0>(sink, 0);
+  release_tiles();
+  constexpr int64_t kRegisters = 4, kValues = kTileBytes / 2;
+  return kRegisters * 2 * kTileRows * kTileRows * kValues;
 }
 #endif
 

@@ -12,6 +12,7 @@ VN_DECLARE_FOR_ISA(int64_t peak_float32(int64_t turns, float* sink))
 #if VN_HAS_HALF
 namespace avx512 {
 int64_t peak_bfloat16(int64_t turns, float* sink);
+int64_t peak_tiles(int64_t turns, float* sink);  // only where Isa::amx is supported
 }  // namespace avx512
 #endif
 

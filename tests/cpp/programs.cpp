@@ -45,7 +45,7 @@ void members(voronerf::GridLevel& l) { read(l.scale, l.shift, l.side, l.entries,
 void members(voronerf::HashGrid& g) { read(g.levels, g.low, g.high, g.features, g.smooth); }
 void members(voronerf::ProgramTable& t) {
   read(t.packs, t.steps, t.operands, t.sums, t.inputs, t.outputs, t.memories, t.lookups, t.scatters, t.grids);
-  read(t.sum_tensors, t.parameters, t.tile, t.columns, t.packed, t.partial, t.scratch, t.scratch_width, t.half);
+  read(t.sum_tensors, t.parameters, t.tile, t.columns, t.packed, t.partial, t.scratch, t.scratch_width, t.layout);
 }
 
 template <typename T>
@@ -80,7 +80,7 @@ void members(Parameter& p) {
 }
 
 struct Description {
-  voronerf::ProgramTable floats, pairs;
+  voronerf::ProgramTable floats, pairs, tiles, parts;
   Array<Parameter> parameters;
   Array<int32_t> gaussians;  // inputs whose second half are variances
   int64_t gradients;         // as in ProgramInputs
@@ -88,7 +88,7 @@ struct Description {
 
 Description next() {
   Description d;
-  read(d.floats, d.pairs, d.parameters, d.gaussians, d.gradients);
+  read(d.floats, d.pairs, d.tiles, d.parts, d.parameters, d.gaussians, d.gradients);
   return d;
 }
 
@@ -190,9 +190,7 @@ struct Case {
   }
 
   // Outputs, then sums, then what is kept. `plain`: keeps nothing and leaves no rows out.
-  Array<Tensor> run(Isa isa, int threads, bool plain) const {
-    const bool half = VN_HAS_HALF && isa == Isa::avx512_bf16;
-    const voronerf::ProgramTable& table = half ? d.pairs : d.floats;
+  Array<Tensor> run(Isa isa, const voronerf::ProgramTable& table, int threads, bool plain) const {
     const auto program = voronerf::make_program(table);
     Array<Tensor> results;
     for (size_t o = 0; o < table.outputs.size(); ++o) {
@@ -251,15 +249,30 @@ struct Case {
   }
 };
 
+// What runs a program. In tile registers the portable path has their double.
+struct Way {
+  Isa isa;
+  voronerf::ProgramTable Description::* table;
+};
+constexpr Way kWays[] = {
+    {Isa::portable, &Description::floats},   {Isa::neon, &Description::floats},  {Isa::avx2, &Description::floats},
+    {Isa::avx512, &Description::floats},     {Isa::avx512_bf16, &Description::pairs}, {Isa::portable, &Description::tiles},
+    {Isa::portable, &Description::parts}, {Isa::amx, &Description::tiles},    {Isa::amx, &Description::parts},
+};
+
 void run_case(const Description& description, int number) {
-  for (const Isa isa : {Isa::portable, Isa::neon, Isa::avx2, Isa::avx512, Isa::avx512_bf16}) {
-    if (!voronerf::isa_supported(isa)) continue;
+  for (const Way& way : kWays) {
+    const voronerf::ProgramTable& table = description.*way.table;
+    if (!voronerf::isa_supported(way.isa)) continue;
+    const bool rounds = way.table == &Description::pairs || way.table == &Description::tiles;
+    const bool first = way.isa == Isa::portable && way.table == &Description::floats;
     for (const bool plain : {true, false}) {
-      start_case(number + 1, isa == Isa::portable && plain);
+      start_case(number + 1, first && plain);
       const Case one(description);
-      const Array<Tensor> alone = one.run(isa, 1, plain), together = one.run(isa, 3, plain);
+      const Array<Tensor> alone = one.run(way.isa, table, 1, plain), together = one.run(way.isa, table, 3, plain);
       const std::string name = "program " + std::to_string(number) + ", instruction set " +
-                               std::to_string(static_cast<int>(isa)) + (plain ? "" : ", as drawn");
+                               std::to_string(static_cast<int>(way.isa)) + ", layout " +
+                               std::to_string(static_cast<int>(table.layout)) + (plain ? "" : ", as drawn");
       for (size_t i = 0; i < alone.size(); ++i) {
         const std::string what = name + ", result " + std::to_string(i);
         same(alone[i].bytes, together[i].bytes, what.c_str());
@@ -270,7 +283,7 @@ void run_case(const Description& description, int number) {
         if (i + description.floats.lookups.size() >= alone.size()) continue;  // kept
         // Of any steps, differences of what was rounded to bfloat16 may be small themselves.
         const double pairs = number % 4 < 2 ? 0.2 : 0.5;
-        like_portable(values, what.c_str(), VN_HAS_HALF && isa == Isa::avx512_bf16 ? pairs : one.tolerance);
+        like_portable(values, what.c_str(), rounds ? pairs : one.tolerance);
       }
     }
   }

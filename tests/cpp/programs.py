@@ -1,7 +1,7 @@
 """Random programs for programs.cpp, as numbers: ``programs.py CASES FILE``.
 
 In each case a layer table, the gradient of one, a program of any steps, and a gradient of one, of the first or second
-order; what is asked for of gradients is drawn too. Each is lowered for float32 products and for pairs of bfloat16.
+order; what is asked for of gradients is drawn too. Each is lowered for every layout of what products take.
 Numbers stand in the order of the members, enumerators by their number.
 """
 
@@ -159,17 +159,17 @@ def random_program(draw: random.Random, number: int) -> tuple[Program, int]:
             return program, first
 
 
-def table_of(program: Program, half: bool) -> Any:
+def table_of(program: Program, layout: str) -> Any:
     """The records that the compiled module would get."""
     records: list[Any] = []
     make, compiled.make_program = compiled.make_program, records.append
-    lowering.lower.__wrapped__(program.text, half)
+    lowering.lower.__wrapped__(program.text, layout)
     compiled.make_program = make
     return records[0]
 
 
 ENUMERATORS = {"op": "ProgramOp", "function": "ProgramFunction", "binary": "ProgramBinary"}
-ENUMERATORS |= {"encoding": "ProgramEncoding", "finish": "ProgramFinish"}
+ENUMERATORS |= {"encoding": "ProgramEncoding", "finish": "ProgramFinish", "layout": "ProgramLayout"}
 
 
 def numbers(record: Any) -> Iterator[str]:
@@ -199,7 +199,8 @@ def main() -> None:
             for i, shape in enumerate(program.parameters):
                 depth = max(shape) if len(shape) > 1 and i not in program.tables else 1
                 parameters.append([math.prod(shape), depth, i in program.tables])
-            for part in (table_of(program, False), table_of(program, True), parameters, gaussians, first):
+            tables = [table_of(program, layout) for layout in compiled.ProgramLayout]
+            for part in (*tables, parameters, gaussians, first):
                 out.write(" ".join(numbers(part)) + "\n")
 
 

@@ -265,7 +265,7 @@ def test_devices_of_a_cuda_build(architectures: list[str], runs: list[int], fail
 def test_peak_of_each_kind(isa: str) -> None:
     assert _native.measure_peak("float32", isa=isa, threads=1) > 1e8
     assert _native.measure_peak("copy", isa=isa, threads=2) > 1e8
-    if isa == "avx512_bf16":
+    if isa in ("avx512_bf16", "amx"):
         assert _native.measure_peak("bfloat16", isa=isa, threads=1) > 1e8
     else:
         with pytest.raises(ValueError, match=r"^measure_peak: kind must be one that the instruction set has, got bfl"):
@@ -283,6 +283,12 @@ def test_bfloat16_is_multiplied_in_what_is_faster(monkeypatch: pytest.MonkeyPatc
         assert _native._choose_isa() == chosen
         with _native.using_isa(chosen):
             assert _native.describe()["bfloat16 products"] == text
+    monkeypatch.setattr(_native, "SUPPORTED_ISAS", ("portable", "avx512", "avx512_bf16", "amx"))
+    monkeypatch.setattr(_native, "_bfloat16_gain", 0.49)
+    assert _native._choose_isa() == "amx"
+    monkeypatch.setattr(_native, "_isa", "amx")
+    assert _native.describe()["bfloat16 products"] == "in bfloat16, in tile registers"
+    monkeypatch.setattr(_native, "_isa", "avx512")
     monkeypatch.setenv("VORONERF_ISA", "avx512")  # forced
     assert _native._choose_isa() == "avx512"
     monkeypatch.setattr(_native, "_bfloat16_gain", 0.0)
@@ -297,7 +303,7 @@ def test_the_gain_of_bfloat16_is_the_same_each_time() -> None:
 
 def test_peak_errors() -> None:
     refuses("measure_peak: kind must be one of float32, bfloat16, copy, got 'fp32'", _native.measure_peak, "fp32")
-    with pytest.raises(ValueError, match=r"^measure_peak: isa must be one of portable, neon, .*avx512_bf16, got 'sse'"):
+    with pytest.raises(ValueError, match=r"^measure_peak: isa must be one of portable, neon, .*avx512_bf16, amx, got 'sse'"):
         _native.measure_peak("copy", isa="sse")
 
 

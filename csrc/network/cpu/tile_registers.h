@@ -83,25 +83,31 @@ template <int C, int A, int B>
 VN_INLINE void tile_products() {
   Tile& c = tiles()[C];
   const Tile &a = tiles()[A], &b = tiles()[B];
-  const auto at = [](const Tile& tile, int64_t row, int64_t i) {  // bfloat16 is the upper half of a float
-    uint16_t half;
-    __builtin_memcpy(&half, tile.data[row] + 2 * i, sizeof half);
-    const uint32_t bits = static_cast<uint32_t>(half) << 16;
-    float value;
-    __builtin_memcpy(&value, &bits, sizeof value);
-    return value;
-  };
-  for (int64_t m = 0; m < c.rows; ++m) {
-    for (int64_t n = 0; n < c.bytes / 4; ++n) {
-      float even = 0.0f, odd = 0.0f, sum;
-      for (int64_t k = 0; k < a.bytes / 4; ++k) {
-        even += at(a, m, 2 * k) * at(b, k, 2 * n);
-        odd += at(a, m, 2 * k + 1) * at(b, k, 2 * n + 1);
+  constexpr int64_t kValues = kTileBytes / 2;
+  float left[kTileRows][kValues], right[kTileRows][kValues];
+  const auto widen = [](const Tile& tile, float(*to)[kValues]) {  // bfloat16 is the upper half of a float
+    uint16_t halves[kValues];
+    for (int64_t row = 0; row < tile.rows; ++row) {
+      __builtin_memcpy(halves, tile.data[row], sizeof halves);
+      for (int64_t i = 0; i < kValues; ++i) {
+        const uint32_t bits = static_cast<uint32_t>(halves[i]) << 16;
+        __builtin_memcpy(to[row] + i, &bits, sizeof bits);
       }
-      __builtin_memcpy(&sum, c.data[m] + 4 * n, sizeof sum);
-      sum += even + odd;
-      __builtin_memcpy(c.data[m] + 4 * n, &sum, sizeof sum);
     }
+  };
+  widen(a, left);
+  widen(b, right);
+  for (int64_t m = 0; m < c.rows; ++m) {
+    float sums[kValues / 2], odd[kValues / 2] = {}, even[kValues / 2] = {};
+    for (int64_t k = 0; k < a.bytes / 4; ++k) {
+      for (int64_t n = 0; n < c.bytes / 4; ++n) {
+        even[n] += left[m][2 * k] * right[k][2 * n];
+        odd[n] += left[m][2 * k + 1] * right[k][2 * n + 1];
+      }
+    }
+    __builtin_memcpy(sums, c.data[m], sizeof sums);
+    for (int64_t n = 0; n < c.bytes / 4; ++n) sums[n] += even[n] + odd[n];
+    __builtin_memcpy(c.data[m], sums, sizeof sums);
   }
 }
 

@@ -82,7 +82,7 @@ _bfloat16_gain = compiled.bfloat16_gain()
 def _choose_isa() -> str:
     """Best instruction set of this processor, or the one of VORONERF_ISA.
 
-    One whose bfloat16 products are slower than float32 ones is not the best. The gain is far from `LEAST_GAIN` on all
+    avx512_bf16 is not the best where its bfloat16 products are slower than float32 ones. The gain is far from `LEAST_GAIN` on all
     known processors, so that every process on a machine chooses the same.
     """
     best = [isa for isa in SUPPORTED_ISAS if isa != "avx512_bf16" or _bfloat16_gain >= LEAST_GAIN]
@@ -227,7 +227,9 @@ def _bfloat16_products() -> str:
     """What bfloat16 is multiplied in on the CPU, and why."""
     if _bfloat16_gain == 0:
         return "in float32: this processor, or this build, has none"
-    used = "in bfloat16" if _isa in ("avx512_bf16", "amx") else "in float32"
+    if _isa == "amx":
+        return "in bfloat16, in tile registers"
+    used = "in bfloat16" if _isa == "avx512_bf16" else "in float32"
     return f"{used}: bfloat16 makes {_bfloat16_gain:.2g} x the operations of float32"
 
 
