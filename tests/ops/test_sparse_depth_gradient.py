@@ -78,11 +78,11 @@ def test_equals_autograd_through_a_slow_loop(device, backend, others, skipped, s
 
 
 def test_what_is_not_finite_stays_in_its_ray(device, backend):
-    """A weight that is NaN is lost with its ray's gradient where it counts; an infinite density lets nothing through."""
+    """A weight that is NaN takes its ray's gradient where it counts; an infinite density lets nothing through."""
     need("sparse_depth_gradient", backend, device, torch.float32)
     counts = (12, 12, 12, 12)
     given = [tensor.clone() for tensor in case(counts)]
-    density, depths, deltas, weights, offsets, distances = given
+    density, depths, deltas, weights, _, distances = given
     near = (depths - distances.repeat_interleave(12)).abs() <= NEARBY * distances.repeat_interleave(12) + deltas
     weights[near] += 0.1
     fine, rule = learnt(given, device, factor=0.25, activated=True, backend=backend), {"factor": 0.25}

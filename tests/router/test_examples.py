@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from convention_harness import EXAMPLES
 
-ELSEWHERE = ("nerf_pytorch_style", "train")  # which have tests of their own
+ELSEWHERE = ("nerf_pytorch_style", "poisson", "train")  # which have tests of their own
 SCRIPTS = sorted(path for path in EXAMPLES.glob("*.py") if path.stem not in ELSEWHERE)
 
 
@@ -51,3 +51,13 @@ def test_training_loop(voronoi: bool, monkeypatch: pytest.MonkeyPatch, capsys: p
 def test_three_lines_are_changed() -> None:
     lines = (EXAMPLES / "nerf_pytorch_style.py").read_text().splitlines()
     assert sum(line.endswith("# changed") for line in lines) == 3
+
+
+def test_conditions_on_faces_join_the_solutions_of_cells(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    errors = []
+    for more in ([], ["--alone"]):
+        run(EXAMPLES / "poisson.py", monkeypatch, "--cells=3", "--steps=700", *more)
+        errors.append(float(capsys.readouterr().out.split()[-1]))
+    assert errors[0] < 0.06 and errors[1] > 3 * errors[0], errors

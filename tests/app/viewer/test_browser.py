@@ -74,7 +74,7 @@ def test_a_phone_has_the_panel_beside_all_of_the_scene(run, served, browser, rat
     client = until(lambda: next(iter(served.clients.values()), None))
     body = browser.find_element("tag name", "body")
     until(lambda: re.search(r"\d+ x 128 pixels in \d+\.\d\d s", body.text))
-    assert "Drag: turn." in body.text and "Click on a cell." in body.text  # the first folder is open
+    assert "Drag: turn." in body.text and "Click or tap a cell." in body.text  # the first folder is open
 
     def seen(part):
         """Where a part of the page is, if all of it is in the window and nothing lies over its middle."""
@@ -97,7 +97,7 @@ def test_a_phone_has_the_panel_beside_all_of_the_scene(run, served, browser, rat
     webdriver.ActionChains(browser).move_by_offset(195, 422).click().perform()
     title.click()
     until(lambda: f"of {run.diagram.num_cells}" in body.text)
-    assert client.picked == cell_at(served.subject, camera, client.look, 0.5, 0.5)
+    assert client.look.picked == cell_at(served.subject, camera, client.look, 0.5, 0.5)
     show.click()
     until(lambda: browser.find_elements("xpath", "//*[@role='option'][.='cells']"))[0].click()
     until(lambda: client.look.pane == "cells")

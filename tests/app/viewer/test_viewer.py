@@ -136,7 +136,7 @@ def test_cells_are_described_hidden_and_kept_alone(run, scene, tab) -> None:
     image = run.render(larger(scene.test.cameras, 128), 0)
     y, x = divmod(int(torch.where(image.opacity > 0.99, 1 / image.depth, 0).argmax()), 128)
     leaf = int(run.diagram.locate(image.heaviest[y, x]))
-    info = tab.gui["Click on a cell."]
+    info = tab.gui["Click or tap a cell."]
 
     def pick(x, y):
         info["_markdown"] = None
@@ -144,6 +144,12 @@ def test_cells_are_described_hidden_and_kept_alone(run, scene, tab) -> None:
         return tab.until(lambda: info["_markdown"])
 
     text = pick(x, y)
+    tab.set("Show", "opacity")  # black and white, but for the outline
+    outlined = (tab.rest() * torch.tensor([1, -1, 1]).numpy()).sum(-1) > 300
+    own = (run.diagram.locate(image.heaviest) == leaf).numpy() & (image.opacity > 0.5).numpy()
+    assert 0 < outlined.sum() < 0.5 * own.sum() and outlined[own].sum() >= 0.8 * outlined.sum()  # as JPEG has it
+    tab.set("Show", "cells")
+    tab.rest()
     assert f"**Cell {leaf}** of {run.diagram.num_cells}" in text and "centre " in text
     before = run.diagram.locate(image.heaviest) == leaf
 
@@ -166,7 +172,7 @@ def test_cells_are_described_hidden_and_kept_alone(run, scene, tab) -> None:
     tab.set("Level", 1)
     tab.rest()
     assert f"of {int(run.diagram.paths()[:, 0].max()) + 1}" in pick(x, y)
-    assert pick(0, 0) == "Click on a cell."
+    assert pick(0, 0) == "Click or tap a cell."
 
 
 def test_a_crop_leaves_what_is_inside(run, scene, tab) -> None:

@@ -33,8 +33,8 @@ SHARP, FULL, LARGEST = 512, 1536, 2048
 MOST_VIEWS, THUMBNAIL = 200, 96
 #: Vertical angles of view in degrees that can be chosen.
 NARROWEST, WIDEST = 5, 120
-NO_CELL = "Click on a cell."
-MOUSE = "Drag: turn. Right drag or two fingers: move. Scroll or pinch: zoom. Click: name the cell."
+NO_CELL = "Click or tap a cell."
+MOUSE = "Drag: turn. Right drag or two fingers: move. Scroll or pinch: zoom. Click or tap: name the cell."
 #: Seconds without a movement after which pictures are counted anew, and between two changes of the count that is shown.
 PAUSE, SAY = 0.5, 0.25
 #: Pixels around the curve: above, right, below, left. Without them its labels are cut off.
@@ -80,7 +80,6 @@ class Client:
     def _start(self) -> None:
         scene, diagram = self.viewer.subject.scene, self.viewer.subject.diagram
         self.look = Look(level=diagram.depth, background="black" if scene.background is None else "white")
-        self.picked: int | None = None
         self.nodes: dict[str, list[Any]] = {kind: [] for kind in ("centres", "cameras", "crop", "keyframes")}
         self.curve: viser.GuiUplotHandle | None = None
         self._build()
@@ -133,14 +132,13 @@ class Client:
 
     def on_diagram(self) -> None:
         """Follows a split: cells have other numbers now."""
-        self.picked = None
         depth = self.viewer.subject.diagram.depth
         self.level.max, self.level.visible = max(depth, 2), depth > 1
         self.level.value = depth  # type: ignore[misc]
         self.info.content = NO_CELL
         if self.nodes["centres"]:
             self._show_centres(True)
-        self.change(level=depth, hidden=frozenset())
+        self.change(level=depth, hidden=frozenset(), picked=None)
 
     def stand(self, cameras: Cameras, view: int) -> None:
         """Moves to one of several cameras."""
@@ -230,16 +228,16 @@ class Client:
     def pick(self, x: float, y: float) -> None:
         """Describes the cell at a position in the picture, 0..1 from the left and from the top."""
         subject = self.viewer.subject
-        self.picked = cell_at(subject, self.camera(self.longest), self.look, x, y)
-        found = self.picked
+        found = cell_at(subject, self.camera(self.longest), self.look, x, y)
+        self.change(picked=found)
         self.info.content = NO_CELL if found is None else describe_cell(subject.diagram, found, self.look.level)
 
     def _hide(self, what: str) -> None:
         if what == "show all":
             self.change(hidden=frozenset())
-        elif self.picked is not None:
+        elif (picked := self.look.picked) is not None:
             groups = groups_of(self.viewer.subject.diagram, self.look.level)
-            inside = groups == groups[self.picked]
+            inside = groups == groups[picked]
             cells = frozenset((inside if what == "hide" else ~inside).nonzero()[:, 0].tolist())
             self.change(hidden=self.look.hidden | cells if what == "hide" else cells)
 

@@ -29,6 +29,10 @@ PANES = ("colour", "depth", "opacity", "cells")
 BACKGROUNDS = {"white": 1.0, "grey": 0.5, "black": 0.0}
 
 
+#: Colour of the outline around the picked cell, of no cell in the palette.
+OUTLINE = (255, 0, 255)
+
+
 @dataclass(frozen=True)
 class Look:
     """What one browser shows, besides its camera.
@@ -39,6 +43,7 @@ class Look:
         level: Of a nested diagram, whose cells are shown; 1 is the coarsest.
         hidden: Leaves that are not rendered.
         crop: Lowest and highest corner of the box that is rendered, or None for the scene's.
+        picked: A leaf that was clicked on, whose cell has an outline, or None.
     """
 
     pane: str = "colour"
@@ -46,6 +51,7 @@ class Look:
     level: int = 1
     hidden: frozenset[int] = frozenset()
     crop: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    picked: int | None = None
 
 
 @dataclass(frozen=True)
@@ -124,7 +130,7 @@ def render_bands(subject: Subject, camera: Cameras, look: Look, rows: int) -> It
     for top in range(0, camera.height, rows):
         band = crop_camera(camera, 0, top, camera.width, min(rows, camera.height - top))
         with subject.weights():
-            yield render_camera(renderer, scene, band, 0, heaviest=look.pane == "cells")
+            yield render_camera(renderer, scene, band, 0, heaviest=look.pane == "cells" or look.picked is not None)
 
 
 def stack_bands(bands: list[RenderedImage]) -> RenderedImage:
@@ -144,7 +150,18 @@ def cells_of(subject: Subject, places: Tensor) -> Tensor:
 
 
 def picture_of(subject: Subject, image: RenderedImage, look: Look) -> Tensor:
-    """The picture of a look's pane."""
+    """The picture of a look's pane, with an outline around the cell that was picked."""
+    picture = _picture_of_pane(subject, image, look)
+    if look.picked is None:
+        return picture
+    groups = groups_of(subject.diagram, look.level)
+    inside = (groups[cells_of(subject, image.heaviest)] == groups[look.picked]) & (image.opacity > 0.5)
+    outside = torch.nn.functional.max_pool2d((~inside)[None].float(), 3, 1, 1)[0] > 0
+    picture[inside & outside] = torch.tensor(OUTLINE, dtype=picture.dtype)
+    return picture
+
+
+def _picture_of_pane(subject: Subject, image: RenderedImage, look: Look) -> Tensor:
     if look.pane == "depth":
         return picture_of_depth(image.depth, image.opacity)
     if look.pane == "opacity":

@@ -200,7 +200,7 @@ class Viewer:
         started = time.perf_counter()
         image = render_look(self.subject, camera, client.look)
         self._took(camera.width * camera.height, time.perf_counter() - started)
-        self._send(client, camera, image, client.look, quality=70)
+        self._send(client, camera, image, client.look, quality=85)
         client.count_picture(camera)
 
     def _draw_sharp(self, client: Client) -> None:

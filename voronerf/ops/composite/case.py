@@ -9,12 +9,13 @@ def _make(draw: Draw, n: int) -> Arguments:
     dtype, s, c = draw.dtype(), draw.among("s", 5, 0, 1, 7, 16, 33, 64), draw.among("channels", 3, 3, 1, 5)
     packed = draw.among("packed", False, True)
     shape = (n * s,) if packed else (n, s)
+    r = n if not packed or n < 64 else n // 64  # of long rays, which packed ones may be
     call: Arguments = {name: draw.uniform(*shape, dtype=dtype) for name in ("sigma", "depths", "deltas")}
     call["rgb"] = draw.uniform(*shape, c, dtype=dtype)
     if packed:
-        call["ray_offsets"] = draw.offsets(n * s, n)
+        call["ray_offsets"] = draw.offsets(n * s, r)
     if draw.among("background", True, False):
-        call["background"] = draw.uniform(*draw.among("backgrounds", (c,), (n, c)), dtype=dtype)
+        call["background"] = draw.uniform(*draw.among("backgrounds", (c,), (r, c)), dtype=dtype)
     return call
 
 
