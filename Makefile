@@ -115,7 +115,7 @@ $(VENV)/.docs: requirements-docs.txt $(VENV)/.tools
 	@touch $@
 
 # What an earlier build left in build/lib would go into the wheel.
-$(VENV)/.wheel: $(VENV)/.built $(shell find voronerf kernels -name '*.py')
+$(VENV)/.wheel: $(VENV)/.built $(shell find voronerf kernels -name '*.py') $(wildcard voronerf/app/web/*)
 	@rm -rf build/lib build/lib.* dist/voronerf-*.whl
 	@$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-build-isolation --no-deps --wheel-dir dist .
 	@touch $@

@@ -336,7 +336,11 @@ if __name__ == "__main__":
     setup(
         packages=[*find_packages(include=["voronerf", "voronerf.*"]), "voronerf.kernels"],
         package_dir={"voronerf": "voronerf", "voronerf.kernels": "kernels"},
-        package_data={"voronerf.ops._core": ["_C.pyi", "interface.txt"], "voronerf": ["py.typed"]},
+        package_data={
+            "voronerf.ops._core": ["_C.pyi", "interface.txt"],
+            "voronerf.app.web": ["*.html", "*.css", "*.js", "*.wgsl"],
+            "voronerf": ["py.typed"],
+        },
         ext_modules=[Extension("voronerf.ops._core._C", sources=[])],
         cmdclass={"build_ext": NinjaBuildExt},
     )

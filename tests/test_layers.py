@@ -24,7 +24,7 @@ LAYERS = (
     {"app.render", "app.evaluate"},
     {"app.train"},
     {"app.run", "app"},
-    {"app.export"},
+    {"app.export", "app.web"},
     {"app.viewer"},
     {"town"},
     {"app.cli", "app.nerfstudio"},  # the table of commands, and what nothing else imports

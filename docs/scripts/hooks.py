@@ -1,4 +1,4 @@
-"""Fills the pages of the site that come from the code, and cleans what docstrings leave in them."""
+"""Fills the pages of the site that come from the code, cleans what docstrings leave in them, and adds a scene."""
 
 from __future__ import annotations
 
@@ -10,8 +10,16 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 
 import options
+import scene
+from mkdocs.structure.files import File
 
 MARKER = "<!-- options -->"
+
+
+def on_files(files: Any, *, config: Any) -> Any:
+    """Adds the page of a scene, which is drawn in the browser."""
+    files.append(File.generated(config, "scene.html", abs_src_path=str(scene.scene_page())))
+    return files
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:

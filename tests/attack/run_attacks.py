@@ -6,6 +6,7 @@ import json
 import os
 import random
 import shutil
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from voronerf.app.train.checkpoint import (
 COMMANDS: tuple[tuple[str, ...], ...] = (
     ("eval", "--views", "1", "--panels", "1", "--lpips", "off"),
     ("render", "--frames", "1"),
+    ("export", "--web", f"{tempfile.gettempdir()}/voronerf-attack-{os.getpid()}.html"),
     ("train", "--resume", "--steps", "18", "--lpips", "off", "--out"),
 )
 

@@ -122,8 +122,11 @@ def test_exports_of_a_run(run, tmp_path, capsys, fails, monkeypatch):
     assert all(file.stat().st_size for file in files)
     output = capsys.readouterr().out
     assert "3 of 3 cells" in output and re.search(r"\b[1-5]?\d triangles, closed", output)
+    succeeds("export", run, "--web", tmp_path / "page.html", "--crop -1 -1 -1 1 1 1")
+    assert (tmp_path / "page.html").stat().st_size > 10_000
+    fails("the file must end in .html", "export", run, "--web page.htm")
     fails("no surface in the box", "export", run, "--crop 9 9 9 9.5 9.5 9.5 --points", tmp_path / "points.ply")
-    fails("export needs a file: --points, --mesh or --cells", "export", run)
+    fails("export needs a file: --points, --mesh, --cells or --web", "export", run)
     fails("the file must end in .glb", "export", run, "--cells cells.stl")
     fails("--crop must be x y z of a corner and of", "export", run, "--crop 0 0 0 1 1 0 --mesh", files[0])
 
@@ -211,6 +214,9 @@ def test_demo_shows_a_run_and_writes_over_none(tmp_path, capsys, monkeypatch, fa
         psnr, config = read_json(run / "summary.json")["psnr"], read_json(run / "config.json")
         assert f"{psnr:.1f} dB after 0.3 s on 8 views" in output and config["data"] == "builtin:16"
         assert imageio_ffmpeg.count_frames_and_secs(str(run / "turn.mp4"))[0] == 3
+        assert (
+            output.endswith(f"open runs/{name}/scene.html\n") and "<!doctype html>" in (run / "scene.html").read_text()
+        )
         for picture in ("turn.png", "placed.png"):
             with Image.open(run / picture) as image:
                 assert image.width >= 16

@@ -56,6 +56,8 @@ def test_chromium_shows_the_scene_and_its_cells(run, served, browser) -> None:
     assert colour.std() > 20
     until(lambda: not far(colour))
 
+    link = browser.find_element("link text", "Draw it in this browser")
+    assert link.get_attribute("href") == f"{served.address}/scene.html"
     browser.find_element("css selector", "input[value='colour']").click()
     until(lambda: browser.find_elements("xpath", "//*[@role='option'][.='cells']"))[0].click()
     until(lambda: client.look.pane == "cells" and far(colour))

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from http.client import HTTPConnection
@@ -36,7 +37,7 @@ from voronerf.app.train import Callback, ConfigError, Scores, TrainConfig, build
 from voronerf.app.train import run as run_training
 from voronerf.app.viewer import view_run, watch
 from voronerf.app.viewer.cameras import scene_bounds
-from voronerf.nerf import orbit_cameras
+from voronerf.nerf import Renderer, Stratified, orbit_cameras
 
 
 @pytest.fixture
@@ -399,6 +400,30 @@ def test_pages_of_other_sites_are_refused(run, host, asked, origin, status) -> N
         with closing(HTTPConnection("127.0.0.1", viewer.port)) as browser:
             browser.request("GET", "/", headers={name: text.format(viewer.port) for name, text in headers.items()})
             assert browser.getresponse().status == status
+
+
+@pytest.mark.parametrize(("asked", "status"), [("127.0.0.1:{}", 200), ("example.org:{}", 403)])
+def test_the_page_that_draws_by_itself_is_served_beside(viewer, tab, asked, status) -> None:
+    link = tab.until(lambda: next((text for text in tab.gui if text.startswith("[Draw it in this")), None))
+    assert "](/scene.html)" in tab.gui[link]["_markdown"]
+
+    def get():
+        with closing(HTTPConnection("127.0.0.1", viewer.port, timeout=60)) as browser:
+            browser.request("GET", "/scene.html", headers={"Host": asked.format(viewer.port)})
+            answer = browser.getresponse()
+            return answer.status, answer.read()
+
+    with ThreadPoolExecutor() as pool:
+        answer = pool.submit(get)
+        tab.until(answer.done)
+    assert answer.result()[0] == status
+    assert (b"data:image/webp" in answer.result()[1]) == (status == 200)
+
+
+def test_a_run_that_no_page_can_draw_has_no_link(run) -> None:
+    plain = replace(run, renderer=Renderer({"field": run.renderer.field}, Stratified(8)))
+    with closing(view_run(plain, port=0)) as viewer:
+        assert viewer.page is None
 
 
 BAD = {

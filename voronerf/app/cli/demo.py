@@ -21,6 +21,7 @@ from voronerf.app.scenes import load_scene
 from voronerf.app.train.callbacks import counted
 from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.run_directory import choose_directory
+from voronerf.app.web import export_web
 from voronerf.nerf.cameras import Cameras, orbit_cameras
 from voronerf.town import editing
 from voronerf.town import open_run as open_town
@@ -33,7 +34,7 @@ TOP, SCALE = (0.0, 0.0, 1.0), 0.35
 
 
 def demo(out: Path | None = None, budget: float = 35.0) -> int:
-    """Train a built-in scene for half a minute and show it: a picture, a video, its cells, and a copy placed in it.
+    """Train a built-in scene for half a minute and show it: a picture, a video, its cells, a copy placed in it, a page.
 
     Args:
         out: A new run directory, which also gets the pictures and the video; default runs/demo, runs/demo-2, ...
@@ -67,8 +68,11 @@ def demo(out: Path | None = None, budget: float = 35.0) -> int:
     )
     say(f"wrote {run / 'turn.png'} and {run / 'turn.mp4'}: the scene, and in colour which cell each point belongs to")
     say(f"wrote {run / 'placed.png'}: {program} place {here} {here} --at {at} --scale {SCALE:g}, without training")
+    _, size = export_web(opened, run / "scene.html")
+    say(f"wrote {run / 'scene.html'}, {size / 1e6:.1f} MB: the scene in any browser with WebGPU, a phone's too")
     has_viewer = importlib.util.find_spec("viser") is not None
     say(f"next: {program} {f'view {here}' if has_viewer else 'train --data DIR, with your pictures'}")
+    say(f"open {run / 'scene.html'}")
     return 0
 
 

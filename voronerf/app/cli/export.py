@@ -15,6 +15,7 @@ from voronerf.app.export import points as point_files
 from voronerf.app.export.space import check_export
 from voronerf.app.train.callbacks import counted
 from voronerf.app.train.config import ConfigError
+from voronerf.app.web import page as pages
 
 
 def export(
@@ -23,6 +24,7 @@ def export(
     points: Path | None = None,
     mesh: Path | None = None,
     cells: Path | None = None,
+    web: Path | None = None,
     count: int = 200_000,
     resolution: int | None = None,
     faces: int = mesh_files.FACES,
@@ -30,21 +32,22 @@ def export(
     coordinates: Literal["scene", "files"] = "scene",
     opening: Opening = AS_IN_TRAINING,
 ) -> int:
-    """Write a trained run as points, a mesh, or the cells of its diagram.
+    """Write a trained run as points, a mesh, the cells of its diagram, or a page that draws it.
 
     Args:
         run: The run directory.
         points: Coloured points with normals on the surface, .ply.
         mesh: The surface as a coloured mesh, .ply, .glb or .obj.
         cells: The cells of the diagram, clipped to the box, an object of its own colour each, .glb.
+        web: A page that draws the scene in any browser with WebGPU, one file that loads nothing from elsewhere, .html.
         count: Points at the most.
         resolution: Cubes of the mesh along the longest side of the box; default 256, or what fits into memory.
         faces: Triangles of the mesh at the most.
         crop: What is exported, x y z of the lowest and of the highest corner, or "saved" for the viewer's crop; default
             the scene's box; of other scenes, what the cameras look at for the mesh, and for points and cells the box
             around the sphere of the contraction.
-        coordinates: Positions are those of the scene as it is rendered, or those of its files: in metres, if the
-            capture is in metres.
+        coordinates: Positions of points, meshes and cells are those of the scene as it is rendered, or those of its
+            files: in metres, if the capture is in metres.
         opening: How the run is opened.
     """
     check_counts(count=count)
@@ -53,11 +56,13 @@ def export(
         mesh: mesh_files.SUFFIXES,
         cells: cell_files.SUFFIXES,
     }
-    if not any((points, mesh, cells)):
-        raise ConfigError("export needs a file: --points, --mesh or --cells")
+    if not any((points, mesh, cells, web)):
+        raise ConfigError("export needs a file: --points, --mesh, --cells or --web")
     for file, suffixes in outputs.items():
         if file is not None:
             check_export(file, suffixes)
+    if web is not None:
+        pages.check_page(web)
     opened = opening.open_without_images(run)
     box, to_files = crop_box(opened, crop), coordinates == "files"
     if points is not None:
@@ -76,4 +81,8 @@ def export(
         with busy("cells"):
             scene = cell_files.export_cells(opened, cells, box=box, to_files=to_files)
         say(f"wrote {cells}: {len(scene.geometry)} of {counted(opened.diagram.num_cells, 'cell')}")
+    if web is not None:
+        with busy("page"):
+            packed, size = pages.export_web(opened if box is None else opened.cropped(box), web)
+        say(f"wrote {web}: {size / 1e6:.2f} MB, {packed.summary}")
     return 0

@@ -37,6 +37,7 @@ NO_CELL = "Click or tap a cell."
 MOUSE = "Drag: turn. Right drag or two fingers: move. Scroll or pinch: zoom. Click or tap: name the cell."
 #: Seconds without a movement after which pictures are counted anew, and between two changes of the count that is shown.
 PAUSE, SAY = 0.5, 0.25
+OWN_GPU = "[Draw it in this browser](/scene.html), by WebGPU: a movement then waits for no picture."
 #: Pixels around the curve: above, right, below, left. Without them its labels are cut off.
 PADDING = (14, 14, 0, 0)
 
@@ -174,6 +175,8 @@ class Client:
     def _build(self) -> None:
         gui, depth = self.handle.gui, self.viewer.subject.diagram.depth
         gui.add_markdown(MOUSE)
+        if self.viewer.page is not None:
+            gui.add_markdown(OWN_GPU)
         self.state = gui.add_markdown("rendering")
         pane = gui.add_dropdown("Show", PANES, initial_value="colour", hint="What each pixel shows.")
         self.on(pane.on_update, lambda: self.change(pane=chosen(pane)))

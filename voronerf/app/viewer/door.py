@@ -11,7 +11,7 @@ import contextlib
 import logging
 import socket
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from ipaddress import ip_address
 from typing import Any
 from urllib.parse import urlsplit
@@ -19,6 +19,7 @@ from urllib.parse import urlsplit
 import msgspec
 import viser
 from websockets.asyncio import server
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 log = logging.getLogger(__name__)
@@ -56,10 +57,11 @@ def chosen(part: Any) -> Any:
 
 
 @contextlib.contextmanager
-def guarded(host: str) -> Iterator[None]:
+def guarded(host: str, pages: Mapping[str, Callable[[], Awaitable[bytes]]]) -> Iterator[None]:
     """A viser server that is made in this context, to listen at `host`, refuses requests of pages of other sites.
 
-    It passes over messages that the viewer has no use for, and disconnects whoever sends what is none.
+    It passes over messages that the viewer has no use for, and disconnects whoever sends what is none. It also serves
+    ``pages``, HTML by their paths.
     """
     serve, made = server.serve, []
 
@@ -85,9 +87,12 @@ def guarded(host: str) -> Iterator[None]:
             if connection.protocol.close_sent is not None and connection.protocol.close_sent.code == 1009:
                 log.warning("a browser is disconnected, it sent more than %d bytes at once", LARGEST)
 
-        def check(connection: server.ServerConnection, request: Request) -> Response | Any:
+        async def check(connection: server.ServerConnection, request: Request) -> Response | Any:
             reason = why_refused(request.headers, host)
-            return process_request(connection, request) if reason is None else connection.respond(403, f"{reason}\n")
+            if reason is not None:
+                return connection.respond(403, f"{reason}\n")
+            page = pages.get(request.path)
+            return process_request(connection, request) if page is None else _answer(await page())
 
         made.append(host)
         return serve(handle, *arguments, process_request=check, **options | {"max_size": LARGEST, "logger": QUIET})
@@ -99,6 +104,11 @@ def guarded(host: str) -> Iterator[None]:
         server.serve = serve  # type: ignore[misc]
     if not made:
         warnings.warn(f"pages of other sites can reach the viewer with viser {viser.__version__}", stacklevel=2)
+
+
+def _answer(page: bytes) -> Response:
+    headers = {"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(page)), "Connection": "close"}
+    return Response(200, "OK", Headers({**headers, "Cache-Control": "no-store"}), page)
 
 
 def _say(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

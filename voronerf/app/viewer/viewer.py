@@ -7,6 +7,7 @@ the thread of the steps, so that a picture is never of half a step. The threads 
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import contextlib
 import io
 import logging
@@ -29,6 +30,7 @@ from voronerf.app.viewer.cameras import axial_depth, look_point
 from voronerf.app.viewer.client import Client
 from voronerf.app.viewer.door import guarded
 from voronerf.app.viewer.pictures import Look, Subject, picture_of, render_bands, render_look, stack_bands
+from voronerf.app.web import CannotDraw, Packed, pack, page_of, turntable
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.renderer import RenderedImage
 
@@ -44,6 +46,8 @@ SMALLEST = 96
 REFRESH = 0.05
 #: Hosts that stand for all addresses of this machine.
 EVERYWHERE = ("0.0.0.0", "::", "")
+#: Where the page is that draws the scene in the browser itself.
+PAGE = "/scene.html"
 #: Depth of empty pixels in scene units, the largest that viser takes.
 NOWHERE = 160.0
 
@@ -55,12 +59,20 @@ class Viewer:
         subject: What is viewed.
         host: Address to listen at.
         port: To listen at; 0 is any that is free.
+        page: Makes the page that draws the subject in the browser itself, served at `PAGE`; None for none.
 
     Raises:
         ConfigError: The address cannot be listened at.
     """
 
-    def __init__(self, subject: Subject, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(
+        self,
+        subject: Subject,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        page: Callable[[], bytes] | None = None,
+    ) -> None:
         check_address(host, port)
         # A tab is closed at any time; what is on its way to it then is lost.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
@@ -70,7 +82,9 @@ class Viewer:
         self.wake = threading.Event()
         self.rate = 100_000.0  # pixels a second
         # viser draws a box around its address
-        with contextlib.redirect_stdout(io.StringIO()), guarded(host):
+        self.page = page
+        pages = {} if page is None else {PAGE: self._make_page}
+        with contextlib.redirect_stdout(io.StringIO()), guarded(host, pages):
             self.server = viser.ViserServer(host=host, port=port, label=subject.name, verbose=False)
         self.host, self.port = host, self.server.get_port()
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
@@ -117,6 +131,20 @@ class Viewer:
         self.points = list(points)
         for client in self.list_clients():
             self.serve_client(client, client.draw_curve)
+
+    async def _make_page(self) -> bytes:
+        """The page, made on the thread that renders."""
+        made: concurrent.futures.Future[bytes] = concurrent.futures.Future()
+
+        def make() -> None:
+            assert self.page is not None
+            try:
+                made.set_result(self.page())
+            except Exception as error:
+                made.set_exception(error)
+
+        self.do(make)
+        return await asyncio.wrap_future(made)
 
     def close(self) -> None:
         """Ends the server; its clients see that it is gone."""
@@ -260,6 +288,11 @@ def view_run(run: Run, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
     Raises:
         ConfigError: The address cannot be listened at.
     """
-    viewer = Viewer(Subject.of(run), host=host, port=port)
+    try:
+        packed: Packed | None = pack(run)
+    except CannotDraw:
+        packed = None
+    page = None if packed is None else lambda: page_of(packed, turntable(run, 1)).encode()
+    viewer = Viewer(Subject.of(run), host=host, port=port, page=page)
     viewer.show_curve(read_curve(run.path))
     return viewer

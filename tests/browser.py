@@ -9,13 +9,16 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-FLAGS = """--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking
---disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader
---hide-scrollbars --force-device-scale-factor=1"""
+FLAGS = """--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update
+--disable-sync --hide-scrollbars --force-device-scale-factor=1"""
+WEBGL = "--headless --disable-gpu --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
+#: On the CPU; without Vulkan, a canvas cannot be drawn to.
+WEBGPU = """--headless=new --enable-unsafe-webgpu --use-webgpu-adapter=swiftshader --enable-features=Vulkan
+--use-vulkan=swiftshader --use-angle=swiftshader"""
 
 
 @contextlib.contextmanager
-def chromium(profile: Path, width: int = 1000, height: int = 700):
+def chromium(profile: Path, width: int = 1000, height: int = 700, *, flags: str = WEBGL):
     """A driver of a browser whose profile is in a folder of its own; skips the test where there is none."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     paths = [shutil.which(name) for name in ("chromium", "chromedriver")]
@@ -23,7 +26,7 @@ def chromium(profile: Path, width: int = 1000, height: int = 700):
         pytest.skip("there is no chromium with its chromedriver")
     options = webdriver.ChromeOptions()
     options.binary_location = paths[0]
-    for flag in (*FLAGS.split(), f"--window-size={width},{height}", f"--user-data-dir={profile}"):
+    for flag in (*FLAGS.split(), *flags.split(), f"--window-size={width},{height}", f"--user-data-dir={profile}"):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(paths[1]))

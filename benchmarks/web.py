@@ -1,0 +1,248 @@
+"""Pages of trained runs beside what `Run.render` gives: in Chromium, whose WebGPU runs on the CPU.
+
+    python benchmarks/web.py --runs runs/lego runs/bonsai runs/demo --pixels 100 --json benchmarks/results/web.json
+
+It needs Debian's packages chromium and chromium-driver, and selenium. Speed on a GPU is a model: the operations that
+the shader asks for in a frame, divided by what a GPU does in a second. They are counted from the steps of the networks,
+and from the strata and samples of the rays of five views, by `COSTS`.
+"""
+
+from __future__ import annotations
+
+import base64
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from harness import metadata
+from numpy.typing import NDArray
+from selenium import webdriver
+from torch import Tensor
+
+from voronerf.app.cli.opening import Opening
+from voronerf.app.files import json_text, read_json, write_text
+from voronerf.app.run import Run
+from voronerf.app.web import export_web
+from voronerf.app.web.shader import fours
+from voronerf.nerf import Cameras, Occupancy
+from voronerf.nerf.marching import FINE_WAVE, OPAQUE
+from voronerf.nerf.radiance import Radiance, radiance_of
+from voronerf.ops import composite
+from voronerf.ops.render_opaque.reference import Wave, walk
+
+FLAGS = """--headless=new --no-sandbox --enable-unsafe-webgpu --use-webgpu-adapter=swiftshader
+--enable-features=Vulkan --use-vulkan=swiftshader --use-angle=swiftshader --no-first-run
+--disable-background-networking --disable-component-update --hide-scrollbars --window-size=800,800"""
+PICTURE = """
+const [camera, done] = arguments;
+voronerf.started.then(() => voronerf.picture(camera)).then(
+  (bytes) => done(btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""))),
+  (error) => done(`error: ${error}`));
+"""
+#: Pixels along the sides of a frame, and every how many of them a ray is counted.
+FRAME, APART = 800, 5
+VIEWS = 5
+#: Of the page while pictures are asked for, so that what it draws itself takes no time.
+SMALL = {"width": 40, "height": 40, "deviceScaleFactor": 1, "mobile": False}
+#: Operations of the shader, beside products of matrices: of a block of 4 x 4 its 8 conversions from float16; of a
+#: corner of a hash grid its weight, its number and the sum; of a centre; of a stratum of a ray, with a contraction;
+#: of a sample its colour and its weight; of a sine or cosine.
+COSTS = {"block": 8, "corner": 18, "centre": 9, "stratum": 45, "contraction": 20, "sample": 60, "wave": 12}
+RATES = (1, 5, 20)  # TFLOP/s
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which runs."""
+
+    runs: tuple[Path, ...]
+    """Run directories; the name of a row is that of the directory."""
+    data: str | None = None
+    """Scene folder; default as in training."""
+    pixels: int = 100
+    """Pixels along the longer side of the pictures that are compared, at most."""
+    json: Path | None = None
+    """Where the results go, beside those of other runs; default: printed only."""
+
+
+@contextmanager
+def browser() -> Iterator[Any]:
+    """Chromium with a profile of its own."""
+    with tempfile.TemporaryDirectory() as profile:
+        options = webdriver.ChromeOptions()
+        options.binary_location = shutil.which("chromium") or ""
+        for flag in (*FLAGS.split(), f"--user-data-dir={profile}"):
+            options.add_argument(flag)
+        driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(shutil.which("chromedriver")))
+        driver.set_script_timeout(600)
+        try:
+            yield driver
+        finally:
+            driver.quit()
+
+
+def first_picture(driver: Any, page: Path) -> float:
+    """Seconds until a page shows its scene."""
+    started = time.perf_counter()
+    driver.get(page.resolve().as_uri())
+    while not driver.execute_script("return document.getElementById('still').hidden"):
+        time.sleep(0.02)
+    return time.perf_counter() - started
+
+
+def drawn(driver: Any, cameras: Cameras, index: int) -> NDArray[np.float64]:
+    """What the page draws by a camera, [h, w, 3] in 0..1."""
+    width, height = cameras.size(index)
+    fx, fy, cx, cy = cameras.intrinsics[index].tolist()
+    pose = cameras.poses[index, :3].flatten().tolist()
+    camera = {"pose": pose, "focal": [fx, fy], "centre": [cx, cy], "width": width, "height": height}
+    found = driver.execute_async_script(PICTURE, camera)
+    if found.startswith("error"):
+        raise RuntimeError(found)
+    return np.frombuffer(base64.b64decode(found), np.uint8).reshape(height, width, 4)[..., :3] / 255
+
+
+def photograph(run: Run, index: int, pinhole: Cameras) -> tuple[Tensor, Tensor]:
+    """A held-out photograph as a camera without distortion would see it, [h, w, 3], and where it does, [h, w]."""
+    cameras, truth = run.scene.test.cameras, run.scene.test.truth(index, run.scene.background_colour())
+    directions = pinhole.image_rays(index).directions
+    places, _ = cameras.project(cameras.origins[index] + directions, index)
+    width, height = cameras.size(index)
+    grid = (places / places.new_tensor([width, height]) * 2 - 1).reshape(1, *pinhole.size(index)[::-1], 2)
+    shown = torch.nn.functional.grid_sample(
+        truth.permute(2, 0, 1)[None], grid, padding_mode="border", align_corners=False
+    )
+    return shown[0].permute(1, 2, 0), (grid[0].abs() < 1).all(-1)
+
+
+def psnr(a: Any, b: Any, where: Any = slice(None)) -> float:
+    """Decibels."""
+    return float(-10 * np.log10(max(np.square(np.asarray(a) - np.asarray(b))[where].mean(), 1e-12)))
+
+
+def compared(run: Run, driver: Any, pixels: int) -> dict[str, Any]:
+    """The page's pictures beside rendered ones and photographs."""
+    cameras = run.scene.test.cameras
+    pinhole = replace(cameras, distortion=None, models=None)
+    pinhole = pinhole.downscaled(max(1, -(-max(cameras.width, cameras.height) // pixels)))
+    between, of_page, of_render = [], [], []
+    for view in np.linspace(0, len(cameras) - 1, VIEWS).round().astype(int).tolist():
+        rendered = run.render(pinhole, view, heaviest=False).colour.clamp(0, 1)
+        page = drawn(driver, pinhole, view)
+        truth, there = photograph(run, view, pinhole)
+        between.append(psnr(page, (rendered * 255).round() / 255))
+        of_page.append(psnr(page, truth, there.numpy()))
+        of_render.append(psnr((rendered * 255).round() / 255, truth, there.numpy()))
+    return {
+        "pixels": f"{pinhole.width} x {pinhole.height}",
+        "psnr_between_worst": min(between),
+        "psnr_between": float(np.mean(between)),
+        "psnr_page": float(np.mean(of_page)),
+        "psnr_render": float(np.mean(of_render)),
+        "worst_difference_db": float(np.abs(np.subtract(of_page, of_render)).max()),
+    }
+
+
+def walked(run: Run, view: int) -> tuple[int, int]:
+    """Strata and samples of a frame's rays, of which every `APART`th along both sides is walked."""
+    sampler, scene, cameras = run.renderer.sampler, run.scene, run.scene.test.cameras
+    assert isinstance(sampler, Occupancy)
+    side, (width, height) = FRAME // APART, cameras.size(view)
+    focal = float(cameras.intrinsics[view, :2].mean()) * side / max(width, height)
+    lens = torch.tensor([[focal, focal, side / 2, side / 2]])
+    whole = Cameras(cameras.poses[[view]], lens, side, side)
+    rays, near, far = whole.image_rays_between(0, near=scene.near, far=scene.far, box=scene.box)
+    hit = (far > near).nonzero()[:, 0]
+    rays, near, far = rays[hit], near[hit], far[hit]
+    stops, samples = torch.zeros(len(hit), dtype=torch.int32), 0
+
+    def look(live: Tensor, start: Tensor | None) -> Wave:
+        nonlocal samples
+        now = rays[live]
+        found, stop = sampler.march(now, near[live], far[live], start=start, most=FINE_WAVE, picture=True)
+        rgb, sigma = run.renderer.field(found.inputs, now.directions, found.ray_index)
+        samples += len(sigma)
+        stops[live] = stop
+        seen = composite(sigma, rgb, found.depths, found.deltas, ray_offsets=found.ray_offsets)
+        return Wave(seen, found.ray_index, found.ray_offsets, found.depths, stop)
+
+    with torch.no_grad():
+        walk(look, far, sampler.picture_samples, FINE_WAVE, OPAQUE, False)
+    return APART**2 * int(stops.sum()), APART**2 * samples
+
+
+def counted(run: Run) -> dict[str, Any]:
+    """Strata, samples, operations and bytes of a frame, in the mean of some views."""
+    known = radiance_of(run.renderer.field)
+    assert isinstance(known, Radiance)
+    views = np.linspace(0, len(run.scene.test.cameras) - 1, VIEWS).round().astype(int).tolist()
+    strata, samples = np.mean([walked(run, view) for view in views], axis=0)
+    of_sample, bytes_of_sample = costs(run, known)
+    of_stratum = COSTS["stratum"] + (COSTS["contraction"] if run.renderer.contraction is not None else 0)
+    operations = strata * of_stratum + samples * of_sample
+    rates = {f"frames_per_second_{rate}_tflops": rate * 1e12 / operations for rate in RATES}
+    return {
+        "strata_per_pixel": strata / FRAME**2,
+        "samples_per_pixel": samples / FRAME**2,
+        "operations_per_sample": of_sample,
+        "gflop_per_frame": operations / 1e9,
+        "gb_asked_per_frame": (strata * 4 + samples * bytes_of_sample + 16 * FRAME**2) / 1e9,
+        **rates,
+    }
+
+
+def costs(run: Run, known: Radiance) -> tuple[int, int]:
+    """Operations of a sample, and the bytes that it asks for, most of which are in a cache."""
+    operations, read, program = COSTS["sample"], 0, known.networks.program
+    for step in program.steps:
+        if step.op == "linear":
+            blocks = fours(step.width) * fours(step.operands[0].width)
+            operations += blocks * (2 * 16 + COSTS["block"])
+            read += 32 * blocks
+        elif step.op == "encode" and step.name == "hash":
+            features = step.width
+            levels = len(run.renderer.field.module.layers.grid.rows)  # type: ignore[attr-defined]
+            operations += 8 * (levels * COSTS["corner"] + 2 * features)
+            read += 8 * 2 * features
+        elif step.op == "encode":
+            operations += COSTS["wave"] * step.width
+        else:
+            operations += step.width
+    diagram = run.diagram
+    met = len(diagram.centres) / max(len(diagram.child_offsets) - 1, 1) * diagram.depth
+    return round(operations + COSTS["centre"] * met), round(read + 16 * met)
+
+
+def main(options: Options) -> None:
+    """Measures and prints each run."""
+    known = read_json(options.json)["results"] if options.json is not None and options.json.is_file() else []
+    results = {row["run"]: row for row in known}
+    with tempfile.TemporaryDirectory() as folder:
+        for path in options.runs:
+            run, page = Opening(data=options.data).open(path), Path(folder) / f"{path.name}.html"
+            packed, size = export_web(run, page)
+            with browser() as driver:
+                seconds = first_picture(driver, page)
+                driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", SMALL)
+                row = {"run": path.name, "file_mb": size / 1e6, "cells": packed.scene["cells"]}
+                row |= {"trained_seconds": run.config.budget, "first_picture_seconds": seconds}
+                row |= compared(run, driver, options.pixels)
+            row |= counted(run)
+            results[path.name] = row
+            print(json_text(row, indent=1), flush=True)
+            if options.json is not None:
+                about = metadata(costs=COSTS, frame=f"{FRAME} x {FRAME}", views=VIEWS)
+                found = {"metadata": about, "results": list(results.values())}
+                write_text(options.json, json_text(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,90 @@
+"""Runs of random networks, of every kind that a page draws, on views of the built-in scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import torch
+from helpers import renderer_of, seeded
+
+from voronerf import HashGridField, NeRF, OccupancyGrid, VoronoiDiagram, VoronoiRouter
+from voronerf.app.run import Run
+from voronerf.app.scenes import builtin_scene
+from voronerf.nerf import Contraction, Perspective
+from voronerf.nerf.fields import KiloNeRF
+
+BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+AXES = torch.tensor([[1.0, 0, 0], [0.0, 0, 1], [0.0, 1, 0]])  # right, up, ahead
+SPHERE = Contraction(torch.tensor([0.1, 0.0, -0.1]), 0.7)
+PERSPECTIVE = Perspective(torch.tensor([0.0, -3.0, 0.2]), AXES, 1.0, (0.8, 0.7))
+#: A field, the options of its router, the contraction, and the spacing of the strata.
+KINDS = {
+    "hash grid": (lambda: HashGridField(width=16, log2_entries=12, box=BOX), {"share": ["features"]}, None, "linear"),
+    "a table for each cell": (
+        lambda: HashGridField(width=8, depth=2, levels=3, level_features=4, log2_entries=10, box=BOX),
+        {},
+        None,
+        "linear",
+    ),
+    "one feature a level": (
+        lambda: HashGridField(width=6, levels=5, level_features=1, log2_entries=10, finest=64, box=BOX),
+        {"share": ["features"]},
+        None,
+        "linear",
+    ),
+    "eight features a level": (
+        lambda: HashGridField(width=6, levels=2, level_features=8, log2_entries=10, view_directions=False),
+        {"share": ["features"]},
+        None,
+        "linear",
+    ),
+    "nerf": (lambda: NeRF(width=18, depth=6, position_octaves=5), {}, None, "linear"),
+    "kilonerf": (lambda: KiloNeRF(position_octaves=6), {}, None, "linear"),
+    "ahead": (lambda: KiloNeRF(width=12, position_octaves=3), {}, PERSPECTIVE, "linear"),
+    "a sphere": (
+        lambda: HashGridField(width=16, log2_entries=12, box=tuple(map(tuple, SPHERE.cube.tolist()))),
+        {"share": ["features"]},
+        SPHERE,
+        "disparity",
+    ),
+}
+
+
+class Rotated(torch.nn.Module):
+    """A field of another codebase, with activations of its own, which is traced."""
+
+    def __init__(self):
+        super().__init__()
+        self.first, self.last = torch.nn.Linear(6, 10), torch.nn.Linear(10, 4)
+
+    def forward(self, positions, directions):
+        found = self.last(torch.nn.functional.silu(self.first(torch.cat([positions, directions], -1))))
+        return torch.tanh(found[:, :3]) * 0.5 + 0.5, torch.nn.functional.leaky_relu(found[:, 3:], 0.0) * 4
+
+
+KINDS["traced"] = (Rotated, {"fuse": True, "coords": "first3"}, None, "linear")
+
+
+def random_run(kind: str) -> Run:
+    """Eight nested cells of random networks in a random grid, seen from around."""
+    make, options, contraction, spacing = KINDS[kind]
+    torch.manual_seed(4)
+    field = make()
+    first = VoronoiDiagram(torch.rand(3, 3, generator=seeded()) - 0.5)
+    router = VoronoiRouter(field, first.centres, **options)
+    router.subdivide(3, points=torch.rand(500, 3, generator=seeded()) * 1.6 - 0.8, weights=torch.ones(500))
+    assert router.diagram.depth == 2 and router.num_cells > 4
+    with torch.no_grad():
+        for parameter in router.parameters():
+            wide = 2.0 if parameter.shape[-2:] == getattr(field, "features", torch.zeros(0, 0)).shape else 0.4
+            parameter.copy_(wide * torch.randn(parameter.shape))
+    scene = replace(builtin_scene(40, train_views=9, test_views=5), contraction=contraction)
+    box = scene.box if contraction is None else contraction.cube
+    scene = scene if contraction is None else replace(scene, box=None, near=0.4, far=40.0)
+    grid = OccupancyGrid(box, (9, 8, 11), threshold=1.0, contraction=contraction)
+    grid.occupied.copy_(torch.rand(9, 8, 11, generator=seeded()) < 0.3)
+    given = {"samples": 40, "picture_samples": 70, "occupancy": grid, "contraction": contraction, "spacing": spacing}
+    space = SimpleNamespace(budget=1)
+    return Run(Path("unused"), space, scene, router, renderer_of({"field": router}, **given))

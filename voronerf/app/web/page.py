@@ -1,0 +1,113 @@
+"""A run as one page: HTML that holds its networks, the shader that draws them, and a turntable for browsers without."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import io
+import json
+import re
+import zlib
+from importlib import resources
+from pathlib import Path
+
+from PIL import Image
+
+from voronerf.app.evaluate.panels import picture_of_colour
+from voronerf.app.files import write_bytes
+from voronerf.app.render.paths import spiral_cameras
+from voronerf.app.run import Run
+from voronerf.app.web.packing import Packed, pack
+from voronerf.nerf.cameras import Cameras, turntable_cameras
+
+SUFFIXES = (".html",)
+#: The turntable: frames, milliseconds of each, and pixels along its longer side.
+FRAMES, FRAME, SIDE = 24, 125, 240
+
+
+def export_web(run: Run, path: Path | str) -> tuple[Packed, int]:
+    """Writes a run as a page that draws it in a browser with WebGPU; one file, which loads nothing from elsewhere.
+
+    Args:
+        run: The run. Its field is one network for each cell, and it has a grid of empty space.
+        path: File to write, .html.
+
+    Returns:
+        What the page holds, and the bytes of the file.
+
+    Raises:
+        ConfigError: The run is none that a page can draw.
+        ValueError: Another suffix.
+        OSError: The file cannot be written.
+
+    Examples:
+        >>> from voronerf.app import Run
+        >>> from voronerf.app.web import export_web
+        >>> def size(run: Run) -> int:
+        ...     return export_web(run, "scene.html")[1]
+    """
+    path = Path(path)
+    check_page(path)
+    packed = pack(run)
+    page = page_of(packed, turntable(run)).encode()
+    write_bytes(path, page)
+    return packed, len(page)
+
+
+def check_page(path: Path) -> None:
+    """Makes the folder of a page; ValueError for another suffix."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{path}: the file must end in {' or '.join(SUFFIXES)}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
+def page_of(packed: Packed, still: bytes) -> str:
+    """The page; `still` is a picture in WebP."""
+    style, script = _file("page.css"), _file("renderer.js") + "\n" + _file("page.js")
+    # Nothing but this script and this style is executed, whatever a run is called.
+    policy = (
+        f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    parts = {
+        "policy": policy,
+        "title": html.escape(packed.scene["name"]),
+        "style": style,
+        "still": "data:image/webp;base64," + base64.b64encode(still).decode(),
+        "scene": json.dumps(packed.scene).replace("<", "\\u003c"),  # no name ends the block
+        "march": packed.shader,
+        "screen": _file("screen.wgsl"),
+        "data": base64.b64encode(zlib.compress(packed.data)).decode(),
+        "script": script,
+    }
+    # In one pass, so that no part is looked for in another.
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _file("page.html"))
+
+
+def turntable(run: Run, frames: int = FRAMES) -> bytes:
+    """The scene, turning, as an animated picture in WebP; it may take a second for a frame."""
+    scene = run.scene
+    cameras = scene.train.cameras
+    if scene.kind == "forward":
+        around = spiral_cameras(cameras, frames, near=scene.near, far=scene.far)
+    else:
+        around = turntable_cameras(cameras, frames)
+    scale = SIDE / max(around.width, around.height)
+    width, height = (max(1, round(scale * side)) for side in (around.width, around.height))
+    around = Cameras(around.poses, around.intrinsics * scale, width, height)
+    first, *others = (
+        Image.fromarray(picture_of_colour(run.render(around, number, heaviest=False).colour).numpy())
+        for number in range(frames)
+    )
+    file = io.BytesIO()
+    first.save(file, "WEBP", save_all=True, append_images=others, duration=FRAME, loop=0, quality=60)
+    return file.getvalue()
+
+
+def _file(name: str) -> str:
+    return resources.files(__package__).joinpath(name).read_text("utf-8")
+
+
+def _digest(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

@@ -1,0 +1,321 @@
+"""The WGSL of a run: constants, the networks step by step, and march.wgsl around them.
+
+A field is a program (`voronerf.ops._core.program`). Each of its values becomes an array of vec4f, four columns each;
+the lanes behind the last column are finite, and the weights that meet them are 0. A matrix becomes blocks of four
+outputs and four inputs, since a product of a mat4x4f and a vec4f needs no sums across lanes. `Layout` says where the
+blocks and biases of a cell lie; `voronerf.app.web.packing` puts them there.
+
+o outputs and i inputs of a matrix, w columns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib import resources
+from typing import Any
+
+from voronerf.app.train.config import ConfigError
+from voronerf.nerf.radiance import Networks
+from voronerf.ops._core.grids import GridLevel, HashGrid
+from voronerf.ops._core.program import PARAMETER, VALUE, Columns, Program, Step
+
+#: Functions of one value x with numbers a and b; finite for every finite x.
+FUNCTIONS = {
+    "copy": "x",
+    "affine": "{a} * x + {b}",
+    "relu": "max(x, vec4f())",
+    "leaky_relu": "select({a} * x, x, x > vec4f())",
+    "abs": "abs(x)",
+    "clamp": "clamp(x, vec4f({a}), vec4f({b}))",
+    "softplus": "softplus({a} * x) / {a}",
+    "sigmoid": "sigmoid(x)",
+    "tanh": "tanh(clamp(x, vec4f(-15), vec4f(15)))",
+    "silu": "x * sigmoid(x)",
+    "sine": "sin(turned({a} * x + {b}))",
+}
+BINARY = {"add": "+", "sub": "-", "mul": "*"}
+#: Numbers that a sample may need: WGSL allows a function 8,192 bytes of variables.
+MOST_NUMBERS = 2000
+#: Stands for infinity, which WGSL has not.
+GREATEST = 3.4e38
+#: Numbers of float16 in a vec4u, in which the parameters are read, and in a block of a matrix.
+WORD, BLOCK = 8, 16
+
+
+class CannotDraw(ConfigError):
+    """A run that a page cannot draw.
+
+    Args:
+        reason: A clause about the run.
+    """
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"a page cannot draw this run: {reason}")
+
+
+@dataclass
+class Layout:
+    """Where the parameters of a cell lie, in numbers from the first of its own.
+
+    Attributes:
+        matrices: (parameter, start column, rows o, columns i, place) of each step that reads a matrix.
+        vectors: (parameter, start, width, place) of each one that is added.
+        size: Of a cell.
+    """
+
+    matrices: list[tuple[int, int, int, int, int]] = field(default_factory=list)
+    vectors: list[tuple[int, int, int, int]] = field(default_factory=list)
+    size: int = 0
+
+    def place(self, count: int) -> int:
+        """Room for so many numbers, from a whole word on."""
+        at = self.size
+        self.size += -(-count // WORD) * WORD
+        return at
+
+
+def fours(width: int) -> int:
+    """How many vec4f hold so many columns."""
+    return -(-width // 4)
+
+
+def networks_text(networks: Networks, layout: Layout) -> str:
+    """The function ``evaluate`` of WGSL: colour and density at a place; fills the layout of a cell's parameters.
+
+    Raises:
+        CannotDraw: A step that has no counterpart, or more numbers than a shader may keep.
+    """
+    program = networks.program
+    numbers = sum(4 * fours(step.width) for step in program.steps)
+    if numbers > MOST_NUMBERS:
+        raise CannotDraw(f"its networks keep {numbers:,} numbers of a sample, a page at most {MOST_NUMBERS:,}")
+    grids = [HashGrid.parse(text) for text in program.grids]
+    lines, made = [], {step.out: step for step in program.steps}
+    readers = [columns.index for step in program.steps for columns in step.operands if columns.of == VALUE]
+    readers += [columns.index for columns in program.outputs]
+    done: set[int] = set()
+    for number, step in enumerate(program.steps):
+        if number in done:
+            continue
+        # A ReLU that alone reads a layer is done with it.
+        after, name = program.steps[number + 1] if number + 1 < len(program.steps) else None, step.name
+        if step.op == "linear" and after is not None and _is_relu_of(after, step) and readers.count(step.out) == 1:
+            done.add(number + 1)
+            step, name = step._replace(out=after.out), "relu"
+        lines += _step(program, step, name, layout, grids, made)
+    (out,) = program.outputs
+    raw = ", ".join(_column(out, made, number) for number in range(4))
+    lines.append(f"let raw = vec4f({raw});")
+    if networks.density_scale is None:
+        lines.append("return raw;")
+    else:
+        lines.append(f"return vec4f(sigmoid(raw).rgb, {_number(networks.density_scale)} * softplus(raw).w);")
+    body = "".join(f"  {line}\n" for line in lines)
+    return (
+        "// Colour and density of a cell's networks at a place, seen along a direction.\n"
+        "fn evaluate(cell: u32, place: vec3f, direction: vec3f) -> vec4f {\n"
+        f"  let own = cell * {layout.size // WORD}u;\n{body}}}\n" + "".join(_grid_text(grid) for grid in grids[:1])
+    )
+
+
+def _is_relu_of(after: Step, step: Step) -> bool:
+    whole = Columns(VALUE, step.out, 0, step.width)
+    return after.op == "function" and after.name == "relu" and after.operands == (whole,) and after.numbers[0] == 0
+
+
+def _step(
+    program: Program, step: Step, name: str, layout: Layout, grids: list[HashGrid], made: dict[int, Step]
+) -> list[str]:
+    """The lines of a step."""
+    out, wide = f"v{step.out}", fours(step.width)
+    declare = f"var {out}: array<vec4f, {wide}>;"
+    every = f"for (var o = 0u; o < {wide}u; o++)"
+    if step.op == "input":
+        return [declare, f"{out}[0] = vec4f({'direction' if step.numbers[0] in program.rays else 'place'}, 0);"]
+    if step.op == "encode":
+        x = step.operands[0]
+        if step.numbers[2] or step.name == "integrated" or x.width != 3 or x.start:
+            raise CannotDraw(f"its networks encode by {step.name} encoding of {x.width} numbers")
+        return [declare, *_encoding(step, f"v{x.index}[0].xyz", out, grids)]
+    if step.op == "linear":
+        return [declare, *_linear(program, step, name, layout, made)]
+    if step.op == "function" and step.numbers[0] == 0 and name in FUNCTIONS:
+        before, given = _whole(step.operands[0], made, f"{out}_of")
+        a, b = (_number(value) for value in step.numbers[1:])
+        value = f"({FUNCTIONS[name].format(a=a, b=b)})"
+        for factor in step.operands[1:]:
+            more, by = _whole(factor, made, f"{out}_by")
+            before, value = [*before, *more], f"{value} * {by}[o]"
+        return [*before, declare, f"{every} {{ let x = {given}[o]; {out}[o] = {value}; }}  // {name}"]
+    if step.op == "binary" and name in BINARY:
+        (before, left), (also, right) = (_whole(columns, made, f"{out}_{n}") for n, columns in enumerate(step.operands))
+        return [*before, *also, declare, f"{every} {{ {out}[o] = {left}[o] {BINARY[name]} {right}[o]; }}"]
+    if step.op == "move":
+        lines = [declare]
+        for columns, at in zip(step.operands, step.numbers):
+            if columns.of != VALUE:
+                raise CannotDraw("its networks put out parameters as they are")
+            for number in range(columns.width):
+                to = int(at) + number
+                lines.append(f"{out}[{to // 4}].{'xyzw'[to % 4]} += {_column(columns, made, number)};")
+        return lines
+    raise CannotDraw(f"its networks have a step {step.op} {name}".rstrip())
+
+
+def _linear(program: Program, step: Step, name: str, layout: Layout, made: dict[int, Step]) -> list[str]:
+    """Blocks of four outputs and four inputs, and what is added."""
+    matrix, start, transposed = map(int, step.numbers)
+    if transposed or name not in ("", "relu"):
+        raise CannotDraw("its networks have a transposed product")
+    x, *added = step.operands
+    before, source = _whole(x, made, f"v{step.out}_of")
+    o, i, out = step.width, x.width, f"v{step.out}"
+    place = layout.place(fours(o) * fours(i) * BLOCK)
+    layout.matrices.append((matrix, start, o, i, place))
+    first = "vec4f()"
+    if added and added[0].of == PARAMETER:
+        bias = layout.place(4 * fours(o))
+        layout.vectors.append((added[0].index, added[0].start, o, bias))
+        first = f"bias(own + {bias // WORD}u, o)"
+    elif added:
+        more, value = _whole(added[0], made, f"v{step.out}_plus")
+        before, first = [*before, *more], f"{value}[o]"
+    last = "max(sum, vec4f())" if name == "relu" else "sum"
+    return [
+        *before,
+        f"for (var o = 0u; o < {fours(o)}u; o++) {{  // linear, {i} to {o}{', relu' if name else ''}",
+        f"  var sum = {first};",
+        f"  let row = own + {place // WORD}u + o * {fours(i) * BLOCK // WORD}u;",
+        f"  for (var i = 0u; i < {fours(i)}u; i++) {{ sum += block(row + {BLOCK // WORD}u * i) * {source}[i]; }}",
+        f"  {out}[o] = {last};",
+        "}",
+    ]
+
+
+def _encoding(step: Step, x: str, out: str, grids: list[HashGrid]) -> list[str]:
+    size = int(step.numbers[0])
+    if step.name == "hash":
+        grid = grids[size]
+        if len(grids) > 1 or grid.interpolation != "linear":
+            raise CannotDraw("its networks have a hash grid with smooth steps, or several grids")
+        lines = [f"let inside = clamp(({x} - GRID_LOW) * GRID_INVERSE, vec3f(), vec3f(1));  // hash grid"]
+        levels = [_level(level, half) for level in grid.rows for half in range(-(-grid.features // 4))]
+        per = max(1, 4 // grid.features)  # levels in a vec4f
+        levels += [f"vec{grid.features}f()" if grid.features > 1 else "0.0"] * (-len(levels) % per)
+        for number in range(fours(step.width)):
+            parts = ",\n  ".join(levels[per * number : per * (number + 1)])
+            lines += f"{out}[{number}] = vec4f(\n  {parts});".split("\n")
+        return lines
+    if step.name == "spherical":
+        return [f"let s = {x};", *_spherical(out, size)]
+    return [  # frequency: x, sin x, cos x, sin 2x, cos 2x, ...
+        f"{out}[0] = vec4f({x}, 0);",
+        f"for (var octave = 0u; octave < {size}u; octave++) {{  // frequencies",
+        f"  let angle = turned(vec4f({x} * exp2(f32(octave)), 0));",
+        "  let s = sin(angle);",
+        "  let c = cos(angle);",
+        "  for (var axis = 0u; axis < 3u; axis++) {",
+        "    let at = 3u + 6u * octave + axis;",
+        f"    {out}[at / 4u][at % 4u] = s[axis];",
+        f"    {out}[(at + 3u) / 4u][(at + 3u) % 4u] = c[axis];",
+        "  }",
+        "}",
+    ]
+
+
+def _level(level: GridLevel, half: int) -> str:
+    hashed = "true" if level.hashed else "false"
+    numbers = f"{_number(level.scale)}, {_number(level.shift)}, {level.side}u, {level.entries}u, {level.offset}u"
+    return f"features_of(cell * TABLE_OF_CELL, inside, Level({numbers}, {hashed}, {half}u))"
+
+
+def _grid_text(grid: HashGrid) -> str:
+    """What reads an entry of the table."""
+    low, high = grid.box
+    inverse = [1 / (b - a) for a, b in zip(low, high)]
+    kind = "f32" if grid.features == 1 else f"vec{min(grid.features, 4)}f"
+    read = {
+        1: "unpack2x16float(table[entry / 2u])[entry % 2u]",
+        2: "unpack2x16float(table[entry])",
+        4: "vec4f(unpack2x16float(table[2u * entry]), unpack2x16float(table[2u * entry + 1u]))",
+        8: "vec4f(unpack2x16float(table[4u * entry + 2u * half]), unpack2x16float(table[4u * entry + 2u * half + 1u]))",
+    }[grid.features]
+    return (
+        f"const GRID_LOW = {_vector(low)};\nconst GRID_INVERSE = {_vector(inverse)};\n"
+        f"alias Features = {kind};\n"
+        f"fn entry_of(entry: u32, half: u32) -> Features {{ return {read}; }}\n"
+    ) + resources.files(__package__).joinpath("grid.wgsl").read_text()
+
+
+def _spherical(out: str, degree: int) -> list[str]:
+    """As in `voronerf.ops.spherical_harmonics.reference`."""
+    bands = [
+        "0.28209479177387814",
+        "-0.48860251190291987 * s.y",
+        "0.48860251190291987 * s.z",
+        "-0.48860251190291987 * s.x",
+        "1.0925484305920792 * s.x * s.y",
+        "-1.0925484305920792 * s.y * s.z",
+        "0.94617469575755997 * s.z * s.z - 0.31539156525251999",
+        "-1.0925484305920792 * s.x * s.z",
+        "0.54627421529603959 * (s.x * s.x - s.y * s.y)",
+        "0.59004358992664352 * s.y * (s.y * s.y - 3 * s.x * s.x)",
+        "2.8906114426405538 * s.x * s.y * s.z",
+        "0.45704579946446572 * s.y * (1 - 5 * s.z * s.z)",
+        "0.3731763325901154 * s.z * (5 * s.z * s.z - 3)",
+        "0.45704579946446572 * s.x * (1 - 5 * s.z * s.z)",
+        "1.4453057213202769 * s.z * (s.x * s.x - s.y * s.y)",
+        "0.59004358992664352 * s.x * (3 * s.y * s.y - s.x * s.x)",
+    ]
+    return [f"{out}[{n // 4}].{'xyzw'[n % 4]} = {text};" for n, text in enumerate(bands[: degree**2])]
+
+
+def _whole(columns: Columns, made: dict[int, Step], name: str) -> tuple[list[str], str]:
+    """Lines before, and an array that begins with the columns and ends with them."""
+    if columns.of != VALUE:
+        raise CannotDraw("its networks compute with parameters other than weights and biases")
+    if not columns.spread and columns.start == 0 and columns.width == made[columns.index].width:
+        return [], f"v{columns.index}"
+    lines = [f"var {name}: array<vec4f, {fours(columns.width)}>;"]
+    for number in range(columns.width):
+        lines.append(f"{name}[{number // 4}].{'xyzw'[number % 4]} = {_column(columns, made, number)};")
+    return lines, name
+
+
+def _column(columns: Columns, made: dict[int, Step], number: int) -> str:
+    if columns.of != VALUE:
+        raise CannotDraw("its networks put out parameters as they are")
+    at = columns.start + (0 if columns.spread else number)
+    return f"v{columns.index}[{at // 4}].{'xyzw'[at % 4]}"
+
+
+def _number(value: Any) -> str:
+    """A float of WGSL, in parentheses if negative."""
+    text = repr(min(max(float(value), -GREATEST), GREATEST))
+    text = text if any(mark in text for mark in ".e") else f"{text}.0"
+    return f"({text})" if text.startswith("-") else text
+
+
+def _vector(values: Any) -> str:
+    values = list(values)
+    return f"vec{len(values)}f({', '.join(_number(value).strip('()') for value in values)})"
+
+
+def shader_text(networks: str, constants: dict[str, Any]) -> str:
+    """The whole shader.
+
+    Args:
+        networks: From `networks_text`.
+        constants: By their names in march.wgsl: booleans, int, float, or lists of three.
+    """
+    lines = []
+    for name, value in constants.items():
+        if isinstance(value, bool):
+            text = str(value).lower()
+        elif isinstance(value, int):
+            text = f"{value}u"
+        else:
+            text = _number(value) if isinstance(value, float) else _vector(value)
+        lines.append(f"const {name} = {text};\n")
+    march = resources.files(__package__).joinpath("march.wgsl").read_text()
+    return "".join(lines) + "\n" + march + "\n" + networks
