@@ -23,7 +23,10 @@ from typing import Any, NoReturn
 import torch
 
 from voronerf import __version__
+from voronerf.app.cli import keep_freed_memory
 from voronerf.ops._core import backends
+
+keep_freed_memory()  # benchmarks are programs, as the command line is one
 
 Run = Callable[[int], Any]
 """A contender: given the number of the call, runs on the inputs that number stands for. Call 0 is the warm-up."""

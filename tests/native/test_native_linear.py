@@ -142,8 +142,8 @@ def test_what_a_step_frees_is_kept() -> None:
         pytest.skip("glibc alone can be asked")
     program = """
 import resource, torch
-from voronerf.app.cli import _prepare
-_prepare()
+from voronerf.app.cli import keep_freed_memory
+keep_freed_memory()
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 step = lambda: [torch.ones(1 << 22) for _ in range(16)]
 found = []

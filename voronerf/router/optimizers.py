@@ -92,6 +92,7 @@ def watch_optimizers(module: nn.Module, line: str) -> list[Any]:
                 f"{_OP}: optimizer ({type(optimizer).__name__}) holds the state of other cells than the router "
                 f"has; write {line}, or make the optimizer afterwards"
             )
+        watched.clear()  # torch does not let a hook remove itself
 
     found = [item for item in gc.get_objects() if issubclass(type(item), torch.optim.Optimizer)]
     return [optimizer.register_step_pre_hook(check) for optimizer in found if ours(optimizer)]
@@ -106,22 +107,27 @@ class Untrained:
     """
 
     def __init__(self, module: nn.Module) -> None:
-        self._parameters = [p for p in module.parameters() if p.requires_grad][:1]
-        self._were, self._calls = [p.detach().clone() for p in self._parameters], 0
+        self._parameters = [p for p in module.parameters() if p.requires_grad]
+        self._were, self._calls = [_some(p).clone() for p in self._parameters], 0
 
     def is_over(self, warn: Callable[[str, str], None]) -> bool:
         """Whether there is nothing more to find out; takes a topic and a message for a warning."""
         self._calls += 1
         if self._calls <= PATIENCE:
             return False
-        for parameter, was in zip(self._parameters, self._were, strict=True):
-            if parameter.grad is not None and torch.equal(parameter.detach(), was):
-                message = (
-                    f"no optimizer has changed the parameters in {PATIENCE} calls, but they have gradients; make it of "
-                    "router.parameters(), since those that the module had before it was wrapped are not trained"
-                )
-                warn("untrained", message)
+        have = any(parameter.grad is not None for parameter in self._parameters)
+        if have and all(torch.equal(_some(p), was) for p, was in zip(self._parameters, self._were, strict=True)):
+            message = (
+                f"no optimizer has changed the parameters in {PATIENCE} calls, but they have gradients; make it of "
+                "router.parameters(), since those that the module had before it was wrapped are not trained"
+            )
+            warn("untrained", message)
         return True
+
+
+def _some(parameter: Tensor) -> Tensor:
+    """Up to two thousand of a parameter's values."""
+    return parameter.detach().flatten()[:: max(1, parameter.numel() // 1000)]
 
 
 # Frozen cells ---------------------------------------------------------------------------------------------------------

@@ -331,7 +331,7 @@ class VoronoiRouter(nn.Module):
             self._doubts.append(FrozenRows(self.module, self.frozen_cells))
 
     def unfreeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
-        """Lets frozen cells learn again, with the optimiser's moments that they had; takes what `freeze` takes."""
+        """Lets frozen cells learn again, with the optimiser's moments that they had; takes cells as `freeze` does."""
         self._set_frozen(self.frozen & ~self._mask("unfreeze", cells))
 
     def _mask(self, method: str, cells: Sequence[int] | Tensor | None) -> Tensor:
@@ -557,7 +557,7 @@ class VoronoiRouter(nn.Module):
         """
         diagram: Any = self._modules["diagram"]
         k, centres, frozen = diagram.num_cells, diagram._buffers["centres"], self._buffers["frozen_cells"]
-        if self._doubts:
+        if not torch.compiler.is_compiling() and self._doubts:
             self._ask_doubts()
         if k == 1:
             return {"frozen": frozen}
@@ -728,7 +728,7 @@ class VoronoiRouter(nn.Module):
 
     def _ask_doubts(self) -> None:
         """Warns or raises, in the first training calls, where optimisers do not do what is expected of them."""
-        if torch.is_grad_enabled() and not torch.compiler.is_compiling():
+        if torch.is_grad_enabled():
             self._doubts = [doubt for doubt in self._doubts if not doubt.is_over(self._dispatch.warn_once)]
 
     def _trust_frozen(self) -> None:
@@ -794,8 +794,8 @@ class VoronoiRouter(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> VoronoiRouter:
         self._dispatch.forget()
         self._assigned = None
-        self._trust_frozen()
         super()._apply(fn, recurse)
+        self._doubts = [Untrained(self.module)]
         freeze_cells(self.module, self.frozen_cells)
         return self
 

@@ -34,15 +34,18 @@ def _prepare() -> None:
     # They spin for some ten microseconds before that: to sleep and wake takes as long, many times in a step.
     if os.environ["OMP_WAIT_POLICY"] == "passive":
         os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-    # The C library keeps freed memory, so that the next step does not wait for the same pages again: glibc's
-    # M_MMAP_THRESHOLD, which takes no more than this, and M_TRIM_THRESHOLD.
-    with contextlib.suppress(AttributeError, TypeError):  # another C library
-        limit = ctypes.CDLL(None).mallopt
-        limit(-3, 1 << 25)
-        limit(-1, 1 << 30)
+    keep_freed_memory()
     # Garbage is collected again when the command runs: while torch is loaded there is none, and to look for it takes a
     # tenth of the time.
     gc.disable()
     # Ctrl-C ends the program without a traceback while it is loaded.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def keep_freed_memory() -> None:
+    """Makes the C library keep freed memory, so that the next step does not wait for the same pages again."""
+    with contextlib.suppress(AttributeError, TypeError):  # a C library without these limits
+        limit = ctypes.CDLL(None).mallopt
+        limit(-3, 1 << 25)  # glibc's M_MMAP_THRESHOLD, which takes no more
+        limit(-1, 1 << 30)  # M_TRIM_THRESHOLD
