@@ -16,7 +16,7 @@ from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.loss import Batch, RayLoss, RenderOutput
 from voronerf.nerf.radiance import Radiance
-from voronerf.nerf.split import SplitStrategy
+from voronerf.nerf.split import Strategy
 from voronerf.ops import Guard
 from voronerf.ops._core import backends
 from voronerf.ops._core.capture import Capture
@@ -129,7 +129,7 @@ class TrainingStep:
         loss: RayLoss,
         optimizer: Adam,
         *,
-        strategy: SplitStrategy | None = None,
+        strategy: Strategy | None = None,
         guard: Guard | None = None,
         generator: torch.Generator,
         autocast: torch.dtype | None = None,

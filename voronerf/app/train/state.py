@@ -111,7 +111,7 @@ class State:
             self.batches,
             self.ray_loss,
             self.optimizer,
-            strategy=self.strategy,  # type: ignore[arg-type]
+            strategy=self.strategy,
             guard=self.guard,
             generator=self.draws,
             autocast=HALVES.get(self.config.precision),

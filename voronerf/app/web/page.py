@@ -16,10 +16,9 @@ from PIL import Image
 
 from voronerf.app.evaluate.panels import picture_of_colour
 from voronerf.app.files import write_bytes
-from voronerf.app.render.paths import spiral_cameras
+from voronerf.app.render.paths import capture_path, resized
 from voronerf.app.run import Run
 from voronerf.app.web.packing import Packed, pack
-from voronerf.nerf.cameras import Cameras, turntable_cameras
 
 SUFFIXES = (".html",)
 #: The turntable: frames, milliseconds of each, and pixels along its longer side.
@@ -89,13 +88,9 @@ def turntable(run: Run, frames: int = FRAMES) -> bytes:
     """The scene, turning, as an animated picture in WebP; it may take a second for a frame."""
     scene = run.scene
     cameras = scene.train.cameras
-    if scene.kind == "forward":
-        around = spiral_cameras(cameras, frames, near=scene.near, far=scene.far)
-    else:
-        around = turntable_cameras(cameras, frames)
+    around = capture_path(cameras, frames, near=scene.near, far=scene.far)
     scale = SIDE / max(around.width, around.height)
-    width, height = (max(1, round(scale * side)) for side in (around.width, around.height))
-    around = Cameras(around.poses, around.intrinsics * scale, width, height)
+    around = resized(around, (max(1, round(scale * around.width)), max(1, round(scale * around.height))))
     first, *others = (
         Image.fromarray(picture_of_colour(run.render(around, number, heaviest=False).colour).numpy())
         for number in range(frames)
