@@ -6,7 +6,6 @@ import json
 import os
 import random
 import shutil
-import tempfile
 import warnings
 from pathlib import Path
 
@@ -29,7 +28,7 @@ from voronerf.app.train.checkpoint import (
 COMMANDS: tuple[tuple[str, ...], ...] = (
     ("eval", "--views", "1", "--panels", "1", "--lpips", "off"),
     ("render", "--frames", "1"),
-    ("export", "--web", f"{tempfile.gettempdir()}/voronerf-attack-{os.getpid()}.html"),
+    ("export", "--web", "{run}/page.html"),
     ("train", "--resume", "--steps", "18", "--lpips", "off", "--out"),
 )
 
@@ -84,7 +83,7 @@ def stranger_run(rng: random.Random, folder: Path, given: Path) -> str:
             path.unlink()
     change(rng, run, outside)
     before = contents(folder, run)
-    verdict = judged(*rng.choice(COMMANDS), run)
+    verdict = judged(*(part.format(run=run) for part in rng.choice(COMMANDS)), run)
     if contents(folder, run) != before:
         raise Failed("something outside of the run was changed")
     return verdict

@@ -9,11 +9,12 @@ from types import SimpleNamespace
 import torch
 from helpers import renderer_of, seeded
 
-from voronerf import HashGridField, NeRF, OccupancyGrid, VoronoiDiagram, VoronoiRouter
+from voronerf import MLP, HashGridField, Layer, NeRF, OccupancyGrid, VoronoiDiagram, VoronoiRouter
 from voronerf.app.run import Run
 from voronerf.app.scenes import builtin_scene
 from voronerf.nerf import Contraction, Perspective
 from voronerf.nerf.fields import KiloNeRF
+from voronerf.nerf.fields.radiance import RadianceField
 
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 AXES = torch.tensor([[1.0, 0, 0], [0.0, 0, 1], [0.0, 1, 0]])  # right, up, ahead
@@ -64,6 +65,22 @@ class Rotated(torch.nn.Module):
         return torch.tanh(found[:, :3]) * 0.5 + 0.5, torch.nn.functional.leaky_relu(found[:, 3:], 0.0) * 4
 
 
+class Spherical(RadianceField):
+    """A layer table with spherical harmonics of the directions."""
+
+    view_directions, density_scale = True, 6.0
+
+    def __init__(self):
+        super().__init__()
+        layers = Layer(("positions",), 9, "softplus"), Layer((0,), 1), Layer((0, "directions"), 3)
+        self.layers = MLP(layers, (2, 1), position_octaves=3, direction_encoding="spherical", direction_degree=4)
+        self.parts = torch.nn.ModuleList(torch.nn.Linear(i, o) for o, i in self.layers.weight_shapes(3, 3))
+
+    def linears(self):
+        return list(self.parts)
+
+
+KINDS["spherical harmonics"] = (Spherical, {}, None, "linear")
 KINDS["traced"] = (Rotated, {"fuse": True, "coords": "first3"}, None, "linear")
 
 

@@ -85,6 +85,7 @@ function readAddress() {
   }
   state.cells = parts.get("cells") === "1";
   state.hidden = new Set(numbers("hide").filter((x) => parts.has("hide") && Number.isInteger(x) && x >= 0 && x < scene.cells));
+  state.axis = 3;
   const [axis, cut] = numbers("cut");
   if (parts.has("cut") && [0, 1, 2].includes(axis) && cut >= 0 && cut <= 1) Object.assign(state, { axis, cut });
   const back = parts.get("back");

@@ -207,7 +207,7 @@ def _encoding(step: Step, x: str, out: str, grids: list[HashGrid]) -> list[str]:
             lines += f"{out}[{number}] = vec4f(\n  {parts});".split("\n")
         return lines
     if step.name == "spherical":
-        return [f"let s = {x};", *_spherical(out, size)]
+        return ["{", f"  let s = {x};  // spherical harmonics", *(f"  {line}" for line in _spherical(out, size)), "}"]
     return [  # frequency: x, sin x, cos x, sin 2x, cos 2x, ...
         f"{out}[0] = vec4f({x}, 0);",
         f"for (var octave = 0u; octave < {size}u; octave++) {{  // frequencies",
