@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 import warp as wp
 from torch import Tensor
 
@@ -19,6 +18,7 @@ from voronerf.kernels._launch import array, filled, launch
 from voronerf.ops._core.declare import declared
 from voronerf.ops.composite.reference import check_ray_offsets
 from voronerf.ops.render_loss.autograd import register
+from voronerf.ops.render_loss.reference import robust_error
 
 wp.set_module_options({"enable_backward": False})
 
@@ -81,6 +81,7 @@ class Inputs:
     scale: wp.float32
     activated: wp.bool
     hidden: wp.float32
+    robust: wp.float32
 
 
 @wp.struct
@@ -128,7 +129,10 @@ def _render_loss_kernel(given: Inputs, found: Found) -> None:
         shown = wp.vec3(given.background[ray, 0], given.background[ray, 1], given.background[ray, 2])
     seen = light + left * shown
     off = seen - wp.vec3(given.target[ray, 0], given.target[ray, 1], given.target[ray, 2])
-    slopes = off * (2.0 / (3.0 * wp.float32(given.target.shape[0])))
+    share = 2.0 / (3.0 * wp.float32(given.target.shape[0]))
+    if given.robust > 0.0:
+        share = share * given.robust / wp.sqrt(wp.dot(off, off) + given.robust * given.robust)
+    slopes = off * share
     for k in range(3):
         found.colour[ray, k] = seen[k]
     found.error[ray] = wp.dot(off, off)
@@ -177,13 +181,13 @@ def _render_loss(given: Any, found: Any) -> None:
     for of_strays in (found.weights, found.gradient):  # samples that belong to no ray
         of_strays.zero_()
     behind = target.new_empty(0, 3) if given.background is None else given.background.expand_as(target)
-    compared = {"target": target, "background": behind, "hidden": given.hidden}
+    compared = {"target": target, "background": behind, "hidden": given.hidden, "robust": given.robust}
     rule = {"scale": given.density_scale, "activated": given.activated}
     inputs = filled(Inputs(), raw=raw, deltas=given.deltas, offsets=given.ray_offsets, **compared, **rule)
     outputs = {name: getattr(found, name) for name in ("colour", "weights", "error", "gradient")}
     launch(_render_loss_kernel, r, [inputs, filled(Found(), **outputs)], raw)
     launch(_density_kernel, m, [inputs, array(found.density, raw)], raw)
-    found.loss.copy_(found.error.mean(dtype=torch.float64) / 3)
+    found.loss.copy_(robust_error(found.error.double(), given.robust).mean() / 3)
 
 
 register(_render_loss)

@@ -8,6 +8,7 @@
 
 #include "common/parallel.h"
 #include "rays/render_loss_isa.h"
+#include "rays/render_loss_math.h"
 
 namespace voronerf {
 
@@ -54,7 +55,7 @@ void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, I
   strays_of(isa, in, out, in.offsets[in.r], in.m);
   each_block(in.r, threads, [&](int64_t begin, int64_t end) { rays_of(isa, in, out, begin, end); });
   double sum = 0.0;
-  for (int64_t i = 0; i < in.r; ++i) sum += static_cast<double>(out.error[i]);
+  for (int64_t i = 0; i < in.r; ++i) sum += static_cast<double>(ray_loss(out.error[i], in.robust));
   *out.loss = static_cast<float>(sum / (3.0 * static_cast<double>(in.r)));
 }
 

@@ -6,6 +6,7 @@
 #include "common/cuda_wrappers.h"
 #include "rays/ray_warp.h"
 #include "rays/render_loss.h"
+#include "rays/render_loss_math.h"
 
 namespace voronerf {
 
@@ -74,16 +75,20 @@ __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs 
   if (background != nullptr && in.background_per_ray) background += 3 * ray;
   const float left = expf(-carry.plus(0.0f)), share = 2.0f / (3.0f * static_cast<float>(in.r));
   float slopes[3], error = 0.0f;
-  Carry behind;
   for (int k = 0; k < 3; ++k) {
     const float shown = background == nullptr ? 0.0f : background[k];
-    const float colour = fmaf(left, shown, sum_of_lanes(light[k])), off = colour - in.target[3 * ray + k];
+    const float colour = fmaf(left, shown, sum_of_lanes(light[k]));
     if (lane == 0) out.colour[3 * ray + k] = colour;
-    error += off * off;
-    slopes[k] = off * share;
-    behind.add(slopes[k] * shown * left);
+    slopes[k] = colour - in.target[3 * ray + k];
+    error += slopes[k] * slopes[k];
   }
   if (lane == 0) out.error[ray] = error;
+  const float scale = share * ray_loss_slope(error, in.robust);
+  Carry behind;
+  for (int k = 0; k < 3; ++k) {
+    slopes[k] *= scale;
+    behind.add(slopes[k] * (background == nullptr ? 0.0f : background[k]) * left);
+  }
   const int64_t chunks = ceil_div<int64_t>(range.end - range.begin, 32);
   for (int64_t chunk = chunks; chunk-- > 0;) {
     const int64_t i = range.begin + 32 * chunk + lane;
@@ -119,11 +124,12 @@ __global__ void __launch_bounds__(kThreads) render_loss_strays(RenderLossInputs 
   }
 }
 
-// One block: the errors summed in an order that does not depend on the device.
-__global__ void __launch_bounds__(kThreads) render_loss_mean(const float* __restrict__ error, int64_t r, float* loss) {
+// One block: the losses of the rays summed in an order that does not depend on the device.
+__global__ void __launch_bounds__(kThreads)
+    render_loss_mean(const float* __restrict__ error, float robust, int64_t r, float* loss) {
   VN_SHARED(sums, double[kThreads]);
   double sum = 0.0;
-  for (int64_t ray = threadIdx.x; ray < r; ray += kThreads) sum += static_cast<double>(error[ray]);
+  for (int64_t ray = threadIdx.x; ray < r; ray += kThreads) sum += static_cast<double>(ray_loss(error[ray], robust));
   sums[threadIdx.x] = sum;
   for (unsigned half = kThreads / 2; half > 0; half /= 2) {
     __syncthreads();
@@ -147,7 +153,7 @@ void render_loss_cuda(const RenderLossInputs& in, const RenderLossOutputs& out, 
       VN_LAUNCH(render_loss_kernel<false>, blocks, kThreads, 0, stream, in, out);
     }
   }
-  VN_LAUNCH(render_loss_mean, 1, kThreads, 0, stream, out.error, in.r, out.loss);
+  VN_LAUNCH(render_loss_mean, 1, kThreads, 0, stream, out.error, in.robust, in.r, out.loss);
 }
 
 }  // namespace voronerf

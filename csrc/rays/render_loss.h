@@ -19,6 +19,7 @@ struct RenderLossInputs {
   float density_scale;
   bool activated;  // colour and density as they are, without scale
   float hidden;    // share of the light; samples that no more than it reaches have no gradient
+  float robust;    // scale of the errors that count less than squared, see render_loss_math.h; 0 for none
   RowCount r, m;
 };
 

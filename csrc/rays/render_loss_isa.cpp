@@ -8,6 +8,7 @@
 // of them waits where the gradient of the density is to be.
 #include "rays/render_loss_isa.h"
 
+#include "rays/render_loss_math.h"
 #include "rays/render_tile.h"
 
 namespace voronerf {
@@ -59,16 +60,20 @@ VN_INLINE void compare(const RenderLossInputs& in, const RenderLossOutputs& out,
     float lanes[kLanes];
     store(lanes, transmittance(splat(static_cast<float>(sums.front[ray - from]))));
     const float left = lanes[0];
-    float error = 0.0f;
-    double behind = 0.0;
+    float off[3], error = 0.0f;
     for (int k = 0; k < 3; ++k) {
       const float shown = background == nullptr ? 0.0f : background[k];
       const float colour = static_cast<float>(sums.light[k][ray - from]) + left * shown;
-      const float off = colour - in.target[3 * ray + k], slope = off * share;
+      off[k] = colour - in.target[3 * ray + k];
       out.colour[3 * ray + k] = colour;
-      error += off * off;
+      error += off[k] * off[k];
+    }
+    const float scale = share * ray_loss_slope(error, in.robust);
+    double behind = 0.0;
+    for (int k = 0; k < 3; ++k) {
+      const float slope = off[k] * scale;
       sums.slopes[k][ray - from] = slope;
-      behind += static_cast<double>(slope) * shown * left;
+      behind += static_cast<double>(slope) * (background == nullptr ? 0.0f : background[k]) * left;
     }
     out.error[ray] = error;
     sums.behind[ray - from] = behind;

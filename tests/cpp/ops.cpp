@@ -248,9 +248,10 @@ void loss(Isa isa) {
   const Array<float> background = uniform<float>(below(2) * (per_ray ? 3 * r : 3));
   Array<float> deltas = uniform<float>(m);
   for (float& delta : deltas) delta = std::fabs(delta);
+  const float robust = below(2) == 0 ? 0.0f : 0.05f;
   const voronerf::RenderLossInputs in{raw.data(), deltas.data(), offsets.data(), target.data(), or_null(background),
-                                      per_ray,    10.0f,         activated,      1e-4f,         r,
-                                      m};
+                                      per_ray,    10.0f,         activated,      1e-4f,         robust,
+                                      r,          m};
   const int64_t sizes[] = {1, 3 * r, m, m, r, 4 * m};
   Array<float> results[2][6];
   for (int i = 0; i < 2; ++i) {

@@ -392,9 +392,11 @@ def ends(rays):
     return torch.ones(len(rays)), torch.full((len(rays),), 5.0)
 
 
-@pytest.mark.parametrize(("full_gradient", "sparse_depth"), [(None, 0), (4.0, 0), (None, 0.1), (4.0, 0.1)])
+@pytest.mark.parametrize(
+    ("full_gradient", "sparse_depth", "robust"), [(None, 0, 0.0), (4.0, 0, 0.05), (None, 0.1, 0.05), (4.0, 0.1, 0.0)]
+)
 @pytest.mark.parametrize("field", [NeRF(width=16, depth=2), HashGridField(width=16, levels=2, log2_entries=10)])
-def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse_depth):
+def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse_depth, robust):
     """With the loss on points that the last rays end at, before, in and behind the grid."""
     grid = tight_grid()
     router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **getattr(field, "router_options", {}))
@@ -407,7 +409,8 @@ def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse
 
     def compare(renderer):
         batch = Batch(rays, *ends(rays), target, background, seen)
-        found = RayLoss(renderer, sparse_depth=sparse_depth)(batch, torch.Generator().manual_seed(3))
+        loss = RayLoss(renderer, sparse_depth=sparse_depth, robust=robust)
+        found = loss(batch, torch.Generator().manual_seed(3))
         return found, torch.autograd.grad(found.loss, list(router.parameters()))
 
     found, gradients = compare(renderer)

@@ -95,6 +95,27 @@ def test_no_density_has_a_gradient_where_light_arrives(device, backend, hidden):
     assert abs(float(leaf.grad[2, 3])) < 1e-4 and (hidden == 0 or not leaf.grad[2].any())
 
 
+@pytest.mark.parametrize("scale", [0.02, 0.5])
+def test_robust_loss_is_squared_for_small_errors_and_grows_linearly(device, backend, scale):
+    """Against the formula of Charbonnier, step by step in float64; rays on target, near it and far from it."""
+    raw, deltas, offsets, target, background = rays([40, 0, 3, 90])
+    seen = step_by_step(raw, deltas, offsets, target, background).colour
+    target = seen + torch.tensor([0.0, 1e-4, 0.1, 0.4], dtype=seen.dtype)[:, None]
+    leaf = raw.clone().requires_grad_()
+    error = step_by_step(leaf, deltas, offsets, target, background).colour.sub(target).square().sum(-1)
+    exact = (2 * scale * ((error + scale**2).sqrt() - scale)).mean() / 3
+    (expected,) = torch.autograd.grad(exact, leaf)
+    given = [t.to(device, t.dtype if t.dtype == torch.int32 else torch.float32) for t in (raw, deltas, offsets, target)]
+    values = given[0].requires_grad_()
+    rule = {"background": background.float().to(device), "density_scale": SCALE, "robust": scale, "backend": backend}
+    found = render_loss(values, *given[1:], **rule)
+    found.loss.backward()
+    torch.testing.assert_close(found.loss.double().cpu(), exact.detach(), rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(found.error.double().cpu(), error.detach(), rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(values.grad.double().cpu(), expected, rtol=1e-3, atol=1e-7)
+    assert float(found.loss) < float(error.mean()) / 3
+
+
 def test_backgrounds(device, backend):
     raw, deltas, offsets, target, _ = (t.to(device) for t in rays([4, 0, 9], torch.float32))
     rest = {"density_scale": SCALE, "backend": backend}

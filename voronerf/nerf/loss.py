@@ -84,7 +84,7 @@ class RenderOutput(NamedTuple):
 
 
 class RayLoss:
-    """The mean squared error of rays at random samples.
+    """The mean squared or robust error of rays at random samples.
 
     Where nothing keeps it from that (:meth:`why_not_fused`), networks, colours, loss and gradients are one operation
     each way; else torch differentiates each pass along the rays.
@@ -93,6 +93,8 @@ class RayLoss:
         renderer: Networks and sampler.
         sparse_depth: Factor of the loss on light that does not come from where the points of a sparse model are
             (Deng et al. 2022, "Depth-supervised NeRF"); 0 is off.
+        robust: Scale of the errors beyond which the loss of a ray is not squared: see `voronerf.ops.render_loss`. What
+            differs from picture to picture, such as exposure, is no reason for fog then. 0 is off.
 
     Examples:
         >>> import torch
@@ -111,8 +113,8 @@ class RayLoss:
         field: forward: fused
     """
 
-    def __init__(self, renderer: Renderer, *, sparse_depth: float = 0.0) -> None:
-        self.renderer, self.sparse_depth = renderer, sparse_depth
+    def __init__(self, renderer: Renderer, *, sparse_depth: float = 0.0, robust: float = 0.0) -> None:
+        self.renderer, self.sparse_depth, self.robust = renderer, sparse_depth, robust
 
     def __call__(
         self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False
@@ -161,6 +163,7 @@ class RayLoss:
             batch.target,
             background=batch.background,
             **field.rule,
+            robust=self.robust,
             hidden=HIDDEN,  # what next to no light reaches learns nothing, and takes no part in the backward pass
             backend=renderer.backend,
         )
@@ -186,7 +189,7 @@ class RayLoss:
     def _separate(self, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:
         given: dict[str, Any] = {"background": batch.background, "jitter": True, "generator": generator}
         *before, last = self.renderer.render(batch.rays, batch.near, batch.far, **given)
-        loss, samples = colour_loss(last.colour, batch.target), last.samples
+        loss, samples = colour_loss(last.colour, batch.target, self.robust), last.samples
         if self.sparse_depth and batch.sparse_depths is not None:
             several = len(batch.sparse_depths)
             known = torch.nn.functional.pad(batch.sparse_depths, (0, len(batch.rays) - several), value=torch.nan)

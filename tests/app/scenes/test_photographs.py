@@ -15,7 +15,7 @@ from voronerf.app import open_run
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.scenes import SceneError, load_scene, photographs
 from voronerf.app.train import ConfigError, TrainConfig
-from voronerf.app.train.build import make_batches, make_renderer, make_routers
+from voronerf.app.train.build import ROBUST, build, make_batches, make_renderer, make_routers
 from voronerf.app.train.defaults import resolve
 from voronerf.nerf.cameras import Cameras, orbit_cameras
 
@@ -78,9 +78,11 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     points = torch.from_numpy(POINTS) @ scene.transform[:3, :3].T + scene.transform[:3, 3]
     config = resolve(TrainConfig(), scene)
     space = make_renderer(config, scene, make_routers(config, "cpu")).sampler.space
-    assert (config.sparse_depth, space.full_gradient) == (0.003, 1.0)
+    assert (config.sparse_depth, space.full_gradient) == (0.0015, 1.0)
     assert config.occupancy and config.samples == (256,)
     assert resolve(TrainConfig(budget=60), scene).samples == (128,)
+    losses = [build(config, each).ray_loss for each in (scene, replace(scene, background="white"))]
+    assert [loss.robust for loss in losses] == [ROBUST, 0.0]  # of photographs alone
     batch = make_batches(config, scene).draw(400, torch.Generator().manual_seed(0))
     assert len(batch.rays) == 400 and len(batch.sparse_depths) == 100
     assert batch.background.shape == (400, 3) and batch.background.unique().numel() > 1000  # drawn for each

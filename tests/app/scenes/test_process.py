@@ -155,6 +155,7 @@ def test_a_model_with_faults_is_not_a_scene(tmp_path, monkeypatch, pictures):
 def test_cameras_far_from_all_others_count_as_missing():
     origins = circle(40)
     assert not lost_cameras(origins).any() and camera_faults(origins) == []
+    assert not lost_cameras(origins[:2]).any() and not lost_cameras(origins[:1]).any()
     origins[7] *= 9
     assert lost_cameras(origins).nonzero().flatten().tolist() == [7]
     assert camera_faults(origins) == []  # one is not all

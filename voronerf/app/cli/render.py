@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 from voronerf.app.cli.display import say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
-from voronerf.app.export.video import check_folder, export_video
-from voronerf.app.render.paths import LONGEST_SIDE, read_camera_path
+from voronerf.app.export.video import FRAMES, check_folder, export_video, video_cameras
+from voronerf.app.render.paths import LONGEST_SIDE, read_camera_path, resized
 from voronerf.app.render.video import check_video
 from voronerf.app.train.config import ConfigError
 
@@ -19,7 +18,7 @@ def render(
     /,
     out: Path | None = None,
     path: Path | None = None,
-    frames: int = 60,
+    frames: int = FRAMES,
     fps: float | None = None,
     size: str | None = None,
     images: bool = False,
@@ -47,24 +46,17 @@ def render(
         raise ConfigError(f"--fps must be 0.01 to 1000, got {fps:g}")
     sides = None if size is None else _sides(size)
     flight = None if path is None else read_camera_path(path)
-    if flight is not None:
-        flight = replace(flight, frames=flight.frames.downscaled(opening.downscale or 1))
     opened = opening.open_without_images(run)
     name = ("video" if path is None else path.stem) + "_depth" * depth
     out = out or run / (name if images else f"{name}.mp4")
     (check_folder if images else check_video)(out)
-    export_video(
-        opened,
-        out,
-        flight=flight,
-        frames=frames,
-        fps=fps,
-        size=sides,
-        images=images,
-        depth=depth,
-        box=crop_box(opened, crop),
-        track=tracked,
-    )
+    if flight is None:
+        cameras, rate = video_cameras(opened.scene, frames, sides), 24.0
+    else:
+        cameras, rate = flight.frames.downscaled(opening.downscale or 1), flight.fps
+        cameras = cameras if sides is None else resized(cameras, sides)
+    box = crop_box(opened, crop)
+    export_video(opened, out, cameras, fps=fps or rate, images=images, depth=depth, box=box, track=tracked)
     say(f"wrote {out}")
     return 0
 

@@ -48,6 +48,8 @@ NODE = 16
 #: What cameras look at lies in this share of their pictures. The share of its points that may be outliers, at either
 #: end of the box; how much longer the box is than what lies between; and how many points tell it.
 SHARED, OUTLIERS, LONGER, POINTS = 0.5, 0.02, 1.2, 100_000
+#: The least side of that box, as a share of its longest: a wall is flat.
+FLAT = 0.1
 #: Triangles of the smallest part that is kept, as a share of the largest part's.
 SMALLEST = 0.02
 #: Colours count by this power of the cosine between a view's direction and the normal.
@@ -119,7 +121,8 @@ def looked_at(views: list[View]) -> Tensor | None:
     if not kept.any():
         return None
     low, high = torch.quantile(points[kept], points.new_tensor((OUTLIERS, 1 - OUTLIERS)), dim=0)
-    middle, half = (low + high) / 2, LONGER * (high - low).clamp_min(1e-6) / 2
+    sides = high - low
+    middle, half = (low + high) / 2, LONGER * sides.clamp_min(FLAT * float(sides.max())) / 2
     return torch.stack((middle - half, middle + half))
 
 

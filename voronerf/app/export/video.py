@@ -10,12 +10,14 @@ from torch import Tensor
 
 from voronerf.app.evaluate.panels import SOLID, picture_of_colour, picture_of_depth, save_picture
 from voronerf.app.export.space import Track, in_silence
-from voronerf.app.render.paths import CameraPath, capture_path, resized
+from voronerf.app.render.paths import capture_path, resized
 from voronerf.app.render.video import write_video
 from voronerf.app.run import Run
 from voronerf.app.scenes import Scene
 from voronerf.nerf.cameras import Cameras, turntable_cameras
 
+#: Frames of a video that nobody says the number of.
+FRAMES = 60
 #: Frames that tell the range of depths of a video.
 RANGE_FRAMES = 4
 
@@ -23,25 +25,21 @@ RANGE_FRAMES = 4
 def export_video(
     run: Run,
     path: Path | str,
+    cameras: Cameras | None = None,
     *,
-    flight: CameraPath | None = None,
-    frames: int = 60,
-    fps: float | None = None,
-    size: tuple[int, int] | None = None,
+    fps: float = 24,
     images: bool = False,
     depth: bool = False,
     box: Tensor | None = None,
     track: Track = in_silence,
 ) -> None:
-    """Renders a video, or its frames as images, along a camera path or where the training cameras were.
+    """Renders a video, or its frames as images.
 
     Args:
         run: The run.
         path: File to write, .mp4; for images a folder, new or empty.
-        flight: The frames and their rate; None for :func:`video_cameras`.
-        frames: How many there are without a flight.
-        fps: Frames a second; None for those of the flight, else 24.
-        size: (width, height) of the frames; None for those of the flight, else of the training images.
+        cameras: The frames; None for 60 of :func:`video_cameras`.
+        fps: Frames a second.
         images: Write a PNG of each frame, 00000.png and so on.
         depth: Show how far away things are, from near (yellow) to far (dark blue), rather than their colours.
         box: [2, 3], what is shown; None for everything.
@@ -56,21 +54,19 @@ def export_video(
     Examples:
         >>> from voronerf.app import Run
         >>> from voronerf.app.export import export_video
+        >>> from voronerf.app.export.video import video_cameras
         >>> def turn(run: Run) -> None:
-        ...     export_video(run, "video.mp4", frames=96)
+        ...     export_video(run, "video.mp4", video_cameras(run.scene, 96))
     """
     path = Path(path)
     if images:
         check_folder(path)
     shown = run if box is None else run.cropped(box)
-    if flight is not None:
-        cameras, fps = flight.frames if size is None else resized(flight.frames, size), fps or flight.fps
-    else:
-        cameras = video_cameras(run.scene, frames, size)
+    cameras = video_cameras(run.scene, FRAMES) if cameras is None else cameras
     numbers = track(range(len(cameras)), "rendering")
     pictures = _depths(shown, cameras, numbers) if depth else _colours(shown, cameras, numbers)
     if not images:
-        write_video(path, pictures, fps or 24)
+        write_video(path, pictures, fps)
         return
     for number, picture in enumerate(pictures):
         save_picture(path / f"{number:05d}.png", picture)

@@ -120,7 +120,7 @@ def photograph_scene(
         transform: float64 [4, 4], from the original coordinates to those of the poses.
     """
     places = torch.stack([view.pose[:3, 3] for view in views])
-    lost = lost_cameras(places) if len(views) > 2 else torch.zeros(len(views), dtype=torch.bool)
+    lost = lost_cameras(places)
     notes = [*notes, *_far_notes(views, lost, reading.keep_far)]
     if not reading.keep_far:
         views = [view for view, left_out in zip(views, lost.tolist()) if not left_out]

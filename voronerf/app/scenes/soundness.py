@@ -36,7 +36,9 @@ ASPECT, BENT, TILTED = 0.05, 1.0, 0.05
 
 
 def lost_cameras(origins: Tensor) -> Tensor:
-    """Which cameras [c, 3] lie far away from the others, bool [c]."""
+    """Which cameras [c, 3] lie far away from the others, bool [c]; of two, none."""
+    if len(origins) < 3:
+        return torch.zeros(len(origins), dtype=torch.bool)
     nearest, some = _nearest(origins), origins[:: len(origins) // MOST_CAMERAS + 1]
     apart = torch.pdist(some)
     alone = (nearest > LOST * nearest.median()) & (nearest > apart.sort().values[int(EXTENT * len(apart))])

@@ -34,6 +34,8 @@ from voronerf.router import VoronoiRouter
 TEMPERATURE = 0.05
 #: Of a grid made for pictures alone: voxels along each axis, and points evaluated in each.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
+#: Scale of the robust loss of photographs, whose exposure and highlights differ; pictures that are computed have none.
+ROBUST = 0.05
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
 SAMPLE_BYTES = 64
 
@@ -108,7 +110,9 @@ def build(
         scene=scene,
         routers=routers,
         renderer=renderer,
-        ray_loss=RayLoss(renderer, sparse_depth=config.sparse_depth or 0.0),
+        ray_loss=RayLoss(
+            renderer, sparse_depth=config.sparse_depth or 0.0, robust=0.0 if scene.background is not None else ROBUST
+        ),
         optimizer=optimizer,
         strategy=strategy,
         batches=batches,

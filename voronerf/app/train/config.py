@@ -139,7 +139,7 @@ class SamplingSettings:
     everywhere."""
     sparse_depth: float | None = None
     """Factor of a loss on light that does not come from where the points of a sparse model are (Deng et al. 2022,
-    "Depth-supervised NeRF"); default 0.003 for COLMAP's models, and 0, which is off, without points."""
+    "Depth-supervised NeRF"); default 0.0015 for COLMAP's models, and 0, which is off, without points."""
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
     """Space as the networks see it: unchanged; with all points outside a sphere mapped into a shell of twice its
     radius; or in normalised device coordinates, for forward-facing scenes. auto is none for a scene with a box and for

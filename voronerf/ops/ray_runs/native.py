@@ -19,7 +19,13 @@ _known = _OWN.inputs(native.compiled.KnownSamples)
 _own = _OWN.outputs(native.compiled.OwnSamples, offsets="run_offsets")
 _runs = _COMPOSE.inputs(native.compiled.RunsOfRays)
 _NO_RAYS = {"deltas": "samples.deltas", "offsets": "samples.run_offsets", "r": "len(samples.run_offsets) - 1"}
-_NO_RAYS |= {"target": "None", "background": "None", "background_per_ray": "False", "activated": "False"}
+_NO_RAYS |= {
+    "target": "None",
+    "background": "None",
+    "background_per_ray": "False",
+    "activated": "False",
+    "robust": "0.0",
+}
 _outputs_of_sums = _SUMS.inputs(native.compiled.RenderLossInputs, **_NO_RAYS, hidden="0.0")
 _outputs = _GRADIENTS.inputs(native.compiled.RenderLossInputs, **_NO_RAYS)
 

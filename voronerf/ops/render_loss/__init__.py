@@ -29,14 +29,17 @@ def render_loss(
     density_scale: Annotated[float | None, "positive"] = None,
     activated: bool = False,
     hidden: Annotated[float, "[0, 1)"] = 0.0,
+    robust: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
 ) -> RenderLoss:
-    """The mean squared error of rendered rays, from what the networks put out for their samples.
+    """The mean squared or robust error of rendered rays, from what the networks put out for their samples.
 
     The colour of a sample is ``sigmoid(raw[:, :3])``, its density ``density_scale * softplus(raw[:, 3])``. With
     ``activated`` both are ``raw`` as it is, for networks with other activations. `composite` makes the colours of the
-    rays of them. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020, equations 3 and 6). The
-    native backend computes loss and gradient in one pass over each ray.
+    rays of them. The loss is ``(colour - target).square().mean()`` (Mildenhall et al. 2020, equations 3 and 6); or with
+    ``robust`` s, where e is the squared error of a ray, summed over its channels, a third of the mean of
+    ``2 s ((e + s^2).sqrt() - s)`` (Charbonnier et al. 1994), which grows with the error of a ray, not with its square,
+    beyond s. The native backend computes loss and gradient in one pass over each ray.
 
     Args:
         raw: [m, 4], colour and density before their activations, or ``activated``: float16, bfloat16, float32 or
@@ -51,6 +54,7 @@ def render_loss(
             scale comes in between, nothing is clamped, and gradients are to them.
         hidden: share of the light, in [0, 1). Samples that no more than it reaches have no gradient; they count as all
             others in those of the samples in front of them.
+        robust: s in [0, 1), the scale of the errors beyond which the loss is not squared; 0 for none.
         backend: "auto", "reference", "native" or "warp".
 
     ``deltas``, ``target`` and ``background`` are float32, or float64 where ``raw`` is; so are the results. The loss is
@@ -96,6 +100,7 @@ def render_loss_gradient(
     density_scale: Annotated[float | None, "positive"] = None,
     activated: bool = False,
     hidden: Annotated[float, "[0, 1)"] = 0.0,
+    robust: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
 ) -> tuple[RenderLoss, Annotated[Tensor, "same [m, 4]"]]:
     """`render_loss` and the gradient of its loss to ``raw``, for `forward_with_tape`; nothing is differentiable.
@@ -109,6 +114,7 @@ def render_loss_gradient(
         density_scale: factor on the density, > 0; None with ``activated``.
         activated: whether ``raw`` is the colour and the density themselves, as in `render_loss`. So is the gradient.
         hidden: share of the light, as in `render_loss`.
+        robust: as in `render_loss`.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

@@ -24,6 +24,7 @@ def _make(draw: Draw, n: int) -> Arguments:
         **call,
         "background": draw.among("background", of_rays, of_all, None),
         "hidden": draw.among("hidden", 1e-3, 0.5),
+        "robust": draw.among("robust", 0.0, 0.05),
     }
 
 

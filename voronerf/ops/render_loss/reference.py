@@ -15,7 +15,7 @@ class RenderLoss(NamedTuple):
     """The result of `render_loss`. Only the loss has gradients.
 
     Attributes:
-        loss: [], the mean squared error of the colours.
+        loss: [], the mean squared error of the colours, or the robust one.
         colour: [r, 3], background included.
         weights: [m], the contribution of each sample.
         density: [m].
@@ -46,6 +46,7 @@ def render_loss(
     density_scale: float,
     activated: bool,
     hidden: float,
+    robust: float,
 ) -> RenderLoss:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
     raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
@@ -58,7 +59,12 @@ def render_loss(
     seen = composite(density, colours, deltas, deltas, ray_offsets, background)
     error = (seen.colour - target).square().sum(-1)
     rest = (seen.colour, seen.weights, density, error)
-    return RenderLoss(error.mean() / 3, *(part.detach() for part in rest))
+    return RenderLoss(robust_error(error, robust).mean() / 3, *(part.detach() for part in rest))
+
+
+def robust_error(error: Tensor, robust: float) -> Tensor:
+    """Squared errors of rays [r], or what the loss takes in their place; see ``voronerf.ops.render_loss``."""
+    return 2 * robust * error / ((error + robust**2).sqrt() + robust) if robust else error
 
 
 def scaled(op: str, given: Any) -> Any:
