@@ -226,7 +226,7 @@ _kept = _Kept()
 
 
 def cpu_precision() -> str:
-    """What ``torch.set_float32_matmul_precision`` says of the CPU: "ieee" (highest), "tf32" (high) or "bf16" (medium)."""
+    """``torch.set_float32_matmul_precision`` of the CPU: "ieee" (highest), "tf32" (high) or "bf16" (medium)."""
     backend: Any = torch.backends.mkldnn  # whose stubs lack it
     return str(backend.matmul.fp32_precision)
 
