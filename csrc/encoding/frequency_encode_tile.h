@@ -135,7 +135,8 @@ VN_INLINE bool all_small(const float* x, int64_t count, float largest) {
 }
 
 // Rows x, `x_stride` floats apart and with kLanes readable floats from every row's start -> out [rows][stride]; with
-// bfloat16 operands also `pairs` [rows][pairs_stride], whole vectors, if not null, and then out only where it is `kept`.
+// bfloat16 operands also `pairs` [rows][pairs_stride], whole vectors, if not null, and then out only where it is
+// `kept`.
 void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns, float* out,
             int64_t stride, float* pairs = nullptr, int64_t pairs_stride = 0, bool kept = true) {
   const int64_t d = columns.d;
@@ -166,7 +167,8 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
         encode_strip<kRegisters / 8, 1, false>(x, x_stride, rows, &one, to, stride, paired, pairs_stride);
       }
     }
-    for (column = (stride + 2 * kLanes - 1) / 2 / kLanes * kLanes; column < pairs_stride; column += kLanes) {
+    column = (stride + 2 * kLanes - 1) / 2 / kLanes * kLanes;  // of pairs: what fills up their rows
+    for (; pairs != nullptr && column < pairs_stride; column += kLanes) {
       for (int64_t row = 0; row < rows; ++row) store(pairs + row * pairs_stride + column, splat(0.0f));
     }
     return;

@@ -66,8 +66,8 @@ struct ProgramStep {
   int32_t depth;         // linear: of the product. output: the first column where it goes. encode: octaves
   int32_t sources;       // linear: operands that are multiplied, next to each other in the matrix; on CUDA one
   int32_t parameter;     // encode of a hash grid: the table
-  int32_t pairs;         // linear with 16-bit products: where its value is stored as pairs too; -1: nowhere
-  bool floats;           // linear: whether anything reads its value as floats
+  int32_t pairs;         // with 16-bit products: where its value is stored as pairs too; -1: nowhere
+  bool floats;           // where there are pairs: whether anything reads its value as floats
   bool points;           // input: hash grids alone read it, and nothing does once they are looked up
   bool in_place;         // input: nothing is copied where it may be read in place
   float a, b;            // of a function
@@ -93,7 +93,7 @@ struct ProgramCode {
   int32_t tile;                    // rows, at most
   int32_t columns;                 // of all slots of a row
   int32_t packed, partial;         // floats of what is made ready for a cell, and of the sums of a task
-  int32_t scratch, scratch_width;  // a slot of two parts of so many columns, for the time of a step
+  int32_t scratch, scratch_width;  // a slot of two parts, in tile registers three, of so many columns, for a step
 };
 
 }  // namespace voronerf

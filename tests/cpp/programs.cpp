@@ -255,9 +255,11 @@ struct Way {
   voronerf::ProgramTable Description::* table;
 };
 constexpr Way kWays[] = {
-    {Isa::portable, &Description::floats},   {Isa::neon, &Description::floats},  {Isa::avx2, &Description::floats},
-    {Isa::avx512, &Description::floats},     {Isa::avx512_bf16, &Description::pairs}, {Isa::portable, &Description::tiles},
-    {Isa::portable, &Description::parts}, {Isa::amx, &Description::tiles},    {Isa::amx, &Description::parts},
+    {Isa::portable, &Description::floats},   {Isa::neon, &Description::floats},
+    {Isa::avx2, &Description::floats},       {Isa::avx512, &Description::floats},
+    {Isa::avx512_bf16, &Description::pairs}, {Isa::portable, &Description::tiles},
+    {Isa::portable, &Description::parts},    {Isa::amx, &Description::tiles},
+    {Isa::amx, &Description::parts},
 };
 
 void run_case(const Description& description, int number) {

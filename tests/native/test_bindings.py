@@ -28,7 +28,9 @@ def test_enumerations_have_the_names_that_users_write() -> None:
     assert sorted(native.compiled.ProgramFunction) == sorted(FUNCTIONS)
     assert sorted(native.compiled.ProgramBinary) == sorted(BINARY)
     assert sorted(native.compiled.ProgramEncoding) == sorted(ENCODINGS)
-    assert set(native.SUPPORTED_ISAS) <= set(native.ISAS) == {"portable", "neon", "avx2", "avx512", "avx512_bf16", "amx"}
+    assert (
+        set(native.SUPPORTED_ISAS) <= set(native.ISAS) == {"portable", "neon", "avx2", "avx512", "avx512_bf16", "amx"}
+    )
 
 
 def test_what_does_not_fit_a_signature_is_refused() -> None:

@@ -303,7 +303,9 @@ def test_the_gain_of_bfloat16_is_the_same_each_time() -> None:
 
 def test_peak_errors() -> None:
     refuses("measure_peak: kind must be one of float32, bfloat16, copy, got 'fp32'", _native.measure_peak, "fp32")
-    with pytest.raises(ValueError, match=r"^measure_peak: isa must be one of portable, neon, .*avx512_bf16, amx, got 'sse'"):
+    with pytest.raises(
+        ValueError, match=r"^measure_peak: isa must be one of portable, neon, .*avx512_bf16, amx, got 'sse'"
+    ):
         _native.measure_peak("copy", isa="sse")
 
 

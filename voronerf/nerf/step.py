@@ -406,8 +406,8 @@ class TrainingStep:
         objects = [self.batches, self.loss, optimizer, self.strategy, self.guard, self.generator, self.autocast]
         objects += [router.assignment, router.temperature, router.backend, router.coords]
         values: list[Any] = [backends.threads(), self._cpu().isa, torch.is_grad_enabled(), len(optimizer.state)]
-        kinds = (torch.backends.cuda.matmul, torch.backends.mkldnn.matmul)
-        values += [torch.are_deterministic_algorithms_enabled(), *(kind.fp32_precision for kind in kinds)]
+        values += [torch.are_deterministic_algorithms_enabled(), torch.backends.cuda.matmul.fp32_precision]
+        values.append(backends.cpu_precision())
         for group in optimizer.param_groups:
             for own in group["params"]:
                 objects += [own._backward_hooks, own._post_accumulate_grad_hooks]

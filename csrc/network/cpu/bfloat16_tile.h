@@ -1,6 +1,7 @@
 // Operands of bfloat16 products, made from float32 rows. Two values share 32 bits, so a pair is handled as one float by
 // what only moves data: blocks broadcast it, panels are laid out by it (gemm_tile.h). Along k, what a pair joins is
-// neighbouring columns of a row (`narrow_row`), or neighbouring rows of a column (`interleave`) where the samples are k.
+// neighbouring columns of a row (`narrow_row`), or neighbouring rows of a column (`interleave`) where the samples are
+// k.
 #pragma once
 
 #include "common/memory_tile.h"
@@ -30,8 +31,8 @@ VN_INLINE F32 interleave(F32 even, F32 odd) {
 
 // One half of what was joined: the first values, or those behind them.
 VN_INLINE F32 widened(F32 pairs, int half) {
-  const __m256i values = half == 0 ? _mm512_castsi512_si256((__m512i)pairs)
-                                   : _mm512_maskz_extracti64x4_epi64(0xf, (__m512i)pairs, 1);
+  const __m256i values =
+      half == 0 ? _mm512_castsi512_si256((__m512i)pairs) : _mm512_maskz_extracti64x4_epi64(0xf, (__m512i)pairs, 1);
   return (F32)_mm512_maskz_slli_epi32(0xffff, _mm512_maskz_cvtepu16_epi32(0xffff, values), 16);
 }
 

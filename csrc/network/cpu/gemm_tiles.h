@@ -201,8 +201,7 @@ VN_INLINE void multiply_shapes(const Product& p, int64_t rows, int64_t columns) 
     const int64_t whole = columns / kBlock * kBlock;
     const Blocks wide{row, end, step, 0, whole, kBlock}, narrow{row, end, step, whole, columns, kTileRows};
     if (whole > 0) {
-      step > kTileRows ? multiply_blocks<2, 2, S, kFloats, P>(p, wide)
-                       : multiply_blocks<1, 2, S, kFloats, P>(p, wide);
+      step > kTileRows ? multiply_blocks<2, 2, S, kFloats, P>(p, wide) : multiply_blocks<1, 2, S, kFloats, P>(p, wide);
     }
     if (whole < columns) {
       step > kTileRows ? multiply_blocks<2, 1, S, kFloats, P>(p, narrow)

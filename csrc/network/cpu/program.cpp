@@ -18,13 +18,13 @@ namespace {
 
 constexpr RowLimits kRows{96, 1024}, kSumRows{384, 4096};
 constexpr int64_t kTaskUnit = 48, kTileUnit = 96;  // tasks are whole tiles or halves of one
-constexpr int64_t kSlack = 128;    // floats behind the slots that vectors may read and write
+constexpr int64_t kSlack = 128;                    // floats behind the slots that vectors may read and write
 
 int64_t aligned(int64_t floats) { return ceil_div<int64_t>(floats, kGranule) * kGranule; }
 
 #if VN_HAS_TILES
-#define VN_FOR_TILES(isa, call)                  \
-  if (isa == Isa::amx) return avx512::call;      \
+#define VN_FOR_TILES(isa, call)             \
+  if (isa == Isa::amx) return avx512::call; \
   return portable::call;
 #else
 #define VN_FOR_TILES(isa, call) return portable::call;

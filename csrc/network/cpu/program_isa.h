@@ -48,8 +48,8 @@ void program_half_run(const ProgramCall& call, int64_t cell, int64_t begin, int6
 #endif
 
 // The same in tile registers; on the portable path in their double.
-#define VN_DECLARE_TILES                                                                                             \
-  void program_tiles_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free);            \
+#define VN_DECLARE_TILES                                                                                         \
+  void program_tiles_pack(const ProgramCall& call, int64_t cell, bool first, float* packed, float* free);        \
   void program_tiles_run(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed, \
                          float* tiles, float* partial);
 VN_DECLARE_IN(portable, VN_DECLARE_TILES)

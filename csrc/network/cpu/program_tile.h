@@ -286,12 +286,27 @@ struct ProgramTile {
     float* const c = pairs == nullptr || step.floats ? to : nullptr;
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       const int64_t columns = smaller(kPanel, step.stride - first);
-      const auto from = [=](float* at, bool of_pairs) { return at == nullptr ? at : at + (of_pairs ? first / 2 : first); };
+      const auto from = [=](float* at, bool of_pairs) {
+        return at == nullptr ? at : at + (of_pairs ? first / 2 : first);
+      };
       const float* start = add.data == kZeros ? kZeros : add.data + first;
       const float* by = slope == nullptr ? nullptr : slope + (slope_in_pairs ? first / 2 : first);
-      const Product product{sources, count,  weights + panels * first * depth, columns,      start,         add.stride, from(c, false),
-                            step.stride, finish, by, from(pairs, true), pairs_stride, slope_in_pairs,
-                            left_of(step.depth), call.parts ? depth * columns : 0, pairs_left};
+      const Product product{sources,
+                            count,
+                            weights + panels * first * depth,
+                            columns,
+                            start,
+                            add.stride,
+                            from(c, false),
+                            step.stride,
+                            finish,
+                            by,
+                            from(pairs, true),
+                            pairs_stride,
+                            slope_in_pairs,
+                            left_of(step.depth),
+                            call.parts ? depth * columns : 0,
+                            pairs_left};
 #if VN_HALF == 2
       multiply_tiles(product, rows, columns);
 #else
@@ -391,7 +406,8 @@ struct ProgramTile {
     const float* const table = packed + pack(step.number).at;
     const bool integrated = step.encoding == ProgramEncoding::integrated;
     float* const pairs = step.pairs < 0 || narrows(step) ? nullptr : slot(step.pairs);
-    encode(x.data, x.stride, table, rows, columns, to, step.stride, pairs, pairs_of(step.width), pairs == nullptr || step.floats);
+    encode(x.data, x.stride, table, rows, columns, to, step.stride, pairs, pairs_of(step.width),
+           pairs == nullptr || step.floats);
     if (integrated) {
       blur(x.data + columns.d, x.stride, table, rows, to, step.stride);
     }
@@ -478,8 +494,22 @@ struct ProgramTile {
 #endif
     for (int64_t first = 0; first < step.stride; first += kPanel) {
       float* c = to + first;
-      const Product product{&source, 1, other.data + first, other.stride, fill ? kZeros : c, fill ? 0 : step.stride,
-                            c, step.stride, Finish::none, nullptr, nullptr, 0, false, a_left, b_left, 0};
+      const Product product{&source,
+                            1,
+                            other.data + first,
+                            other.stride,
+                            fill ? kZeros : c,
+                            fill ? 0 : step.stride,
+                            c,
+                            step.stride,
+                            Finish::none,
+                            nullptr,
+                            nullptr,
+                            0,
+                            false,
+                            a_left,
+                            b_left,
+                            0};
       const int64_t columns = smaller(kPanel, step.stride - first);
 #if VN_HALF == 2
       multiply_tiles(product, of_a.width, columns);
@@ -488,7 +518,6 @@ struct ProgramTile {
 #endif
     }
   }
-
 };
 
 [[maybe_unused]] void run_tiles(const ProgramCall& call, int64_t cell, int64_t begin, int64_t end, const float* packed,

@@ -5,7 +5,8 @@
 //   tile_load      rows `stride` bytes apart
 //   tile_store     likewise
 //   tile_zero
-//   tile_products  C[m][n] += sum over k of A[m][2k] B[k][2n] + A[m][2k+1] B[k][2n+1]: rows of C and A, columns of C and
+//   tile_products  C[m][n] += sum over k of A[m][2k] B[k][2n] + A[m][2k+1] B[k][2n+1]: rows of C and A, columns of C
+//   and
 //                  B in pairs. Sums are float32, rounded to the nearest; what is below its smallest normal number is 0.
 //
 // The shape belongs to the thread, which releases it before it does something else: only then has the kernel nothing
@@ -85,7 +86,7 @@ VN_INLINE void tile_products() {
   const Tile &a = tiles()[A], &b = tiles()[B];
   constexpr int64_t kValues = kTileBytes / 2;
   float left[kTileRows][kValues], right[kTileRows][kValues];
-  const auto widen = [](const Tile& tile, float(*to)[kValues]) {  // bfloat16 is the upper half of a float
+  const auto widen = [](const Tile& tile, float (*to)[kValues]) {  // bfloat16 is the upper half of a float
     uint16_t halves[kValues];
     for (int64_t row = 0; row < tile.rows; ++row) {
       __builtin_memcpy(halves, tile.data[row], sizeof halves);

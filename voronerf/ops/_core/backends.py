@@ -225,6 +225,12 @@ class _Kept(threading.local):
 _kept = _Kept()
 
 
+def cpu_precision() -> str:
+    """``torch.set_float32_matmul_precision`` of the CPU: "ieee" (highest), "tf32" (high) or "bf16" (medium)."""
+    backend: Any = torch.backends.mkldnn  # whose stubs lack it
+    return str(backend.matmul.fp32_precision)
+
+
 def threads() -> int:
     """Threads that share the work of an op: torch's for the calling thread, or what `torch_on_one_thread` keeps."""
     return _kept.threads or torch.get_num_threads()

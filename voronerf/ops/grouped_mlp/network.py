@@ -2,7 +2,7 @@
 and direction.
 
 Tensors are cast to float32 on the way in and back on the way out, a cell having few weights. With bfloat16 storage, or
-under autocast to it, products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16), and
+under autocast to it, products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16, AMX), and
 float32 ones elsewhere; sums are float32 always.
 """
 

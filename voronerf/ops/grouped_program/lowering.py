@@ -352,12 +352,12 @@ class _Lowering:
         kind = f"few{'_turned' * transposed}" if few else kind
         deep = self.pairs_of(depth) if self.tiles else -(-depth // 2) if self.half else depth
         number = self.pack(kind, matrix, start, width, deep * (order or _padded(step.width)), (o, i))
-        by_pairs = [at < count or (self.tiles and relu_slope and c is step.operands[-1]) for at, c in enumerate(step.operands)]
-        records = [self.operand(c, product=paired) for c, paired in zip(step.operands, by_pairs)]
+        slope = len(step.operands) - 1 if relu_slope and self.tiles else _NONE
+        records = [self.operand(c, product=at < count or at == slope) for at, c in enumerate(step.operands)]
         entrywise = [c for c in step.operands[count:] if all(c[:2] != x[:2] for x in sources)]
         value = self.make(step, dying, entrywise)
         as_pairs = self._as_pairs(step)
-        narrow = self.half and any(as_pairs) and not few and not (relu_slope and not self.tiles)
+        narrow = self.half and any(as_pairs) and not few and (self.tiles or not relu_slope)
         filled = value.stride % (2 * _GRANULE) == 0 and step.width % 2 == 0 and value.memory == _NONE
         if self.tiles:  # what is added fills up rows with what may be infinite
             filled = step.width % _GRANULE == 0 or all(c.of == PARAMETER for c in added)
@@ -371,11 +371,12 @@ class _Lowering:
         """Of each reader of a value, whether it takes pairs."""
 
         def takes(reader: Step, place: int) -> bool:
-            product = reader.op == "linear" and place == 0
-            if self.tiles:
-                slope = reader.op == "linear" and reader.name == "relu_slope" and place == len(reader.operands) - 1
-                product = product or slope or reader.op in ("outer", "columns")[: 1 if self.parts else 2]
-            return product and _all_of(reader.operands[place], step.width)
+            if not _all_of(reader.operands[place], step.width):
+                return False
+            if reader.op == "linear":
+                slope = reader.name == "relu_slope" and place == len(reader.operands) - 1
+                return place == 0 or (self.tiles and slope)
+            return self.tiles and (reader.op == "outer" or (reader.op == "columns" and not self.parts))
 
         return [takes(reader, place) for reader, place in self.readers.get(step.out, [])]
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.ops._core import native
+from voronerf.ops._core import backends, native
 from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import asked_for
@@ -257,7 +257,7 @@ def _layout(products: str, tensor: Tensor) -> str:
     as ``torch.set_float32_matmul_precision`` says, of which "high" are products in parts."""
     if native.on_cuda(tensor):
         return "floats"
-    asked = torch.backends.mkldnn.matmul.fp32_precision if products == "float32" else products
+    asked = backends.cpu_precision() if products == "float32" else products
     return _LAYOUTS.get((native.cpu().isa, asked), "floats")
 
 

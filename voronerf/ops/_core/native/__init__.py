@@ -82,8 +82,8 @@ _bfloat16_gain = compiled.bfloat16_gain()
 def _choose_isa() -> str:
     """Best instruction set of this processor, or the one of VORONERF_ISA.
 
-    avx512_bf16 is not the best where its bfloat16 products are slower than float32 ones. The gain is far from `LEAST_GAIN` on all
-    known processors, so that every process on a machine chooses the same.
+    avx512_bf16 is not the best where its bfloat16 products are slower than float32 ones. The gain is far from
+    `LEAST_GAIN` on all known processors, so that every process on a machine chooses the same.
     """
     best = [isa for isa in SUPPORTED_ISAS if isa != "avx512_bf16" or _bfloat16_gain >= LEAST_GAIN]
     wanted = os.environ.get("VORONERF_ISA") or best[-1]

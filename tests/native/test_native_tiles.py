@@ -1,0 +1,133 @@
+"""Products in tile registers: on every machine in their double, and in those of AMX where the processor has them."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from voronerf.ops import grouped_mlp
+from voronerf.ops._core.layers import MLP, Layer
+
+native = pytest.importorskip("voronerf.ops._core.native")
+programs = pytest.importorskip("voronerf.ops.grouped_program.native")
+
+PRECISIONS = {"highest": 2e-6, "high": 1e-4, "medium": 0.05}
+"""Of ``torch.set_float32_matmul_precision``, with the largest error of results and gradients beside float64."""
+
+
+@pytest.fixture(params=["double", "amx"])
+def registers(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    if request.param == "amx":
+        if "amx" not in native.SUPPORTED_ISAS:
+            pytest.skip("this processor has no AMX")
+        with native.using_isa("amx"):
+            yield "amx"
+        return
+    double = {("portable", asked): layout for (isa, asked), layout in programs._LAYOUTS.items() if isa == "amx"}
+    monkeypatch.setattr(programs, "_LAYOUTS", double)
+    with native.using_isa("portable"):
+        yield "double"
+
+
+@pytest.fixture
+def precision() -> Iterator[Callable[[str], None]]:
+    before = torch.get_float32_matmul_precision()
+    yield torch.set_float32_matmul_precision
+    torch.set_float32_matmul_precision(before)
+
+
+def network(
+    widths: tuple[int, ...], p: int, octaves: int | None, counts: list[int], seed: int = 0
+) -> dict[str, object]:
+    """Layers one after the other, the last of which reads the positions again."""
+    layers = [Layer(("positions",), widths[0], "softplus")]
+    layers += [Layer((i,), width, "softplus") for i, width in enumerate(widths[1:])]
+    layers.append(Layer((len(layers) - 1, "positions"), 4))
+    table = MLP(tuple(layers), (len(layers) - 1,), position_octaves=octaves)
+    draw = torch.Generator().manual_seed(seed)
+    k, rows = len(counts), sum(counts)
+    shapes = table.weight_shapes(p, 0)
+    return {
+        "layers": table,
+        "positions": torch.randn(rows, p, generator=draw),
+        "offsets": torch.tensor([0, *torch.tensor(counts).cumsum(0).tolist()], dtype=torch.int32),
+        "weights": [torch.randn(k, o, i, generator=draw) / i**0.5 for o, i in shapes],
+        "biases": [torch.randn(k, o, generator=draw) for o, _ in shapes],
+    }
+
+
+def outcome(given: dict[str, object], dtype: torch.dtype, backend: str) -> list[Tensor]:
+    """The result, then the gradients of positions, weights and biases."""
+    leaves = [given["positions"], *given["weights"], *given["biases"]]  # type: ignore[misc]
+    leaves = [leaf.to(dtype, copy=True).requires_grad_() for leaf in leaves]
+    count = len(given["weights"])  # type: ignore[arg-type]
+    x, weights, biases = leaves[0], leaves[1 : 1 + count], leaves[1 + count :]
+    y = grouped_mlp(x, given["offsets"], weights, biases, layers=given["layers"], backend=backend)  # type: ignore[arg-type]
+    arriving = torch.sin(torch.arange(y.numel(), dtype=torch.float64)).view(y.shape).to(y.dtype)
+    return [y.detach(), *torch.autograd.grad(y, leaves, arriving)]
+
+
+def error(found: list[Tensor], exact: list[Tensor]) -> float:
+    distances = [float((a.double() - b).norm() / (b.norm() + 1e-9)) for a, b in zip(found, exact, strict=True)]
+    return max(distances)
+
+
+@pytest.mark.parametrize("asked", PRECISIONS)
+@pytest.mark.parametrize(
+    ("widths", "p", "octaves"),
+    [((64, 64, 64), 3, 10), ((32,), 3, 4), ((1, 3), 1, None), ((17, 48, 33), 5, 2), ((130, 65), 90, None)],
+)
+def test_each_precision_is_as_exact_as_it_says(
+    widths: tuple[int, ...], p: int, octaves: int | None, asked: str, registers: str, precision: Callable[[str], None]
+) -> None:
+    given = network(widths, p, octaves, [97, 0, 1, 40])
+    exact, tight = outcome(given, torch.float64, "reference"), outcome(given, torch.float32, "native")
+    precision(asked)
+    found = outcome(given, torch.float32, "native")
+    assert error(found, exact) < PRECISIONS[asked]
+    same = all(torch.equal(a, b) for a, b in zip(found, tight))
+    assert same == (asked == "highest")
+
+
+@pytest.mark.parametrize("asked", ["high", "medium"])
+@pytest.mark.parametrize("rows", [0, 1, 2, 15, 16, 17, 31, 32, 33, 63, 65, 95, 96, 97, 129, 1025])
+def test_any_number_of_rows(rows: int, asked: str, registers: str, precision: Callable[[str], None]) -> None:
+    given = network((40, 64), 3, 4, [rows, 3])
+    exact = outcome(given, torch.float64, "reference")
+    precision(asked)
+    assert error(outcome(given, torch.float32, "native"), exact) < PRECISIONS[asked]
+
+
+def test_other_threads_and_forked_children_compute_the_same(precision: Callable[[str], None], registers: str) -> None:
+    given = network((64, 64), 3, 4, [500, 33])
+    precision("high")
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)  # which a forked child can run
+    try:
+        want = outcome(given, torch.float32, "native")
+        found: list[list[Tensor]] = []
+        others = [
+            threading.Thread(target=lambda: found.append(outcome(given, torch.float32, "native"))) for _ in range(3)
+        ]
+        for other in others:
+            other.start()
+        for other in others:
+            other.join()
+        assert len(found) == 3
+        assert all(torch.equal(a, b) for each in found for a, b in zip(each, want, strict=True))
+        with torch.no_grad():
+            y = want[0]
+            child = os.fork()
+            if child == 0:
+                arguments = (given["positions"], given["offsets"], given["weights"], given["biases"])
+                same = torch.equal(grouped_mlp(*arguments, layers=given["layers"], backend="native"), y)  # type: ignore[arg-type]
+                os._exit(0 if same else 1)
+            _, status = os.waitpid(child, 0)
+        assert os.waitstatus_to_exitcode(status) == 0
+    finally:
+        torch.set_num_threads(before)
