@@ -11,7 +11,15 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import options
 
+import voronerf
+
 MARKER = "<!-- options -->"
+
+
+def on_config(config: Any) -> Any:
+    """Says the version at the foot of each page."""
+    config.copyright = f"voronerf {voronerf.__version__}"
+    return config
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
