@@ -208,15 +208,19 @@ def toolkit_major(nvcc: Path) -> int:
 def bindings() -> str:
     """A file that includes those of csrc/bindings, whose headers take the compiler longer than themselves."""
     files = sorted((SOURCES / "bindings").glob("*.cpp"))
-    return "".join(f'#include "{file.as_posix()}"\n' for file in files)
+    return "".join(f'#include "bindings/{file.name}"\n' for file in files)
 
 
-def ninja_file(module: Path, cuda: Cuda) -> str:
-    """Text of build.ninja; paths in it are quoted for ninja, commands run in the build folder."""
+def ninja_file(module: Path, cuda: Cuda, folder: Path | None = None) -> str:
+    """Text of build.ninja; paths in it are quoted for ninja, commands run in the build folder or another.
+
+    Sources are named from there, so that a copy of the tree with its objects need not be built again.
+    """
+    sources = Path(os.path.relpath(SOURCES, folder or build_folder()))
     common = ["-std=c++17", "-O3", *([] if WINDOWS else ["-fPIC"]), "-fvisibility=hidden", "-Wall", "-Wextra", "-I."]
     # Without OpenMP its pragmas mean nothing, nor do the numbers of threads that stand in them.
     threads = ["-fopenmp"] if openmp() else ["-Wno-unknown-pragmas", "-Wno-unused-parameter"]
-    includes = [f"-I{SOURCES}", f"-isystem{pybind11_headers()}", f"-isystem{sysconfig.get_path('include')}"]
+    includes = [f"-I{sources.as_posix()}", f"-isystem{pybind11_headers()}", f"-isystem{sysconfig.get_path('include')}"]
     # After CXXFLAGS: results are defined by separate roundings (csrc/geometry/nearest_centre_math.h), fused ones are
     # named, and NaN and infinity are distinguished from numbers. A root that may set errno is a call, which keeps its
     # loop from becoming vectors.
@@ -243,7 +247,7 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
     ]
     if cuda.nvcc is not None:
         host = join(["-Xcompiler", "-fPIC,-fvisibility=hidden,-ffp-contract=off", *host_compiler()])
-        flags = join(["-std=c++17", "-O3", "-cudart=static", *cuda.flags(), f"-I{SOURCES}", "-I."])
+        flags = join(["-std=c++17", "-O3", "-cudart=static", *cuda.flags(), f"-I{sources.as_posix()}", "-I."])
         lines += [
             "rule nvcc",
             f"  command = {join([str(cuda.nvcc)])} {flags} {host} -MMD -MF $out.d -c $in -o $out",
@@ -259,16 +263,17 @@ def ninja_file(module: Path, cuda: Cuda) -> str:
         if source.parent.name == "bindings":
             continue
         name = source.relative_to(SOURCES).as_posix()  # files of two rooms may share theirs
+        path = quote((sources / name).as_posix())
         if source.name.endswith("_isa.cpp"):
             for isa, flags_of_isa in isas().items():
                 objects.append(f"{name}.{isa}.o")
-                lines += [f"build {objects[-1]}: cxx {quote(str(source))}", f"  flags = {join(flags_of_isa)}"]
+                lines += [f"build {objects[-1]}: cxx {path}", f"  flags = {join(flags_of_isa)}"]
         elif source.suffix == ".cpp":
             objects.append(f"{name}.o")
-            lines.append(f"build {objects[-1]}: cxx {quote(str(source))}")
+            lines.append(f"build {objects[-1]}: cxx {path}")
         elif source.suffix == ".cu" and cuda.nvcc is not None:
             objects.append(f"{name}.o")
-            lines.append(f"build {objects[-1]}: nvcc {quote(str(source))}")
+            lines.append(f"build {objects[-1]}: nvcc {path}")
     lines.append(f"build {quote(module.name)}: link {' '.join(objects)}")
     return "\n".join([*lines, f"default {quote(module.name)}", ""])
 

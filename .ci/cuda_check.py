@@ -53,7 +53,7 @@ def main(architectures: list[str]) -> int:
         return 1
     cuda = BUILD["Cuda"]("", Path(nvcc), tuple(architectures))
     OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "cuda.ninja").write_text(BUILD["ninja_file"](Path("_C.so"), cuda))
+    (OUT / "cuda.ninja").write_text(BUILD["ninja_file"](Path("_C.so"), cuda, OUT))
     objects = [f"{path.relative_to(ROOT / 'csrc').as_posix()}.o" for path in sorted((ROOT / "csrc").rglob("*.cu"))]
     for name in objects:  # what is up to date says nothing
         (OUT / name).unlink(missing_ok=True)

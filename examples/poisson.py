@@ -1,7 +1,7 @@
 """A differential equation by one network per cell: -div grad u = f in the unit square, u = 0 at its border.
 
-Cells are not continuous, so the equation and the border alone leave each cell a solution of its own, whose loss is small
-and which is wrong. What joins them are conditions on faces, as in XPINNs (Jagtap and Karniadakis 2020): values, and
+Cells are not continuous, so the equation and the border alone leave each cell a solution of its own, which has a small
+loss and is wrong. What joins them are conditions on faces, as in XPINNs (Jagtap and Karniadakis 2020): values, and
 derivatives across the face, are the same on both sides. ``--alone`` leaves them out.
 """
 

@@ -216,7 +216,8 @@ def test_cuda_check_compiles_with_the_folder_that_includes_start_from(check, rep
     check.main(["80"])
     compiled = [line for line in (tmp_path / "commands").read_text().splitlines() if " -c " in line]
     assert len(compiled) == len(list((ROOT / "csrc").rglob("*.cu")))
-    assert all(f" -I{ROOT / 'csrc'} " in line for line in compiled)
+    folder = Path(os.path.relpath(ROOT / "csrc", check.OUT)).as_posix()
+    assert all(f" -I{folder} " in line for line in compiled)
 
 
 def test_cuda_check_names_what_does_not_compile(reporting):

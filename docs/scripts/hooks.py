@@ -13,6 +13,8 @@ import options
 import scene
 from mkdocs.structure.files import File
 
+import voronerf
+
 MARKER = "<!-- options -->"
 
 
@@ -20,6 +22,12 @@ def on_files(files: Any, *, config: Any) -> Any:
     """Adds the page of a scene, which is drawn in the browser."""
     files.append(File.generated(config, "scene.html", abs_src_path=str(scene.scene_page())))
     return files
+
+
+def on_config(config: Any) -> Any:
+    """Says the version at the foot of each page."""
+    config.copyright = f"voronerf {voronerf.__version__}"
+    return config
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import given
+import mutate
 import op_attacks
 import rank_attacks
 import run_attacks
@@ -27,7 +28,7 @@ from attempts import FAILED, MEMORY, REFUSED, RIGHT, Part, Tally, prepare, run_p
 PARTS = {
     part.name: (part, long, short)
     for part, long, short in (
-        (Part("valid-calls", op_attacks.valid_call, 60, 200), 140_000, 150),
+        (Part("valid-calls", op_attacks.valid_call, 60, 200, peak=3 * MEMORY), 140_000, 150),
         (Part("invalid-calls", op_attacks.invalid_call, 20, 200, MEMORY // 2), 60_000, 150),
         (Part("kills", training_attacks.killed_training, 300, 1, prepare=given.prepare_scenes), 20, 1),
         (Part("ranks", rank_attacks.harmed_ranks, 600), 16, 0),
@@ -48,8 +49,14 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the first attempt of each part (default: 0)")
     parser.add_argument("--count", type=int, help="attempts of each part; a chain of kills is one")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes (default: one a core)")
+    parser.add_argument(
+        "--mutate", nargs="*", metavar="WORD", help="plant faults, all or those named by words, instead"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="with --mutate, for what became of each fault")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="no attempt begins later")
     options = parser.parse_args()
+    if options.mutate is not None:
+        return mutate.plant(options.mutate, options.json)
     unknown = [name for name in options.parts if name not in PARTS]
     if unknown:
         parser.error(f"PART must be one of {', '.join(PARTS)}, got {unknown[0]}")

@@ -26,7 +26,7 @@ from pathlib import Path
 import torch
 
 REFUSED, RIGHT, FAILED = "refused", "right", "failed"
-#: Memory in bytes that no attempt may exceed: what a stranger sends is refused before it takes more.
+#: Memory in bytes that what a stranger sends may take: it is refused before it takes more.
 MEMORY = 2 << 30
 
 
@@ -44,6 +44,7 @@ class Part:
         seconds: Limit of an attempt.
         memory: Bytes that an attempt may allocate; None where it starts what needs more address space.
         batch: Attempts of a process.
+        peak: Bytes of memory that an attempt may take in all.
         prepare: Makes, in a process of its own, what the attempts of the part start from.
     """
 
@@ -52,6 +53,7 @@ class Part:
     seconds: int
     batch: int = 1
     memory: int | None = None
+    peak: int = MEMORY
     prepare: Callable[[Path], None] | None = None
 
 
@@ -128,7 +130,7 @@ class _Worker:
             failures.append((self.seeds[done], ended if status != -signal.SIGALRM else f"took {self.part.seconds} s"))
             tally.counts[FAILED] += 1
             done += 1
-        elif peak > MEMORY:
+        elif peak > self.part.peak:
             failures.append((self.seeds[0], f"took {peak / 2**30:.1f} GiB of memory"))
             tally.counts[FAILED] += 1
         tally.failures.extend(failures)

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 from attempts import FAILED, REFUSED, RIGHT, Failed, Part, run_part
+from faults import FAULTS
 from helpers import python
 
+ROOT = Path(__file__).resolve().parents[2]
 linux = pytest.mark.skipif(sys.platform != "linux", reason="forks, and limits memory and files")
 
 
@@ -30,6 +32,15 @@ def test_a_crash_is_a_failure_like_another(tmp_path):
     tally = run_part(Part("part", harmed, 2, batch=4), range(6), tmp_path, jobs=2)
     assert tally.counts == {RIGHT: 2, REFUSED: 1, FAILED: 3}
     assert sorted(tally.failures) == [(1, "ended by SIGKILL"), (2, "took 2 s"), (3, "Failed: wrong")]
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.what)
+def test_a_fault_can_be_planted(fault):
+    """Its line is in its file once; ``python tests/attack --mutate`` plants it, and needs minutes."""
+    text = (ROOT / fault.file).read_text()
+    assert text.count(fault.line) == 1 and fault.line != fault.wrong
+    tests = fault.tests[: fault.tests.index("-k")] if "-k" in fault.tests else fault.tests
+    assert tests and all((ROOT / test).exists() for test in tests)
 
 
 @pytest.mark.slow

@@ -63,6 +63,16 @@ def test_named_cells_and_minimum_of_samples():
     assert split_diagram(ROOT, points, importance, 4, cells=[]).diagram is ROOT
 
 
+def test_just_enough_samples_are_enough():
+    """As many distinct samples as children, or as the minimum; one fewer leaves the cell as it is."""
+    root = VoronoiDiagram(torch.tensor([[0.0, 0, 0], [10.0, 0, 0]]))
+    points = torch.cat((torch.rand(4, 3, generator=seeded(2)), torch.rand(3, 3, generator=seeded(3)) + root.centres[1]))
+    split = split_diagram(root, points, torch.ones(7), 4, generator=seeded(1))
+    assert list(split.balances) == [0]
+    split = split_diagram(root, points, torch.ones(7), 2, min_samples=4, generator=seeded(1))
+    assert list(split.balances) == [0]
+
+
 def test_samples_at_one_place_or_without_importance_do_not_count():
     points, importance = three_clouds((50, 50, 50))
     cells = ROOT.locate(points)

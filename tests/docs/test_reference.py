@@ -7,10 +7,13 @@ import importlib
 import inspect
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+
+import voronerf
 
 PAGES = Path(__file__).resolve().parents[2] / "docs" / "reference"
 PACKAGES = ("voronerf", *(f"voronerf.{name}" for name in ("ops", "diagram", "router", "nerf", "nerf.fields", "town")))
@@ -67,3 +70,9 @@ def test_example_of_a_public_name_runs(name: str) -> None:
         assert outcome.failed == 0, f"{test.name}: {outcome.failed} of {outcome.attempted} fail, see the output"
         ran += outcome.attempted
     assert ran
+
+
+def test_pages_say_the_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(PAGES.parent / "scripts"))
+    hooks = importlib.import_module("hooks")
+    assert hooks.on_config(SimpleNamespace()).copyright == f"voronerf {voronerf.__version__}"

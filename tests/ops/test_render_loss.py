@@ -153,6 +153,10 @@ def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend):
     assert found.colour[1].isnan().all() and found.loss.isnan()
     for ray in (0, 2):
         assert torch.equal(found.colour[ray], clean.colour[ray])
+    leaf = spoiled.requires_grad_()
+    render_loss(leaf, deltas, offsets, target, **rest).loss.backward()
+    assert leaf.grad[7:9].isnan().all()  # behind it: no light that is known
+    assert leaf.grad[:4].isfinite().all() and leaf.grad[9:].isfinite().all()
 
 
 @pytest.mark.parametrize("activated", [False, True])

@@ -99,3 +99,17 @@ def test_a_gap_that_another_rank_may_fill_ends_a_run():
     assert own_samples(*given, cells, own, bent=False).run_offsets.tolist() == [0, 2, 4]
     assert own_samples(*given, cells, own, bent=False, hidden=False).run_offsets.tolist() == [0, 4]
     assert own_samples(*given, cells, own * 0 - 1, bent=False, hidden=False).run_offsets.tolist() == [0]
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_runs_of_a_ray_that_begin_alike_keep_their_order(backend):
+    """The first hides the second: an opaque red one before a green one, and the other way round."""
+    reason = backends.why_not("compose_runs", backend, torch.device("cpu"))
+    if reason is not None:
+        pytest.skip(reason)
+    red, green = torch.eye(3)[:2]
+    for first, second in ((red, green), (green, red)):
+        rest = torch.tensor([50.0, 2.0, 0.0])  # optical depth, where they begin, ray
+        sums = torch.stack((torch.cat((first, rest)), torch.cat((second, rest))))
+        answers, loss = compose_runs(sums, first[None], first=0, rays=1, backend=backend)
+        assert float(loss) < 1e-12 and answers[:, 4].tolist() == [0, 50]

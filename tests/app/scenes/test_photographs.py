@@ -14,6 +14,7 @@ from scene_files import needs, rewrite, write_capture, write_colmap, write_image
 from voronerf.app import open_run
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.scenes import SceneError, load_scene, photographs
+from voronerf.app.scenes.colmap import read_model
 from voronerf.app.train import ConfigError, TrainConfig
 from voronerf.app.train.build import ROBUST, build, make_batches, make_renderer, make_routers
 from voronerf.app.train.defaults import resolve
@@ -412,3 +413,13 @@ def test_fern_faces_forward():
     scene = load_scene(needs("fern"), downscale=24)
     assert scene.kind == "forward" and scene.train.images.shape == (17, 126, 168, 3)
     assert scene.near == pytest.approx(0.75) and 5 < scene.far < 10
+
+
+def test_points_that_two_images_see_are_left_out(tmp_path):
+    write_colmap(tmp_path, POSES, [SIZE] * COUNT, POINTS, binary=False)
+    path = tmp_path / "sparse/0/points3D.txt"
+    lines = path.read_text().splitlines()
+    for number, seen in ((0, 2), (1, 3)):
+        lines[number] = " ".join(lines[number].split()[: 8 + 2 * seen])
+    path.write_text("\n".join(lines) + "\n")
+    assert read_model(tmp_path / "sparse/0").numbers.tolist() == list(range(1, len(POINTS)))

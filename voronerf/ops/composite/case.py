@@ -11,6 +11,8 @@ def _make(draw: Draw, n: int) -> Arguments:
     shape = (n * s,) if packed else (n, s)
     r = n if not packed or n < 64 else n // 64  # of long rays, which packed ones may be
     call: Arguments = {name: draw.uniform(*shape, dtype=dtype) for name in ("sigma", "depths", "deltas")}
+    if packed:  # so that light reaches the end of a long ray
+        call["sigma"] = 0.05 * call["sigma"]
     call["rgb"] = draw.uniform(*shape, c, dtype=dtype)
     if packed:
         call["ray_offsets"] = draw.offsets(n * s, r)

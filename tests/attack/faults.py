@@ -1,0 +1,320 @@
+"""Faults of one line for the tests to find: ``python tests/attack --mutate``.
+
+Most are wrong only behind a boundary, for one kind of input or on one of several paths: any test sees the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A line that is replaced by another.
+
+    Attributes:
+        what: What goes wrong.
+        file: From the root of the repository.
+        line: A part of a line that occurs once in the file.
+        wrong: What takes its place.
+        tests: Arguments of pytest: of the tests of `make test`, those of the part.
+    """
+
+    what: str
+    file: str
+    line: str
+    wrong: str
+    tests: tuple[str, ...]
+
+
+def _kernel(op: str, what: str, file: str, line: str, wrong: str) -> Fault:
+    """Of an operation, which has tests of its own beside those of all."""
+    own = ("tests/town/test_sums.py",) if op in ("own_samples", "compose_runs") else (f"tests/ops/test_{op}.py",)
+    words = f"{op} or test_sums" if "town" in own[0] else op
+    tests = ("tests/attack/test_blocks.py", *own, "tests/ops/test_every_op.py", "-k", words)
+    return Fault(f"{op}: {what}", f"csrc/{file}", line, wrong, tests)
+
+
+def _python(what: str, file: str, line: str, wrong: str, *tests: str) -> Fault:
+    return Fault(what, f"voronerf/{file}", line, wrong, tests)
+
+
+FAULTS = (
+    _kernel(
+        "cell_sort",
+        "the last row above 100,000 is lost",
+        "geometry/cell_sort.cpp",
+        "order[place[cells[i]]++] =",
+        "if (i < 100000 || i + 1 < n) order[place[cells[i]]++] =",
+    ),
+    _kernel(
+        "cell_sort",
+        "negative cells are not refused",
+        "geometry/cell_sort.cpp",
+        "if (static_cast<uint32_t>(cells[i]) < static_cast<uint32_t>(k)) {",
+        "if (cells[i] < k) {",
+    ),
+    _kernel(
+        "nearest_centre",
+        "blocks behind the first lose their last point",
+        "geometry/nearest_centre.cpp",
+        "std::min(kBlock, n - start)",
+        "std::min(kBlock - (b > 0), n - start)",
+    ),
+    _kernel(
+        "nearest_centre",
+        "near ties with a centre of another 256 are not decided in float64",
+        "geometry/nearest_centre_isa.cpp",
+        "second[u] = min(max(v, best[u]), min(as_float(next[u]), second[u]));",
+        "second[u] = min(as_float(next[u]), second[u]);",
+    ),
+    _kernel(
+        "locate_cell",
+        "points of a block behind the first take the groups of its last",
+        "geometry/tree_descent.h",
+        "levels[0].groups[0] = {0, 0, n};",
+        "levels[0].groups[0] = {0, 0, n < kDescentBlock ? n : n - 1};",
+    ),
+    _kernel(
+        "march_rays",
+        "cells three away from an occupied one count as farther",
+        "rays/march_rays.cpp",
+        "away < std::min<int64_t>(kMarchRoom, in.z)",
+        "away < std::min<int64_t>(kMarchRoom - 1, in.z)",
+    ),
+    _kernel(
+        "march_rays",
+        "a ray that has all its samples goes on at the last of them",
+        "rays/march_rays_isa.cpp",
+        "if (++got == in.most) next = stratum + 1;",
+        "if (++got == in.most) next = stratum;",
+    ),
+    _kernel(
+        "composite",
+        "the last of 128 samples hides nothing behind it",
+        "rays/composite_isa.cpp",
+        "before += static_cast<double>(optical[i]);",
+        "if (i + 1 < kChunk) before += static_cast<double>(optical[i]);",
+    ),
+    _kernel(
+        "render_loss",
+        "the optical depth in front is forgotten between blocks of 128",
+        "rays/render_loss_isa.cpp",
+        "double front = sums.front[ray];",
+        "double front = together ? sums.front[ray] : 0.0;",
+    ),
+    _kernel(
+        "render_loss",
+        "what is behind is forgotten between blocks of 128",
+        "rays/render_loss_isa.cpp",
+        "double behind = sums.behind[ray];",
+        "double behind = together || end < kChunk ? sums.behind[ray] : 0.0;",
+    ),
+    _kernel(
+        "render_loss",
+        "the gradient of NaN light is 0",
+        "rays/render_loss_isa.cpp",
+        "const Bits seen = ~(light <= splat(hidden));",
+        "const Bits seen = light > splat(hidden);",
+    ),
+    _kernel(
+        "own_samples",
+        "runs of bent rays go on across cells",
+        "rays/ray_runs.cpp",
+        "(in.bent || cell != out.cells[count - 1])",
+        "cell != out.cells[count - 1]",
+    ),
+    _kernel(
+        "compose_runs",
+        "runs of a ray that begin alike change places",
+        "rays/ray_runs.cpp",
+        "return start(a) < start(b);",
+        "return start(a) < start(b) || (start(a) == start(b) && a > b);",
+    ),
+    _kernel(
+        "resample",
+        "a target on the edge of two bins belongs to the earlier",
+        "rays/resample.cpp",
+        "target >= upper)",
+        "target > upper)",
+    ),
+    _kernel(
+        "keep_heaviest",
+        "one of those that stay is lost when a part is full",
+        "rays/keep_heaviest.cpp",
+        "      count = q;",
+        "      count = q - 1;",
+    ),
+    _kernel(
+        "draw_pixels",
+        "pixels of known depth are moved",
+        "rays/draw_pixels.cpp",
+        "const int64_t first = std::min(std::max<int64_t>(begin, in.several), end);",
+        "const int64_t first = begin;",
+    ),
+    _kernel(
+        "scale_gradient",
+        "blocks of 1,024 samples lose the last",
+        "rays/scale_gradient.cpp",
+        "std::min<int64_t>(m, (block + 1) * kSamples)",
+        "std::min<int64_t>(m, (block + 1) * kSamples - 1)",
+    ),
+    _kernel(
+        "observe_occupancy",
+        "the last cell of each thread's part is left out",
+        "rays/observe_occupancy.cpp",
+        "(part + 1) / parts) - first;",
+        "(part + 1) / parts) - first - (parts > 1 ? 1 : 0);",
+    ),
+    _kernel(
+        "pixel_rays",
+        "the pixel behind the last image is taken",
+        "rays/pixel_rays.cpp",
+        "in.pixels[i] >= all)",
+        "in.pixels[i] > all)",
+    ),
+    _kernel(
+        "sparse_depth_gradient",
+        "light of 0.001 has a gradient",
+        "rays/sparse_depth.cpp",
+        "<= in.nearby * distance + in.deltas[i];",
+        "< in.nearby * distance;",
+    ),
+    _kernel(
+        "adam",
+        "blocks of 16,384 entries behind the first lose the last",
+        "encoding/adam.cpp",
+        "std::min(sizes[i], begin + kBlock)",
+        "std::min(sizes[i], begin + kBlock - (begin > 0))",
+    ),
+    _kernel(
+        "frequency_encode",
+        "the last tile is lost on several threads",
+        "encoding/encode.cpp",
+        "const int64_t rows = ceil_div(tiles, ranges) * kEncodeRows;",
+        "const int64_t rows = tiles / ranges * kEncodeRows;",
+    ),
+    _kernel(
+        "hash_encode",
+        "runs of 1,024 points behind the first lose the last",
+        "encoding/hash_encode.cpp",
+        "run(i * kRun, std::min(n, (i + 1) * kRun));",
+        "run(i * kRun, std::min(n, (i + 1) * kRun - (i > 0)));",
+    ),
+    _kernel(
+        "hash_encode",
+        "the cell behind the last table is taken",
+        "encoding/hash_encode.cpp",
+        "*last < in.tables)",
+        "*last <= in.tables)",
+    ),
+    _kernel(
+        "spherical_harmonics",
+        "blocks of 1,024 lose the last direction",
+        "encoding/spherical_harmonics.cpp",
+        "std::min(kBlock, n - i * kBlock)",
+        "std::min(kBlock - (i > 0), n - i * kBlock)",
+    ),
+    _kernel(
+        "grouped_program",
+        "gradients of cells without rows are not written",
+        "network/cpu/program.cpp",
+        "if (count > 0 || empty)",
+        "if (count > 0)",
+    ),
+    _kernel(
+        "grouped_program",
+        "a row with a gradient goes to the cell before",
+        "network/cpu/program.cpp",
+        "std::lower_bound(found.rows.begin()",
+        "std::upper_bound(found.rows.begin()",
+    ),
+    _kernel(
+        "grouped_program",
+        "the second of three parts of a cell's sum is left out",
+        "network/cpu/program_isa.cpp",
+        "for (int64_t part = 1; part < count; ++part) {",
+        "for (int64_t part = count > 2 ? 2 : 1; part < count; ++part) {",
+    ),
+    _kernel(
+        "grouped_program",
+        "the third derivative of GELU is another",
+        "network/function_table.h",
+        "nearby(x) * nearby(x) - splat(4.0f)",
+        "nearby(x) * nearby(x) - splat(3.0f)",
+    ),
+    _python(
+        "Sorted rows come back in another order in the backward pass",
+        "router/grouping.py",
+        "_Permute.apply(gradient, inverse, index), None, None",
+        "_Permute.apply(gradient, index, inverse), None, None",
+        "tests/router/test_router_rules.py",
+        "tests/router/test_router_use.py",
+        "tests/router/test_router.py",
+    ),
+    _python(
+        "A contraction's inverse is that of a ball of radius 1",
+        "nerf/contraction.py",
+        "clamp_min(1e-3) * length.clamp_min(1))",
+        "clamp_min(1e-3))",
+        "tests/nerf",
+    ),
+    _python(
+        "The oldest batch of a reservoir does not come first",
+        "diagram/reservoir.py",
+        "start = added % self.batches if added > self.batches else 0",
+        "start = 0",
+        "tests/diagram",
+    ),
+    _python(
+        "A cell with just enough samples is not split",
+        "diagram/subdivision.py",
+        "counts[cell] >= max(k, min_samples)",
+        "counts[cell] > max(k, min_samples)",
+        "tests/diagram",
+    ),
+    _python(
+        "One checkpoint more is kept than was asked for",
+        "app/train/checkpoint.py",
+        "if number < keep:",
+        "if number <= keep:",
+        "tests/app/train/test_checkpoint.py",
+        "tests/app/train/test_resume.py",
+    ),
+    _python(
+        "A checkpoint's sums leave out its values",
+        "app/train/checkpoint.py",
+        '        found[_VALUES] = zlib.crc32(metadata["values"].encode())',
+        "        sums.pop(_VALUES, None)",
+        "tests/app/train/test_checkpoint.py",
+    ),
+    _python(
+        "Pages of other sites may use the viewer",
+        "app/viewer/door.py",
+        "if site is not None and site != asked:",
+        "if site is not None and not asked:",
+        "tests/app/viewer",
+    ),
+    _python(
+        "COLMAP's points that two images see are kept",
+        "app/scenes/colmap.py",
+        "if seen >= LEAST_SEEN and",
+        "if seen >= LEAST_SEEN - 1 and",
+        "tests/app/scenes",
+    ),
+    _python(
+        "A partial file replaces the old one before it is whole",
+        "app/files.py",
+        '            with open(partial, "xb") as file:',
+        '            with open(path, "wb") as file:',
+        "tests/app/train/test_checkpoint.py",
+    ),
+    _python(
+        "A placed part keeps the densities of its own scale",
+        "town/parts.py",
+        "density if self.frame.is_identity else density / self.frame.scale",
+        "density",
+        "tests/town/test_parts.py",
+        "tests/town/test_editing.py",
+    ),
+)
