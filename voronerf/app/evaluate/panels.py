@@ -26,7 +26,7 @@ HUE_STEP, SATURATION_STEP, VALUE_STEP = 0.6180339887498949, 0.7548776662466927, 
 ERROR_SCALE = 0.3  # mean absolute error over the channels that gets the last colour of the map
 SOLID = 0.5  # opacity above which the depth of a pixel counts for the scale
 PICTURE_HEIGHT, PICTURE_WIDTH = 240, 1200  # pictures are enlarged to about this height, and never beyond this width
-CAPTION, GAP = 18, 6
+CAPTION, FONT, GAP = 24, 16, 6
 
 
 def palette(count: int) -> Tensor:
@@ -99,7 +99,7 @@ def contact_sheet(pictures: Mapping[str, Tensor]) -> Tensor:
     step = width * zoom + GAP
     sheet = Image.new("RGB", (len(pictures) * step + GAP, GAP + CAPTION + height * zoom + GAP), "white")
     draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default()
+    font = ImageFont.load_default(FONT)
     for index, (caption, picture) in enumerate(pictures.items()):
         left, top = GAP + index * step, GAP
         enlarged = Image.fromarray(picture.numpy()).resize((width * zoom, height * zoom), Image.Resampling.NEAREST)

@@ -15,8 +15,8 @@ from voronerf.ops._core import backends
 
 #: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
 READ_EVERY = 3 * GROUP
-#: Seconds after which a training answers, to Ctrl-C and to its callbacks, if its steps are not longer.
-ANSWER = 0.1
+#: Seconds after which a training answers, such as to Ctrl-C, if its steps are not longer.
+ANSWER = 0.3
 
 
 class TrainingError(RuntimeError):
@@ -74,7 +74,6 @@ def train(
         clock: Counts seconds.
     """
     strategy, sampler, optimizer = state.strategy, state.sampler, state.optimizer
-    group = min((callback.group for callback in callbacks), default=GROUP)
     before, one_thread = state.step, backends.torch_on_one_thread if state.thread_deterministic else nullcontext
     state.training_step.as_it_is, quick = one_thread, GROUP
     while state.fraction < 1 and state.seconds < until and not state.stopped:
@@ -85,6 +84,7 @@ def train(
         optimizer.set_learning_rate(state.learning_rate())
         if not state.router.training:
             state.renderer.train()
+        group = min((callback.group for callback in callbacks), default=GROUP)
         steps = min(state.steps_alike(), steps_to_judgement(state), group, quick)
         made = state.training_step(state.rays, steps, at=state.step - state.began)
         state.count_steps(steps, made.rays)

@@ -49,8 +49,6 @@ class Training(Callback):
         scores: Whose curve is shown.
     """
 
-    group = GROUP
-
     def __init__(self, viewer: Viewer, state: State, scores: Scores) -> None:
         self.viewer, self.state, self.scores, self.cells = viewer, state, scores, state.router.num_cells
         self.paused = False
@@ -63,6 +61,11 @@ class Training(Callback):
         self.button.on_click(lambda _: self.pause(not self.paused))
         self.end = gui.add_button("Stop training", order=-2, hint="It can be trained further.")
         self.end.on_click(lambda _: self.stop())
+
+    @property
+    def group(self) -> int:  # type: ignore[override]
+        """Each step is followed by a picture while somebody looks."""
+        return 1 if self.viewer.clients else GROUP
 
     def pause(self, paused: bool) -> None:
         """Pauses the training after the current step, or continues it."""
