@@ -30,7 +30,7 @@ from voronerf.app.scenes.builtin.caster import Caster
 from voronerf.app.scenes.builtin.pictures import LIGHT, shaded
 from voronerf.app.scenes.builtin.solids import Array, Box, Cylinder, Solid, Sphere, Texture, rotation
 from voronerf.app.scenes.builtin.textures import bricks, checker, diagonals, globe, plain, spiral
-from voronerf.app.scenes.photographs import hold_out
+from voronerf.app.scenes.photographs import HOLD_OUT
 from voronerf.nerf.cameras import Cameras, look_at
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.volume import per_ray
@@ -185,7 +185,7 @@ def write_room(folder: Path, seed: int, *, views: int = 72, width: int = 200, he
     (folder / "sparse/0/points3D.txt").write_text(text + "\n")
     lens = f"1 PINHOLE {width} {height} {0.75 * width} {0.75 * width} {width / 2} {height / 2}\n"
     (folder / "sparse/0/cameras.txt").write_text(lens)
-    np.save(folder / "depths.npy", np.stack(depths)[hold_out(views).numpy()])
+    np.save(folder / "depths.npy", np.stack(depths)[::HOLD_OUT])
 
 
 def quaternion(turn: Array) -> Array:

@@ -9,7 +9,7 @@ from emulated import emulated
 from graphs import graphs
 
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.train import State, TrainConfig, build, train
+from voronerf.app.train import Callback, State, TrainConfig, build, train
 from voronerf.nerf import SplitStrategy
 
 pytestmark = pytest.mark.native
@@ -37,7 +37,7 @@ def built(**options):
 
 
 def steps(state, count):
-    train(state, until=state.seconds + count, clock=itertools.count().__next__)
+    train(state, [Callback()], until=state.seconds + count, clock=itertools.count().__next__)  # one by one
 
 
 def everything(state):

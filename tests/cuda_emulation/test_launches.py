@@ -9,7 +9,7 @@ from launches import asked
 
 import voronerf
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.train import State, TrainConfig, build, train
+from voronerf.app.train import Callback, State, TrainConfig, build, train
 
 LAUNCHES, READS = 26, 0
 """Of a default step. The launches go down only."""
@@ -51,7 +51,7 @@ def trained(steps, monkeypatch, *, empty=False):
             for table in (state.sampler.grid.density, state.sampler.grid.occupied):
                 table[:, :, 8:] = 0
             state.step = 1  # voxels are evaluated again at the first step
-        train(state, until=steps - state.step, clock=itertools.count().__next__)
+        train(state, [Callback()], until=steps - state.step, clock=itertools.count().__next__)  # one by one
     return state, outputs[-1]
 
 
@@ -71,6 +71,7 @@ def test_rows_beyond_the_samples_change_nothing(monkeypatch, request):
     assert 0 < int(rows) < 32 * 8  # some rows were beyond
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)
+    monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 1)
     state.read_output(output)
     assert 32 < state.rays <= 256  # as many more as the samples left out allow
 
@@ -82,7 +83,7 @@ def test_a_default_step(monkeypatch, on_device):
         state, _ = trained(6, monkeypatch)
     monkeypatch.setattr(State, "read_output", lambda state, output: None)
     with asked() as counted:
-        train(state, until=state.seconds + 1, clock=itertools.count().__next__)
+        train(state, [Callback()], until=state.seconds + 1, clock=itertools.count().__next__)
     told = f"{counted.kernels} {counted.operations} {counted.reads}"
     assert counted.launches <= LAUNCHES and counted.reads.total() <= READS, told
     assert not counted.on_cpu

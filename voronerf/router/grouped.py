@@ -191,6 +191,8 @@ def _weight_norm(v: Tensor, g: Tensor, dim: int = 0) -> Tensor:
 
 def name_of(function: Any) -> str:
     """A function's name for messages."""
+    if isinstance(owner := getattr(function, "__self__", None), type):  # such as apply of a function of autograd
+        return f"{owner.__name__}.{function.__name__}"
     resolved = torch.overrides.resolve_name(function)
     return resolved or getattr(function, "__qualname__", None) or str(function)
 
