@@ -62,12 +62,12 @@ def test_panel_file(tmp_path):
     panels.save_panel(path, colour, RenderedImage(colour, opacity, opacity, colour), cells)
     width, height = Image.open(path).size
     zoom = -(-panels.PICTURE_HEIGHT // 7)
-    assert (width, height) == (5 * (9 * zoom + 6) + 6, 7 * zoom + 6 + 18 + 6)
+    assert (width, height) == (5 * (9 * zoom + 6) + 6, 7 * zoom + 6 + panels.CAPTION + 6)
     strip = torch.zeros(1, 5000, 3, dtype=torch.uint8)  # enlarged to 240 rows it would take 288 million pixels
-    assert panels.contact_sheet({"truth": strip}).shape == (6 + 18 + 1 + 6, 5000 + 6 + 6, 3)
+    assert panels.contact_sheet({"truth": strip}).shape == (6 + panels.CAPTION + 1 + 6, 5000 + 6 + 6, 3)
     pixels = np.asarray(Image.open(path))
     truth = panels.picture_of_colour(colour)
-    assert pixels[6 + 18, 6].tolist() == truth[0, 0].tolist()
+    assert pixels[6 + panels.CAPTION, 6].tolist() == truth[0, 0].tolist()
     refuses("one size", panels.contact_sheet, {"a": truth, "b": truth[1:]})
 
 
