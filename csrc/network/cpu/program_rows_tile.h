@@ -73,6 +73,14 @@ VN_INLINE int64_t pairs_of(int64_t width) { return (width + 31) / 32 * 16; }
 
 #if VN_HALF
 
+// Behind the last column of rows of pairs: there infinity times a weight of 0 has left NaN.
+VN_INLINE void clear_behind(float* pairs, int64_t width, int64_t rows, int64_t stride) {
+  const int64_t bytes = 2 * (2 * pairs_of(width) - width);
+  for (int64_t row = 0; row < rows && bytes > 0; ++row, pairs += stride) {
+    __builtin_memset(static_cast<char*>(static_cast<void*>(pairs)) + 2 * width, 0, static_cast<size_t>(bytes));
+  }
+}
+
 // Columns as pairs, the last one filled up with 0; so many floats behind them, if not 0, what rounding has left.
 VN_INLINE void narrow_rows(const Rows& x, int64_t width, int64_t rows, float* to, int64_t stride, int64_t left = 0) {
   for (int64_t row = 0; row < rows; ++row, to += stride) {

@@ -313,6 +313,9 @@ struct ProgramTile {
       multiply<false>(product, rows, columns);
 #endif
     }
+#if VN_HALF == 2
+    if (pairs != nullptr) clear_behind(pairs, step.width, rows, pairs_stride);
+#endif
   }
 
   // Of rows of pairs, and in parts of what rounding has left, which lies behind them: the stride, and how far.
