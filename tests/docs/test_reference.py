@@ -73,6 +73,7 @@ def test_example_of_a_public_name_runs(name: str) -> None:
 
 
 def test_pages_say_the_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mkdocs", reason="mkdocs is not installed: make docs installs it")
     monkeypatch.syspath_prepend(str(PAGES.parent / "scripts"))
     hooks = importlib.import_module("hooks")
     assert hooks.on_config(SimpleNamespace()).copyright == f"voronerf {voronerf.__version__}"
