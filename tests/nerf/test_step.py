@@ -201,6 +201,7 @@ def test_numbers_of_rows_that_are_much_the_same():
         lambda t: setattr(t.router.module, "density_scale", 3.0),
         lambda t: t.router.to(torch.float64).to(torch.float32),
         lambda t: torch.set_num_threads(3),
+        lambda t: setattr(torch.backends.mkldnn.matmul, "fp32_precision", "tf32"),
     ],
 )
 def test_what_changes_is_followed(change):
@@ -208,6 +209,7 @@ def test_what_changes_is_followed(change):
     try:
         for as_it_is in (False, True):
             torch.set_num_threads(before)
+            torch.set_float32_matmul_precision("highest")
             training = Training(cells=3)
             training.optimizer.average = 0.9
             training.train(4, as_it_is=as_it_is)
@@ -218,6 +220,7 @@ def test_what_changes_is_followed(change):
             found.append([*steps, *(e for e in training.everything() if e is not None)])
     finally:
         torch.set_num_threads(before)
+        torch.set_float32_matmul_precision("highest")
     assert same(*found)
 
 
