@@ -1,10 +1,11 @@
-"""Draws the figures of docs/method.md with the library itself, into docs/images/method.
+"""Draws the figures of docs/method.md with the library itself, into docs/images/method, and the chart of the first page.
 
 python docs/scripts/figures.py
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import matplotlib
@@ -17,7 +18,8 @@ from voronerf import VoronoiDiagram, balance, cell_sort, split_diagram
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-OUT = Path(__file__).resolve().parents[1] / "images" / "method"
+DOCS = Path(__file__).resolve().parents[1]
+OUT = DOCS / "images" / "method"
 COLOURS = plt.get_cmap("tab20").colors
 SIZE = 500  # pixels along a side of a drawn plane
 
@@ -29,6 +31,7 @@ def main() -> None:
     draw_balance(points, importance)
     draw_nested(points, importance)
     draw_sort()
+    draw_loops()
 
 
 def samples() -> tuple[Tensor, Tensor]:
@@ -126,6 +129,37 @@ def draw_sort() -> None:
     axis.set_ylim(0, 3)
     axis.axis("off")
     figure.savefig(OUT / "sort.png", dpi=110)
+    plt.close(figure)
+
+
+def draw_loops() -> None:
+    """How long networks of many cells take here, and in the fastest loop over cells in PyTorch."""
+    measured = json.loads((DOCS.parent / "benchmarks" / "results" / "throughput.json").read_text())
+    rows = {
+        (row["case"], row["dtype"], row["direction"]): row
+        for row in measured["results"]
+        if (row["op"], row["backend"]) == ("routed_mlp", "native")
+    }
+    names = {
+        "nerf64 n=262144 k=16": "16 NeRFs of width 64",
+        "w64d4 n=262144 k=16": "16 MLPs of width 64",
+        "mlp32 n=262144 k=256": "256 MLPs of width 32",
+    }
+    figure, axis = plt.subplots(figsize=(8, 3), constrained_layout=True)
+    chosen = [rows[case, "float32", "forward+backward"] for case in names]
+    sides = {
+        "voronerf": ("#00897b", [row["median_ms"] for row in chosen]),
+        "the fastest loop over cells in PyTorch": ("#9e9e9e", [min(row["alternatives"].values()) for row in chosen]),
+    }
+    for shift, (name, (colour, times)) in zip((-0.19, 0.19), sides.items()):
+        bars = axis.barh([place + shift for place in range(len(times))], times, 0.36, color=colour, label=name)
+        axis.bar_label(bars, [f"{time:.0f} ms" for time in times], padding=4, fontsize=9)
+    axis.set_yticks(range(len(names)), names.values())
+    axis.invert_yaxis()
+    axis.set_xticks([])
+    axis.spines[["top", "right", "bottom"]].set_visible(False)
+    figure.legend(loc="outside upper right", frameon=False, ncols=2)
+    figure.savefig(DOCS / "images" / "loops.png", dpi=110)
     plt.close(figure)
 
 

@@ -1,7 +1,9 @@
-"""Fills the pages of the site that come from the code, cleans what docstrings leave in them, and adds a scene."""
+"""Fills the pages of the site that come from the code, cleans what docstrings leave in them, sets formulas, and adds a
+scene."""
 
 from __future__ import annotations
 
+import html
 import re
 import sys
 from pathlib import Path
@@ -11,6 +13,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import options
 import scene
+from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
 import voronerf
@@ -38,6 +41,12 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     return markdown
 
 
-def on_page_content(html: str, **_: Any) -> str:
-    """Drops the roles of cross-references in docstrings, such as :class:, which only Sphinx reads."""
-    return re.sub(r":(?:class|meth|func|mod|attr|data):<code>~?", "<code>", html)
+def on_page_content(content: str, **_: Any) -> str:
+    """Sets formulas as MathML, which browsers draw themselves, and drops the roles of cross-references in docstrings,
+    such as :class:, which only Sphinx reads."""
+    content = re.sub(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', _formula, content, flags=re.DOTALL)
+    return re.sub(r":(?:class|meth|func|mod|attr|data):<code>~?", "<code>", content)
+
+
+def _formula(found: re.Match[str]) -> str:
+    return str(convert(html.unescape(found[2]), display="inline" if found[1] == "span" else "block"))
