@@ -1,4 +1,4 @@
-"""Draws the figures of docs/method.md with the library itself, into docs/images/method, and the chart of the first page.
+"""Draws the figures of docs/method.md with the library itself, into docs/images/method, and the first page's chart.
 
 python docs/scripts/figures.py
 """

@@ -58,6 +58,28 @@ def test_project_inverts_rays(distortion):
     torch.testing.assert_close(depth, distance[:, 0] * (rays.directions @ some.forward[2]), rtol=1e-4, atol=1e-5)
 
 
+def test_a_camera_that_sees_all_around():
+    """As nerfstudio's: the middle is ahead, a quarter of the width is 90 degrees, and the upper edge is straight up."""
+    some = Cameras.all_around(orbit_cameras(3, radius=3, elevation=20, width=1, height=1, focal=1).poses, 40)
+    one = Cameras.all_around(torch.eye(4)[None], 40)
+    seen = one.rays(0, torch.tensor([40.0, 60, 20, 0, 40, 50]), torch.tensor([20.0, 20, 20, 20, 0, 30]))
+    half = math.sqrt(0.5)
+    expected = [[0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 1, 0], [0.5, -half, -0.5]]
+    torch.testing.assert_close(seen.directions, torch.tensor(expected), atol=1e-6, rtol=0)
+    rays = some.image_rays(2, cones=True)
+    distance = torch.linspace(0.5, 9, 3200)
+    pixels, depth = some.project(rays.origins + distance[:, None] * rays.directions, 2)
+    x, y = torch.meshgrid(torch.arange(80) + 0.5, torch.arange(40) + 0.5, indexing="xy")
+    torch.testing.assert_close(pixels, torch.stack((x.reshape(-1), y.reshape(-1)), -1), atol=1e-3, rtol=0)
+    torch.testing.assert_close(depth, distance)
+    width = torch.tensor(math.pi / 40 * 2 / math.sqrt(12))
+    torch.testing.assert_close(rays.radii, width.expand(3200))
+    ahead = some[:2].perspective()
+    assert (ahead.width, ahead.height, ahead.distortion) == (20, 20, None)
+    corners = ahead.rays(0, torch.tensor([0.0, 20.0]), torch.tensor([10.0, 10.0])).directions
+    assert abs(float(corners[0] @ corners[1])) < 1e-6  # 90 degrees
+
+
 def test_points_behind_have_negative_depth():
     one = cameras(1)
     _, depth = one.project(one.origins - 2 * one.forward, 0)

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.nerf.lenses import FISHEYE, PERSPECTIVE, LensTables, distort, unproject
+from voronerf.nerf.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, LensTables, distort, unproject
 from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 
 __all__ = ["Cameras", "Rays", "focus_point", "look_at", "orbit_cameras", "turntable_cameras"]
@@ -69,8 +69,8 @@ class Cameras:
         width: of every image, in pixels; of the widest where they differ.
         height: of every image, in pixels; of the highest where they differ.
         distortion: float32 [c, 8], coefficients of the lenses, see `voronerf.nerf.lenses.distort`, or None for none.
-        models: int32 [c], the camera model of each: 0 perspective, 1 fisheye, 2 FOV. It needs coefficients. None is
-            perspective for all.
+        models: int32 [c], the camera model of each: 0 perspective, 1 fisheye, 2 FOV, 3 equirectangular (360 degrees).
+            It needs coefficients. None is perspective for all.
         sizes: int64 [c, 2], (width, height) of each image, or None if they are of one size. See `size`.
 
     Examples:
@@ -218,13 +218,44 @@ class Cameras:
         if self.distortion is None:
             return lens, None
         models = torch.zeros_like(lens) if self.models is None else self.models
-        bent = (self.distortion != 0).any(1) | (models == FISHEYE)
+        bent = (self.distortion != 0).any(1) | (models == FISHEYE) | (models == EQUIRECTANGULAR)
         if not bool(bent.any()):
             return lens, None
         every = torch.cat((self.intrinsics, self.distortion, models[:, None].to(self.intrinsics)), dim=1)
         distinct, of = every[bent].unique(dim=0, return_inverse=True)
         lens[bent] = of.to(torch.int32)
         return lens, LensTables(distinct, self.width, self.height)
+
+    def perspective(self) -> Cameras:
+        """The cameras without their lenses; one that sees all around looks ahead, 90 degrees wide."""
+        if self.models is None:
+            return replace(self, distortion=None)
+        around = self.models == EQUIRECTANGULAR
+        sizes = torch.tensor([self.size(index) for index in range(len(self))], device=self.poses.device)
+        sides = (sizes[:, 1:] // 2).clamp_min(1).expand(-1, 2)
+        ahead = torch.cat((sides, sides), 1).to(self.intrinsics) / 2
+        intrinsics = torch.where(around[:, None], ahead, self.intrinsics)
+        return Cameras.of_images(self.poses, intrinsics, torch.where(around[:, None], sides, sizes))
+
+    @classmethod
+    def all_around(cls, poses: Tensor, height: int) -> Cameras:
+        """Cameras that see all around, in equirectangular images of `height` x twice as many pixels.
+
+        Args:
+            poses: [c, 4, 4]; the middle of the image is what they look at, up is its upper edge.
+            height: of the images, in pixels.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf.nerf import Cameras
+            >>> cameras = Cameras.all_around(torch.eye(4)[None], height=90)
+            >>> cameras.width, cameras.project(torch.tensor([[2.0, 0.0, 0.0]]), 0)[0]  # to the right
+            (180, tensor([[135.,  45.]]))
+        """
+        count, scale = len(poses), height / math.pi
+        intrinsics = poses.new_tensor((scale, scale, height, height / 2)).repeat(count, 1)
+        models = torch.full((count,), EQUIRECTANGULAR, dtype=torch.int32, device=poses.device)
+        return cls(poses, intrinsics, 2 * height, height, poses.new_zeros(count, 8), models)
 
     def downscaled(self, factor: int) -> Cameras:
         """Cameras of the images averaged over blocks of `factor` x `factor` pixels.
@@ -256,7 +287,8 @@ class Cameras:
             y: [b] row, in pixels from the upper edge.
             cones: give the rays radii of 2 / sqrt(12) of the width of a pixel, so that the variance of a cone across
                 its axis is that of the pixel (Barron et al. 2021, section 3.1). A pixel away from the optical axis is
-                farther away and so appears narrower. Lens distortion of the size of a pixel is ignored.
+                farther away and so appears narrower, but that of a fisheye or a picture all around, which covers the
+                same angle. Lens distortion of the size of a pixel is ignored.
         """
         x, y = _position(x).to(self.poses.dtype), _position(y).to(self.poses.dtype)
         camera = torch.full_like(x, image_index, dtype=torch.int64) if isinstance(image_index, int) else image_index
@@ -277,7 +309,11 @@ class Cameras:
     def radii(self, directions: Tensor, camera: Tensor) -> Tensor:
         """The radii [b] of cones along `directions` [b, 3] of the cameras int [b]."""
         widths = self.intrinsics[:, :2].prod(-1).rsqrt() * (2 / math.sqrt(12))
-        return widths[camera] * (directions * self.forward[camera]).sum(-1)
+        slant = (directions * self.forward[camera]).sum(-1)
+        if self.models is not None:
+            by_angle = (self.models == FISHEYE) | (self.models == EQUIRECTANGULAR)
+            slant = torch.where(by_angle[camera], 1.0, slant)
+        return widths[camera] * slant
 
     def image_rays(self, index: int, *, cones: bool = False, backend: str = "auto") -> Rays:
         """Rays through all pixel centres of one camera, row by row: [height * width], of its own image."""
@@ -312,7 +348,8 @@ class Cameras:
 
         Returns:
             (pixels [n, 2], depth [n]): positions (x, y) in the image, and distance along the optical axis in world
-            units. Points with depth <= 0 are behind the camera, and their pixels are meaningless but for a fisheye.
+            units. Points with depth <= 0 are behind the camera, and their pixels are meaningless but for a fisheye. An
+            equirectangular camera sees all around, and depth is the distance.
         """
         pose = self.poses[index]
         local = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -322,6 +359,10 @@ class Cameras:
             across = local[:, :2].norm(dim=-1)
             share = torch.atan2(across, depth) / across.clamp_min(1e-12)
             u, v = local[:, 0] * share, -local[:, 1] * share
+        elif model == EQUIRECTANGULAR:
+            u = torch.atan2(local[:, 0], depth)
+            v = torch.atan2(-local[:, 1], torch.hypot(local[:, 0], depth))
+            depth = local.norm(dim=-1)
         else:
             safe = torch.where(depth > 0, depth, torch.ones_like(depth))
             u, v = local[:, 0] / safe, -local[:, 1] / safe
@@ -425,6 +466,7 @@ def turntable_cameras(cameras: Cameras, count: int) -> Cameras:
         >>> len(turntable_cameras(seen, 60))
         60
     """
+    cameras = cameras.perspective()
     centre = focus_point(cameras)
     if centre is None:
         centre = (cameras.origins + cameras.forward).mean(0)

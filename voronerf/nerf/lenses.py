@@ -12,15 +12,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["FISHEYE", "FOV", "PERSPECTIVE", "LensTables", "distort", "undistort", "unproject"]
+__all__ = ["EQUIRECTANGULAR", "FISHEYE", "FOV", "PERSPECTIVE", "LensTables", "distort", "undistort", "unproject"]
 
 #: The camera models, by their numbers in `Cameras.models`.
-PERSPECTIVE, FISHEYE, FOV = range(3)
+PERSPECTIVE, FISHEYE, FOV, EQUIRECTANGULAR = range(4)
 NEWTON_STEPS = 12
 #: Newton's method stops at steps of this length: it doubles the digits, so what is left is below float64's.
 SETTLED = 1e-9
 #: In the place of zero, where a length divides.
 TINY = 1e-12
+#: Radians beyond the border of a picture all around that are a matter of rounding.
+ROUNDED = 1e-6
 #: How far from its position, in pixels, a point may be imaged that counts as its inverse.
 MISSED = 1e-3
 #: Bytes that the tables of one capture may take. A pixel takes 8, an RGB picture 3.
@@ -37,7 +39,9 @@ def distort(u: Tensor, v: Tensor, coefficients: Tensor, model: int = PERSPECTIVE
       and the tangential terms of p1 and p2;
     - fisheye, COLMAP's THIN_PRISM_FISHEYE: the factor 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, the tangential terms,
       s1 r^2 and s2 r^2. OpenCV's fisheye has k1 to k4 alone;
-    - FOV, COLMAP's: the factor atan(2 r tan(omega / 2)) / (r omega).
+    - FOV, COLMAP's: the factor atan(2 r tan(omega / 2)) / (r omega);
+    - equirectangular, of pictures all around: none. (u, v) are the angles to the right and downwards, so that fx and fy
+      are pixels a radian.
 
     Source: OpenCV, "Camera Calibration and 3D Reconstruction" and "Fisheye camera model"; COLMAP, "Camera Models";
     Devernay and Faugeras, "Straight lines have to be straight", 2001, for FOV.
@@ -47,7 +51,7 @@ def distort(u: Tensor, v: Tensor, coefficients: Tensor, model: int = PERSPECTIVE
         v: [n].
         coefficients: [8]: (k1, k2, p1, p2, k3, k4, k5, k6), of a fisheye (k1, k2, p1, p2, k3, k4, s1, s2), of an FOV
             lens (omega, 0, ...).
-        model: PERSPECTIVE, FISHEYE or FOV.
+        model: PERSPECTIVE, FISHEYE, FOV or EQUIRECTANGULAR.
     """
     if model == FOV:
         omega, radius = float(coefficients[0]), torch.hypot(u, v).clamp_min(TINY)
@@ -110,7 +114,7 @@ def unproject(
         y: [n], downwards.
         intrinsics: [4], (fx, fy, cx, cy) in pixels.
         coefficients: [8], see `distort`.
-        model: PERSPECTIVE, FISHEYE or FOV.
+        model: PERSPECTIVE, FISHEYE, FOV or EQUIRECTANGULAR.
 
     Returns:
         (float64 [n, 3] of unit length in the camera's OpenGL axes, bool [n] whether the lens images that direction
@@ -127,6 +131,9 @@ def unproject(
         there &= angle < math.pi
         share = torch.sinc(angle / math.pi)  # sin(angle) / angle
         a, b, ahead = a * share, b * share, angle.cos()
+    elif model == EQUIRECTANGULAR:
+        there &= (a.abs() < math.pi + ROUNDED) & (b.abs() < math.pi / 2 + ROUNDED)
+        a, b, ahead = a.sin() * b.cos(), b.sin(), a.cos() * b.cos()
     return torch.nn.functional.normalize(torch.stack((a, -b, -ahead), dim=-1), dim=-1), there
 
 

@@ -10,6 +10,7 @@ from helpers import read_json, refuses
 from voronerf.app.render.paths import (
     CameraPath,
     capture_path,
+    panoramas,
     read_camera_path,
     resized,
     smooth_path,
@@ -45,6 +46,22 @@ def test_a_file_of_nerfstudio(tmp_path):
     assert path.keyframes.intrinsics[0, 1] == pytest.approx(20 / math.tan(math.radians(30)))
     file.write_text(json.dumps(by_hand(keyframes=[])))
     assert read_camera_path(file).keyframes is None and read_camera_path(file).fps == 24
+
+
+def test_frames_that_show_all_around(tmp_path):
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps(by_hand(camera_type="equirectangular")))
+    frames = read_camera_path(file).frames
+    torch.testing.assert_close(
+        frames.project(torch.tensor([[4.0, 5, 6], [14.0, -5, 6]]), 1)[0][:, 0], torch.tensor([40.0, 60])
+    )
+    assert torch.equal(panoramas(frames, (80, 40)).poses, frames.poses)
+    down = look_at(torch.tensor([[1.0, 2, 3], [0.0, 0, 3]]), torch.zeros(3), torch.tensor([0.0, 0, 1]))
+    tilted = Cameras(down, torch.ones(2, 4), 6, 4)
+    level = panoramas(tilted, (20, 10))
+    assert torch.equal(level.origins, tilted.origins) and level.width == 20
+    torch.testing.assert_close(level.poses[:, 2, 1], torch.ones(2))  # the horizon is level, also of one straight down
+    refuses("must be 2 to 1, got 20 x 11", panoramas, tilted, (20, 11))
 
 
 def test_what_is_written_is_read(tmp_path):
@@ -85,7 +102,8 @@ def test_what_is_written_is_read(tmp_path):
         ({"render_width": 10**9}, "render_width must be an integer of 1 to 8192, got 1000000000"),
         ({"render_height": True}, "render_height must be an integer of 1 to 8192, got True"),
         ({"fps": "fast"}, "fps must be a number of 0.01 to 1000, got 'fast'"),
-        ({"camera_type": "fisheye"}, "camera_type must be perspective, got 'fisheye'"),
+        ({"camera_type": "fisheye"}, "camera_type must be perspective or equirectangular, got 'fisheye'"),
+        ({"camera_type": "equirectangular", "render_width": 81}, "frames must be 2 to 1, got 81 x 40"),
     ],
 )
 def test_files_that_are_no_paths(tmp_path, changes, rule):
@@ -165,7 +183,7 @@ def test_frames_have_the_size_of_most_images_or_another():
     assert (seen.width, seen.height) == (32, 32)
     frames = capture_path(seen, 5, near=1, far=9)
     assert (frames.width, frames.height) == (32, 24) and frames.intrinsics[0].tolist() == [40, 40, 16, 12]
-    wide = capture_path(seen, 5, near=1, far=9, size=(128, 72))  # what is above and below is cut off
+    wide = resized(frames, (128, 72))  # what is above and below is cut off
     assert (wide.width, wide.height) == (128, 72) and wide.intrinsics[0].tolist() == [160, 160, 64, 36]
     assert resized(wide, (32, 24)).intrinsics[0].tolist() == pytest.approx([160 / 3, 160 / 3, 16, 12])
 

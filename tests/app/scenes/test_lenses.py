@@ -57,6 +57,25 @@ def test_each_image_of_a_folder_has_its_own_model(tmp_path):
                 torch.testing.assert_close(found, pixels, atol=1e-4, rtol=0)
 
 
+def test_pictures_all_around(tmp_path):
+    """As nerfstudio writes them: the focal length says nothing, and rays are reduced and kept with the images."""
+    poses = orbit_cameras(3, radius=4, elevation=20, width=1, height=1, focal=1).poses
+    write_images(tmp_path, [(64, 32)] * 3)
+    frames = [
+        {"file_path": f"images/{index:02d}.jpg", "transform_matrix": pose.tolist()} for index, pose in enumerate(poses)
+    ]
+    entries = {"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32, "fl_x": 32, "fl_y": 32, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(entries))
+    scene = load_scene(tmp_path, downscale=2)
+    assert scene.kind == "inside-out" and not any("check the cameras" in note for note in scene.notes)
+    write_scene(tmp_path / "scene.json", scene)
+    for read in (scene, read_scene(tmp_path / "scene.json")):
+        cameras = read.train.cameras
+        rays = cameras.image_rays(0)
+        assert (cameras.width, cameras.height) == (32, 16)
+        torch.testing.assert_close(rays.directions, Cameras.all_around(cameras.poses, 16).image_rays(0).directions)
+
+
 def test_refuses_unknown_models():
     refuses("camera model DIVISION is not supported, only SIMPLE_PINHOLE, PINHOLE", colmap_lens, "DIVISION", [1.0])
     refuses("RADIAL must have 5 parameters, got 4", colmap_lens, "RADIAL", [1.0] * 4)

@@ -8,7 +8,7 @@ from pathlib import Path
 from voronerf.app.cli.display import say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Crop, Opening, check_counts, crop_box
 from voronerf.app.export.video import FRAMES, check_folder, export_video, video_cameras
-from voronerf.app.render.paths import LONGEST_SIDE, read_camera_path, resized
+from voronerf.app.render.paths import LONGEST_SIDE, panoramas, read_camera_path, resized
 from voronerf.app.render.video import check_video
 from voronerf.app.train.config import ConfigError
 
@@ -23,6 +23,7 @@ def render(
     size: str | None = None,
     images: bool = False,
     depth: bool = False,
+    panorama: bool = False,
     crop: Crop = None,
     opening: Opening = AS_IN_TRAINING,
 ) -> int:
@@ -38,6 +39,7 @@ def render(
         size: Width and height of the frames, such as 1280x720; default those of the training images, or of the path.
         images: Write the frames as PNG images into a folder.
         depth: Show how far away things are, near ones in yellow.
+        panorama: Show all around, in equirectangular frames with the horizon in the middle; --size must be 2 to 1.
         crop: Show a box only, x y z of its lowest and of its highest corner, or "saved" for the viewer's.
         opening: How the run is opened.
     """
@@ -51,10 +53,13 @@ def render(
     out = out or run / (name if images else f"{name}.mp4")
     (check_folder if images else check_video)(out)
     if flight is None:
-        cameras, rate = video_cameras(opened.scene, frames, sides), 24.0
+        cameras, rate = video_cameras(opened.scene, frames), 24.0
     else:
         cameras, rate = flight.frames.downscaled(opening.downscale or 1), flight.fps
-        cameras = cameras if sides is None else resized(cameras, sides)
+    if panorama or cameras.models is not None:
+        cameras = panoramas(cameras, sides or (2 * cameras.height, cameras.height))
+    elif sides is not None:
+        cameras = resized(cameras, sides)
     box = crop_box(opened, crop)
     export_video(opened, out, cameras, fps=fps or rate, images=images, depth=depth, box=box, track=tracked)
     say(f"wrote {out}")

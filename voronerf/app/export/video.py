@@ -10,7 +10,7 @@ from torch import Tensor
 
 from voronerf.app.evaluate.panels import SOLID, picture_of_colour, picture_of_depth, save_picture
 from voronerf.app.export.space import Track, in_silence
-from voronerf.app.render.paths import capture_path, resized
+from voronerf.app.render.paths import capture_path
 from voronerf.app.render.video import write_video
 from voronerf.app.run import Run
 from voronerf.app.scenes import Scene
@@ -72,19 +72,17 @@ def export_video(
         save_picture(path / f"{number:05d}.png", picture)
 
 
-def video_cameras(scene: Scene, count: int, size: tuple[int, int] | None = None) -> Cameras:
+def video_cameras(scene: Scene, count: int) -> Cameras:
     """The cameras of a video: a turntable of an object, else a path that stays where the training cameras were.
 
     Args:
         scene: Whose training cameras they are like.
         count: Frames.
-        size: (width, height) of the frames; None for those of the training images.
     """
     seen = scene.train.cameras
     if scene.kind == "object":
-        cameras = turntable_cameras(seen, count)
-        return cameras if size is None else resized(cameras, size)
-    return capture_path(seen, count, near=scene.near, far=scene.far, size=size)
+        return turntable_cameras(seen, count)
+    return capture_path(seen, count, near=scene.near, far=scene.far)
 
 
 def check_folder(folder: Path) -> None:

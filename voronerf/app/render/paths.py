@@ -68,8 +68,8 @@ def read_camera_path(file: Path | str) -> CameraPath:
     Positions are those of the scene that is rendered. Crops, times and transitions of the file have no effect.
 
     Raises:
-        ValueError: the file is no such path, of another type of camera than perspective, or too large; it names the
-            file, the frame and the field.
+        ValueError: the file is no such path, of another type of camera than perspective or equirectangular, or too
+            large; it names the file, the frame and the field.
         OSError: it cannot be read.
 
     Examples:
@@ -88,8 +88,8 @@ def read_camera_path(file: Path | str) -> CameraPath:
     if not isinstance(entries, dict) or not isinstance(entries.get("camera_path"), list):
         raise ValueError(f"{file}: is not a camera path: it must have a list camera_path")
     kind = entries.get("camera_type", "perspective")
-    if kind != "perspective":
-        raise ValueError(f"{file}: camera_type must be perspective, got {kind!r:.60}")
+    if kind not in ("perspective", "equirectangular"):
+        raise ValueError(f"{file}: camera_type must be perspective or equirectangular, got {kind!r:.60}")
     sizes = {}
     for name in ("render_width", "render_height"):
         size = entries.get(name)
@@ -99,6 +99,10 @@ def read_camera_path(file: Path | str) -> CameraPath:
     size = sizes["render_width"], sizes["render_height"]
     fps = _number(entries.get("fps", 24), 0.01, 1000, f"{file}: fps")
     frames = _read_cameras(entries["camera_path"], "camera_to_world", size, f"{file}: camera_path")
+    if kind == "equirectangular":
+        if size[0] != 2 * size[1]:
+            raise ValueError(f"{file}: equirectangular frames must be 2 to 1, got {size[0]} x {size[1]}")
+        frames = Cameras.all_around(frames.poses, size[1])
     keyframes = entries.get("keyframes") or None
     if keyframes is not None:
         keyframes = _read_cameras(keyframes, "matrix", size, f"{file}: keyframes")
@@ -170,22 +174,19 @@ def smooth_path(keyframes: Cameras, count: int, *, closed: bool = False) -> Came
     return Cameras(poses.float(), intrinsics, keyframes.width, keyframes.height)
 
 
-def capture_path(
-    cameras: Cameras, count: int, *, near: float, far: float, size: tuple[int, int] | None = None
-) -> Cameras:
+def capture_path(cameras: Cameras, count: int, *, near: float, far: float) -> Cameras:
     """A path that stays where the given cameras were, so that it shows what they have seen.
 
     Cameras that look one way have the spiral of LLFF (Mildenhall et al. 2019): of their extent, it looks at what they
     look at. Those around something have a turn around it, at the mean distance and height of the cameras that are near;
     if they leave a gap, the path goes to its one side and back, without crossing it. Cameras that look outwards have a
-    smooth path through some of them, in their order.
+    smooth path through some of them, in their order. The frames have the size that most of the cameras have.
 
     Args:
         cameras: such as those of the training views; the focal length is their mean.
         count: frames.
         near: where the scene begins along a ray.
         far: where it ends; both say what parallel cameras look at.
-        size: (width, height) of the frames; None for the one that most of the cameras have.
 
     Raises:
         ValueError: no frame.
@@ -211,12 +212,12 @@ def capture_path(
         poses = smooth_path(cameras[some], count).poses
     focal = float(alike.intrinsics[:, :2].mean())
     intrinsics = cameras.intrinsics.new_tensor((focal, focal, alike.width / 2, alike.height / 2)).repeat(count, 1)
-    frames = Cameras(poses.float(), intrinsics, alike.width, alike.height)
-    return frames if size is None else resized(frames, size)
+    return Cameras(poses.float(), intrinsics, alike.width, alike.height)
 
 
 def like_most(cameras: Cameras) -> Cameras:
     """Those of the cameras whose images have the commonest size, without their lenses."""
+    cameras = cameras.perspective()
     sizes = [cameras.size(index) for index in range(len(cameras))]
     width, height = max(sizes, key=sizes.count)
     own = torch.tensor([size == (width, height) for size in sizes], device=cameras.poses.device)
@@ -230,6 +231,23 @@ def resized(cameras: Cameras, size: tuple[int, int]) -> Cameras:
     intrinsics[:, 2] += (size[0] - scale * cameras.width) / 2
     intrinsics[:, 3] += (size[1] - scale * cameras.height) / 2
     return Cameras(cameras.poses, intrinsics, *size)
+
+
+def panoramas(cameras: Cameras, size: tuple[int, int]) -> Cameras:
+    """Cameras at the same places that see all around, z up, in pictures of (width, height), 2 to 1.
+
+    Raises:
+        ValueError: another size.
+    """
+    if size[0] != 2 * size[1]:
+        raise ValueError(f"pictures all around must be 2 to 1, got {size[0]} x {size[1]}")
+    if cameras.models is not None:
+        return Cameras.all_around(cameras.poses, size[1])
+    level = cameras.forward * cameras.forward.new_tensor((1.0, 1.0, 0.0))
+    up = cameras.poses.new_tensor((0.0, 0.0, 1.0))
+    targets = cameras.origins + torch.where(level.norm(dim=-1, keepdim=True) > 1e-3, level, cameras.poses[:, :3, 1])
+    poses = [look_at(origin[None], target, up)[0] for origin, target in zip(cameras.origins, targets)]
+    return Cameras.all_around(torch.stack(poses), size[1])
 
 
 def _spiral(cameras: Cameras, count: int, focus: Tensor | None, near: float, far: float) -> Tensor:

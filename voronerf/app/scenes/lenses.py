@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from voronerf.nerf.cameras import Cameras
-from voronerf.nerf.lenses import FISHEYE, FOV, PERSPECTIVE, unproject
+from voronerf.nerf.lenses import EQUIRECTANGULAR, FISHEYE, FOV, PERSPECTIVE, unproject
 
 
 class Lens(NamedTuple):
@@ -42,6 +42,7 @@ COEFFICIENTS = {
     PERSPECTIVE: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     FISHEYE: ("k1", "k2", "p1", "p2", "k3", "k4", "s1", "s2"),
     FOV: ("omega", *7 * ("",)),
+    EQUIRECTANGULAR: 8 * ("",),
 }
 
 

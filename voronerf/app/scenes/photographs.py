@@ -20,7 +20,7 @@ from torch import Tensor
 from voronerf.app.scenes.carving import carve_box
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import read_images, read_masks
-from voronerf.app.scenes.lenses import FISHEYE, PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
+from voronerf.app.scenes.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
 from voronerf.app.scenes.scene import Scene, SparseDepth, Split
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
 from voronerf.nerf.cameras import Cameras, focus_point
@@ -139,7 +139,8 @@ def photograph_scene(
     alpha = images.shape[-1] == 4 and any(bool((image[..., 3] < 255).any()) for image in images)
 
     poses = torch.stack([view.pose for view in views])
-    kind = _kind(poses, alpha, reading.kind, source)
+    around = any(view.lens.model == EQUIRECTANGULAR for view in views)
+    kind = _kind(poses, alpha, reading.kind, source, around)
     if kind != "object" and images.shape[-1] == 4:
         # its own store: a part of each pixel cannot be drawn from a mapped file without a copy
         opaque = (
@@ -333,14 +334,16 @@ def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
     return torch.stack((x, torch.linalg.cross(z, x), z))
 
 
-def _kind(poses: Tensor, alpha: bool, asked: str, source: Path) -> str:
-    """The kind that was asked for, or the one that alpha and cameras show."""
+def _kind(poses: Tensor, alpha: bool, asked: str, source: Path, around: bool) -> str:
+    """The kind that was asked for, or the one that alpha and cameras show; some may see all around."""
     if asked == "object" and not alpha:
         raise SceneError(f"{source}: --kind object needs images with transparent pixels, these are opaque")
     if asked != "auto":
         return asked
     if alpha:
         return "object"
+    if around:
+        return "inside-out"
     cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
     forward = cameras.forward
     if float(forward.mean(0).norm()) > PARALLEL:

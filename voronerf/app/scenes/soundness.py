@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from voronerf.app.scenes.lenses import Lens
+from voronerf.nerf.lenses import EQUIRECTANGULAR
 
 #: A camera is lost if its nearest neighbour is farther than this many times the median distance between neighbours, and
 #: than this share of the distances between all cameras. The first alone would call all lost that stand beside a burst;
@@ -70,6 +71,8 @@ def camera_faults(
         if far > DEEPEST * near:
             faults.append(f"the points lie at depths from {near:.3g} to {far:.3g}")
     for lens, width in dict.fromkeys(lenses):
+        if lens.model == EQUIRECTANGULAR:
+            continue
         fx, fy, *_ = lens.intrinsics
         if not FOCAL_LENGTHS[0] <= fx / width <= FOCAL_LENGTHS[1]:
             faults.append(f"a focal length of {fx / width:.3g} image widths is unlikely")

@@ -21,7 +21,7 @@ from torch import Tensor
 from voronerf.app.files import leads_outside, read_json, write_text
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import read_header
-from voronerf.app.scenes.lenses import COEFFICIENTS, FISHEYE, FOV, PERSPECTIVE, Lens
+from voronerf.app.scenes.lenses import COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, FOV, PERSPECTIVE, Lens
 from voronerf.app.scenes.photographs import Reading, View, least_factor, photograph_scene
 from voronerf.app.scenes.scene import Scene
 
@@ -36,10 +36,17 @@ LONGEST = 1000
 SPLITS = ("train_filenames", "test_filenames", "val_filenames")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+MODELS = (*PERSPECTIVE_MODELS, *FISHEYE_MODELS, "EQUIRECTANGULAR")
 LENS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "distortion_params", "camera_model", "is_fisheye")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's distortion_params
-# k4 of a perspective camera belongs to r^8 in nerfstudio, and to the divisor in OpenCV.
-UNSUPPORTED = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
+UNSUPPORTED = ("k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
+#: Of the lens models, the distortion that is used.
+KNOWN = {
+    # k4 of a perspective camera belongs to r^8 in nerfstudio, and to the divisor in OpenCV.
+    PERSPECTIVE: (("k1", "k2", "k3", "p1", "p2"), ""),
+    FISHEYE: (("k1", "k2", "k3", "k4"), " of a fisheye"),
+    EQUIRECTANGULAR: ((), " of an EQUIRECTANGULAR image"),
+}
 
 
 class Frame(NamedTuple):
@@ -276,19 +283,25 @@ def _view(frame: Frame, downscale: int) -> View:
     """The view of a frame, with its lens; checks that all of its model is used."""
     values, path = frame.values, frame.source
     model = values.get("camera_model", "OPENCV")
-    if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS:
-        names = ", ".join(PERSPECTIVE_MODELS + FISHEYE_MODELS)
-        raise SceneError(f"{path}: camera model {model!s:.60} is not supported, only {names}")
-    fisheye = model in FISHEYE_MODELS or bool(values.get("is_fisheye"))
-    refused = ("p1", "p2", *UNSUPPORTED[1:]) if fisheye else UNSUPPORTED
-    if used := [key for key in refused if number(values, key, path)]:
-        known = "k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, k3, p1, p2"
-        raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only {known}")
+    if model not in MODELS:
+        raise SceneError(f"{path}: camera model {model!s:.60} is not supported, only {', '.join(MODELS)}")
+    kind = FISHEYE if model in FISHEYE_MODELS or bool(values.get("is_fisheye")) else PERSPECTIVE
+    kind = EQUIRECTANGULAR if model == "EQUIRECTANGULAR" else kind
+    known, whose = KNOWN[kind]
+    if used := [key for key in DISTORTION + UNSUPPORTED if key not in known and number(values, key, path)]:
+        only = f"only {', '.join(known)}{whose}" if known else f"there is none{whose}"
+        raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, {only}")
     width, height = size = read_header(frame.path, downscale).size
     for key, actual in (("w", width), ("h", height)):
         stated = number(values, key, path, positive=True)
         if stated is not None and abs(stated - actual) >= 1:  # exporters that scale images may write fractions
             raise SceneError(f"{frame.path}: is {width} x {height} pixels, but {path} says {key} = {stated:g}")
+    if kind == EQUIRECTANGULAR:  # whose fl_x is half of the width in nerfstudio, and says nothing
+        if width != 2 * height:
+            raise SceneError(f"{frame.path}: an EQUIRECTANGULAR image must be 2 to 1, got {width} x {height} pixels")
+        scale = height / math.pi
+        lens = Lens((scale, scale, width / 2, height / 2), 8 * (0.0,), kind)
+        return View(frame.path, frame.pose, lens, size, frame.mask)
     fx, fy = (
         focal_length(values, f"fl_{axis}", side, path) or focal_length(values, f"camera_angle_{axis}", side, path)
         for axis, side in zip("xy", size)
@@ -298,7 +311,6 @@ def _view(frame: Frame, downscale: int) -> View:
     cx, cy = number(values, "cx", path), number(values, "cy", path)
     intrinsics = (fx or fy or 0, fy or fx or 0, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
-    kind = FISHEYE if fisheye else PERSPECTIVE
     lens = Lens(intrinsics, tuple(given.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
     return View(frame.path, frame.pose, lens, size, frame.mask)
 
@@ -330,7 +342,7 @@ def write_transforms(path: Path, shots: Sequence[Shot]) -> None:
         (fx, fy, cx, cy), coefficients, model = shot.lens
         values = {name: value for name, value in zip(COEFFICIENTS[model], coefficients) if value}
         known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "p1", "p2", "k3")
-        if model == FOV or not values.keys() <= set(known):
+        if model in (FOV, EQUIRECTANGULAR) or not values.keys() <= set(known):
             raise SceneError(f"{path}: the lens of {shot.file} is none that transforms.json has")
         lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": shot.width, "h": shot.height}
         lens |= {name: values.get(name, 0.0) for name in known}

@@ -54,6 +54,7 @@ def make_camera(
 
 def frustum(cameras: Cameras, number: int) -> dict[str, Any]:
     """The arguments of viser's ``add_camera_frustum`` for one of several cameras."""
+    cameras, number = cameras[[number]].perspective(), 0
     pose, (width, height) = cameras.poses[number].double().numpy(), cameras.size(number)
     fov = 2 * math.atan(height / 2 / float(cameras.intrinsics[number, 1]))
     wxyz = SO3.from_matrix(pose[:3, :3] @ FLIP).wxyz

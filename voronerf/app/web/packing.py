@@ -224,10 +224,10 @@ def _check_finite(value: Any) -> None:
 
 def _views(run: Run) -> dict[str, Any]:
     """The training cameras, where the first view stands, and what is cut."""
-    scene, cameras = run.scene, run.scene.train.cameras
+    scene, cameras = run.scene, run.scene.train.cameras.perspective()
     chosen = np.linspace(0, len(cameras) - 1, min(len(cameras), MOST_CAMERAS)).round().astype(int)
     chosen = chosen[_tour(cameras.origins[chosen].numpy())]
-    first = scene.test.cameras if len(scene.test.cameras) else cameras
+    first = scene.test.cameras.perspective() if len(scene.test.cameras) else cameras
     target = focus_point(cameras)
     contraction = scene.contraction
     if scene.box is not None:
