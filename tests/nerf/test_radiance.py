@@ -11,6 +11,7 @@ from torch import nn
 
 from voronerf import MLP, HashGridField, Layer, NeRF, OccupancyGrid, VoronoiRouter
 from voronerf.nerf import Adam, Batch, DirectionPerSample, RayLoss, Rays
+from voronerf.nerf.fields.nerf import MipNeRF
 from voronerf.nerf.fields.radiance import RadianceField
 from voronerf.nerf.occupancy import density_of
 from voronerf.nerf.radiance import Radiance, radiance_of
@@ -271,6 +272,8 @@ def test_what_keeps_a_field_from_the_fast_step():
     table, field = make("table")
     table.module.view.register_forward_hook(lambda module, args, found: found)
     assert why(field) == "NeRF does more than its layer table says"
+    cones = VoronoiRouter(MipNeRF(width=8, depth=1), centres)
+    assert why(cones, first=False) == "the field takes 6 numbers for a sample, and there are 3"
 
 
 def test_explains_the_step_in_one_way(monkeypatch):

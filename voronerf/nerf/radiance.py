@@ -132,6 +132,8 @@ def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], 
         )
     if 0 not in reads:
         return "the field does not depend on positions"
+    if (width := program.inputs[reads.index(0)]) != inputs:
+        return f"the field takes {width} numbers for a sample, and there are {inputs}"
     colour, density = program.outputs
     raw = _raw(program.steps, colour, density)
     before, scale = raw if raw is not None else ([colour, density], None)
