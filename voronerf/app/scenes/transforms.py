@@ -267,12 +267,12 @@ def capture_scene(
         notes.append("its depth images are not used")
     applied = entries.get("applied_transform")
     transform = None if applied is None else pose_of(applied, str(path), "applied_transform")
-    views = [_view(frame, reading.downscale or 1) for frame in frames]
+    views = [_view(frame) for frame in frames]
     factor = reading.downscale or least_factor(max(max(view.size) for view in views))
     return photograph_scene(path, folder, views, held_out, reading, factor=factor, notes=notes, transform=transform)
 
 
-def _view(frame: Frame, downscale: int) -> View:
+def _view(frame: Frame) -> View:
     """The view of a frame, with its lens; checks that all of its model is used."""
     values, path = frame.values, frame.source
     model = values.get("camera_model", "OPENCV")
@@ -284,7 +284,8 @@ def _view(frame: Frame, downscale: int) -> View:
     if used := [key for key in refused if number(values, key, path)]:
         known = "k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, k3, p1, p2"
         raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, only {known}")
-    width, height = size = read_header(frame.path, downscale).size
+    header = read_header(frame.path)
+    width, height = size = header.size
     for key, actual in (("w", width), ("h", height)):
         stated = number(values, key, path, positive=True)
         if stated is not None and abs(stated - actual) >= 1:  # exporters that scale images may write fractions
@@ -300,7 +301,7 @@ def _view(frame: Frame, downscale: int) -> View:
     given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
     kind = FISHEYE if fisheye else PERSPECTIVE
     lens = Lens(intrinsics, tuple(given.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
-    return View(frame.path, frame.pose, lens, size, frame.mask)
+    return View(frame.path, frame.pose, lens, size, frame.mask, header=header)
 
 
 def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
