@@ -1,7 +1,6 @@
 // Each ray depends on itself alone, and one thread sums their losses, so results do not depend on the threads.
 #include "rays/sparse_depth.h"
 
-#include <algorithm>
 #include <cmath>
 #include <stdexcept>
 #include <string>
@@ -37,7 +36,7 @@ float learn_ray(const SparseDepth& in, int64_t begin, int64_t end, float distanc
     const float to_density = -in.deltas[i] / total * (through - (total - static_cast<float>(light)));
     gradient[4 * i + 3] += in.factor * to_density * slope(in, i);
   }
-  return -std::log(std::min(total, 1.0f));
+  return -std::log(total);
 }
 
 }  // namespace

@@ -284,7 +284,7 @@ FAULTS = (
     _python(
         "A checkpoint's sums leave out its values",
         "app/train/checkpoint.py",
-        '        found[_VALUES] = zlib.crc32(metadata["values"].encode())',
+        '        checked[_VALUES] = zlib.crc32(metadata["values"].encode())',
         "        sums.pop(_VALUES, None)",
         "tests/app/train/test_checkpoint.py",
     ),

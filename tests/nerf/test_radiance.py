@@ -101,13 +101,13 @@ def batch_of(rays=64, sparse=0):
     return Batch(Rays(origins, directions), *ends, torch.rand(rays, 3, generator=generator), torch.ones(3), depths)
 
 
-def losses(field, monkeypatch, sparse_depth=0.0, backend="auto"):
+def losses(field, monkeypatch, backend="auto", **terms):
     """The fast step and the separate one, both for all samples."""
     monkeypatch.setattr("voronerf.nerf.loss.HIDDEN", 0.0)
     grid = OccupancyGrid(BOX, 8, threshold=0.1)
     grid.occupied = torch.rand(8, 8, 8, generator=seeded(5)) < 0.7
     fast, separate = (
-        RayLoss(renderer_of({"field": of}, samples=24, occupancy=grid, backend=backend), sparse_depth=sparse_depth)
+        RayLoss(renderer_of({"field": of}, samples=24, occupancy=grid, backend=backend), **terms)
         for of in (field, lambda *given: field(*given))
     )
     return fast, separate
@@ -141,6 +141,21 @@ def test_the_fast_step_is_the_separate_one(name, k, monkeypatch):
 def test_with_points_of_a_sparse_model(name, monkeypatch):
     router, field = make(name)
     compare(router, *losses(field, monkeypatch, sparse_depth=0.3), batch_of(sparse=20))
+
+
+@pytest.mark.parametrize("name", ["softplus", "relu", "table"])
+def test_with_a_term_in_torch(name, monkeypatch):
+    """Of all that a ray shows: the fast step carries it through the outputs of the networks."""
+    router, field = make(name)
+
+    def term(seen, batch):
+        near = (seen.colour - batch.target).abs().mean() + (seen.depth / batch.far).mean()
+        return near + seen.opacity.square().mean() + seen.weights.square().sum() / len(batch.rays)
+
+    fast, separate = losses(field, monkeypatch, term=term, sparse_depth=0.3)
+    compare(router, fast, separate, batch_of(sparse=20))
+    without = losses(field, monkeypatch, sparse_depth=0.3)[0](batch_of(sparse=20), seeded(3))
+    assert fast(batch_of(sparse=20), seeded(3)).loss > without.loss + 0.1
 
 
 @pytest.mark.parametrize("name", ["relu", "one shared", "hash"])

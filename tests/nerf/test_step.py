@@ -253,6 +253,11 @@ def test_what_python_does_is_not_lost():
     training.train(6)
     assert training.sampler.asked == 6
     assert "Counting may do in Python what is not seen" in training.step.explain()
+    training = Training()
+    training.train(2)
+    training.loss.term = lambda seen, batch: seen.opacity.mean()
+    training.train(1)
+    assert "function may do in Python what is not seen" in training.step.explain()
 
 
 class Torch(torch.nn.Module):

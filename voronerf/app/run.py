@@ -16,7 +16,7 @@ from voronerf.app.files import json_text, read_json, write_text
 from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene, load_scene
 from voronerf.app.train.build import make_picture_grid, make_renderer, present_device
-from voronerf.app.train.checkpoint import last_checkpoint
+from voronerf.app.train.checkpoint import is_shown, last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.resume import open_routers, stored_values
 from voronerf.app.train.run_directory import check_folders, check_stored_paths
@@ -176,11 +176,6 @@ def shown_scene(
     return config, scene
 
 
-def _shows(name: str) -> bool:
-    """Whether a tensor of a checkpoint is for pictures, not for training alone."""
-    return not name.startswith("optimizer.") or name.endswith(".average")
-
-
 def open_run(
     path: Path | str,
     *,
@@ -240,7 +235,7 @@ def open_run(
     path = Path(path)
     device = present_device(device)
     check_folders(path)
-    checkpoint = last_checkpoint(path, keep=_shows)
+    checkpoint = last_checkpoint(path, keep=is_shown)
     config, _ = stored_values(checkpoint)
     routers = open_routers(config, checkpoint, device, backend)
     config, scene = shown_scene(path, config, scene, data, downscale, allow_outside)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,13 +14,14 @@ from voronerf.nerf.occupancy import HIDDEN
 from voronerf.nerf.radiance import Radiance, radiance_of, router_of
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.sampling import colour_loss
-from voronerf.nerf.volume import Samples
+from voronerf.nerf.volume import Rendered, Samples, composed
 from voronerf.ops._core import backends
 from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.ops.render_loss import render_loss_gradient
+from voronerf.ops.render_loss.reference import activate
 from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
-from voronerf.ops.sparse_depth_gradient.reference import near_point, sparse_depth_loss
+from voronerf.ops.sparse_depth_gradient.reference import sparse_depth_loss
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,8 @@ class RayLoss:
             (Deng et al. 2022, "Depth-supervised NeRF"); 0 is off.
         robust: Scale of the errors beyond which the loss of a ray is not squared: see `voronerf.ops.render_loss`. What
             differs from picture to picture, such as exposure, is no reason for fog then. 0 is off.
+        term: A further term of the loss, a scalar that torch computes from the rendered rays and their batch. The
+            networks alone learn from it, and a :class:`TrainingStep` with it is not recorded.
 
     Examples:
         >>> import torch
@@ -111,10 +115,18 @@ class RayLoss:
         loss: networks, colours and loss are separate operations
         not faster: empty space is not skipped
         field: forward: fused
+        >>> clear = RayLoss(loss.renderer, term=lambda seen, batch: 0.1 * (seen.opacity * (1 - seen.opacity)).mean())
     """
 
-    def __init__(self, renderer: Renderer, *, sparse_depth: float = 0.0, robust: float = 0.0) -> None:
-        self.renderer, self.sparse_depth, self.robust = renderer, sparse_depth, robust
+    def __init__(
+        self,
+        renderer: Renderer,
+        *,
+        sparse_depth: float = 0.0,
+        robust: float = 0.0,
+        term: Callable[[Rendered, Batch], Tensor] | None = None,
+    ) -> None:
+        self.renderer, self.sparse_depth, self.robust, self.term = renderer, sparse_depth, robust, term
 
     def __call__(
         self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False
@@ -181,22 +193,29 @@ class RayLoss:
                 **field.rule,
                 backend=renderer.backend,
             )
+        if self.term is not None:
+            with torch.enable_grad():
+                raw = tape.raw.detach().requires_grad_()
+                values = activate(raw, **field.rule)
+                seen = composed(*values, batch.far, samples, batch.background, renderer.backend)
+                further = self.term(seen, batch)
+            found.loss.add_(further.detach())
+            gradient.add_(torch.autograd.grad(further, raw)[0])
         if (full := renderer.sampler.space.full_gradient) is not None:
             scale_gradient(gradient, samples.depths, full, backend=renderer.backend)
         loss = tape.backward(found.loss, gradient, defer=not backward)
         return RenderOutput(loss, found.error, found.weights, found.density, samples, found.colour)
 
     def _separate(self, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:
-        given: dict[str, Any] = {"background": batch.background, "jitter": True, "generator": generator}
-        *before, last = self.renderer.render(batch.rays, batch.near, batch.far, **given)
+        *before, last = self.renderer.render(
+            batch.rays, batch.near, batch.far, background=batch.background, jitter=True, generator=generator
+        )
         loss, samples = colour_loss(last.colour, batch.target, self.robust), last.samples
         if self.sparse_depth and batch.sparse_depths is not None:
-            several = len(batch.sparse_depths)
-            known = torch.nn.functional.pad(batch.sparse_depths, (0, len(batch.rays) - several), value=torch.nan)
-            ray = samples.ray_index.long()
-            there = last.weights * near_point(samples.depths, samples.deltas, known[ray])
-            light = torch.zeros_like(known).index_add(0, ray, there)
-            loss = loss + self.sparse_depth * sparse_depth_loss(light[:several]).mean()
+            along = last.weights, samples.depths, samples.deltas, samples.ray_offsets
+            loss = loss + self.sparse_depth * sparse_depth_loss(*along, batch.sparse_depths).mean()
+        if self.term is not None:
+            loss = loss + self.term(last, batch)
         for first in before:
             loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
         error = (last.colour.detach() - batch.target).square().sum(-1)

@@ -153,8 +153,7 @@ def union_depths(
 
 def colour_loss(colour: Tensor, target: Tensor, robust: float = 0.0) -> Tensor:
     """The mean squared error of colours [r, 3] (NeRF, equation 6), or the robust one of `voronerf.ops.render_loss`."""
-    off = (colour - target).square()
-    return robust_error(off.sum(-1), robust).mean() / 3 if robust else off.mean()
+    return robust_error((colour - target).square().sum(-1), robust).mean() / 3
 
 
 def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:

@@ -356,7 +356,7 @@ class TrainingStep:
             return "it runs under autocast"
         if self.batches.fetch is not None:
             return "its pictures are read from disk"
-        for part in (self.batches, self.loss, renderer.sampler, self.optimizer, self.strategy):
+        for part in (self.batches, self.loss, self.loss.term, renderer.sampler, self.optimizer, self.strategy):
             if part is not None and not type(part).__module__.startswith("voronerf."):
                 return f"{type(part).__name__} may do in Python what is not seen"
         return self.loss.why_not_fused()

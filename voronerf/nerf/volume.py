@@ -184,7 +184,13 @@ def render_samples(
         background: [3] or [r, 3]; None is black.
         backend: Of the composite op.
     """
-    rgb, density = ask(field, rays, samples, space)
+    return composed(*ask(field, rays, samples, space), far, samples, background, backend)
+
+
+def composed(
+    rgb: Tensor, density: Tensor, far: Tensor, samples: Samples, background: Tensor | None, backend: str
+) -> Rendered:
+    """Colours of rays from colours [m, 3] and densities [m] of samples; the rest as for `render_samples`."""
     along = (samples.by_ray(values) for values in (density, rgb, samples.depths, samples.deltas))
     offsets = samples.ray_offsets if samples.edges is None else None
     found = composite(*along, ray_offsets=offsets, background=background, backend=backend)

@@ -17,18 +17,17 @@ import torch
 from torch import Tensor
 
 from voronerf.app.files import json_text, write_text
-from voronerf.app.run import open_run
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import read_scene, write_scene
 from voronerf.app.scenes.scene import Split
-from voronerf.app.train.build import PICTURE_POINTS, PICTURE_RESOLUTION, make_picture_grid
-from voronerf.app.train.checkpoint import checkpoint_paths, last_checkpoint
+from voronerf.app.train.build import PICTURE_POINTS, PICTURE_RESOLUTION, make_picture_grid, make_renderer
+from voronerf.app.train.checkpoint import checkpoint_paths, is_shown, last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.occupancy import PICTURE_OPACITY, OccupancyGrid
 from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.network import Network, config_of, is_shown
+from voronerf.town.network import Network, config_of
 from voronerf.town.parts import Part, Parts
 from voronerf.town.run import TOWN, is_town, open_parts, write_parts
 
@@ -53,7 +52,7 @@ class Source:
         """The source in a run directory. Of its networks the field alone is taken."""
         run = Path(run)
         name, record = run.name, run / "scene.json"
-        checkpoint = last_checkpoint(run, keep=lambda tensor: is_shown(tensor) or not tensor.startswith("optimizer."))
+        checkpoint = last_checkpoint(run, keep=is_shown)
         if not record.is_file():
             raise ConfigError(f"{run}: must hold a run with the record of its scene, scene.json")
         config, scene, state = config_of(checkpoint), read_scene(record), checkpoint.group("occupancy")
@@ -75,7 +74,7 @@ class Source:
             region = [Solid.box(low, high)]
             if grid is None:
                 config = replace(config, sampling="stratified")
-                grid = make_picture_grid(config, scene, open_run(run, scene=scene).renderer)
+                grid = make_picture_grid(config, scene, make_renderer(config, scene, {"field": network.router}))
         return cls(name, config, scene, Parts([Part([network], region=region)]), grid)
 
 

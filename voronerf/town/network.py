@@ -42,13 +42,9 @@ class Network:
 
     def stored(self) -> Checkpoint:
         """The checkpoint without what only a training needs."""
-        tensors = {name: tensor.cpu() for name, tensor in self.checkpoint.tensors.items() if is_shown(name)}
+        shown = {k: v for k, v in self.checkpoint.tensors.items() if k.startswith("router") or k.endswith(".average")}
+        tensors = {name: tensor.cpu() for name, tensor in shown.items()}
         return Checkpoint(tensors, {"config": self.checkpoint.values["config"]})
-
-
-def is_shown(name: str) -> bool:
-    """Whether a tensor of a checkpoint says what networks show, and is not for training alone."""
-    return name.startswith("router") or name.endswith(".average")
 
 
 def config_of(checkpoint: Checkpoint) -> TrainConfig:

@@ -24,6 +24,7 @@ from voronerf.app.train.checkpoint import (
     Checkpoint,
     CheckpointError,
     checkpoint_path,
+    is_shown,
     last_checkpoint,
     load_checkpoint,
     save_checkpoint,
@@ -37,7 +38,7 @@ from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy, Sampler, Stratified
 from voronerf.nerf.volume import Space
 from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.network import Network, config_of, is_shown
+from voronerf.town.network import Network, config_of
 from voronerf.town.parts import Part, Parts
 
 #: The file by which the directory of a run of several parts is told.
@@ -160,7 +161,7 @@ def open_run(
     path = Path(path)
     device = present_device(device)
     check_folders(path)
-    checkpoint = last_checkpoint(path)
+    checkpoint = last_checkpoint(path, keep=is_shown)
     config = config_of(checkpoint)
     config, scene = shown_scene(path, config, scene, data, downscale, allow_outside)
     scene = _in_place(scene, read_scene(path / "scene.json"))

@@ -62,7 +62,7 @@ def test_downscale(tmp_path):
     for size in ("0", "1601", "00400", "4e2", "-4"):
         fails(f"builtin:{size}", "size must be 1 to 1600 pixels")
     write_noise(tmp_path)
-    fails(tmp_path, "0.png", "downscaling by 7 leaves no pixel of 8 x 6", downscale=7)
+    fails(tmp_path, "1.png", "downscaling by 7 leaves no pixel of 8 x 6", downscale=7)
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def test_what_is_written_is_read(tmp_path, scene, contraction) -> None:
     [
         (lambda values: values.pop("near"), "near"),
         (lambda values: values.update(near=3.0, far=2.0), "near and far must satisfy 0 <= near < far, got 3.0 and 2.0"),
-        (lambda values: values.update(spacing="odd"), "spacing must be one of"),
+        (lambda values: values.update(kind="odd"), "kind must be one of"),
         (lambda values: values.update(box=[[0, 0, 0], [1, -1, 1]]), "box must be its lowest and highest corner"),
         (lambda values: values["train"].update(poses=[[1.0]]), "poses must have shape [c, 4, 4], got [1, 1]"),
         (lambda values: values["train"].update(poses=[float("nan")]), "poses must be finite"),

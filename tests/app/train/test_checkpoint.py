@@ -76,7 +76,11 @@ def test_tensors_are_pages_of_files(tmp_path):
     found = load_checkpoint(tmp_path / "whole").tensors
     assert anonymous_memory() - before < x.nbytes / 4
     assert found["x"].equal(x) and found["y"].equal(y)
-    assert load_checkpoint(tmp_path / "whole", keep=lambda entry: entry != "x").tensors.keys() == {"y"}
+    data = bytearray((tmp_path / "whole").read_bytes())
+    data[-x.nbytes // 2] ^= 1  # within x, the larger
+    (tmp_path / "damaged").write_bytes(data)
+    refuses("damaged: a damaged checkpoint, x has", load_checkpoint, tmp_path / "damaged", error=CheckpointError)
+    assert load_checkpoint(tmp_path / "damaged", keep=lambda entry: entry != "x").tensors.keys() == {"y"}
 
 
 def test_a_single_changed_bit_is_found(tmp_path):

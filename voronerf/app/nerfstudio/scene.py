@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from nerfstudio.cameras.cameras import Cameras as TheirCameras
 from torch import Tensor
@@ -31,12 +33,11 @@ def scene_of(cameras: TheirCameras, box: Tensor, *, contracted: bool) -> Scene:
     intrinsics = torch.cat((cameras.fx, cameras.fy, cameras.cx, cameras.cy), dim=-1).cpu()
     ours = Cameras(poses, intrinsics, int(cameras.width.max()), int(cameras.height.max()))
     views = Split(ours, torch.empty(0, ours.height, ours.width, 3, dtype=torch.uint8), ())
+    about: dict[str, Any] = {"name": "nerfstudio", "train": views, "test": views}
     if not contracted:
         box = box.cpu().float()
         far = float((ours.origins - box.mean(0)).norm(dim=-1).max() + (box[1] - box[0]).norm())
-        return Scene("nerfstudio", views, views, 0.0, far, box, "linear", None)
+        return Scene(near=0.0, far=far, box=box, **about)
     frame = find_frame(poses.double(), "unbounded", normalise=False)
     sphere = Contraction(frame.centre.float(), frame.radius)
-    return Scene(
-        "nerfstudio", views, views, frame.near, frame.far, None, "disparity", None, kind="unbounded", contraction=sphere
-    )
+    return Scene(near=frame.near, far=frame.far, kind="unbounded", contraction=sphere, **about)

@@ -65,17 +65,8 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     train = _split(train_frames, images[:count], sizes[:count], downscale, on_disk)
     test = _split(test_frames, images[count:], sizes[count:], downscale, on_disk)
     box = carve_box(train.cameras, train.images[..., 3], near, far) if images.shape[-1] == 4 else None
-    return Scene(
-        folder.resolve().name,
-        train,
-        test,
-        near,
-        far,
-        box,
-        "linear",
-        "white",
-        notes=("Blender scene, an object on white",),
-    )
+    name, notes = folder.resolve().name, ("Blender scene, an object on white",)
+    return Scene(name=name, train=train, test=test, near=near, far=far, box=box, background="white", notes=notes)
 
 
 def _split(frames: Sequence[Frame], images: torch.Tensor, sizes: torch.Tensor, downscale: int, on_disk: bool) -> Split:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import math
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
@@ -38,13 +40,19 @@ BAND = 2**20
 
 
 class Header(NamedTuple):
-    """What an image file says of itself: (width, height), an alpha channel, bytes of memory to decode it, and by how
-    many quarters its orientation tag turns it anticlockwise."""
+    """What an image file says of itself: (width, height), an alpha channel, bytes of a decoded pixel, whether
+    it is JPEG, and by how many quarters its orientation tag turns it anticlockwise."""
 
     size: tuple[int, int]
     alpha: bool
-    decoded: int
+    depth: int
+    jpeg: bool
     turns: int
+
+    def decoded(self, factor: int) -> int:
+        """Bytes of memory to decode it."""
+        width, height = (-(-side // _reduction(self.jpeg, factor)) for side in self.size)
+        return width * height * self.depth
 
 
 def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
@@ -72,18 +80,15 @@ def area_average(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     return np.rint(values).clip(0, 255).astype(np.uint8)
 
 
-def read_header(path: Path, factor: int) -> Header:
+def read_header(path: Path) -> Header:
     """Reads the header of an image file, without its pixels."""
     with _opened(path) as file:
-        size, alpha, turns = file.size, _has_alpha(file), 0
-        if file.format == "JPEG":  # of PNG, Pillow would decode the pixels
+        jpeg, turns = file.format == "JPEG", 0
+        if jpeg:  # of PNG, Pillow would decode the pixels
             with contextlib.suppress(*UNREADABLE):  # a broken tag is none
                 turns = TURNS.get(file.getexif().get(ExifTags.Base.Orientation, 1), 0)
-        if factor > min(size):
-            raise SceneError(f"{path}: downscaling by {factor} leaves no pixel of {size[0]} x {size[1]}")
-        _reduce_while_decoding(file, factor)
         # Pillow keeps colours in four bytes a pixel.
-        return Header(size, alpha, file.width * file.height * (1 if len(file.getbands()) == 1 else 4), turns)
+        return Header(file.size, _has_alpha(file), 1 if len(file.getbands()) == 1 else 4, jpeg, turns)
 
 
 def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
@@ -129,6 +134,7 @@ def read_images(
     paths: Sequence[Path],
     factor: int,
     *,
+    headers: Sequence[Header | None] = (),
     keep: str = "auto",
     name: str = "images",
     most_channels: int = 4,
@@ -138,20 +144,24 @@ def read_images(
 
     Args:
         paths: at least one file.
+        headers: of those that were looked at already, with None for others.
         factor: of the reduction, >= 1.
         keep: in "memory"; on "disk", see `voronerf.app.scenes.store`; or "auto": on disk what does not fit into memory.
         name: of the scene.
         most_channels: 3 leaves alpha out.
         upright: turn images by their orientation tags.
     """
-    headers = [read_header(path, factor) for path in paths]
-    sizes = torch.tensor([header.size for header in headers])
-    turns = [header.turns if upright else 0 for header in headers]
+    seen = [header or read_header(path) for path, header in itertools.zip_longest(paths, headers)]
+    for path, header in zip(paths, seen):
+        if factor > min(header.size):
+            raise SceneError(f"{path}: downscaling by {factor} leaves no pixel of {header.size[0]} x {header.size[1]}")
+    sizes = torch.tensor([header.size for header in seen])
+    turns = [header.turns if upright else 0 for header in seen]
     size = _turned(sizes, turns).amax(0).tolist()
     differ = bool((sizes != sizes[:1]).any())
-    channels = min(4 if any(header.alpha for header in headers) else 3, most_channels)
+    channels = min(4 if any(header.alpha for header in seen) else 3, most_channels)
     shape = (len(paths), size[1] // factor, size[0] // factor, channels)
-    decoded = max(header.decoded for header in headers)
+    decoded = max(header.decoded(factor) for header in seen)
     threads = max(1, min(THREADS, IN_HAND // decoded))
     pixels = shape[1] * shape[2]
     needed, free = len(paths) * pixels * channels + max(decoded, pixels * VIEW), available_memory()
@@ -277,9 +287,12 @@ def _has_alpha(file: Image.Image) -> bool:
 
 def _reduce_while_decoding(file: Image.Image, factor: int) -> int:
     """Lets a JPEG file be decoded in a part of its size; returns the factor that is left."""
-    if file.format != "JPEG" or factor % 2:
-        return factor
-    size = file.size
-    step = next(step for step in (8, 4, 2) if factor % step == 0)
-    file.draft("RGB", (size[0] // step, size[1] // step))
+    size, step = file.size, _reduction(file.format == "JPEG", factor)
+    if step > 1:
+        file.draft("RGB", (size[0] // step, size[1] // step))
     return factor if file.size == size else factor // step
+
+
+def _reduction(jpeg: bool, factor: int) -> int:
+    """By how much a file can be reduced while it is decoded."""
+    return math.gcd(factor, 8) if jpeg else 1

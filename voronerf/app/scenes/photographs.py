@@ -7,6 +7,7 @@ camera is at distance 1.
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from voronerf.app.scenes.carving import carve_box
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.images import read_images, read_masks
+from voronerf.app.scenes.images import Header, read_images, read_masks
 from voronerf.app.scenes.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
 from voronerf.app.scenes.scene import Scene, SparseDepth, Split
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
@@ -53,7 +54,8 @@ KIND_LINES = {
 
 class View(NamedTuple):
     """A photograph: its file, its pose float64 [4, 4], camera to world, its lens and the (width, height) that this is
-    for; and where known its mask, the depths between which its points lie, and the points float64 [s, 3] themselves."""
+    for; and where known its mask, the depths between which its points lie, these points float64 [s, 3], and the
+    header of the file."""
 
     path: Path
     pose: Tensor
@@ -62,6 +64,7 @@ class View(NamedTuple):
     mask: Path | None = None
     bounds: tuple[float, float] | None = None
     points: Tensor | None = None
+    header: Header | None = None
 
 
 @dataclass(frozen=True)
@@ -125,72 +128,88 @@ def photograph_scene(
     if not reading.keep_far:
         views = [view for view, left_out in zip(views, lost.tolist()) if not left_out]
         held_out = None if held_out is None else held_out[~lost]
-    if held_out is None:
-        held_out = torch.arange(len(views)) % HOLD_OUT == 0
-    if len(views) < 2 or not bool(held_out.any()) or bool(held_out.all()):
-        raise SceneError(f"{source}: one image is too few, one is held out for testing")
-    # Training views first, so that the images of either part are a slice and no copy.
-    order = torch.cat(((~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0])).tolist()
-    views, count = [views[index] for index in order], int((~held_out).sum())
-    paths = [view.path for view in views]
+    views, count = _training_first(views, held_out, source)
     name = folder.resolve().name
-    images, sizes, on_disk, turns = read_images(paths, factor, keep=reading.images, name=name, upright=True)
-    masks = read_masks([view.mask for view in views], paths, sizes, factor, on_disk=on_disk, name=name, turns=turns)
-    alpha = images.shape[-1] == 4 and any(bool((image[..., 3] < 255).any()) for image in images)
-
-    poses = torch.stack([view.pose for view in views])
-    around = any(view.lens.model == EQUIRECTANGULAR for view in views)
-    kind = _kind(poses, alpha, reading.kind, source, around)
-    if kind != "object" and images.shape[-1] == 4:
-        # its own store: a part of each pixel cannot be drawn from a mapped file without a copy
-        opaque = (
-            read_images(paths, factor, keep="disk", name=name, most_channels=3, upright=True).images
-            if on_disk
-            else None
-        )
-        images = images[..., :3].contiguous() if opaque is None else opaque
+    pictures = _read_pictures(views, factor, reading, source, name)
     bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64)
-    upright = _turned(Cameras(poses, torch.ones(len(poses), 4), 1, 1), turns).poses
+    poses, kind = _poses(views), pictures.kind
+    upright = _turned(Cameras(poses, torch.ones(len(poses), 4), 1, 1), pictures.turns).poses
     frame = find_frame(upright, kind, bounds if len(bounds) else None, normalise=reading.normalise)
-    cameras = _cameras(frame.poses(poses), views, sizes, source)
+    cameras = _cameras(frame.poses(poses), views, pictures.sizes, source)
     contraction = _contraction(kind, frame, cameras)
     # Last, since the rows and columns that a reduction drops are those of the files.
-    cameras = _turned(cameras.downscaled(factor), turns)
+    cameras = _turned(cameras.downscaled(factor), pictures.turns)
     try:
         _ = cameras.lenses
     except ValueError as error:
         raise SceneError(f"{source}: {error}") from None
-    masks = _without_dark_corners(cameras, masks, source, views)
-    near, far, box = frame.near, frame.far, None
-    if kind == "object":
-        box = carve_box(cameras[:count], images[:count, ..., 3], near, far)
-
-    names = tuple(distinct_names(paths, folder))
-    parts = [
-        Split(cameras[part], images[part], names[part], None if masks is None else masks[part], on_disk)
+    masks = _without_dark_corners(cameras, pictures.masks, source, views)
+    names = tuple(distinct_names([view.path for view in views], folder))
+    train, test = (
+        Split(
+            cameras[part], pictures.images[part], names[part], None if masks is None else masks[part], pictures.on_disk
+        )
         for part in (slice(count), slice(count, None))
-    ]
-    parts[0] = replace(parts[0], sparse_depth=find_depths(parts[0], views[:count], frame))
+    )
+    is_object = kind == "object"
     faults = camera_faults(places, bounds, ((view.lens, view.size[0]) for view in views))
     notes = [*notes, _note(kind, frame, reading), *(f"check the cameras: {fault}" for fault in faults)]
     if reading.downscale is None and factor > 1:
         size = f"{cameras.width} x {cameras.height}"
         notes.append(f"images are reduced by {factor}, to {size} (--downscale 1 keeps their size)")
-    to_scene = frame.matrix if transform is None else frame.matrix @ transform
     return Scene(
-        name,
-        parts[0],
-        parts[1],
-        near,
-        far,
-        box,
-        "linear" if kind == "object" else "disparity",
-        "white" if kind == "object" else None,
-        kind,
-        contraction,
-        to_scene,
-        tuple(notes),
+        name=name,
+        train=replace(train, sparse_depth=find_depths(train, views[:count], frame)),
+        test=test,
+        near=frame.near,
+        far=frame.far,
+        box=carve_box(train.cameras, train.images[..., 3], frame.near, frame.far) if is_object else None,
+        background="white" if is_object else None,
+        kind=kind,
+        contraction=contraction,
+        transform=frame.matrix if transform is None else frame.matrix @ transform,
+        notes=tuple(notes),
     )
+
+
+def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path) -> tuple[list[View], int]:
+    """The training views and then the others, so that the images of both are slices and no copies; how many train."""
+    if held_out is None:
+        held_out = torch.arange(len(views)) % HOLD_OUT == 0
+    order = held_out.int().argsort(stable=True).tolist()
+    count = int((~held_out).sum())
+    if not 0 < count < len(views):
+        raise SceneError(f"{source}: one image is too few, one is held out for testing")
+    return [views[index] for index in order], count
+
+
+class Pictures(NamedTuple):
+    """The images and masks of views, see `read_images`, and the kind of scene that they show."""
+
+    images: Tensor
+    masks: Tensor | None
+    sizes: Tensor
+    turns: list[int]
+    on_disk: bool
+    kind: str
+
+
+def _read_pictures(views: Sequence[View], factor: int, reading: Reading, source: Path, name: str) -> Pictures:
+    """Reads the image files of views; alpha stays where an object stands on white."""
+    paths, headers = [view.path for view in views], [view.header for view in views]
+    read = functools.partial(read_images, paths, factor, headers=headers, name=name, upright=True)
+    images, sizes, on_disk, turns = read(keep=reading.images)
+    masks = read_masks([view.mask for view in views], paths, sizes, factor, on_disk=on_disk, name=name, turns=turns)
+    alpha = images.shape[-1] == 4 and any(bool((image[..., 3] < 255).any()) for image in images)
+    kind = _kind(views, alpha, reading.kind, source)
+    if kind != "object" and images.shape[-1] == 4:
+        # On disk they are stored again: a part of each pixel cannot be drawn from a mapped file without a copy.
+        images = read(keep="disk", most_channels=3).images if on_disk else images[..., :3].contiguous()
+    return Pictures(images, masks, sizes, turns, on_disk, kind)
+
+
+def _poses(views: Sequence[View]) -> Tensor:
+    return torch.stack([view.pose for view in views])
 
 
 def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
@@ -334,16 +353,17 @@ def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
     return torch.stack((x, torch.linalg.cross(z, x), z))
 
 
-def _kind(poses: Tensor, alpha: bool, asked: str, source: Path, around: bool) -> str:
-    """The kind that was asked for, or the one that alpha and cameras show; some may see all around."""
+def _kind(views: Sequence[View], alpha: bool, asked: str, source: Path) -> str:
+    """The kind that was asked for, or the one that alpha and cameras show."""
     if asked == "object" and not alpha:
         raise SceneError(f"{source}: --kind object needs images with transparent pixels, these are opaque")
     if asked != "auto":
         return asked
     if alpha:
         return "object"
-    if around:
+    if any(view.lens.model == EQUIRECTANGULAR for view in views):
         return "inside-out"
+    poses = _poses(views)
     cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
     forward = cameras.forward
     if float(forward.mean(0).norm()) > PARALLEL:

@@ -167,7 +167,7 @@ def process(
     if not (images := out / "images").is_dir():
         _gather(source, out, frames, say)
     files = listed_images(images)
-    shared = len({read_header(path, 1).size for path in files}) == 1
+    shared = len({read_header(path).size for path in files}) == 1
     say(f"{len(files)} images with {'one camera' if shared else 'a camera each'}; {work} keeps what COLMAP finds")
     stages = Stages(pycolmap, work, images, progress)
     _match(stages, [path.name for path in files], settings, shared)
@@ -242,7 +242,7 @@ def _gather(source: Path, out: Path, frames: int, say: Callable[[str], None]) ->
                 if path in phone:
                     _convert_heif(path, copy)
                 else:
-                    read_image(path, min(8, *read_header(path, 1).size))  # COLMAP would take one that is cut off
+                    read_image(path, min(8, *read_header(path).size))  # COLMAP would take one that is cut off
                     shutil.copyfile(path, copy)
         else:
             _take_frames(source, part, frames)
@@ -522,7 +522,7 @@ def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
 
 def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
     """Writes the images reduced by area, unless they are there or would be too small."""
-    if folder.is_dir() or max(max(read_header(path, 1).size) for path in files) // factor < LEAST_SIDE:
+    if folder.is_dir() or max(max(read_header(path).size) for path in files) // factor < LEAST_SIDE:
         return
     part = _emptied(folder.with_name(f".{folder.name}"))
     for path in files:

@@ -20,7 +20,7 @@ from voronerf.nerf.contraction import Contraction, Perspective
 
 CONTRACTIONS = {"sphere": Contraction, "perspective": Perspective}
 #: What a text of a scene may be.
-WORDS = {"spacing": ("linear", "disparity"), "background": ("white", None), "kind": KINDS}
+WORDS = {"background": ("white", None), "kind": KINDS}
 INTEGERS = {"sizes": torch.int64, "models": torch.int32}
 
 
@@ -80,9 +80,8 @@ def read_scene(path: Path) -> Scene:
             raise ValueError("box must be its lowest and highest corner")
         transform = _tensor("transform", values["transform"], torch.float64)
         train, test = _split(values["train"]), _split(values["test"])
-        return Scene(
-            str(values["name"]), train, test, near, far, box, contraction=contraction, transform=transform, **words
-        )
+        space: dict[str, Any] = {"near": near, "far": far, "box": box, "contraction": contraction}
+        return Scene(name=str(values["name"]), train=train, test=test, transform=transform, **space, **words)
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RuntimeError) as error:
         raise SceneError(f"{path}: is not the record of a scene: {error}") from None
 

@@ -81,7 +81,7 @@ class Split:
         return None if self.masks is None else self.masks[index, :height, :width]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
     """Training and test views of the same space.
 
@@ -92,7 +92,6 @@ class Scene:
         near: distance along a ray at which the scene begins.
         far: distance along a ray at which the scene ends.
         box: float32 [2, 3], lowest and highest corner of an axis-aligned box around everything, or None if unknown.
-        spacing: of the samples along a ray, "linear" or "disparity".
         background: "white" behind transparent pixels; None for an opaque capture without a background.
         kind: one of `KINDS`.
         contraction: what makes the space of a scene without a box finite, or None: the sphere around the origin and all
@@ -113,13 +112,17 @@ class Scene:
     test: Split
     near: float
     far: float
-    box: Tensor | None
-    spacing: str
-    background: str | None
+    box: Tensor | None = None
+    background: str | None = None
     kind: str = "object"
     contraction: Contraction | Perspective | None = None
     transform: Tensor | None = None
     notes: tuple[str, ...] = ()
+
+    @property
+    def spacing(self) -> str:
+        """Of the samples along a ray: "linear" through an object, else "disparity"."""
+        return "linear" if self.kind == "object" else "disparity"
 
     def background_colour(self, device: torch.device | str = "cpu") -> Tensor | None:
         """The background as float32 [3] in 0..1, or None."""

@@ -274,12 +274,12 @@ def capture_scene(
         notes.append("its depth images are not used")
     applied = entries.get("applied_transform")
     transform = None if applied is None else pose_of(applied, str(path), "applied_transform")
-    views = [_view(frame, reading.downscale or 1) for frame in frames]
+    views = [_view(frame) for frame in frames]
     factor = reading.downscale or least_factor(max(max(view.size) for view in views))
     return photograph_scene(path, folder, views, held_out, reading, factor=factor, notes=notes, transform=transform)
 
 
-def _view(frame: Frame, downscale: int) -> View:
+def _view(frame: Frame) -> View:
     """The view of a frame, with its lens; checks that all of its model is used."""
     values, path = frame.values, frame.source
     model = values.get("camera_model", "OPENCV")
@@ -291,7 +291,8 @@ def _view(frame: Frame, downscale: int) -> View:
     if used := [key for key in DISTORTION + UNSUPPORTED if key not in known and number(values, key, path)]:
         only = f"only {', '.join(known)}{whose}" if known else f"there is none{whose}"
         raise SceneError(f"{path}: lens distortion {', '.join(used)} is not supported, {only}")
-    width, height = size = read_header(frame.path, downscale).size
+    header = read_header(frame.path)
+    width, height = size = header.size
     for key, actual in (("w", width), ("h", height)):
         stated = number(values, key, path, positive=True)
         if stated is not None and abs(stated - actual) >= 1:  # exporters that scale images may write fractions
@@ -301,7 +302,7 @@ def _view(frame: Frame, downscale: int) -> View:
             raise SceneError(f"{frame.path}: an EQUIRECTANGULAR image must be 2 to 1, got {width} x {height} pixels")
         scale = height / math.pi
         lens = Lens((scale, scale, width / 2, height / 2), 8 * (0.0,), kind)
-        return View(frame.path, frame.pose, lens, size, frame.mask)
+        return View(frame.path, frame.pose, lens, size, frame.mask, header=header)
     fx, fy = (
         focal_length(values, f"fl_{axis}", side, path) or focal_length(values, f"camera_angle_{axis}", side, path)
         for axis, side in zip("xy", size)
@@ -312,7 +313,7 @@ def _view(frame: Frame, downscale: int) -> View:
     intrinsics = (fx or fy or 0, fy or fx or 0, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
     lens = Lens(intrinsics, tuple(given.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
-    return View(frame.path, frame.pose, lens, size, frame.mask)
+    return View(frame.path, frame.pose, lens, size, frame.mask, header=header)
 
 
 def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:

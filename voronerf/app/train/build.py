@@ -7,6 +7,7 @@ import functools
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -73,9 +74,9 @@ def build(
     """
     config = resolve(replace(config, device=present_device(config.device)), scene, speed)
     if config.parameters is not None:
-        config = replace(config, width=solve_width(config, config.parameters))
-        if config.lr is None:
-            config = replace(config, lr=config.field_type.learning_rate(config.network_options))
+        width = solve_width(config, config.parameters)
+        lr = config.field_type.learning_rate({**config.network_options, "width": width})
+        config = replace(config, width=width, lr=lr if config.lr is None else config.lr)
     check_memory(config)
     device = torch.device(config.device)
     check_backend(config, device)
@@ -232,9 +233,15 @@ def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> 
     return grid
 
 
-def parameter_shapes(config: TrainConfig) -> dict[str, tuple[torch.Size, bool]]:
-    """The shape of each parameter of a network, and whether all cells share it; without memory for any of them."""
-    make, share = functools.partial(config.field_type.build, config.network_options), config.field_type.router_options
+def parameter_shapes(config: TrainConfig, **options: Any) -> dict[str, tuple[torch.Size, bool]]:
+    """The shape of each parameter of a network, and whether all cells share it; without memory for any of them.
+
+    Args:
+        config: The settings.
+        options: Of the network, in the place of those of the settings.
+    """
+    kind = config.field_type
+    make, share = functools.partial(kind.build, {**config.network_options, **options}), kind.router_options
     network: nn.Module
     try:
         with torch.device("meta"):
@@ -250,9 +257,8 @@ def parameter_shapes(config: TrainConfig) -> dict[str, tuple[torch.Size, bool]]:
 
 def count_parameters(config: TrainConfig, width: int | None = None) -> int:
     """Parameters of all networks of all final cells, with another width than the configured one where given."""
-    if width is not None:
-        config = replace(config, width=width)
-    shapes, cells = parameter_shapes(config).values(), config.final_cells
+    options = {} if width is None else {"width": width}
+    shapes, cells = parameter_shapes(config, **options).values(), config.final_cells
     each = sum((1 if shared else cells) * shape.numel() for shape, shared in shapes)
     return each * len(SAMPLERS[config.sampling].networks(config.field_type.cones))
 

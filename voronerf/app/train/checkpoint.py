@@ -116,6 +116,11 @@ def _all(name: str) -> bool:
     return True
 
 
+def is_shown(name: str) -> bool:
+    """Whether a tensor is for pictures, and not for training alone."""
+    return name.startswith(("router", "part-", "occupancy.")) or name.endswith(".average")
+
+
 def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:
     """The last checkpoint of a run that can be read; a warning tells of those passed over.
 
@@ -158,7 +163,7 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
 
     Args:
         path: The file.
-        keep: Which tensors, by their names, are asked for. All are checked.
+        keep: Which tensors, by their names, are read and checked. None of the others may be missing.
     """
     if not path.is_file():
         raise CheckpointError(f"{path}: there is no checkpoint")
@@ -171,15 +176,15 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
             if metadata.get("format") != FORMAT:
                 raise CheckpointError(f"{path}: not a {FORMAT} file, its format is {metadata.get('format')!r}")
             sums = parse_json(metadata["checksums"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        found = {name: _checksum(tensor) for name, tensor in tensors.items()}
-        found[_VALUES] = zlib.crc32(metadata["values"].encode())
-        for name in sorted(sums.keys() | found.keys()):
-            if sums.get(name) != found.get(name):
-                what = "has another checksum" if name in found else "is missing"
-                raise CheckpointError(f"{path}: a damaged checkpoint, {name} {what}")
-        values = parse_json(metadata["values"])
-        return Checkpoint({name: tensor for name, tensor in tensors.items() if keep(name)}, values, str(path))
+            names = [*file.keys()]
+            tensors = {name: file.get_tensor(name) for name in names if keep(name)}
+        if missing := sorted(sums.keys() ^ {*names, _VALUES}):
+            raise CheckpointError(f"{path}: a damaged checkpoint, {missing[0]} or its checksum is missing")
+        checked = {name: _checksum(tensor) for name, tensor in tensors.items()}
+        checked[_VALUES] = zlib.crc32(metadata["values"].encode())
+        if wrong := sorted(name for name, checksum in checked.items() if checksum != sums[name]):
+            raise CheckpointError(f"{path}: a damaged checkpoint, {wrong[0]} has another checksum")
+        return Checkpoint(tensors, parse_json(metadata["values"]), str(path))
     except CheckpointError:
         raise
     except (SafetensorError, ValueError, KeyError, AttributeError, OSError) as error:

@@ -36,47 +36,50 @@ def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfi
     depend on it, since the same seed should give the same networks everywhere.
     """
     kind, boxed = config.field_type, scene.box is not None
-    if config.contraction == "auto":
-        if kind.scene_options is None or boxed:
-            config = replace(config, contraction="none")
-        else:
-            forward = isinstance(scene.contraction, Perspective)
-            config = replace(config, contraction="ndc" if forward else "sphere")
-    contracted = config.contraction != "none"
-    space = scene.space(config.contraction, cones=kind.cones)
+    contraction, sparse_depth, rays, samples = config.contraction, config.sparse_depth, config.rays, config.samples
+    if contraction == "auto":
+        forward = isinstance(scene.contraction, Perspective)
+        contraction = "none" if kind.scene_options is None or boxed else "ndc" if forward else "sphere"
+    contracted = contraction != "none"
+    space = scene.space(contraction, cones=kind.cones)
     pixel = scene.pixel(space)
-    if config.occupancy and (why_no_occupancy(config) is not None or not (boxed or contracted)):
-        config = replace(config, occupancy=False)
+    occupancy = config.occupancy and why_no_occupancy(config) is None and (boxed or contracted)
     points = scene.train.sparse_depth is not None
     if config.sparse_depth and not points:
         raise ConfigError(f"--sparse-depth needs a COLMAP model with points, got {config.sparse_depth:g} without")
-    if config.sparse_depth is None:
-        config = replace(config, sparse_depth=SPARSE_DEPTH if points else 0.0)
+    if sparse_depth is None:
+        sparse_depth = SPARSE_DEPTH if points else 0.0
     seconds = STEP_SECONDS * (config.steps or 0) if config.budget is None else config.budget * speed
-    if config.rays is None:
+    if rays is None:
         grows = config.budget is not None and kind.scene_options is not None and not contracted and seconds > SHORT
-        rays = RAYS * 2 ** math.floor(math.log(seconds / SHORT, 4) + 1e-9) if grows else RAYS
-        config = replace(config, rays=min(rays, MOST_RAYS))
-    if config.samples is None:
+        rays = min(RAYS * 2 ** math.floor(math.log(seconds / SHORT, 4) + 1e-9), MOST_RAYS) if grows else RAYS
+    if samples is None:
         passes = SAMPLERS[config.sampling].passes
-        samples = EACH_SAMPLES if passes > 1 else SAMPLES
-        if config.occupancy:
+        each = EACH_SAMPLES if passes > 1 else SAMPLES
+        if occupancy:
             side = 0.0 if scene.box is None else float((scene.box[1] - scene.box[0]).amax())
             # The rule was measured with hash grids: a step of a larger network takes several times as long.
             long = seconds if contracted or kind.scene_options is not None else 0.0
-            samples = usual_samples(side / pixel, contracted=contracted, seconds=long)
-        config = replace(config, samples=(samples,) * passes)
+            each = usual_samples(side / pixel, contracted=contracted, seconds=long)
+        samples = (each,) * passes
     options: dict[str, Any] = {}
     if "position_octaves" in kind.options:
         options["position_octaves"] = kind.octaves(octaves_for(pixel))
     if kind.scene_options is not None:
         options |= kind.scene_options(pixel, scene.cube(space), contracted, seconds)
     more = [f"{name}={value}" for name, value in options.items() if name not in config.network_options]
-    config = replace(config, field_options=(*config.field_options, *more))
-    if config.depth is None:
-        config = replace(config, depth=kind.options.get("depth"))
-    if config.width is None and config.parameters is None:
-        config = replace(config, width=kind.options.get("width"))
+    width = kind.options.get("width") if config.parameters is None else None
+    config = replace(
+        config,
+        contraction=contraction,
+        occupancy=occupancy,
+        sparse_depth=sparse_depth,
+        rays=rays,
+        samples=samples,
+        field_options=(*config.field_options, *more),
+        depth=kind.options.get("depth") if config.depth is None else config.depth,
+        width=width if config.width is None else config.width,
+    )
     if config.lr is None and config.parameters is None:
         config = replace(config, lr=kind.learning_rate(config.network_options))
     return config

@@ -79,7 +79,7 @@ def scaled(op: str, given: Any) -> Any:
     return given._replace(density_scale=1.0)
 
 
-def activate(raw: Tensor, density_scale: float, activated: bool) -> tuple[Tensor, Tensor]:
+def activate(raw: Tensor, density_scale: float = 1.0, activated: bool = False) -> tuple[Tensor, Tensor]:
     """Colours [m, 3] and densities [m] of what networks put out [m, 4]; as they are where they are activated."""
     if activated:
         return raw[:, :3], raw[:, 3]

@@ -40,7 +40,7 @@ def sparse_depth_gradient(
     """Adds the loss of rays that end at known points, and its gradient, to those of ``render_loss_gradient``, in place.
 
     A sample is near the point if it lies within 0.03 of the distance of the point and its own length of it. The loss of
-    a ray is ``-log`` of the sum of the weights of these samples, from 0.001 to 1: the likelihood of Deng et al. 2022,
+    a ray is ``-log`` of the sum of the weights of these samples, at least 0.001: the likelihood of Deng et al. 2022,
     "Depth-supervised NeRF", with a box in the place of their Gaussian. Fog before the point takes from them. With the
     transmittance T behind a sample and the light S from points that lie behind it, the derivative of the sum by its
     density is ``delta (T near - S)``. What is added is ``factor`` times the sum of the losses, and to the last column

@@ -5,12 +5,15 @@ from __future__ import annotations
 import torch
 
 from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops.composite.reference import composite
 
 
 def _make(draw: Draw, n: int) -> Arguments:
     """n samples on five rays, the first three with points, one of which is nowhere."""
-    call: Arguments = {name: draw.uniform(n) for name in ("density", "depths", "deltas", "weights")}
+    call: Arguments = {name: draw.uniform(n) for name in ("density", "depths", "deltas")}
     call |= {"loss": torch.tensor(0.5), "gradient": draw.normal(n, 4).contiguous(), "ray_offsets": draw.offsets(n, 5)}
+    along = call["density"], call["density"][:, None], call["depths"], call["deltas"], call["ray_offsets"]
+    call["weights"] = composite(*along).weights
     rule = {"activated": True} if draw.among("activated", False, True) else {"density_scale": 3.0}
     return {**call, "distances": torch.tensor([0.4, 0.9, torch.nan]), "factor": 0.5, **rule}
 

@@ -74,8 +74,8 @@ def city_scene(
         return replace(render_views(cameras, part, caster, kept), on_disk=images == "disk")
 
     train, test = views("train", 0, train_views), views("test", 1, test_views)
-    far = math.hypot(*sides) + 3
-    return Scene(name, train, test, NEAR, far, torch.from_numpy(bounds(solids)), "linear", "white")
+    box, far = torch.from_numpy(bounds(solids)), math.hypot(*sides) + 3
+    return Scene(name=name, train=train, test=test, near=NEAR, far=far, box=box, background="white")
 
 
 def city_views(cameras: Cameras, blocks: tuple[int, int]) -> Split:

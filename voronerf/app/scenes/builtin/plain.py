@@ -66,7 +66,7 @@ def builtin_scene(
         for part, cameras in (("train", train), ("test", test))
     )
     box = torch.from_numpy(bounds(SOLIDS))
-    return Scene("builtin", train_split, test_split, NEAR, FAR, box, "linear", "white")
+    return Scene(name="builtin", train=train_split, test=test_split, near=NEAR, far=FAR, box=box, background="white")
 
 
 def _cameras(elevation: Tensor, azimuth: Tensor, size: int) -> Cameras:
