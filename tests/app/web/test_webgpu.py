@@ -16,13 +16,13 @@ from test_packing import HOSTILE
 from voronerf.app import open_run
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import TrainConfig
-from voronerf.app.web import export_web
+from voronerf.app.web import pack, page_of, turntable
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 
 #: Small, since a CPU draws it.
-WINDOW = {"width": 200, "height": 200, "deviceScaleFactor": 1, "mobile": False}
+WINDOW = {"width": 160, "height": 160, "deviceScaleFactor": 1, "mobile": False}
 PICTURE = """
 const [camera, done] = arguments;
 voronerf.started.then(() => voronerf.picture(camera)).then(
@@ -50,7 +50,7 @@ def page(browser, runs, tmp_path_factory):
     def opened(run, fragment=""):
         if id(run) not in written:
             written[id(run)] = folder / f"{len(written)}.html", run
-            export_web(run, written[id(run)][0])
+            written[id(run)][0].write_text(page_of(pack(run), turntable(run, frames=1)))
         browser.get("about:blank")
         browser.get(f"{written[id(run)][0].as_uri()}{fragment}")
         return browser
@@ -94,7 +94,7 @@ def test_a_trained_run_looks_as_it_is_rendered(page, tmp_path):
     trained(config, scene)
     run = open_run(tmp_path, scene=scene)
     browser = page(run)
-    for index in range(5):
+    for index in (0, 3):
         wanted = rendered(run, scene.test.cameras, index)
         assert wanted.std() > 20
         assert psnr(picture(browser, scene.test.cameras, index), wanted) >= 45
@@ -105,10 +105,9 @@ def test_a_trained_run_looks_as_it_is_rendered(page, tmp_path):
 def test_every_kind_of_field_and_space_is_drawn(page, runs, kind):
     run = runs(kind)
     browser, cameras = page(run), run.scene.test.cameras
-    for index in (0, 3):
-        wanted = rendered(run, cameras, index)
-        assert wanted.std() > 5
-        assert psnr(picture(browser, cameras, index), wanted) >= 45
+    wanted = rendered(run, cameras, 3)
+    assert wanted.std() > 5
+    assert psnr(picture(browser, cameras, 3), wanted) >= 45
     assert quiet(browser)
 
 
