@@ -16,7 +16,7 @@ from test_packing import HOSTILE
 from voronerf.app import open_run
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import TrainConfig
-from voronerf.app.web import pack, page_of, turntable
+from voronerf.app.web import export_web
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
@@ -50,7 +50,7 @@ def page(browser, runs, tmp_path_factory):
     def opened(run, fragment=""):
         if id(run) not in written:
             written[id(run)] = folder / f"{len(written)}.html", run
-            written[id(run)][0].write_text(page_of(pack(run), turntable(run, frames=1)))
+            export_web(run, written[id(run)][0])
         browser.get("about:blank")
         browser.get(f"{written[id(run)][0].as_uri()}{fragment}")
         return browser
@@ -242,6 +242,6 @@ def test_without_webgpu_the_page_says_so_and_turns_a_picture(page, runs):
         page(run)
         until(lambda: "This browser has no WebGPU." in browser.find_element("id", "note").text)
         still_picture = browser.find_element("css selector", "#still img")
-        assert still_picture.is_displayed() and still_picture.get_property("naturalWidth") == 240
+        assert still_picture.is_displayed() and still_picture.get_property("naturalWidth") == 40
     finally:
         browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
