@@ -197,8 +197,8 @@ class Cameras:
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Cameras:
         """With another tensor for each; the tables of the lenses are shared."""
-        given = ((field.name, getattr(self, field.name)) for field in fields(self))
-        changed: dict[str, Any] = {name: change(value) for name, value in given if isinstance(value, Tensor)}
+        members = ((field.name, getattr(self, field.name)) for field in fields(self))
+        changed: dict[str, Any] = {name: change(value) for name, value in members if isinstance(value, Tensor)}
         return replace(self, **changed)._with_lenses(change(self.lenses[0]), self.lenses[1])
 
     def _with_lenses(self, lens: Tensor, tables: LensTables | None) -> Cameras:
@@ -264,9 +264,9 @@ class Cameras:
         local = torch.stack(((x - cx) / fx, -(y - cy) / fy, -torch.ones_like(x)), dim=-1)
         if self.distortion is not None:
             for index in camera.unique().tolist():
-                own = camera == index
+                of_camera = camera == index
                 lens = self.intrinsics[index], self.distortion[index], self._model(index)
-                local[own] = unproject(x[own], y[own], *lens)[0].to(local)
+                local[of_camera] = unproject(x[of_camera], y[of_camera], *lens)[0].to(local)
         pose = self.poses[camera]
         directions = torch.nn.functional.normalize((pose[:, :3, :3] * local[:, None, :]).sum(-1), dim=-1)
         return Rays(pose[:, :3, 3], directions, self.radii(directions, camera) if cones else None)

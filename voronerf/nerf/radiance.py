@@ -61,16 +61,16 @@ class Radiance(NamedTuple):
         if _on_warp(inputs.device, backend):
             seen = {"directions": directions, "direction_index": ray_index} if rays else {}
             return {"positions": inputs, **cast(Any, self.cells.table)(), **seen, **places}
-        given = {"inputs": [inputs, directions], "ray_index": ray_index} if rays else {"inputs": [inputs]}
-        return {"program": self.networks.program, "parameters": self.cells.parameters, **given, **places}
+        tensors = {"inputs": [inputs, directions], "ray_index": ray_index} if rays else {"inputs": [inputs]}
+        return {"program": self.networks.program, "parameters": self.cells.parameters, **tensors, **places}
 
     def density(self, points: Tensor) -> Tensor | None:
         """[n], of points [n, 3], without the layers of the colour; None if it depends on the direction."""
         router, program = self.router, self.networks.density
         if program is None or _on_warp(points.device, router.backend):
             return None
-        given = {"program": program, "inputs": [points], "parameters": self.cells.parameters, **router.places(points)}
-        return forward_with_tape(given, backend=router.backend).raw[:, 0]
+        network = {"program": program, "inputs": [points], "parameters": self.cells.parameters, **router.places(points)}
+        return forward_with_tape(network, backend=router.backend).raw[:, 0]
 
 
 def radiance_of(
@@ -157,13 +157,13 @@ def _past_moves(program: Program) -> Program:
 
 def _of_fields(program: Program, outputs: Sequence[Columns], reads: tuple[int, ...], width: int) -> Program:
     """A program with positions as its first input, directions of rays as its second if read, and one output."""
-    own, b = pruned(Builder(program).program(outputs)), Builder()
-    read = {int(step.numbers[0]) for step in own.steps if step.op == "input"}
+    needed, b = pruned(Builder(program).program(outputs)), Builder()
+    read = {int(step.numbers[0]) for step in needed.steps if step.op == "input"}
     arguments = [b.input(width)]
     if any(reads[number] == 1 for number in read):
         arguments.append(b.input(3, ray=True))
-    found = b.replay(own, {number: arguments[reads[number]] for number in read})
-    return b.program([b.side_by_side(found)])
+    values = b.replay(needed, {number: arguments[reads[number]] for number in read})
+    return b.program([b.side_by_side(values)])
 
 
 def _raw(steps: Sequence[Step], colour: Columns, density: Columns) -> tuple[list[Columns], float] | None:

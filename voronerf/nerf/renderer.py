@@ -137,8 +137,8 @@ class Renderer:
         near, far = per_ray(near, rays), per_ray(far, rays)
 
         def look(name: str, samples: Samples) -> Rendered:
-            given = self.fields[name], rays, far, samples, self.sampler.space
-            return render_samples(*given, background=background, backend=self.backend)
+            arguments = self.fields[name], rays, far, samples, self.sampler.space
+            return render_samples(*arguments, background=background, backend=self.backend)
 
         samples, before = self.sampler.draw(look, rays, near, far, jitter=jitter, generator=generator)
         return (*before, look("field", samples))
@@ -155,8 +155,8 @@ class Renderer:
             background: [3] or [r, 3]; None is black.
             heaviest: whether to find the heaviest samples; without it that part of the result means nothing.
         """
-        given = self.field, rays, near, far
-        if (seen := self.sampler.see(*given, background=background, heaviest=heaviest)) is not None:
+        arguments = self.field, rays, near, far
+        if (seen := self.sampler.see(*arguments, background=background, heaviest=heaviest)) is not None:
             return seen
         last = self.render(rays, near, far, background=background)[-1]
         places = rays.origins

@@ -114,9 +114,9 @@ def load_scene(
     """
     if downscale is not None and downscale < 1:
         raise SceneError(f"{source}: downscale must be >= 1, got {downscale}")
-    for name, given, known in (("format", format, FORMATS), ("kind", kind, KINDS)):
-        if given != "auto" and given not in known:
-            raise SceneError(f"{source}: {name} must be auto, {' or '.join(known)}, got {given!r:.60}")
+    for name, word, known in (("format", format, FORMATS), ("kind", kind, KINDS)):
+        if word != "auto" and word not in known:
+            raise SceneError(f"{source}: {name} must be auto, {' or '.join(known)}, got {word!r:.60}")
     if images not in ("auto", "memory", "disk"):
         raise SceneError(f"{source}: images must be auto, memory or disk, got {images!r:.60}")
     if is_builtin(source):

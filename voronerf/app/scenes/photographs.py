@@ -400,15 +400,15 @@ def _turned(cameras: Cameras, turns: Sequence[int]) -> Cameras:
     prism = torch.zeros(len(cameras), dtype=torch.bool) if cameras.models is None else cameras.models == FISHEYE
     sizes = torch.tensor([cameras.size(index) for index in range(len(cameras))])
     for step in range(3):
-        own = torch.tensor(turns) > step
-        right, up = poses[own, :3, :2].unbind(-1)
-        poses[own, :3, :2] = torch.stack((-up, right), -1)
-        fx, fy, cx, cy = intrinsics[own].unbind(-1)
-        intrinsics[own] = torch.stack((fy, fx, cy, sizes[own, 0] - cx), -1)
-        bent[own, 2:4] = torch.stack((-bent[own, 3], bent[own, 2]), -1)  # p1 and p2
-        both = own & prism
+        turning = torch.tensor(turns) > step
+        right, up = poses[turning, :3, :2].unbind(-1)
+        poses[turning, :3, :2] = torch.stack((-up, right), -1)
+        fx, fy, cx, cy = intrinsics[turning].unbind(-1)
+        intrinsics[turning] = torch.stack((fy, fx, cy, sizes[turning, 0] - cx), -1)
+        bent[turning, 2:4] = torch.stack((-bent[turning, 3], bent[turning, 2]), -1)  # p1 and p2
+        both = turning & prism
         bent[both, 6:8] = torch.stack((bent[both, 7], -bent[both, 6]), -1)  # s1 and s2
-        sizes[own] = sizes[own].flip(1)
+        sizes[turning] = sizes[turning].flip(1)
     distortion = None if cameras.distortion is None else bent
     return Cameras.of_images(poses, intrinsics, sizes, distortion, cameras.models)
 

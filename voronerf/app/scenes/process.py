@@ -208,11 +208,11 @@ def _begin(out: Path, settings: Settings) -> Path:
     work = out / "colmap"
     noted = work / "settings.json"
     if noted.is_file():
-        found, asked = json.loads(noted.read_text()), settings._asdict()
-        if other := [name for name, value in asked.items() if found.get(name) != value]:
+        before, asked = json.loads(noted.read_text()), settings._asdict()
+        if other := [name for name, value in asked.items() if before.get(name) != value]:
             name = other[0]
             raise SceneError(
-                f"{work}: was begun with --{name.replace('_', '-')} {found.get(name)}, not {asked[name]}; give the "
+                f"{work}: was begun with --{name.replace('_', '-')} {before.get(name)}, not {asked[name]}; give the "
                 "same, or another folder"
             )
         if (out / "sparse" / "0").exists():
@@ -466,10 +466,10 @@ def _map(stages: Stages, name: str) -> Model | None:
             for failure in errors:
                 raise failure
         os.replace(part, folder)
-    found = [path for path in folder.iterdir() if (path / "images.bin").is_file()]
-    if not found:
+    models = [path for path in folder.iterdir() if (path / "images.bin").is_file()]
+    if not models:
         return None
-    largest = max(found, key=lambda path: len(read_model(path).images))
+    largest = max(models, key=lambda path: len(read_model(path).images))
     model = read_model(largest)
     lost = _lost(model)
     images = [image for image in model.images if image.name not in lost]
@@ -508,12 +508,12 @@ def _described(model: Model | None, images: int) -> str:
 
 def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
     """Writes the cameras, images and points of a model, without what is lost."""
-    found = colmap.Reconstruction(model.folder)
-    for image in list(found.images.values()):
+    reconstruction = colmap.Reconstruction(model.folder)
+    for image in list(reconstruction.images.values()):
         if image.name in model.lost:
-            found.deregister_frame(image.frame_id)
+            reconstruction.deregister_frame(image.frame_id)
     part = _emptied(folder.with_name(f".{folder.name}"))
-    found.write_binary(part)
+    reconstruction.write_binary(part)
     for path in part.iterdir():
         if path.stem not in FILES:  # of rigs: each image has its pose
             path.unlink()

@@ -84,9 +84,9 @@ def camera_faults(
 
 def _nearest(origins: Tensor) -> Tensor:
     """The distance of each camera to the nearest other one, [c]."""
-    found = torch.empty(len(origins), dtype=origins.dtype)
+    nearest = torch.empty(len(origins), dtype=origins.dtype)
     for rows in torch.arange(len(origins)).split(1024):
         distances = torch.cdist(origins[rows], origins)
         distances[torch.arange(len(rows)), rows] = float("inf")
-        found[rows] = distances.amin(1)
-    return found
+        nearest[rows] = distances.amin(1)
+    return nearest

@@ -71,7 +71,7 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path}: has no frames")
     shared = _named_distortion(entries, path)
-    found = []
+    present = []
     for position, frame in enumerate(frames):
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or "\0" in name:
@@ -83,14 +83,14 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
         image = _find_image(path.parent, name, allow_outside, where)
         if image is not None:
             mask = _mask(path.parent, frame.get("mask_path"), allow_outside, where)
-            found.append(Frame(image, pose, path, {**shared, **_named_distortion(frame, path)}, mask))
-    if not found:
+            present.append(Frame(image, pose, path, {**shared, **_named_distortion(frame, path)}, mask))
+    if not present:
         raise SceneError(
             f"{path}: none of its {len(frames)} images exists, the first is {path.parent / frames[0]['file_path']}"
         )
-    if missing := len(frames) - len(found):
+    if missing := len(frames) - len(present):
         log.warning("%s: %d of %d listed images are missing and are skipped", path, missing, len(frames))
-    return entries, found
+    return entries, present
 
 
 def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = False) -> float | None:
@@ -298,20 +298,20 @@ def _view(frame: Frame) -> View:
         raise SceneError(f"{path}: has no focal length (fl_x or camera_angle_x)")
     cx, cy = number(values, "cx", path), number(values, "cy", path)
     intrinsics = (fx or fy or 0, fy or fx or 0, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
+    distortion = {key: number(values, key, path) or 0.0 for key in DISTORTION}
     kind = FISHEYE if fisheye else PERSPECTIVE
-    lens = Lens(intrinsics, tuple(given.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
+    lens = Lens(intrinsics, tuple(distortion.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
     return View(frame.path, frame.pose, lens, size, frame.mask, header=header)
 
 
 def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
     """The entries with k1, k2... in the place of nerfstudio's distortion_params."""
-    given = entries.get("distortion_params")
-    if given is None or given == []:
+    numbers = entries.get("distortion_params")
+    if numbers is None or numbers == []:
         return entries
-    if not isinstance(given, list) or len(given) != len(DISTORTION):
-        raise SceneError(f"{path}: distortion_params must be six numbers, {', '.join(DISTORTION)}, got {given!r:.60}")
-    return {**entries, **dict(zip(DISTORTION, given))}
+    if not isinstance(numbers, list) or len(numbers) != len(DISTORTION):
+        raise SceneError(f"{path}: distortion_params must be six numbers, {', '.join(DISTORTION)}, got {numbers!r:.60}")
+    return {**entries, **dict(zip(DISTORTION, numbers))}
 
 
 class Shot(NamedTuple):

@@ -217,8 +217,8 @@ def make_grid(
     contraction = scene.space(config.contraction, device=device).contraction
     if contraction is None and scene.box is None:
         raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
-    samples, given = (config.samples or (0,))[0], {"resolution": resolution, "opacity": opacity, "device": device}
-    return OccupancyGrid.for_training(scene.box, samples, contraction=contraction, **given)  # type: ignore[arg-type]
+    samples, options = (config.samples or (0,))[0], {"resolution": resolution, "opacity": opacity, "device": device}
+    return OccupancyGrid.for_training(scene.box, samples, contraction=contraction, **options)  # type: ignore[arg-type]
 
 
 def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> OccupancyGrid:

@@ -137,13 +137,13 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
     errors = []
     for path in paths:
         try:
-            found = load_checkpoint(path, keep=keep)
+            checkpoint = load_checkpoint(path, keep=keep)
         except CheckpointError as error:
             errors.append(error)
             continue
         if errors:
             warnings.warn(f"{errors[0]}; {path.name} takes its place", stacklevel=2)
-        return found
+        return checkpoint
     raise errors[0]
 
 

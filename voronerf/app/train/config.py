@@ -214,8 +214,8 @@ class TrainConfig(
     def network_options(self) -> dict[str, Any]:
         """What the field is made with: the settings that it has options for, and ``field_options``."""
         settings = {name: getattr(self, name) for name in NETWORK_SETTINGS if name in self.field_type.options}
-        given = {name: value for name, value in settings.items() if value is not None}
-        return given | dict(parse_option(text) for text in self.field_options)
+        chosen = {name: value for name, value in settings.items() if value is not None}
+        return chosen | dict(parse_option(text) for text in self.field_options)
 
     @property
     def plan(self) -> tuple[PlannedSplit, ...]:
@@ -366,18 +366,18 @@ def check_config(config: TrainConfig) -> None:
 def _check_field_options(config: TrainConfig) -> None:
     options = config.field_type.options
     for name in NETWORK_SETTINGS:
-        given = getattr(config, name)
-        if name not in options and given is not None:
-            raise ConfigError(f"--{name.replace('_', '-')} must not come with --field {config.field}, got {given!r}")
-    own = [name for name in options if name not in NETWORK_SETTINGS]
+        setting = getattr(config, name)
+        if name not in options and setting is not None:
+            raise ConfigError(f"--{name.replace('_', '-')} must not come with --field {config.field}, got {setting!r}")
+    known = [name for name in options if name not in NETWORK_SETTINGS]
     for text in config.field_options:
         if "=" not in text:
             raise ConfigError(f"--field-options must be NAME=VALUE, got {text!r}")
         name, value = parse_option(text)
         if name in NETWORK_SETTINGS:
             raise ConfigError(f"--field-options must not hold {name}, use --{name.replace('_', '-')}; got {text!r}")
-        if name not in own:
-            raise ConfigError(f"--field-options of {config.field} are {', '.join(own) or 'none'}; got {text!r}")
+        if name not in known:
+            raise ConfigError(f"--field-options of {config.field} are {', '.join(known) or 'none'}; got {text!r}")
         is_number = isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
         if isinstance(options[name], (int, float)) and not (is_number or value is None):
             raise ConfigError(f"--field-options must give {name} a finite number, got {text!r:.60}")

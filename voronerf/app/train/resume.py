@@ -148,9 +148,11 @@ def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
             raise CheckpointError(f"{checkpoint.source}: {error}") from None
         for key, (shape, shared) in shapes.items():
             wanted = [*([] if shared else [diagram.num_cells]), *shape]
-            found = tensors.get(f"module.{key}")
-            if found is None or list(found.shape) != wanted or found.dtype != torch.float32:
-                came = "nothing" if found is None else f"{str(found.dtype).removeprefix('torch.')} {list(found.shape)}"
+            tensor = tensors.get(f"module.{key}")
+            if tensor is None or list(tensor.shape) != wanted or tensor.dtype != torch.float32:
+                came = (
+                    "nothing" if tensor is None else f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
+                )
                 raise CheckpointError(
                     f"{checkpoint.source}: the checkpoint is of another architecture: {group(name)}.module.{key} "
                     f"must be float32 {wanted}, got {came}"

@@ -141,8 +141,8 @@ def why_refused(headers: Mapping[str, str], host: str) -> str | None:
         site = None if origin is None else urlsplit(origin).netloc
     except (ValueError, LookupError):  # an address that is none, or a header twice
         return "its headers cannot be read"
-    own = socket.gethostname().lower()
-    if not (name in ("localhost", own, f"{own}.local", host.lower()) or _is_address(name)):
+    machine = socket.gethostname().lower()
+    if not (name in ("localhost", machine, f"{machine}.local", host.lower()) or _is_address(name)):
         return f"the viewer must be opened by an address or as localhost, not as {name}; --host {name} allows it"
     if site is not None and site != asked:
         return f"a page of {origin} must not use the viewer at {asked}"

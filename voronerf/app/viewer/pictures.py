@@ -169,8 +169,8 @@ def _picture_of_pane(subject: Subject, image: RenderedImage, look: Look) -> Tens
     if look.pane == "cells":
         groups = groups_of(subject.diagram, look.level)[cells_of(subject, image.heaviest)]
         return picture_of_cells(groups, image.opacity, image.colour)
-    own = subject.scene.background_colour()
-    other = BACKGROUNDS[look.background] - (image.colour.new_zeros(3) if own is None else own)
+    background = subject.scene.background_colour()
+    other = BACKGROUNDS[look.background] - (image.colour.new_zeros(3) if background is None else background)
     return picture_of_colour(image.colour + (1 - image.opacity)[..., None] * other)
 
 
