@@ -23,7 +23,7 @@ WINDOW = 1 / 30
 #: Weight decay of tables: of what nothing asks for again, such as noise that early steps have left in empty space. With
 #: more views than these it is less by as much: a place is asked for again only after many more steps.
 TABLE_DECAY, DECAY_VIEWS = 0.1, 300
-#: Of the averaged weights in an optimiser's state, beside Adam's moments.
+#: Key of the averaged weights in an optimiser's state, beside Adam's moments.
 _AVERAGE = "average"
 
 

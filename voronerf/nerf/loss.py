@@ -52,7 +52,7 @@ class Batch:
 
 
 class RenderOutput(NamedTuple):
-    """What :class:`RayLoss` gives. Only the loss has gradients.
+    """The result of :class:`RayLoss`. Only the loss has gradients.
 
     Attributes:
         loss: [].
@@ -131,7 +131,7 @@ class RayLoss:
     def __call__(
         self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False
     ) -> RenderOutput:
-        """The loss of a batch, and what its samples have found.
+        """Computes the loss of a batch.
 
         Args:
             batch: The rays.
@@ -149,7 +149,7 @@ class RayLoss:
         return self._fused(field, batch, generator, backward)
 
     def why_not_fused(self) -> str | None:
-        """What keeps networks, colours, loss and gradients from being one operation; None if nothing does.
+        """The reason why networks, colours, loss and gradients are not one operation; None if they are.
 
         What a module with ``fuse=True`` computes is known from its first step on, which traces it.
         """
@@ -157,7 +157,7 @@ class RayLoss:
         return radiance if isinstance(radiance, str) else None
 
     def radiance(self, samples: tuple[Tensor, Tensor] | None = None) -> Radiance | str:
-        """What the field computes; or why the operations are separate. Samples are those of `radiance_of`."""
+        """The program of the field, or why the operations are separate; samples as for `radiance_of`."""
         renderer = self.renderer
         if renderer.sampler.grid is None:
             return "empty space is not skipped"

@@ -29,7 +29,7 @@ FINE_WAVE = 4
 
 
 class RayColours(NamedTuple):
-    """What the rays of a picture see.
+    """Colours and depths of the rays of a picture.
 
     Attributes:
         colour: [r, 3], the background included.
@@ -117,7 +117,7 @@ def render_until_opaque(
 
 
 def _network(field: Field, rays: Rays, sampler: Occupancy) -> dict[str, Any] | None:
-    """What ``render_opaque`` asks in the place of a field; None if it is more than networks, for Warp and CUDA."""
+    """The arguments with which ``render_opaque`` asks a field; None if it is more than networks, for Warp and CUDA."""
     router = router_of(field)
     if router is None or not rays.origins.is_cpu or "warp" in (sampler.backend, router.backend):
         return None

@@ -312,7 +312,7 @@ class OccupancyGrid:
         return march_rays(*arguments, contraction=self._numbers, **rule)
 
     def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaysSeen:
-        """What rays see of networks in occupied voxels; other arguments are those of `voronerf.ops.render_opaque`."""
+        """Renders rays through networks in occupied voxels; other arguments as of `voronerf.ops.render_opaque`."""
         arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
         return render_opaque(*arguments, contraction=self._numbers, **rule)
 
@@ -377,7 +377,7 @@ def density_of(field: Field, points: Tensor) -> Tensor:
 
 
 def _density_of(field: Field, points: Tensor) -> Tensor:
-    """The same, with NaN as it is."""
+    """Density as in `density_of`, but NaN stays NaN."""
     direction = _along_z(points.device)
     known = radiance_of(field, (points, direction.expand(len(points), -1)))
     sigma = None if isinstance(known, str) else known.density(points)

@@ -1,4 +1,4 @@
-"""What a field computes, for the operations that take networks, colours and loss together. n samples, r rays."""
+"""Fields as programs, for the operations that take networks, colours and loss together. n samples, r rays."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ class Radiance(NamedTuple):
 
     @property
     def rule(self) -> dict[str, Any]:
-        """What the outputs mean, as `render_loss` takes it."""
+        """How `render_loss` shall read the outputs."""
         scale = self.networks.density_scale
         return {"activated": True} if scale is None else {"density_scale": scale}
 
     def arguments(self, inputs: Tensor, directions: Tensor, ray_index: Tensor, backend: str) -> dict[str, Any]:
-        """Those of `forward_with_tape` for samples; see :class:`voronerf.nerf.Field` and :class:`Networks`."""
+        """The arguments of `forward_with_tape` for samples; see :class:`voronerf.nerf.Field` and :class:`Networks`."""
         places, rays = self.router.places(inputs), self.networks.program.rays
         if _on_warp(inputs.device, backend):
             seen = {"directions": directions, "direction_index": ray_index} if rays else {}
@@ -76,7 +76,7 @@ class Radiance(NamedTuple):
 def radiance_of(
     field: Field, samples: tuple[Tensor, Tensor] | None = None, *, inputs: int = 3, backend: str = "auto"
 ) -> Radiance | str:
-    """What a field computes; or why that is not known.
+    """The program of a field; or the reason why it is unknown.
 
     Args:
         field: A router, or one in a `DirectionPerSample`.
@@ -115,7 +115,7 @@ def _on_warp(device: torch.device, backend: str) -> bool:
 
 
 def _by_warp(cells: CellProgram, networks: Networks) -> bool:
-    """Whether what a layer table puts out are the outputs themselves."""
+    """Whether a layer table has its outputs activated itself."""
     if cells.table is None or cells.after is None or networks.density_scale is None:
         return False
     after = _networks(cells.after.text, (0,), cells.shapes, cells.after.inputs[0])
@@ -141,7 +141,7 @@ def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], 
 
 
 def _past_moves(program: Program) -> Program:
-    """The same, reading what was put side by side where it comes from: the density without the colour beside it."""
+    """A program that reads columns at their source, not where they were put side by side: density without colour."""
     moves = {step.out: step for step in program.steps if step.op == "move"}
 
     def source(columns: Columns) -> Columns:

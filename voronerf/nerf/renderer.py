@@ -21,7 +21,7 @@ from voronerf.nerf.volume import Rendered, Samples, per_ray, render_samples
 
 
 class RenderedImage(NamedTuple):
-    """What `Renderer.image` returns.
+    """A rendered picture, of `Renderer.image`.
 
     Attributes:
         colour: [h, w, 3], the background included.
@@ -97,7 +97,7 @@ class Renderer:
 
     @property
     def contraction(self) -> Contraction | Perspective | None:
-        """Of the space that the fields work in."""
+        """The contraction of the space that the fields work in."""
         return self.sampler.space.contraction
 
     @property
@@ -146,7 +146,7 @@ class Renderer:
     def see(
         self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None = None, heaviest: bool = True
     ) -> RayColours:
-        """What rays of a picture see, without randomness.
+        """Renders rays of a picture, without randomness.
 
         Args:
             rays: r rays.

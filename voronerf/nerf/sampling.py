@@ -1,4 +1,4 @@
-"""Where the samples of a ray lie, and what they should have seen. r rays, s samples a ray; distances in world units."""
+"""Depths of the samples of a ray, and the loss of its colour. r rays, s samples a ray; distances in world units."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What changes over a training: the learning rate and the rays of a step."""
+"""Schedules of a training: the learning rate, and the rays of a step."""
 
 from __future__ import annotations
 

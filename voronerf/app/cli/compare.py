@@ -19,7 +19,7 @@ FIGURES = (
     *(("cells", "cells", 0), ("parameters", "parameters", 0), ("steps", "steps", 0), ("seconds", "training [s]", 0)),
     *(("rays_per_second", "rays/s", 0), ("psnr", "PSNR [dB]", 2), ("ssim", "SSIM", 4), ("lpips", "LPIPS", 4)),
 )
-#: Those that are of test views, and the mark of them where only the middle of views was scored.
+#: Figures of test views, and their mark where only the middle of views was scored.
 SCORES, PARTLY = ("psnr", "ssim", "lpips"), "*"
 #: Settings that say where a run is, rather than what it is.
 PLACES = ("out", "resume", "allow_outside", "panels", "tensorboard")

@@ -28,11 +28,11 @@ from tyro.constructors import (
 from voronerf.app.train.config import ConfigError, TrainConfig, did_you_mean, either
 
 RULES = ConstructorRegistry()
-#: What a number must be.
+#: Words for the kinds of numbers.
 NUMBERS = {int: "a whole number", float: "a number"}
 #: Defaults that are none.
 NOTHING = (None, (), inspect.Parameter.empty)
-#: What sets the colours of a terminal.
+#: Codes that set the colours of a terminal.
 COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -65,7 +65,7 @@ def parse(name: str, command: Callable[..., int], words: Sequence[str]) -> Calla
 
 
 def in_a_line(box: str) -> str:
-    """What a box of tyro's says, and which options are similar to those that it does not know."""
+    """The message in a box of tyro's, and options similar to those that it does not know."""
     _, *rows = (line[2:].rstrip(" │") for line in COLOURS.sub("", box).splitlines())
     parts = [[*part] for is_rule, part in itertools.groupby(rows, lambda row: row[:1] in ("─", "-")) if not is_rule]
     message = re.sub("^Error parsing ([^:]+):", r"\1", " ".join(" ".join(parts[0]).split())).rstrip(".")

@@ -59,7 +59,7 @@ from voronerf.ops._core import backends
 LONGEST_NAME = 255 - len(".png")
 #: Panels of a training that is not told how many.
 PANELS = 4
-#: What ends a training with a checkpoint: Ctrl-C, kill, a closed terminal, and the warning that Slurm can send.
+#: Signals that end a training with a checkpoint: Ctrl-C, kill, a closed terminal, and the warning that Slurm can send.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
 
 #: Printed before a training without any options.

@@ -113,7 +113,7 @@ class VoronerfModel(Model):
     # --- training --------------------------------------------------------------------------------------------------
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:
-        """What comes before and after each step of nerfstudio's trainer."""
+        """The callbacks before and after each step of nerfstudio's trainer."""
         trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
         assert trainer is not None and optimizers is not None
         steps, optimizer = trainer.config.max_num_iterations, optimizers.optimizers["fields"]
@@ -245,7 +245,7 @@ class VoronerfModel(Model):
     # --- checkpoints -----------------------------------------------------------------------------------------------
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What nerfstudio's checkpoints hold beside the parameters and the diagram."""
+        """The state in nerfstudio's checkpoints beside the parameters and the diagram."""
         grid = self.renderer.occupancy
         return {
             "strategy": self.strategy.state_dict(),

@@ -216,7 +216,7 @@ def capture_path(
 
 
 def like_most(cameras: Cameras) -> Cameras:
-    """Those of the cameras whose images have the commonest size, without their lenses."""
+    """The cameras whose images have the commonest size, without their lenses."""
     sizes = [cameras.size(index) for index in range(len(cameras))]
     width, height = max(sizes, key=sizes.count)
     alike = torch.tensor([size == (width, height) for size in sizes], device=cameras.poses.device)

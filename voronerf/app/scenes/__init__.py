@@ -27,19 +27,19 @@ CACHED = 100  # pixels a side, from which on the built-in scene is kept
 MOST_PIXELS = 1600  # a side of the built-in scene
 
 
-#: Of files that `voronerf process` may read.
+#: Suffixes of videos that `voronerf process` may read.
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".mpg")
 
 
 class Format(NamedTuple):
-    """What shows that a folder has a format, how it is loaded, and how it is told if not by a file of that name."""
+    """A format of scenes: the file that shows it, its loader, and how it is found if not by a file of that name."""
 
     sign: str
     load: Callable[[Path, Reading], Scene]
     find: Callable[[Path], Path | None] | None = None
 
     def held(self, folder: Path) -> bool:
-        """Whether a folder has it."""
+        """Whether a folder has this format."""
         return (folder / self.sign).is_file() if self.find is None else self.find(folder) is not None
 
 

@@ -40,7 +40,7 @@ BAND = 2**20
 
 
 class Header(NamedTuple):
-    """What an image file says of itself: (width, height), an alpha channel, bytes of a decoded pixel, whether
+    """The header of an image file: (width, height), an alpha channel, bytes of a decoded pixel, whether
     it is JPEG, and by how many quarters its orientation tag turns it anticlockwise."""
 
     size: tuple[int, int]
@@ -114,7 +114,7 @@ def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
 
 
 class Decoded(NamedTuple):
-    """What `read_images` gives.
+    """The result of `read_images`.
 
     Attributes:
         images: uint8 [c, h, w, 3], or [c, h, w, 4] where any image has an alpha channel, with the smaller ones in the

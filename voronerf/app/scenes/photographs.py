@@ -225,7 +225,7 @@ def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
 
 
 def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDepth | None:
-    """Where the views of a split see their points: those that lie in the image, and where the mask counts."""
+    """The pixels in which views of a split see their points, inside the image and the mask."""
     pixels, distances = [], []
     for index, view in enumerate(views):
         if view.points is None:
@@ -245,7 +245,7 @@ def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDept
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a scene lies: a similarity, and what is measured in the space behind it.
+    """The frame of a scene: a similarity, and bounds that are measured after it.
 
     Attributes:
         matrix: float64 [4, 4], from the coordinates of the files to those of the scene.
@@ -320,7 +320,7 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
 
 
 def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Perspective | None:
-    """Of a scene without a box: a cube around all that forward-facing cameras see, or a ball."""
+    """The contraction of a scene without a box: a cube around all that forward-facing cameras see, or a ball."""
     centre = frame.centre.float()
     if kind == "object":
         return None

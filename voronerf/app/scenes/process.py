@@ -41,7 +41,7 @@ from voronerf.app.scenes.lenses import MODELS
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
 from voronerf.app.scenes.transforms import Shot, write_transforms
 
-#: Of a video. A playlist would name other files.
+#: Formats of a video. A playlist would name other files.
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
 LEAST_IMAGES = 3
 MATCHINGS = ("auto", "exhaustive", "sequential")
@@ -80,7 +80,7 @@ Item = TypeVar("Item")
 
 
 class Settings(NamedTuple):
-    """What the stages are asked to do; a folder of other settings is not gone on with."""
+    """The settings of all stages; a folder that was begun with others is refused."""
 
     source: str
     frames: int
@@ -92,7 +92,7 @@ class Settings(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """What a mapper found."""
+    """The model that a mapper made."""
 
     folder: Path  # of its files
     mapper: str  # "global" or "incremental"
@@ -303,7 +303,7 @@ def _take_frames(video: Path, folder: Path, count: int) -> None:
 
 @dataclass(frozen=True)
 class Stages:
-    """What all stages work on."""
+    """The files and settings that all stages work on."""
 
     colmap: Any  # the module pycolmap
     work: Path  # the folder of what the stages leave

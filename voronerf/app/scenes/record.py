@@ -19,7 +19,7 @@ from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 
 CONTRACTIONS = {"sphere": Contraction, "perspective": Perspective}
-#: What a text of a scene may be.
+#: Values that a text of a scene may have.
 WORDS = {"background": ("white", None), "kind": KINDS}
 INTEGERS = {"sizes": torch.int64, "models": torch.int32}
 

@@ -22,7 +22,7 @@ KINDS = ("object", "forward", "inside-out", "unbounded")
 
 
 class SparseDepth(NamedTuple):
-    """Where images show points that are known, and how far from the camera they are.
+    """The pixels that show points of a sparse model, and the distances of these points.
 
     Attributes:
         pixels: int64 [s], numbered through all images: image * h * w + row * w + column.
@@ -121,7 +121,7 @@ class Scene:
 
     @property
     def spacing(self) -> str:
-        """Of the samples along a ray: "linear" through an object, else "disparity"."""
+        """How samples are spaced along a ray: "linear" through an object, else by "disparity"."""
         return "linear" if self.kind == "object" else "disparity"
 
     def background_colour(self, device: torch.device | str = "cpu") -> Tensor | None:

@@ -33,7 +33,7 @@ from voronerf.router import VoronoiRouter
 
 #: Temperature of the stochastic assignment, in scene units.
 TEMPERATURE = 0.05
-#: Of a grid made for pictures alone: voxels along each axis, and points evaluated in each.
+#: Voxels along each axis of a grid for pictures alone, and points evaluated in each.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 #: Scale of the robust loss of photographs, whose exposure and highlights differ; pictures that are computed have none.
 ROBUST = 0.05

@@ -192,7 +192,7 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
 
 
 def _checksum(tensor: Tensor) -> int:
-    """Of the elements, the shape and the dtype; it differs wherever a single bit does."""
+    """The checksum of elements, shape and dtype."""
     kind = zlib.crc32(f"{tensor.dtype} {list(tensor.shape)}".encode())
     return zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, kind)
 

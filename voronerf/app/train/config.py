@@ -34,7 +34,7 @@ class ConfigError(Exception):
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """What is learnt."""
+    """The scene that is learnt."""
 
     data: str = "builtin"
     """Scene folder (--format says which there are), or a built-in scene: "builtin", "builtin:400" of so many
@@ -63,7 +63,7 @@ class SceneSettings:
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Where, how long, and by what."""
+    """The run directory, the length of the run, and the device."""
 
     out: Path | None = None
     """Run directory, which must not hold a run unless --resume is given; default: runs/SCENE, or the first free
@@ -165,7 +165,7 @@ class OptimiserSettings:
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """What is measured on the way."""
+    """Evaluations on the way."""
 
     evaluations: int = 8
     """Evaluations during the run, evenly spaced; the last one is at the end."""
@@ -212,7 +212,7 @@ class TrainConfig(
 
     @property
     def network_options(self) -> dict[str, Any]:
-        """What the field is made with: the settings that it has options for, and ``field_options``."""
+        """The arguments of the field: settings that it has options for, and ``field_options``."""
         settings = {name: getattr(self, name) for name in NETWORK_SETTINGS if name in self.field_type.options}
         chosen = {name: value for name, value in settings.items() if value is not None}
         return chosen | dict(parse_option(text) for text in self.field_options)
@@ -286,7 +286,7 @@ RESUMABLE = frozenset(
 
 
 def differences(a: TrainConfig, b: TrainConfig) -> list[str]:
-    """What keeps a checkpoint of ``a`` from being continued under ``b``: "--width 64 -> 128" and so on."""
+    """The settings in which ``b`` must not differ to continue ``a``: "--width 64 -> 128" and so on."""
     return [
         f"--{f.name.replace('_', '-')} {getattr(a, f.name)} -> {getattr(b, f.name)}"
         for f in dataclasses.fields(TrainConfig)

@@ -22,7 +22,7 @@ from voronerf.router import VoronoiRouter
 
 @dataclass(frozen=True)
 class Stored:
-    """What a checkpoint keeps beside its tensors, by the names of a state."""
+    """The values of a checkpoint beside its tensors, by the names of a state."""
 
     config: dict[str, Any]
     step: int
@@ -108,7 +108,7 @@ def load(state: State, checkpoint: Checkpoint) -> None:
 
 
 def _threads(state: State) -> int:
-    """Those of torch, on which its sums depend; 0 where native operations compute the networks."""
+    """The threads of torch, on which its sums depend; 0 where native operations compute the networks."""
     return 0 if state.thread_deterministic else torch.get_num_threads()
 
 

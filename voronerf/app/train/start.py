@@ -65,7 +65,7 @@ def _judged_at(state: State) -> int:
 
 
 def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:
-    """What is wrong with a start, from a step of it; None if nothing is. Waits for the device.
+    """The fault of a start, from one of its steps; None if it is good. Waits for the device.
 
     Args:
         batch: Of the step, r rays.

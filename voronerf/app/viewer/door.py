@@ -117,7 +117,7 @@ def _say(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
 
 
 def why_refused(headers: Mapping[str, str], host: str) -> str | None:
-    """Why a request to what listens at `host` is refused; None if it is not.
+    """The reason why a request to a server at `host` is refused; None if it is not.
 
     A page must come from where it connects to, as for Jupyter. And it must ask by an address, or by a name that is
     known to be this machine's: the owner of any other name can have it lead here after the page is loaded (DNS

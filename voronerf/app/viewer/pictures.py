@@ -1,4 +1,4 @@
-"""What a viewer shows: the panes of a rendered camera, hidden cells, the cell behind a pixel.
+"""The pictures of a viewer: the panes of a rendered camera, hidden cells, the cell behind a pixel.
 
 h x w pixels, k cells. Pictures are uint8 [h, w, 3].
 """
@@ -35,7 +35,7 @@ OUTLINE = (255, 0, 255)
 
 @dataclass(frozen=True)
 class Look:
-    """What one browser shows, besides its camera.
+    """The choices of one browser, besides its camera.
 
     Attributes:
         pane: One of `PANES`.
@@ -56,7 +56,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Subject:
-    """What is viewed: a trained run, or one in training.
+    """A run in a viewer, trained or in training.
 
     Attributes:
         name: For titles.

@@ -1,4 +1,4 @@
-"""What a page holds of a run: bytes in the order in which the shader reads them, and a description in JSON.
+"""The contents of a page: bytes in the order in which the shader reads them, and a description in JSON.
 
 The parts, one after another, each from a multiple of 16 bytes on:
 
@@ -38,7 +38,7 @@ LARGEST = 2**27
 MOST_CAMERAS = 240
 #: Points on which a module that was not is traced.
 TRACED = 16
-#: Of float16.
+#: Largest float16.
 GREATEST = 65504.0
 
 
@@ -58,7 +58,7 @@ class Packed:
 
     @property
     def summary(self) -> str:
-        """What the page holds, in a line."""
+        """Describes the contents of the page in a line."""
         sizes = {name: size for name, (_, size) in self.scene["parts"].items()}
         table = f"a table of {sizes['table'] / 1e6:.2f} MB, " if sizes["table"] > 16 else ""
         networks = f"networks of {sizes['parameters'] / 1e6:.2f} MB, "
