@@ -99,19 +99,12 @@ class Cameras:
     def __post_init__(self) -> None:
         if self.poses.dim() != 3 or self.poses.shape[1:] != (4, 4):
             raise ValueError(f"Cameras: poses must have shape [c, 4, 4], got {list(self.poses.shape)}")
-        expected = [len(self.poses), 4]
-        if list(self.intrinsics.shape) != expected:
-            raise ValueError(f"Cameras: intrinsics must have shape {expected}, got {list(self.intrinsics.shape)}")
-        expected = [len(self.poses), 8]
-        if self.distortion is not None and list(self.distortion.shape) != expected:
-            raise ValueError(f"Cameras: distortion must have shape {expected}, got {list(self.distortion.shape)}")
-        if self.models is not None and list(self.models.shape) != expected[:1]:
-            raise ValueError(f"Cameras: models must have shape {expected[:1]}, got {list(self.models.shape)}")
+        for name, rest in (("intrinsics", [4]), ("distortion", [8]), ("models", []), ("sizes", [2])):
+            value, expected = getattr(self, name), [len(self.poses), *rest]
+            if value is not None and list(value.shape) != expected:
+                raise ValueError(f"Cameras: {name} must have shape {expected}, got {list(value.shape)}")
         if self.models is not None and self.distortion is None:
             raise ValueError("Cameras: distortion must be given with models, got None")
-        expected = [len(self.poses), 2]
-        if self.sizes is not None and list(self.sizes.shape) != expected:
-            raise ValueError(f"Cameras: sizes must have shape {expected}, got {list(self.sizes.shape)}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Cameras: width and height must be >= 1, got {self.width} x {self.height}")
 
