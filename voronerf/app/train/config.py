@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from voronerf.app.files import parse_json
 from voronerf.app.train.schema import check_types
 from voronerf.nerf.fields import FIELDS, FieldType
 from voronerf.nerf.samplers import SAMPLERS
@@ -191,7 +190,7 @@ class TrainConfig(
         >>> config = TrainConfig(data="builtin", steps=1000, cells=(4, 4), width=32)
         >>> config.final_cells
         16
-        >>> TrainConfig.from_json(config.to_json()) == config
+        >>> TrainConfig.from_values(config.to_values()) == config
         True
     """
 
@@ -234,21 +233,8 @@ class TrainConfig(
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def to_json(self) -> str:
-        """The settings as JSON text, which :meth:`from_json` reads."""
+        """The settings as the text of a JSON file."""
         return json.dumps(self.to_values(), indent=2) + "\n"
-
-    @staticmethod
-    def from_json(text: str, source: str = "config.json") -> TrainConfig:
-        """Reads what :meth:`to_json` wrote.
-
-        Raises:
-            ConfigError: For text that is not a configuration, or one of another version; names ``source``.
-        """
-        try:
-            values = parse_json(text)
-        except ValueError as error:
-            raise ConfigError(f"{source}: not a configuration of this version: {error}") from None
-        return TrainConfig.from_values(values, source)
 
     @staticmethod
     def from_values(values: Any, source: str = "config.json") -> TrainConfig:
