@@ -35,7 +35,7 @@ def folder(tmp_path_factory, scene):
 
 def test_a_run_is_what_was_trained(folder, scene) -> None:
     summary, run = read_json(folder / "summary.json"), open_run(str(folder), scene=scene)
-    assert run.path == folder and run.config == TrainConfig.from_json((folder / "config.json").read_text())
+    assert run.path == folder and run.config == TrainConfig.from_values(read_json(folder / "config.json"))
     assert run.diagram is run.router.diagram and run.renderer.field is run.router and run.diagram.num_cells == 4
     scores = run.evaluate(lpips="off")
     assert {name: scores[name] for name in ("psnr", "ssim")} == {name: summary[name] for name in ("psnr", "ssim")}

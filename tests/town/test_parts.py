@@ -13,7 +13,7 @@ from voronerf.app.train.config import TrainConfig
 from voronerf.nerf import Contraction
 from voronerf.nerf.fields import HashGridField
 from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.network import Network
+from voronerf.town.network import StoredRouter
 from voronerf.town.parts import Part, Parts
 
 
@@ -50,7 +50,7 @@ def queries(n: int = 500, width: float = 2.0):
 
 
 def part_of(router: VoronoiRouter, diagram: VoronoiDiagram | None = None, owner=None, **placed) -> Part:
-    return Part([Network.of(router, TrainConfig())], diagram, owner, **placed)
+    return Part([StoredRouter.of(router, TrainConfig())], diagram, owner, **placed)
 
 
 def close(a: torch.Tensor, b: torch.Tensor) -> bool:
@@ -134,7 +134,7 @@ def test_solids_move_with_their_frames(torch_seed) -> None:
 def test_leaves_of_several_routers(torch_seed) -> None:
     router, asked = hashed(4), queries(width=1.0)
     owner = torch.tensor([1, 0, 1, 1])
-    networks = [Network.of(router.part((owner == i).nonzero()[:, 0]), TrainConfig()) for i in (0, 1)]
+    networks = [StoredRouter.of(router.part((owner == i).nonzero()[:, 0]), TrainConfig()) for i in (0, 1)]
     parts = Parts([Part(networks, router.diagram, owner)]).eval()
     found, wanted = parts(*asked), router(*asked)
     assert close(found[0], wanted[0]) and close(found[1], wanted[1])

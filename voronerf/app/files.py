@@ -83,7 +83,7 @@ def leads_outside(path: Path, folder: Path) -> bool:
 
 
 def cache_folder() -> Path:
-    """Where files are kept that can be made again: VORONERF_CACHE, or `voronerf` in the user's folder of caches."""
+    """The folder of files that can be made again: VORONERF_CACHE, or `voronerf` in the user's folder of caches."""
     return Path(
         os.environ.get("VORONERF_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "voronerf"
     ).expanduser()

@@ -143,21 +143,21 @@ def balance(
     def weigh(centres: Tensor) -> Tensor:
         return cell_weights(nearest_cell(samples, centres, backend=backend), masses, k)
 
-    found = first_centres(samples, masses, k, centres, generator)
-    before = after = weigh(found)
+    chosen = first_centres(samples, masses, k, centres, generator)
+    before = after = weigh(chosen)
     if centres == "centroidal":
-        found = lloyd(samples, masses, found, backend=backend)
-        after = weigh(found)
+        chosen = lloyd(samples, masses, chosen, backend=backend)
+        after = weigh(chosen)
     elif centres == "balanced" and k > 1:
         if (d := samples.shape[1]) > 3:
-            found, after = balance_in_torch(samples, masses, found, steps, 0.05, 8)
+            chosen, after = balance_in_torch(samples, masses, chosen, steps, 0.05, 8)
         else:
-            given = in_space(samples), masses, in_space(found)
-            found, after = ops.balance_centres(*given, steps=steps, backend=backend)
-        found = found[:, :d]
+            arguments = in_space(samples), masses, in_space(chosen)
+            chosen, after = ops.balance_centres(*arguments, steps=steps, backend=backend)
+        chosen = chosen[:, :d]
     device = points.device
     return Balance(
-        centres=found.to(device),
+        centres=chosen.to(device),
         before=before.to(device),
         after=after.to(device),
         imbalance_before=imbalance(before),

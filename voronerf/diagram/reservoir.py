@@ -50,8 +50,8 @@ class SampleReservoir:
             ValueError: a number below 1.
         """
         if min(capacity, batches, d) < 1:
-            given = f"{capacity}, {batches} and {d}"
-            raise ValueError(f"SampleReservoir: capacity, batches and d must be at least 1, got {given}")
+            came = f"{capacity}, {batches} and {d}"
+            raise ValueError(f"SampleReservoir: capacity, batches and d must be at least 1, got {came}")
         self.capacity, self.batches = capacity, batches
         self.quota = -(-capacity // batches)
         self._points = torch.zeros(batches, self.quota, d, device=device)

@@ -116,8 +116,8 @@ def split_diagram(
     balances: dict[int, Balance] = {}
     for cell in chosen if k > 1 else []:
         inside = leaves == cell
-        given = points[inside], importance[inside], k
-        balances[cell] = balance(*given, centres=centres, steps=steps, generator=generator, backend=backend)
+        members = points[inside], importance[inside], k
+        balances[cell] = balance(*members, centres=centres, steps=steps, generator=generator, backend=backend)
     refined, parents = diagram.refine({cell: result.centres for cell, result in balances.items()})
     return Split(refined if balances else diagram, parents, balances)
 
@@ -166,10 +166,10 @@ def finer_diagram(
         result = split_diagram(present, points, weights, finer, **split)
         finer, parents = result.diagram, result.parents
     elif points is not None or weights is not None or split.keys() - {"generator", "backend"}:
-        given = [n for n, v in (("points", points), ("weights", weights)) if v is not None]
-        given += [name for name in split if name not in ("generator", "backend")]
+        named = [n for n, v in (("points", points), ("weights", weights)) if v is not None]
+        named += [name for name in split if name not in ("generator", "backend")]
         raise ValueError(
-            f"VoronoiRouter.subdivide: {given[0]} must come with a number of children, got a VoronoiDiagram"
+            f"VoronoiRouter.subdivide: {named[0]} must come with a number of children, got a VoronoiDiagram"
         )
     if parents is None:
         parents = present.locate(finer.leaf_centres.to(present.centres.device)).long()

@@ -286,8 +286,8 @@ class VoronoiDiagram(nn.Module):
         parents = torch.repeat_interleave(torch.arange(self.num_cells), counts).to(device)
         if self.num_cells == 1 and grafts:
             graft = grafts[0]
-            own = (table.to(device, copy=True) for table in (graft.centres, graft.child_offsets, graft.child))
-            return VoronoiDiagram._from_tables(*own), parents
+            copies = (table.to(device, copy=True) for table in (graft.centres, graft.child_offsets, graft.child))
+            return VoronoiDiagram._from_tables(*copies), parents
 
         # The grafts' rows and diagrams go behind the present ones; only leaf numbers and links have to be shifted.
         first_leaf = (counts.cumsum(0) - counts).to(device, torch.int32)
@@ -331,10 +331,10 @@ class VoronoiDiagram(nn.Module):
             for row in range(offsets[node], offsets[node + 1]):
                 if -child[row] - 1 in number if child[row] < 0 else rows[child[row]]:
                     rows[node].append(row)
-        nodes = {node: i for i, node in enumerate(node for node, found in enumerate(rows) if found)}
-        kept = [row for found in rows for row in found]
+        nodes = {node: i for i, node in enumerate(node for node, some in enumerate(rows) if some)}
+        kept = [row for some in rows for row in some]
         links = [nodes[child[row]] if child[row] >= 0 else -1 - number[-child[row] - 1] for row in kept]
-        ends = torch.tensor([0, *(len(found) for found in rows if found)]).cumsum(0)
+        ends = torch.tensor([0, *(len(some) for some in rows if some)]).cumsum(0)
         device = self.centres.device
         table = torch.tensor(links, dtype=torch.int32, device=device)
         return VoronoiDiagram._from_tables(self.centres[kept], ends.to(device, torch.int32), table)

@@ -23,7 +23,7 @@ WINDOW = 1 / 30
 #: Weight decay of tables: of what nothing asks for again, such as noise that early steps have left in empty space. With
 #: more views than these it is less by as much: a place is asked for again only after many more steps.
 TABLE_DECAY, DECAY_VIEWS = 0.1, 300
-#: Of the averaged weights in an optimiser's state, beside Adam's moments.
+#: Key of the averaged weights in an optimiser's state, beside Adam's moments.
 _AVERAGE = "average"
 
 
@@ -189,8 +189,8 @@ class Adam(torch.optim.Adam):
         try:
             yield
         finally:
-            for parameter, own in zip(held, weights, strict=True):
-                parameter.data = own
+            for parameter, average in zip(held, weights, strict=True):
+                parameter.data = average
 
     @torch.no_grad()
     def update(self, guard: Guard | None = None, loss: Tensor | None = None) -> None:
@@ -206,11 +206,11 @@ class Adam(torch.optim.Adam):
         for (parameter, group), parts in zip(held, trained_parts([entry[0] for entry in held]), strict=True):
             state = self._state(parameter)
             step, every = state["step"], not group.get("sparse", False)
-            own = parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]
+            whole = parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]
             for number, part in enumerate(parts):
                 counted = step.clone() if number else step  # once for a parameter
                 rules.append(Rule(counted, rates[id(group)], group["betas"], group["eps"], every))
-                tensors.append(own if part is ... else tuple(tensor[part] for tensor in own))
+                tensors.append(whole if part is ... else tuple(tensor[part] for tensor in whole))
         if rules:
             adam(rules, *zip(*tensors, strict=True), guard=guard, loss=loss, backend=self.backend)
 

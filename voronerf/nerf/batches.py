@@ -81,8 +81,8 @@ class RayBatches:
         if sparse is not None:
             pixels, distances = (tensor.to(self.place) for tensor in sparse)
             if views is not None:
-                own = torch.isin(pixels // (cameras.width * cameras.height), views.to(self.place))
-                pixels, distances = pixels[own], distances[own]
+                in_views = torch.isin(pixels // (cameras.width * cameras.height), views.to(self.place))
+                pixels, distances = pixels[in_views], distances[in_views]
             self.sparse = (pixels, distances) if len(pixels) else None
 
     def _useful_pixels(self, masks: Tensor | None, views: Tensor | None) -> Runs | None:
@@ -90,7 +90,7 @@ class RayBatches:
         cameras = self.cameras
         if self.box is None and masks is None and cameras.sizes is None and views is None:
             return None
-        found = []
+        runs = []
         for image in range(len(cameras)) if views is None else views.tolist():
             width, height = cameras.size(image)
             chosen = torch.ones(height, width, dtype=torch.bool, device=self.place)
@@ -103,8 +103,8 @@ class RayBatches:
             edges = torch.nn.functional.pad(chosen.to(torch.int8), (1, 1)).diff(dim=1)
             row, column = (edges == 1).nonzero(as_tuple=True)
             last = (edges == -1).nonzero(as_tuple=True)[1]
-            found.append(torch.stack(((image * cameras.height + row) * cameras.width + column, last - column)))
-        start, length = torch.cat(found, dim=1)
+            runs.append(torch.stack(((image * cameras.height + row) * cameras.width + column, last - column)))
+        start, length = torch.cat(runs, dim=1)
         return Runs.of(start, length) if 0 < int(length.sum()) < self._pixels else None
 
     @property
@@ -129,7 +129,7 @@ class RayBatches:
             self.fetch(index)
         background = uniforms if self.random_background else self.background
         cameras = self.cameras
-        found = cameras.pixel_rays(
+        rays_seen = cameras.pixel_rays(
             self.images,
             index,
             near=self.near,
@@ -140,7 +140,7 @@ class RayBatches:
         )
         radii = None
         if self.cones:
-            radii = cameras.radii(found.directions, index // (cameras.width * cameras.height)).to(self.device)
-        origins, directions, near, far, colour = (tensor.to(self.device) for tensor in found)
+            radii = cameras.radii(rays_seen.directions, index // (cameras.width * cameras.height)).to(self.device)
+        origins, directions, near, far, colour = (tensor.to(self.device) for tensor in rays_seen)
         background = None if background is None else background.to(self.device)
         return Batch(Rays(origins, directions, radii), near, far, colour, background, depths)

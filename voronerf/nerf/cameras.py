@@ -99,19 +99,12 @@ class Cameras:
     def __post_init__(self) -> None:
         if self.poses.dim() != 3 or self.poses.shape[1:] != (4, 4):
             raise ValueError(f"Cameras: poses must have shape [c, 4, 4], got {list(self.poses.shape)}")
-        expected = [len(self.poses), 4]
-        if list(self.intrinsics.shape) != expected:
-            raise ValueError(f"Cameras: intrinsics must have shape {expected}, got {list(self.intrinsics.shape)}")
-        expected = [len(self.poses), 8]
-        if self.distortion is not None and list(self.distortion.shape) != expected:
-            raise ValueError(f"Cameras: distortion must have shape {expected}, got {list(self.distortion.shape)}")
-        if self.models is not None and list(self.models.shape) != expected[:1]:
-            raise ValueError(f"Cameras: models must have shape {expected[:1]}, got {list(self.models.shape)}")
+        for name, rest in (("intrinsics", [4]), ("distortion", [8]), ("models", []), ("sizes", [2])):
+            value, expected = getattr(self, name), [len(self.poses), *rest]
+            if value is not None and list(value.shape) != expected:
+                raise ValueError(f"Cameras: {name} must have shape {expected}, got {list(value.shape)}")
         if self.models is not None and self.distortion is None:
             raise ValueError("Cameras: distortion must be given with models, got None")
-        expected = [len(self.poses), 2]
-        if self.sizes is not None and list(self.sizes.shape) != expected:
-            raise ValueError(f"Cameras: sizes must have shape {expected}, got {list(self.sizes.shape)}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Cameras: width and height must be >= 1, got {self.width} x {self.height}")
 
@@ -197,8 +190,8 @@ class Cameras:
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Cameras:
         """With another tensor for each; the tables of the lenses are shared."""
-        given = ((field.name, getattr(self, field.name)) for field in fields(self))
-        changed: dict[str, Any] = {name: change(value) for name, value in given if isinstance(value, Tensor)}
+        members = ((field.name, getattr(self, field.name)) for field in fields(self))
+        changed: dict[str, Any] = {name: change(value) for name, value in members if isinstance(value, Tensor)}
         return replace(self, **changed)._with_lenses(change(self.lenses[0]), self.lenses[1])
 
     def _with_lenses(self, lens: Tensor, tables: LensTables | None) -> Cameras:
@@ -296,9 +289,9 @@ class Cameras:
         local = torch.stack(((x - cx) / fx, -(y - cy) / fy, -torch.ones_like(x)), dim=-1)
         if self.distortion is not None:
             for index in camera.unique().tolist():
-                own = camera == index
+                of_camera = camera == index
                 lens = self.intrinsics[index], self.distortion[index], self._model(index)
-                local[own] = unproject(x[own], y[own], *lens)[0].to(local)
+                local[of_camera] = unproject(x[of_camera], y[of_camera], *lens)[0].to(local)
         pose = self.poses[camera]
         directions = torch.nn.functional.normalize((pose[:, :3, :3] * local[:, None, :]).sum(-1), dim=-1)
         return Rays(pose[:, :3, 3], directions, self.radii(directions, camera) if cones else None)

@@ -51,7 +51,7 @@ class Contraction:
         return centre + self.radius * offset * ((2 - 1 / length) / length)
 
     def inverse(self, points: Tensor) -> Tensor:
-        """Where points [..., 3] of the contracted space come from; at most 1,000 R from the centre."""
+        """The points of the world that are contracted to points [..., 3]; at most 1,000 R from the centre."""
         centre = self.centre.to(points)
         offset = (points - centre) / self.radius
         length = offset.norm(dim=-1, keepdim=True)
@@ -136,7 +136,7 @@ class Perspective:
         return torch.cat((across, 1 - 2 * self.near / depth), dim=-1)
 
     def inverse(self, points: Tensor) -> Tensor:
-        """Where points [..., 3] of the contracted space come from; at most 2,000 times the near plane's depth away."""
+        """The points of the world that are contracted to points [..., 3]; at most 2,000 near depths away."""
         depth = 2 * self.near / (1 - points[..., 2:]).clamp_min(1e-3)
         across = points[..., :2] * depth * depth.new_tensor(self.slopes)
         return torch.cat((across, depth), dim=-1) @ self.axes.to(points) + self.centre.to(points)

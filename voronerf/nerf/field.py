@@ -52,10 +52,10 @@ class DirectionPerSample(nn.Module):
     def forward(self, positions: Tensor, directions: Tensor, ray_index: Tensor) -> tuple[Tensor, Tensor]:
         """Evaluates the field; see :class:`Field`."""
         n = len(positions)
-        found = self.network(positions, directions.index_select(0, ray_index))
-        if not (isinstance(found, (tuple, list)) and len(found) == 2):
-            raise ValueError(f"field: forward must return (colour, density), got {type(found).__name__}")
-        colour, density = found
+        outputs = self.network(positions, directions.index_select(0, ray_index))
+        if not (isinstance(outputs, (tuple, list)) and len(outputs) == 2):
+            raise ValueError(f"field: forward must return (colour, density), got {type(outputs).__name__}")
+        colour, density = outputs
         if colour.shape != (n, 3) or density.shape not in ((n,), (n, 1)):
             raise ValueError(
                 f"field: forward must return a colour [{n}, 3] and a density [{n}], "

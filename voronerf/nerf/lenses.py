@@ -85,7 +85,7 @@ def undistort(u: Tensor, v: Tensor, coefficients: Tensor, model: int = PERSPECTI
 
 
 def _bend(u: Tensor, v: Tensor, terms: Sequence[float], model: int) -> tuple[Tensor, ...]:
-    """Where the polynomials put (u, v): (a, b) and the derivatives da/du, da/dv, db/du, db/dv."""
+    """The image (a, b) of (u, v) under the polynomials, and the derivatives da/du, da/dv, db/du, db/dv."""
     k1, k2, p1, p2, k3, k4, k5, k6 = terms
     s1, s2 = (k5, k6) if model == FISHEYE else (0.0, 0.0)
     r2 = u * u + v * v

@@ -52,7 +52,7 @@ class Batch:
 
 
 class RenderOutput(NamedTuple):
-    """What :class:`RayLoss` gives. Only the loss has gradients.
+    """The result of :class:`RayLoss`. Only the loss has gradients.
 
     Attributes:
         loss: [].
@@ -131,7 +131,7 @@ class RayLoss:
     def __call__(
         self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False
     ) -> RenderOutput:
-        """The loss of a batch, and what its samples have found.
+        """Computes the loss of a batch.
 
         Args:
             batch: The rays.
@@ -149,15 +149,15 @@ class RayLoss:
         return self._fused(field, batch, generator, backward)
 
     def why_not_fused(self) -> str | None:
-        """What keeps networks, colours, loss and gradients from being one operation; None if nothing does.
+        """The reason why networks, colours, loss and gradients are not one operation; None if they are.
 
         What a module with ``fuse=True`` computes is known from its first step on, which traces it.
         """
-        found = self.radiance()
-        return found if isinstance(found, str) else None
+        radiance = self.radiance()
+        return radiance if isinstance(radiance, str) else None
 
     def radiance(self, samples: tuple[Tensor, Tensor] | None = None) -> Radiance | str:
-        """What the field computes; or why the operations are separate. Samples are those of `radiance_of`."""
+        """The program of the field, or why the operations are separate; samples as for `radiance_of`."""
         renderer = self.renderer
         if renderer.sampler.grid is None:
             return "empty space is not skipped"
@@ -168,7 +168,7 @@ class RayLoss:
         samples = renderer.sampler.sample(batch.rays, batch.near, batch.far, jitter=True, generator=generator)
         network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index, renderer.backend)
         tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
-        found, gradient = render_loss_gradient(
+        result, gradient = render_loss_gradient(
             tape.raw,
             samples.deltas,
             samples.ray_offsets,
@@ -181,12 +181,12 @@ class RayLoss:
         )
         if depths is not None:
             sparse_depth_gradient(
-                found.loss,
+                result.loss,
                 gradient,
-                found.density,
+                result.density,
                 samples.depths,
                 samples.deltas,
-                found.weights,
+                result.weights,
                 samples.ray_offsets,
                 depths,
                 factor=self.sparse_depth / len(depths),
@@ -199,12 +199,12 @@ class RayLoss:
                 values = activate(raw, **field.rule)
                 seen = composed(*values, batch.far, samples, batch.background, renderer.backend)
                 further = self.term(seen, batch)
-            found.loss.add_(further.detach())
+            result.loss.add_(further.detach())
             gradient.add_(torch.autograd.grad(further, raw)[0])
         if (full := renderer.sampler.space.full_gradient) is not None:
             scale_gradient(gradient, samples.depths, full, backend=renderer.backend)
-        loss = tape.backward(found.loss, gradient, defer=not backward)
-        return RenderOutput(loss, found.error, found.weights, found.density, samples, found.colour)
+        loss = tape.backward(result.loss, gradient, defer=not backward)
+        return RenderOutput(loss, result.error, result.weights, result.density, samples, result.colour)
 
     def _separate(self, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:
         *before, last = self.renderer.render(

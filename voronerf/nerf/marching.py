@@ -29,7 +29,7 @@ FINE_WAVE = 4
 
 
 class RayColours(NamedTuple):
-    """What the rays of a picture see.
+    """Colours and depths of the rays of a picture.
 
     Attributes:
         colour: [r, 3], the background included.
@@ -117,14 +117,14 @@ def render_until_opaque(
 
 
 def _network(field: Field, rays: Rays, sampler: Occupancy) -> dict[str, Any] | None:
-    """What ``render_opaque`` asks in the place of a field; None if it is more than networks, for Warp and CUDA."""
+    """The arguments with which ``render_opaque`` asks a field; None if it is more than networks, for Warp and CUDA."""
     router = router_of(field)
     if router is None or not rays.origins.is_cpu or "warp" in (sampler.backend, router.backend):
         return None
     known = radiance_of(field, (rays.origins, rays.directions))
     if isinstance(known, str):
         return None
-    found = known.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32), sampler.backend)
-    if "cells" in found:  # which each sample has of its own
+    arguments = known.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32), sampler.backend)
+    if "cells" in arguments:  # which each sample has of its own
         return None
-    return {"network": {name: value for name, value in found.items() if name in OF_PROGRAM}, **known.rule}
+    return {"network": {name: value for name, value in arguments.items() if name in OF_PROGRAM}, **known.rule}

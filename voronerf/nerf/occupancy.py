@@ -215,9 +215,9 @@ class OccupancyGrid:
             self.points(part, torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device))
             for part in voxels.split(CHUNK)
         ]
-        found = [_density_of(field, part) for part in points]
-        if found:
-            self._enter(torch.cat(points), torch.cat(found), decay=decay, hidden=0.0, backend=backend)
+        densities = [_density_of(field, part) for part in points]
+        if densities:
+            self._enter(torch.cat(points), torch.cat(densities), decay=decay, hidden=0.0, backend=backend)
 
     @torch.no_grad()
     def revisit(
@@ -308,13 +308,13 @@ class OccupancyGrid:
 
     def march(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> March:
         """The samples of rays that lie in occupied voxels; other arguments are those of `voronerf.ops.march_rays`."""
-        given = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
-        return march_rays(*given, contraction=self._numbers, **rule)
+        arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
+        return march_rays(*arguments, contraction=self._numbers, **rule)
 
     def see(self, rays: Rays, near: Tensor, far: Tensor, samples: int, **rule: Any) -> RaysSeen:
-        """What rays see of networks in occupied voxels; other arguments are those of `voronerf.ops.render_opaque`."""
-        given = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
-        return render_opaque(*given, contraction=self._numbers, **rule)
+        """Renders rays through networks in occupied voxels; other arguments as of `voronerf.ops.render_opaque`."""
+        arguments = rays.origins, rays.directions, near, far, self.occupied, self.box, samples
+        return render_opaque(*arguments, contraction=self._numbers, **rule)
 
     def state_dict(self) -> dict[str, Tensor]:
         """The tensors from which `from_state` makes the same grid, bit for bit."""
@@ -377,7 +377,7 @@ def density_of(field: Field, points: Tensor) -> Tensor:
 
 
 def _density_of(field: Field, points: Tensor) -> Tensor:
-    """The same, with NaN as it is."""
+    """Density as in `density_of`, but NaN stays NaN."""
     direction = _along_z(points.device)
     known = radiance_of(field, (points, direction.expand(len(points), -1)))
     sigma = None if isinstance(known, str) else known.density(points)

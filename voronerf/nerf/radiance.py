@@ -1,4 +1,4 @@
-"""What a field computes, for the operations that take networks, colours and loss together. n samples, r rays."""
+"""Fields as programs, for the operations that take networks, colours and loss together. n samples, r rays."""
 
 from __future__ import annotations
 
@@ -51,32 +51,32 @@ class Radiance(NamedTuple):
 
     @property
     def rule(self) -> dict[str, Any]:
-        """What the outputs mean, as `render_loss` takes it."""
+        """How `render_loss` shall read the outputs."""
         scale = self.networks.density_scale
         return {"activated": True} if scale is None else {"density_scale": scale}
 
     def arguments(self, inputs: Tensor, directions: Tensor, ray_index: Tensor, backend: str) -> dict[str, Any]:
-        """Those of `forward_with_tape` for samples; see :class:`voronerf.nerf.Field` and :class:`Networks`."""
+        """The arguments of `forward_with_tape` for samples; see :class:`voronerf.nerf.Field` and :class:`Networks`."""
         places, rays = self.router.places(inputs), self.networks.program.rays
         if _on_warp(inputs.device, backend):
             seen = {"directions": directions, "direction_index": ray_index} if rays else {}
             return {"positions": inputs, **cast(Any, self.cells.table)(), **seen, **places}
-        given = {"inputs": [inputs, directions], "ray_index": ray_index} if rays else {"inputs": [inputs]}
-        return {"program": self.networks.program, "parameters": self.cells.parameters, **given, **places}
+        tensors = {"inputs": [inputs, directions], "ray_index": ray_index} if rays else {"inputs": [inputs]}
+        return {"program": self.networks.program, "parameters": self.cells.parameters, **tensors, **places}
 
     def density(self, points: Tensor) -> Tensor | None:
         """[n], of points [n, 3], without the layers of the colour; None if it depends on the direction."""
         router, program = self.router, self.networks.density
         if program is None or _on_warp(points.device, router.backend):
             return None
-        given = {"program": program, "inputs": [points], "parameters": self.cells.parameters, **router.places(points)}
-        return forward_with_tape(given, backend=router.backend).raw[:, 0]
+        network = {"program": program, "inputs": [points], "parameters": self.cells.parameters, **router.places(points)}
+        return forward_with_tape(network, backend=router.backend).raw[:, 0]
 
 
 def radiance_of(
     field: Field, samples: tuple[Tensor, Tensor] | None = None, *, inputs: int = 3, backend: str = "auto"
 ) -> Radiance | str:
-    """What a field computes; or why that is not known.
+    """The program of a field; or the reason why it is unknown.
 
     Args:
         field: A router, or one in a `DirectionPerSample`.
@@ -115,7 +115,7 @@ def _on_warp(device: torch.device, backend: str) -> bool:
 
 
 def _by_warp(cells: CellProgram, networks: Networks) -> bool:
-    """Whether what a layer table puts out are the outputs themselves."""
+    """Whether a layer table has its outputs activated itself."""
     if cells.table is None or cells.after is None or networks.density_scale is None:
         return False
     after = _networks(cells.after.text, (0,), cells.shapes, cells.after.inputs[0])
@@ -143,7 +143,7 @@ def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], 
 
 
 def _past_moves(program: Program) -> Program:
-    """The same, reading what was put side by side where it comes from: the density without the colour beside it."""
+    """A program that reads columns at their source, not where they were put side by side: density without colour."""
     moves = {step.out: step for step in program.steps if step.op == "move"}
 
     def source(columns: Columns) -> Columns:
@@ -159,13 +159,13 @@ def _past_moves(program: Program) -> Program:
 
 def _of_fields(program: Program, outputs: Sequence[Columns], reads: tuple[int, ...], width: int) -> Program:
     """A program with positions as its first input, directions of rays as its second if read, and one output."""
-    own, b = pruned(Builder(program).program(outputs)), Builder()
-    read = {int(step.numbers[0]) for step in own.steps if step.op == "input"}
+    needed, b = pruned(Builder(program).program(outputs)), Builder()
+    read = {int(step.numbers[0]) for step in needed.steps if step.op == "input"}
     arguments = [b.input(width)]
     if any(reads[number] == 1 for number in read):
         arguments.append(b.input(3, ray=True))
-    found = b.replay(own, {number: arguments[reads[number]] for number in read})
-    return b.program([b.side_by_side(found)])
+    values = b.replay(needed, {number: arguments[reads[number]] for number in read})
+    return b.program([b.side_by_side(values)])
 
 
 def _raw(steps: Sequence[Step], colour: Columns, density: Columns) -> tuple[list[Columns], float] | None:

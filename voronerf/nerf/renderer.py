@@ -21,7 +21,7 @@ from voronerf.nerf.volume import Rendered, Samples, per_ray, render_samples
 
 
 class RenderedImage(NamedTuple):
-    """What `Renderer.image` returns.
+    """A rendered picture, of `Renderer.image`.
 
     Attributes:
         colour: [h, w, 3], the background included.
@@ -97,7 +97,7 @@ class Renderer:
 
     @property
     def contraction(self) -> Contraction | Perspective | None:
-        """Of the space that the fields work in."""
+        """The contraction of the space that the fields work in."""
         return self.sampler.space.contraction
 
     @property
@@ -137,8 +137,8 @@ class Renderer:
         near, far = per_ray(near, rays), per_ray(far, rays)
 
         def look(name: str, samples: Samples) -> Rendered:
-            given = self.fields[name], rays, far, samples, self.sampler.space
-            return render_samples(*given, background=background, backend=self.backend)
+            arguments = self.fields[name], rays, far, samples, self.sampler.space
+            return render_samples(*arguments, background=background, backend=self.backend)
 
         samples, before = self.sampler.draw(look, rays, near, far, jitter=jitter, generator=generator)
         return (*before, look("field", samples))
@@ -146,7 +146,7 @@ class Renderer:
     def see(
         self, rays: Rays, near: Tensor, far: Tensor, background: Tensor | None = None, heaviest: bool = True
     ) -> RayColours:
-        """What rays of a picture see, without randomness.
+        """Renders rays of a picture, without randomness.
 
         Args:
             rays: r rays.
@@ -155,8 +155,8 @@ class Renderer:
             background: [3] or [r, 3]; None is black.
             heaviest: whether to find the heaviest samples; without it that part of the result means nothing.
         """
-        given = self.field, rays, near, far
-        if (seen := self.sampler.see(*given, background=background, heaviest=heaviest)) is not None:
+        arguments = self.field, rays, near, far
+        if (seen := self.sampler.see(*arguments, background=background, heaviest=heaviest)) is not None:
             return seen
         last = self.render(rays, near, far, background=background)[-1]
         places = rays.origins

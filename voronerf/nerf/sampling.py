@@ -1,4 +1,4 @@
-"""Where the samples of a ray lie, and what they should have seen. r rays, s samples a ray; distances in world units."""
+"""Depths of the samples of a ray, and the loss of its colour. r rays, s samples a ray; distances in world units."""
 
 from __future__ import annotations
 
@@ -146,8 +146,8 @@ def union_depths(
         (depths [r, s + f] ascending, edges [r, s + f + 1]). A sample stands for the part of the ray up to halfway to
         its neighbours.
     """
-    found = resample(weights, edges, count, uniforms=uniforms, backend=backend)
-    every = torch.cat((depths, found), dim=1).sort(dim=1).values
+    drawn = resample(weights, edges, count, uniforms=uniforms, backend=backend)
+    every = torch.cat((depths, drawn), dim=1).sort(dim=1).values
     return every, torch.cat((edges[:, :1], (every[:, 1:] + every[:, :-1]) / 2, edges[:, -1:]), dim=1)
 
 

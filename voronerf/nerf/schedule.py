@@ -1,4 +1,4 @@
-"""What changes over a training: the learning rate and the rays of a step."""
+"""Schedules of a training: the learning rate, and the rays of a step."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def learning_rate(lr: float, fraction: float, step: int, *, hold: float = 0.0, b
     return lr * rise * math.exp(math.log(FINAL) * fallen)
 
 
-def next_rays(now: int, found: int, *, rays: int, samples: int, growth: float, contracted: bool = False) -> int:
+def next_rays(now: int, taken: int, *, rays: int, samples: int, growth: float, contracted: bool = False) -> int:
     """Rays of the next step: the more of the samples are left out as empty, the more rays a step takes.
 
     Args:
         now: Rays of the last step.
-        found: Samples that it had in occupied space.
+        taken: Samples that it had in occupied space.
         rays: Rays of the first step, and the fewest.
         samples: Strata of a ray of the last step.
         growth: The most rays, as a multiple of ``rays``.
@@ -52,5 +52,5 @@ def next_rays(now: int, found: int, *, rays: int, samples: int, growth: float, c
     """
     most = CONTRACTED_FILL_SAMPLES if contracted else FILL_SAMPLES
     share = FILL * max(samples / most, 1.0)
-    wanted = now * share * rays * samples / max(found, 1)
+    wanted = now * share * rays * samples / max(taken, 1)
     return int(min(max(wanted, rays), rays * growth))

@@ -153,8 +153,8 @@ def ask(field: Field, rays: Rays, samples: Samples, space: Space) -> tuple[Tenso
 
     Their gradients shrink near the camera as `Space` says.
     """
-    found = field(samples.inputs, rays.directions, samples.ray_index)
-    rgb, density = (values.to(samples.depths.dtype) for values in found)
+    outputs = field(samples.inputs, rays.directions, samples.ray_index)
+    rgb, density = (values.to(samples.depths.dtype) for values in outputs)
     if space.full_gradient is not None:
         share = shares_of(samples.depths, space.full_gradient)
         for values, scale in ((rgb, share[:, None]), (density, share)):
@@ -193,9 +193,9 @@ def composed(
     """Colours of rays from colours [m, 3] and densities [m] of samples; the rest as for `render_samples`."""
     along = (samples.by_ray(values) for values in (density, rgb, samples.depths, samples.deltas))
     offsets = samples.ray_offsets if samples.edges is None else None
-    found = composite(*along, ray_offsets=offsets, background=background, backend=backend)
-    depth = normalised(found.depth, found.opacity, far)
-    return Rendered(found.colour, found.opacity, depth, found.weights.reshape(-1), rgb, density, samples)
+    seen = composite(*along, ray_offsets=offsets, background=background, backend=backend)
+    depth = normalised(seen.depth, seen.opacity, far)
+    return Rendered(seen.colour, seen.opacity, depth, seen.weights.reshape(-1), rgb, density, samples)
 
 
 def normalised(depth: Tensor, opacity: Tensor, far: Tensor) -> Tensor:

@@ -51,7 +51,7 @@ def check_module(module: nn.Module) -> None:
 
 def _check_reach(module: nn.Module) -> None:
     """Raises TypeError where parameters are reached past their names, which are all that cells replace."""
-    own = {address: name for name, p in module.named_parameters() if (address := _address(p))}
+    owner = {address: name for name, p in module.named_parameters() if (address := _address(p))}
     objects = {id(p): f"parameter `{name}`" for name, p in module.named_parameters()}
     objects |= {id(part): f"part `{name}`" if name else "module" for name, part in module.named_modules()}
     for name, part in module.named_modules():
@@ -60,9 +60,9 @@ def _check_reach(module: nn.Module) -> None:
         for attribute, value in (kept | dict(part.named_buffers(recurse=False))).items():
             for leaf in _leaves(value):
                 reason = ""
-                if isinstance(leaf, Tensor) and _address(leaf) in own:
+                if isinstance(leaf, Tensor) and _address(leaf) in owner:
                     reason = (
-                        f"a view of the parameter `{own[_address(leaf)]}`, which cells replace (make it in forward)"
+                        f"a view of the parameter `{owner[_address(leaf)]}`, which cells replace (make it in forward)"
                     )
                 elif isinstance(leaf, types.FunctionType) and (held := _held_by(leaf, objects)):
                     reason = f"a function that holds the {held}, of which cells have their own (make it a method)"
@@ -82,25 +82,25 @@ def _address(tensor: Tensor) -> int:
 
 def _leaves(value: Any) -> list[Any]:
     """Tensors and functions in a value, in what it holds, and so on."""
-    found, seen, level = [], set[int](), [value]
+    leaves, seen, level = [], set[int](), [value]
     for _ in range(DEEPEST):
         items = [item for item in level if id(item) not in seen and not isinstance(item, nn.Module)]
         seen.update(map(id, items))
         held = [contents(item) for item in items]
-        found += [item for item, inner in zip(items, held, strict=True) if inner is None]
+        leaves += [item for item, inner in zip(items, held, strict=True) if inner is None]
         level = [item for inner in held for item in (inner or {}).values()]
-    return found
+    return leaves
 
 
 def _held_by(function: types.FunctionType, objects: dict[int, str]) -> str:
     """Which of some objects a function reaches; a copy of the function is the same function."""
     names = function.__code__.co_names
-    found = [function.__globals__[name] for name in names if name in function.__globals__]
+    values = [function.__globals__[name] for name in names if name in function.__globals__]
     for cell in function.__closure__ or ():
         with contextlib.suppress(ValueError):  # a cell that is still empty
-            found.append(cell.cell_contents)
-    found += [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
-    for held in found:
+            values.append(cell.cell_contents)
+    values += [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()]
+    for held in values:
         for item in (*held, held) if isinstance(held, (list, tuple)) else (held,):
             item = item.__self__ if isinstance(item, types.MethodType) else item
             if id(item) in objects:
@@ -153,15 +153,15 @@ def fill_cell(routed: nn.Module, index: int, module: nn.Module, op: str) -> None
     odd = sorted(ours.keys() ^ theirs.keys())
     if odd:
         raise ValueError(f"{op}: module must have the parameters of the routed one, got a difference in {odd[0]!r}")
-    for name, own in ours.items():
-        shape, value = own.shape[id(own) in stacked :], theirs[name]
+    for name, tensor in ours.items():
+        shape, value = tensor.shape[id(tensor) in stacked :], theirs[name]
         if value.shape != shape:
             raise ValueError(f"{op}: module's {name} must have shape {list(shape)}, got {list(value.shape)}")
-        if id(own) not in stacked and not torch.equal(value.to(own), own):
+        if id(tensor) not in stacked and not torch.equal(value.to(tensor), tensor):
             raise ValueError(f"{op}: module's {name} must be that of the routed one, since cells share it")
-    for name, own in ours.items():
-        if id(own) in stacked:
-            own[index] = theirs[name].to(own)
+    for name, tensor in ours.items():
+        if id(tensor) in stacked:
+            tensor[index] = theirs[name].to(tensor)
 
 
 def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:
@@ -201,8 +201,8 @@ def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | No
 
 def plain_cell(routed: nn.Module, index: int) -> nn.Module:
     """A plain copy of one cell's module, with parameters of its own."""
-    own = {id(p): nn.Parameter(p.detach()[index].clone(), p.requires_grad) for p in cell_parameters(routed)}
-    plain: nn.Module = clone_module(routed, own)
+    copies = {id(p): nn.Parameter(p.detach()[index].clone(), p.requires_grad) for p in cell_parameters(routed)}
+    plain: nn.Module = clone_module(routed, copies)
     for part in plain.modules():
         vars(part).pop(SHARED, None)
     return plain
@@ -215,15 +215,15 @@ def apply_to_cells(routed: nn.Module, k: int, function: Callable[[nn.Module], An
     """
     stacked = {id(parameter) for parameter in cell_parameters(routed)}
     for index in range(k):
-        given = plain_cell(routed, index).apply(function).state_dict()
+        changed = plain_cell(routed, index).apply(function).state_dict()
         with torch.no_grad():
-            for name, own in routed.state_dict(keep_vars=True).items():
-                if given.get(name) is None or given[name].shape != own.shape[id(own) in stacked :]:
+            for name, tensor in routed.state_dict(keep_vars=True).items():
+                if changed.get(name) is None or changed[name].shape != tensor.shape[id(tensor) in stacked :]:
                     raise ValueError(f"{_OP}.apply: fn must keep names and shapes of parameters, got another {name!r}")
-                if id(own) in stacked:
-                    own[index] = given[name].to(own)
+                if id(tensor) in stacked:
+                    tensor[index] = changed[name].to(tensor)
                 elif index == 0:
-                    own.copy_(given[name])
+                    tensor.copy_(changed[name])
 
 
 def renew_cells(

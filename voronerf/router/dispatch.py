@@ -29,7 +29,7 @@ from voronerf.router.double import Double
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters, parts_of
-from voronerf.router.known import Known
+from voronerf.router.known import KnownCall
 from voronerf.router.layout import Call, Results, map_tensors
 from voronerf.router.probe import Options, Probe, check_rays
 from voronerf.router.program import Activation, CellProgram
@@ -57,7 +57,7 @@ class CallPlan:
         open: Whether another batch may run grouped, though the first did not.
         chosen: The fastest way and why, by the size of a batch and the number of cells.
         constants: What is no tensor among the arguments of the call that it was made for, if it is fused.
-        watch: What its trace read of the module, as it was.
+        watch: Values of the module that its trace read.
         skip: The next calls that run cell by cell before another way is tried again.
         wait: ``skip`` after the next batch that cannot be grouped.
     """
@@ -116,7 +116,7 @@ class Dispatch:
         """Drops all plans, after a change of dtype, device or parameters' names."""
         self.plans: dict[Any, list[CallPlan]] = {}  # the latest first; several where they are traced with other values
         self._fixed: dict[Any, tuple[set[Source], str]] = {}  # what cannot be an input of a trace, and why
-        self.known: dict[Any, Known] = {}  # by `kind_of`
+        self.known: dict[Any, KnownCall] = {}  # by `kind_of`
         self._known, self._trees = list[Any](), list[Any]()  # parameters, and parts of the module, at the last call
         self._k = 0  # cells, then
         self._inner: list[Any] = []  # shapes of one cell's parameters
@@ -133,7 +133,7 @@ class Dispatch:
     def program(
         self, call: Call, grouping: Grouping | None, device: torch.device, k: int, options: Options, backend: str
     ) -> CellProgram | str:
-        """What a call of this kind computes as one program; or why that is not known.
+        """The program of a call of this kind; or the reason why it is unknown.
 
         Args:
             call: The call.
@@ -182,29 +182,29 @@ class Dispatch:
             results = self._run(plan, call, grouping)
         else:
             results = self._run_apart(plan, call, grouping, frozen)
-        if call.like is not None and (known := Known.of(plan, call, grouping)):
+        if call.like is not None and (known := KnownCall.of(plan, call, grouping)):
             if len(self.known) >= _PLANS:
                 self.known = {}
             self.known[call.like] = known
         return results
 
-    def find(self, kind: Any, k: int) -> Known | None:
-        """What is known of calls of a kind, if the module is as it was; while it compiles it is taken for that."""
-        found = self.known.get(kind)
-        if found is None or torch.compiler.is_compiling():
-            return found
-        return None if is_watched() or not self._same_parameters(k) or found.plan.watch.changed() else found
+    def find(self, kind: Any, k: int) -> KnownCall | None:
+        """The known call of a kind, if the module has not changed; while it compiles this is assumed."""
+        entry = self.known.get(kind)
+        if entry is None or torch.compiler.is_compiling():
+            return entry
+        return None if is_watched() or not self._same_parameters(k) or entry.plan.watch.changed() else entry
 
     def _same_parameters(self, k: int) -> bool:
         """Whether the module has the parameters and parts of the last call."""
         if k != self._k:
             return False
-        for own, name, shape, dtype, device in self._known:
-            p = own.get(name)
+        for registry, name, shape, dtype, device in self._known:
+            p = registry.get(name)
             if p is None or p.shape != shape or p.dtype is not dtype or p.get_device() != device:
                 return False
-        for own, was in self._trees:
-            if len(own) != len(was) or not all(map(operator.is_, own.values(), was)):
+        for registry, was in self._trees:
+            if len(registry) != len(was) or not all(map(operator.is_, registry.values(), was)):
                 return False
         return True
 
@@ -232,9 +232,9 @@ class Dispatch:
         if inner != self._inner:
             self.forget()
         self._inner, self._k, owned = inner, k, owned_parameters(call.module)
-        self._known = [(own._parameters, name, p.shape, p.dtype, p.get_device()) for own, name, p in owned]
-        trees = [own._modules for own in parts_of(call.module).values()]
-        self._trees = [(own, tuple(own.values())) for own in trees if own]
+        self._known = [(part._parameters, name, p.shape, p.dtype, p.get_device()) for part, name, p in owned]
+        trees = [part._modules for part in parts_of(call.module).values()]
+        self._trees = [(part, tuple(part.values())) for part in trees if part]
 
     def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
         """The plan for calls of this kind, which the first of them makes, and one that finds other values."""
@@ -268,18 +268,18 @@ class Dispatch:
             made.watch = Watch.of(call.module, made.fused.reads, made.fused.inputs)
         if probe.refused and made.fused is not None:
             fixed = self._fixed.setdefault(key, (set(), probe.refused))[0]
-            fixed.update(*(own.sources - made.fused.inputs.sources for own in inputs))
+            fixed.update(*(other.sources - made.fused.inputs.sources for other in inputs))
         before = set(map(id, plans))
-        self.known = {like: own for like, own in self.known.items() if id(own.plan) not in before}
+        self.known = {like: other for like, other in self.known.items() if id(other.plan) not in before}
         if plans and [way.name for way in plans[0].ways] == [way.name for way in ways]:
             made.chosen = plans[0].chosen
-        self.plans[key] = [made] if made.fused is None else [made, *(own for own in plans if own is not plan)]
+        self.plans[key] = [made] if made.fused is None else [made, *(other for other in plans if other is not plan)]
         return made
 
     def _inputs(
         self, call: Call, constants: dict[str, Any], plans: list[CallPlan], key: Any
     ) -> tuple[list[Inputs], str]:
-        """What a trace may take as inputs, after something has changed; or none, and that it changed too often."""
+        """Attributes that a new trace takes as inputs, after a change; or none, and that they changed too often."""
         fused = plans[0].fused
         assert fused is not None
         changed, parts = plans[0].changed(constants), list(parts_of(call.module).values())
@@ -325,8 +325,8 @@ class Dispatch:
                 first,
                 f"{1e3 * times[first]:.3g} ms for {n} samples, {others}" if min(times) else "",
             )
-        first, own = plan.chosen[size]
-        return ways[first], "; ".join(filter(None, (ways[first].why, own)))
+        first, why = plan.chosen[size]
+        return ways[first], "; ".join(filter(None, (ways[first].why, why)))
 
     def _run(self, plan: CallPlan, call: Call, grouping: Grouping) -> Results:
         """Runs a call as planned, or cell by cell where its batch cannot be grouped."""
@@ -366,23 +366,23 @@ class Dispatch:
         n, cells = grouping.n, grouping.cells
         cells = torch.zeros(n, dtype=torch.int32, device=grouping.device) if cells is None else cells
         still = frozen.index_select(0, cells)
-        found, rows = list[Results](), list[Tensor]()
-        for own, context in ((~still, contextlib.nullcontext()), (still, torch.no_grad())):
-            rows.append(own.nonzero()[:, 0])
+        outcomes, rows = list[Results](), list[Tensor]()
+        for mask, context in ((~still, contextlib.nullcontext()), (still, torch.no_grad())):
+            rows.append(mask.nonzero()[:, 0])
             if len(rows[-1]):
                 count, chosen = len(rows[-1]), cells[rows[-1]]
                 part = Grouping(chosen, count, grouping.k, grouping.device, grouping.backend, rows[-1])
                 with context:
-                    found.append(self._run(plan, call, part))
+                    outcomes.append(self._run(plan, call, part))
         order, tensors = torch.cat(rows), []
-        for parts in zip(*(results.unsorted for results in found), strict=True):
+        for parts in zip(*(results.unsorted for results in outcomes), strict=True):
             joined = torch.cat(parts)
             # The backward of index_copy is a gather, where that of an index would add up.
             joined = torch.zeros_like(joined).index_copy(0, order, joined)
             if joined.is_floating_point() and not len(rows[0]):  # a batch without samples to learn from is no error
                 joined = _Constant.apply(joined, *(p for p in cell_parameters(call.module) if p.requires_grad))
             tensors.append(joined)
-        return Results(found[0].value, tensors)
+        return Results(outcomes[0].value, tensors)
 
     def warn_once(self, topic: str, message: str) -> None:
         """Warns, the first time that a topic comes up, at the line that called the router."""

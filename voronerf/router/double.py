@@ -49,19 +49,19 @@ class Double:
         self._kept: list[tuple[nn.Module, dict[str, Any]]] = []  # parts whose ``forward`` may assign, and what they had
         self._registries: list[tuple[nn.Module, dict[str, Any], set[str]]] = []
         for key, part in parts.items():
-            twin, own = twins[key], dict(vars(part))
+            twin, members = twins[key], dict(vars(part))
             if twin is part:
                 continue
-            registry = own["_parameters"] = dict(part._parameters)
-            own["_buffers"] = dict(part._buffers)
-            own["_modules"] = {name: twins.get(id(child), child) for name, child in part._modules.items()}
-            others = [item for item in own.items() if type(item[1]) not in _PLAIN]
+            registry = members["_parameters"] = dict(part._parameters)
+            members["_buffers"] = dict(part._buffers)
+            members["_modules"] = {name: twins.get(id(child), child) for name, child in part._modules.items()}
+            others = [item for item in members.items() if type(item[1]) not in _PLAIN]
             for name, value in others:  # nearly all of them are empty dicts of hooks
                 if (type(value) not in _OF_HOOKS or value) and name not in _REGISTRIES and _reaches(value, parts):
-                    own[name] = _moved(value, twins)
-            vars(twin).update(own)
+                    members[name] = _moved(value, twins)
+            vars(twin).update(members)
             if not type(part).__module__.startswith(_LAYERS) or part._forward_pre_hooks:
-                self._kept.append((twin, own))
+                self._kept.append((twin, members))
             self._places += [(registry, name, id(p)) for name, p in registry.items() if p is not None]
             self._registries.append((twin, registry, set(registry)))
 
@@ -73,9 +73,9 @@ class Double:
         """
         placed = self.fill(values)
         versions = _versions(placed)
-        own = Call(self.module, call.method, call.layout, call.names, call.args, call.kwargs, call.kinds)
+        copied = Call(self.module, call.method, call.layout, call.names, call.args, call.kwargs, call.kinds)
         try:
-            return own.run(rows)
+            return copied.run(rows)
         finally:
             self._check(call.name, placed, versions)
             self._begin_again()
@@ -87,18 +87,18 @@ class Double:
                 odd = sorted(vars(twin)["_parameters"].keys() ^ names)
                 raise Forbidden(f"{_OP}: {name} must not add or remove parameters, but does so with {odd[0]!r}")
         now = _versions(placed)
-        for (registry, own, value), before, after in zip(placed, versions, now, strict=True):
-            if registry[own] is not value or before != after:
-                does = "replace parameters" if registry[own] is not value else "write into its parameters"
-                raise Forbidden(f"{_OP}: {name} must not {does}, but does so with {own!r}")
+        for (registry, key, value), before, after in zip(placed, versions, now, strict=True):
+            if registry[key] is not value or before != after:
+                does = "replace parameters" if registry[key] is not value else "write into its parameters"
+                raise Forbidden(f"{_OP}: {name} must not {does}, but does so with {key!r}")
 
     def _begin_again(self) -> None:
         """Gives the parts the attributes that they had before the run."""
-        for twin, own in self._kept:
+        for twin, members in self._kept:
             now = vars(twin)
-            if now.keys() != own.keys() or not all(map(operator.is_, now.values(), own.values())):
+            if now.keys() != members.keys() or not all(map(operator.is_, now.values(), members.values())):
                 now.clear()
-                now.update(own)
+                now.update(members)
 
     def fill(self, values: Mapping[int, Any]) -> list[tuple[dict[str, Any], str, Any]]:
         """Puts tensors in the place of parameters, by their id; gives (registry, name, tensor) of each."""
@@ -197,9 +197,9 @@ def _moved(value: Any, twins: Mapping[int, nn.Module]) -> Any:
         if isinstance(leaf, (set, frozenset)):
             return type(leaf)(_moved(item, twins) for item in leaf)
         if callable(leaf) and type(leaf) not in _PLAIN and not isinstance(leaf, type) and hasattr(leaf, "__dict__"):
-            own: Any = object.__new__(type(leaf))
-            vars(own).update({name: _moved(item, twins) for name, item in vars(leaf).items()})
-            return own
+            moved: Any = object.__new__(type(leaf))
+            vars(moved).update({name: _moved(item, twins) for name, item in vars(leaf).items()})
+            return moved
         return leaf
 
     return map_tree(value, change)

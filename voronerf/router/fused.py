@@ -45,10 +45,10 @@ class ParameterEntries:
 
     def constants(self) -> list[float] | None:
         """Its entries, if they are numbers."""
-        found: list[float] | None = None
+        values: list[float] | None = None
         if isinstance(self.of, Tensor):
-            found = self.of.detach().flatten().cpu()[self._numbers].tolist()
-        return found
+            values = self.of.detach().flatten().cpu()[self._numbers].tolist()
+        return values
 
     def own(self, values: Mapping[Any, Any]) -> Tensor:
         """The parameter itself, where these are all of its entries in its own shape; else as `of_values`."""
@@ -68,7 +68,7 @@ class ParameterEntries:
 
 
 @dataclass
-class Run:
+class Segment:
     """One program and where its tensors come from and go to."""
 
     program: Program
@@ -96,9 +96,9 @@ class Fused:
         reads: (place, name) of the attributes of parts that ``forward`` read.
     """
 
-    def __init__(self, call: Call, given: list[Tensor], inputs: Inputs) -> None:
+    def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
         self.module, self.inputs = call.module, inputs
-        trace = Trace(self._with_inputs(call, given[0].device), given, inputs)
+        trace = Trace(self._with_inputs(call, tensors[0].device), tensors, inputs)
         parts, self.reads = list(parts_of(call.module).values()), trace.reads
         self._places = [(parts[i], i, name) for i, name in trace.places]
         self._n, self._inputs, self._shared, self._parameters = trace.n, trace.inputs, trace.shared, trace.parameters
@@ -164,10 +164,10 @@ class Fused:
         """The first run that can read a value."""
         if node in self._ready:
             return self._ready[node]
-        lowering, found = self._lowering, [0]
+        lowering, levels = self._lowering, [0]
         for value in {lowering.columns[i][0] for i in lowering.order(self._entries[node].codes)[1].tolist()}:
-            found.append(lowering.level(value) + (value not in lowering.sources))
-        return max(found)
+            levels.append(lowering.level(value) + (value not in lowering.sources))
+        return max(levels)
 
     def _known(self, node: fx.Node) -> Entries:
         """Where the entries of a node's value come from."""
@@ -281,22 +281,22 @@ class Fused:
             waiting |= {c.index for c in step.operands if c.of == VALUE}
         return True
 
-    def _cut(self) -> dict[int, Run]:
+    def _cut(self) -> dict[int, Segment]:
         """The steps in runs, by their level."""
         lowering, steps = self._lowering, self._lowering.builder.steps
         live = self._live
         level = {value: lowering.level(value) for value in live}
-        runs: dict[int, Run] = {}
+        runs: dict[int, Segment] = {}
         for number in sorted({level[v] for v in live if v not in lowering.sources}):
-            own = [steps[v] for v in sorted(live) if level[v] == number and v not in lowering.sources]
+            chosen = [steps[v] for v in sorted(live) if level[v] == number and v not in lowering.sources]
             later = {c.index for v in live if level[v] > number for c in steps[v].operands if c.of == VALUE}
-            outputs: list[Any] = [step.out for step in own if step.out in later]
+            outputs: list[Any] = [step.out for step in chosen if step.out in later]
             kept = [Columns(VALUE, v, 0, steps[v].width) for v in outputs]
             for node, columns in self._made.items():
                 if level[columns.index] == number and columns.index not in lowering.sources:
                     outputs.append(node)
                     kept.append(columns)
-            runs[number] = _renumbered(own, kept, lowering, outputs)
+            runs[number] = _renumbered(chosen, kept, lowering, outputs)
         for node, columns in self._made.items():
             if columns.index in lowering.sources:
                 raise Unfusable(f"{name_of(node.target)}{node.meta.get('line', '')} returns an argument")
@@ -323,8 +323,8 @@ class Fused:
         recorded = torch.is_grad_enabled()
         with torch.set_grad_enabled(recorded or self._differentiates):
             self._compute(values, grouping, sort)
-        found = [values[node] if recorded else values[node].detach() for node in self._outputs]
-        return Results(self.result, found, grouping if sort else None)
+        outputs = [values[node] if recorded else values[node].detach() for node in self._outputs]
+        return Results(self.result, outputs, grouping if sort else None)
 
     @functools.cached_property
     def whole(self) -> Whole | str:
@@ -359,23 +359,23 @@ class Fused:
     def _sources(self) -> list[tuple[dict[str, Any], str, ParameterEntries | None]]:
         """Where the parameters of :attr:`whole` are, and their entries that it takes; None for a parameter as it is."""
         (run,) = self._runs.values()
-        found = list[tuple[dict[str, Any], str, ParameterEntries | None]]()
+        sources = list[tuple[dict[str, Any], str, ParameterEntries | None]]()
         for taken in run.parameters:
             if isinstance(taken.of, Tensor):
-                found.append(({"": taken.own({}).float()}, "", None))
+                sources.append(({"": taken.own({}).float()}, "", None))
                 continue
             owner, name = self._owned[self._parameters[taken.of]]
-            own = cast(Tensor, owner._parameters[name])
-            as_it_is = own.dtype is torch.float32 and taken.own({taken.of: own}) is own
-            found.append((owner._parameters, name, None if as_it_is else taken))
-        return found
+            parameter = cast(Tensor, owner._parameters[name])
+            as_it_is = parameter.dtype is torch.float32 and taken.own({taken.of: parameter}) is parameter
+            sources.append((owner._parameters, name, None if as_it_is else taken))
+        return sources
 
     def parameters(self, k: int, device: torch.device, backend: str) -> list[Tensor]:
         """Those of :attr:`whole`, float32: the module's own where they are a parameter as it is, else made of them."""
         if not self.computes:
             return [
-                own[name] if taken is None else taken.own({taken.of: own[name]}).float()
-                for own, name, taken in self._sources
+                registry[name] if taken is None else taken.own({taken.of: registry[name]}).float()
+                for registry, name, taken in self._sources
             ]
         tensors = [self.inputs.tensor(lookup(part, name), device) for part, _, name in self._places]
         values: dict[Any, Any] = dict(zip(self._shared, tensors, strict=True))
@@ -409,13 +409,13 @@ class Fused:
             if number in self._runs:
                 self._compute_run(self._runs[number], values, grouping, order)
 
-    def _compute_run(self, run: Run, values: dict[Any, Any], grouping: Grouping, order: Tensor | None) -> None:
+    def _compute_run(self, run: Segment, values: dict[Any, Any], grouping: Grouping, order: Tensor | None) -> None:
         n = values[self._n]
         rows = [_flat(values[source], n) for source in run.inputs]
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
         half = torch.is_autocast_enabled(grouping.device.type) or any(x.dtype in HALF for x in rows)
         parameters = [taken.of_values(values).to(dtype) for taken in run.parameters]
-        found = grouped_program(
+        outputs = grouped_program(
             [x.to(dtype) for x in rows],
             parameters,
             grouping.offsets,
@@ -423,7 +423,7 @@ class Fused:
             order=order,
             backend=grouping.backend,
         )
-        for of, tensor in zip(run.outputs, found, strict=True):
+        for of, tensor in zip(run.outputs, outputs, strict=True):
             if isinstance(of, fx.Node):
                 shape, at, m = of.meta["layout"]
                 tensor = tensor.reshape(n * m, *shape).movedim(0, at) if at else tensor.reshape(n * m, *shape)
@@ -431,9 +431,9 @@ class Fused:
             values[of] = tensor
 
 
-def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outputs: list[Any]) -> Run:
+def _renumbered(steps: list[Step], kept: list[Columns], lowering: Lowering, outputs: list[Any]) -> Segment:
     """A program of some of the steps, with numbers of its own."""
-    b, run = Builder(), Run(Program((), (), (), ()), outputs=outputs)
+    b, run = Builder(), Segment(Program((), (), (), ()), outputs=outputs)
     values: dict[int, int] = {}
     parameters: dict[int, int] = {}
 

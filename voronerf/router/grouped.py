@@ -36,8 +36,8 @@ _RULES: dict[Any, Rule] = {}
 
 def find(names: str, *places: Any) -> frozenset[Any]:
     """The functions of these names that modules or classes have."""
-    found = (getattr(place, name, None) for place in places for name in names.split())
-    return frozenset(function for function in found if function is not None)
+    functions = (getattr(place, name, None) for place in places for name in names.split())
+    return frozenset(function for function in functions if function is not None)
 
 
 _VALUES = {"T", "H", "mT", "mH", "data", "grad", "real", "imag", "_base"}
@@ -174,8 +174,8 @@ def for_all_cells(func: Any, args: Any, kwargs: Any, fail: Callable[[str], Excep
 
     def on_one(*single: Tensor) -> Any:
         following = iter(single)
-        given = map_tensors((args, kwargs), lambda value: next(following) if isinstance(value, PerCell) else value)
-        return function(*given[0], **given[1])
+        arguments = map_tensors((args, kwargs), lambda value: next(following) if isinstance(value, PerCell) else value)
+        return function(*arguments[0], **arguments[1])
 
     try:
         return map_tensors(torch.vmap(on_one, randomness="different")(*stacks), PerCell)
@@ -279,17 +279,17 @@ class GroupedRun(TorchFunctionMode):
         if any(type(tensor) is PerCell for tensor in operands):
             return self._with_parameters(func, args, kwargs, operands, marked)
         result = without_randomness(func, args, kwargs) if self.quiet else func(*args, **kwargs)
-        found = tensors_of(result)
+        outputs = tensors_of(result)
         if marked:
             if writes_in_place(func):
                 self.mark(operands[0])
             name = getattr(func, "__name__", "")
-            for tensor in found:
+            for tensor in outputs:
                 self.mark(tensor, name if name in ("any", "all") else "")
-            if not found:
+            if not outputs:
                 self._check_read(func, result, marked[0])
         elif func in CREATE:
-            for tensor in found:
+            for tensor in outputs:
                 if tensor.shape[:1] == (self.n,):
                     self.mark(tensor)
         return result
@@ -351,7 +351,7 @@ class Grouped:
 
     def run(self, call: Call, grouping: Grouping) -> Results:
         """Results in the order of the grouping; raises :class:`Ungroupable`."""
-        given = call.arranged(grouping)
+        arguments = call.arranged(grouping)
         parts = grouping.parts(self.piece) if grouping.device.type == "cpu" else [grouping]
         # Parameters are split once for all parts: their gradient is then put together once, where that of a slice would
         # fill a tensor of all cells for each part. Parts of one cell have the same piece.
@@ -359,12 +359,12 @@ class Grouped:
         for p in cell_parameters(call.module):
             pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))
         values, widest, tables, double = [], 1, dict[Any, Any](), Double(call.module)
-        for part, rows in zip(parts, split_rows(given, [part.n for part in parts]), strict=True):
+        for part, rows in zip(parts, split_rows(arguments, [part.n for part in parts]), strict=True):
             run = GroupedRun(part, tables, self.quiet)
             for tensor in rows:
                 run.mark(tensor)
             origin = part.start
-            stand_ins = {id(p): PerCell(own[origin], (p, origin)) for p, own in pieces}
+            stand_ins = {id(p): PerCell(piece[origin], (p, origin)) for p, piece in pieces}
             with run:
                 values.append(double.run(call, rows, stand_ins))
             if run.failed is not None:

@@ -173,15 +173,15 @@ class Assigned(NamedTuple):
 # Parameters -----------------------------------------------------------------------------------------------------------
 
 
-def parts_of(module: nn.Module, found: dict[int, nn.Module] | None = None) -> dict[int, nn.Module]:
+def parts_of(module: nn.Module, parts: dict[int, nn.Module] | None = None) -> dict[int, nn.Module]:
     """All parts of a module tree by their id, in the order of ``modules()``, which takes three times as long."""
-    found = {} if found is None else found
-    if id(module) not in found:
-        found[id(module)] = module
+    parts = {} if parts is None else parts
+    if id(module) not in parts:
+        parts[id(module)] = module
         for child in module._modules.values():
             if child is not None:
-                parts_of(child, found)
-    return found
+                parts_of(child, parts)
+    return parts
 
 
 def owned_parameters(module: nn.Module) -> list[tuple[nn.Module, str, nn.Parameter]]:
@@ -203,8 +203,8 @@ def cell_parameters(module: nn.Module) -> list[nn.Parameter]:
 def cells_of(stacked: Tensor) -> tuple[Tensor, ...]:
     """[k, ...] -> the tensor of each cell."""
     large = stacked.nbytes >= LARGE and stacked.requires_grad and torch.is_grad_enabled()
-    found: tuple[Tensor, ...] = _Cells.apply(stacked) if large else stacked.unbind(0)
-    return found
+    cells: tuple[Tensor, ...] = _Cells.apply(stacked) if large else stacked.unbind(0)
+    return cells
 
 
 class _Cells(torch.autograd.Function):

@@ -46,36 +46,36 @@ def kind_of(method: str, training: bool, args: Sequence[Any], kwargs: dict[str, 
     return tuple(kind)
 
 
-class Known:
+class KnownCall:
     """What is known of the calls of one kind, from the first of them and its plan."""
 
     def __init__(self, plan: CallPlan, fused: Fused, whole: Whole, call: Call, grouping: Grouping) -> None:
         from voronerf.ops.routed_mlp.native import How, run_routed
 
-        (program, reads, results), given = whole, (*call.args, *call.kwargs.values())
-        self._tensors = [i for i, value in enumerate(given) if isinstance(value, Tensor)]
+        (program, reads, results), arguments = whole, (*call.args, *call.kwargs.values())
+        self._tensors = [i for i, value in enumerate(arguments) if isinstance(value, Tensor)]
         self._reads = [self._tensors[number] for number in reads]
-        self._learns = torch.is_grad_enabled() and any(given[i].requires_grad for i in self._reads)
+        self._learns = torch.is_grad_enabled() and any(arguments[i].requires_grad for i in self._reads)
         self._module = call.module
         self.plan, self._method, self._run, self._how = plan, call.method, run_routed, How(program.text)
         self._leading, self._one, device = len(call.layout.lead), call.layout.lead[0] == 1, grouping.device
-        half = torch.is_autocast_enabled(device.type) or any(given[i].dtype in HALF for i in self._tensors)
+        half = torch.is_autocast_enabled(device.type) or any(arguments[i].dtype in HALF for i in self._tensors)
         ones = 0 if call.layout.flat else self._leading - 1
         self._results = [(shape[ones:], dtype if half and dtype in HALF else torch.float32) for shape, dtype in results]
         plain = all(len(tail) == 1 and dtype is torch.float32 for tail, dtype in self._results)
         self._as_they_are = self._leading == 1 and plain
         self._parameters, self._shapes, self._in_graphs = fused.parameters, program.parameters, not fused.computes
         parameters = fused.parameters(grouping.k, device, grouping.backend)
-        self._shares = any(p.dim() == len(own) for p, own in zip(parameters, self._shapes, strict=True))
+        self._shares = any(p.dim() == len(size) for p, size in zip(parameters, self._shapes, strict=True))
         value = fused.result
         self._value: Callable[[list[Tensor]], Any] = functools.partial(rebuild, value)
         if isinstance(value, Tensor):
-            self._value = lambda own: own[0]
+            self._value = lambda results: results[0]
         elif type(value) in (list, tuple) and all(isinstance(part, Tensor) for part in value):
             self._value = type(value)
 
     @staticmethod
-    def of(plan: CallPlan, call: Call, grouping: Grouping) -> Known | None:
+    def of(plan: CallPlan, call: Call, grouping: Grouping) -> KnownCall | None:
         """What is known of calls like this one; None where more is needed than one program of the compiled module."""
         fused, layout, device = plan.fused, call.layout, grouping.device
         whole = "" if fused is None else fused.whole
@@ -88,14 +88,14 @@ class Known:
         if not flat or any(x.dtype not in (torch.float32, *HALF) for x in tensors_of((call.args, call.kwargs))):
             return None
         chosen = backends.chosen("grouped_program", device, torch.float32, backend=grouping.backend)
-        return Known(plan, fused, whole, call, grouping) if chosen == "native" else None
+        return KnownCall(plan, fused, whole, call, grouping) if chosen == "native" else None
 
     def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """The results of a call of a router, None where it is unlike the others after all; coords [..., d] are those
         that it was given."""
-        given = (*args, *kwargs.values()) if kwargs else args
+        arguments = (*args, *kwargs.values()) if kwargs else args
         if coords is None and type(router.coords) is str:  # as when the kind was found
-            positions, d = given[self._tensors[0]], router._d
+            positions, d = arguments[self._tensors[0]], router._d
             positions = positions if positions.shape[-1] == d else positions[..., :d]
             if router._unseen and not torch.compiler.is_compiling():
                 router._look_at(positions, args, kwargs, coords)
@@ -114,19 +114,19 @@ class Known:
         elif (lead[0] == 1) != self._one or not self.plan.takes_first(n, k):
             return None
         for i in self._tensors:
-            shape = (x := given[i]).shape
+            shape = (x := arguments[i]).shape
             if not shape or shape[0] != lead[0] or (not compiles and x.is_inference() and torch.is_grad_enabled()):
                 return None
         rows = []
         for i in self._reads:
-            x = given[i] if given[i].dim() == 2 else given[i].reshape(n, -1)
+            x = arguments[i] if arguments[i].dim() == 2 else arguments[i].reshape(n, -1)
             rows.append(x if x.dtype is torch.float32 else x.float())
         parameters = self._parameters(k, rows[0].device, router.backend)
         if self._shares:
-            parameters = [p[None] if p.dim() == len(own) else p for p, own in zip(parameters, self._shapes)]
+            parameters = [p[None] if p.dim() == len(size) else p for p, size in zip(parameters, self._shapes)]
         if self._learns:  # of views the engine knows whether their gradients are asked for, of leaves it does not
             rows, parameters = [x.view_as(x) for x in rows], [p.view_as(p) for p in parameters]
-        found = self._run(self._how, rows, parameters, k, **router._places_of(self._method, positions))
+        results = self._run(self._how, rows, parameters, k, **router._places_of(self._method, positions))
         if not self._as_they_are:
-            found = [own.reshape(*lead, *tail).to(dtype) for own, (tail, dtype) in zip(found, self._results)]
-        return self._value(found)
+            results = [rows.reshape(*lead, *tail).to(dtype) for rows, (tail, dtype) in zip(results, self._results)]
+        return self._value(results)

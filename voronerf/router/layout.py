@@ -69,8 +69,8 @@ def _rebuilt(value: Any, items: dict[Any, Any], new: dict[Any, Any]) -> Any:
         return kind(new.values())
     changed = {key: item for key, item in new.items() if item is not items[key]}
     if hasattr(value, "__post_init__"):  # it may derive other attributes, such as a shape
-        given = {f.name for f in dataclasses.fields(value) if f.init}
-        value = dataclasses.replace(value, **{key: changed.pop(key) for key in given & changed.keys()})
+        names = {f.name for f in dataclasses.fields(value) if f.init}
+        value = dataclasses.replace(value, **{key: changed.pop(key) for key in names & changed.keys()})
     rebuilt = copy.copy(value)
     for key, item in changed.items():
         object.__setattr__(rebuilt, key, item)
@@ -79,21 +79,21 @@ def _rebuilt(value: Any, items: dict[Any, Any], new: dict[Any, Any]) -> Any:
 
 def tensors_of(value: Any) -> list[Tensor]:
     """All tensors of a structure, in the order of :func:`map_tree`."""
-    found: list[Tensor] = []
-    _collect((value,), found, 0)
-    return found
+    tensors: list[Tensor] = []
+    _collect((value,), tensors, 0)
+    return tensors
 
 
-def _collect(items: Iterable[Any], found: list[Tensor], depth: int) -> None:
+def _collect(items: Iterable[Any], tensors: list[Tensor], depth: int) -> None:
     # Every function of a grouped module comes here with its arguments: what holds no tensor is passed over at once.
     for item in items:
         kind = type(item)
         if kind in _LEAVES:
             continue
         if isinstance(item, Tensor):
-            found.append(item)
+            tensors.append(item)
         elif depth <= DEEPEST:
-            _collect(item if kind in (list, tuple) else (contents(item) or {}).values(), found, depth + 1)
+            _collect(item if kind in (list, tuple) else (contents(item) or {}).values(), tensors, depth + 1)
 
 
 def map_tensors(value: Any, change: Callable[[Tensor], Any]) -> Any:
@@ -237,31 +237,31 @@ class Call:
                 self.kinds[name] = self.layout.kind(name, value, nested)
             return value if self.kinds[name] == SHARED else change(value, self.kinds[name])
 
-        given = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
-        values = [map_tree(value, changed, name) for name, value in given]
+        arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
+        values = [map_tree(value, changed, name) for name, value in arguments]
         return tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
 
     def constants(self) -> dict[str, Any]:
         """What is no tensor among the arguments and inside of them, by name."""
-        found: dict[str, Any] = {}
+        constants: dict[str, Any] = {}
 
         def note(name: str, value: Any, nested: bool) -> Any:
             if not isinstance(value, Tensor):
-                found[name] = value
+                constants[name] = value
             return value
 
         for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True):
             map_tree(value, note, name)
-        return found
+        return constants
 
     def with_tensors(self, names: Container[str], make: Callable[[Any], Tensor]) -> Call:
         """The same with tensors that all samples share in the place of numbers."""
-        given = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
-        values = [map_tree(v, lambda name, leaf, _: make(leaf) if name in names else leaf, n) for n, v in given]
+        arguments = zip(self.names, (*self.args, *self.kwargs.values()), strict=True)
+        values = [map_tree(v, lambda name, leaf, _: make(leaf) if name in names else leaf, n) for n, v in arguments]
         args, kwargs = tuple(values[: len(self.args)]), dict(zip(self.kwargs, values[len(self.args) :]))
-        own = dataclasses.replace(self, args=args, kwargs=kwargs, kinds=dict(self.kinds))
-        own.changed(lambda tensor, kind: tensor)
-        return own
+        call = dataclasses.replace(self, args=args, kwargs=kwargs, kinds=dict(self.kinds))
+        call.changed(lambda tensor, kind: tensor)
+        return call
 
     def part(self, most: int) -> tuple[Call, Tensor] | None:
         """A call with some of the samples, and int64 [m], which; None where all of them are few enough.
@@ -287,21 +287,21 @@ class Call:
 
     def shared(self) -> list[Tensor]:
         """The tensors that are the same for all samples; known after :meth:`changed`."""
-        found: list[Tensor] = []
+        tensors: list[Tensor] = []
 
         def note(name: str, value: Any, nested: bool) -> Any:
             if self.kinds.get(name) == SHARED:
-                found.append(value)
+                tensors.append(value)
             return value
 
         for name, value in zip(self.names, (*self.args, *self.kwargs.values()), strict=True):
             map_tree(value, note, name)
-        return found
+        return tensors
 
     def arranged(self, grouping: Grouping | None) -> list[Tensor]:
         """The rows of the arguments as the module sees them, in the order of a grouping, or for None as they came."""
         layout, n = self.layout, self.layout.n if grouping is None else grouping.n
-        found: list[Tensor] = []
+        tensors: list[Tensor] = []
 
         @functools.cache
         def rays(device: torch.device) -> Tensor:
@@ -320,11 +320,11 @@ class Call:
                 rows = rows.index_select(0, rays(rows.device))
             elif grouping is not None:
                 rows = grouping.sort(rows)
-            found.append(layout.shown(rows.view_as(rows), kind))  # an object of its own, which is marked
+            tensors.append(layout.shown(rows.view_as(rows), kind))  # an object of its own, which is marked
             return tensor
 
         self.changed(arrange)
-        return found
+        return tensors
 
 
 def split_rows(rows: list[Tensor], sizes: list[int]) -> list[Sequence[Tensor]]:

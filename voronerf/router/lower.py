@@ -284,19 +284,19 @@ class Lowering:
 
     def parts(self, numbers: Tensor) -> list[tuple[Columns, int]]:
         """Columns by their numbers, in as few pieces as may be, each with its place."""
-        found: list[tuple[Columns, int]] = []
+        parts: list[tuple[Columns, int]] = []
         for at, number in enumerate(numbers.tolist()):
             value, column = self.columns[number]
-            last = found[-1][0] if found else None
+            last = parts[-1][0] if parts else None
             if last is not None and last.index == value:
                 if not last.spread and last.start + last.width == column:
-                    found[-1] = last._replace(width=last.width + 1), found[-1][1]
+                    parts[-1] = last._replace(width=last.width + 1), parts[-1][1]
                     continue
                 if last.start == column and (last.spread or last.width == 1):
-                    found[-1] = last._replace(width=last.width + 1, spread=True), found[-1][1]
+                    parts[-1] = last._replace(width=last.width + 1, spread=True), parts[-1][1]
                     continue
-            found.append((Columns(VALUE, value, column, 1), at))
-        return found
+            parts.append((Columns(VALUE, value, column, 1), at))
+        return parts
 
     def operand(self, numbers: Tensor) -> Columns:
         """Columns by their numbers, as an operand."""
@@ -329,7 +329,7 @@ class Lowering:
         """
         device = next((t.device.type for t in tensors_of((args, kwargs))), "cpu")
         with torch.inference_mode(), torch.autocast(device, enabled=False):
-            mode = _Recording(self)
+            mode = _EntryMode(self)
 
             def own(value: Tensor) -> Tensor:
                 copied = value.detach().clone()
@@ -349,7 +349,7 @@ class Lowering:
         return result, args, mode.of_result
 
 
-class _Recording(TorchDispatchMode):
+class _EntryMode(TorchDispatchMode):
     """Records the ATen functions that a function calls."""
 
     @classmethod
@@ -368,7 +368,7 @@ class _Recording(TorchDispatchMode):
         self._kept[id(tensor)] = tensor, entries
 
     def entries(self, tensor: Tensor) -> Entries | None:
-        """Where the entries of a tensor come from; None for a constant."""
+        """The source of each entry of a tensor; None for a constant."""
         return self._kept.get(id(tensor), (None, None))[1]
 
     def of_result(self, tensor: Tensor) -> Entries:
@@ -379,16 +379,16 @@ class _Recording(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         name = func.overloadpacket.__name__
-        found = [self.entries(tensor) for tensor in tensors_of((args, kwargs))]
-        if not any(found):
+        operands = [self.entries(tensor) for tensor in tensors_of((args, kwargs))]
+        if not any(operands):
             return func(*args, **kwargs)
-        rows = any(e is not None and e.of is None for e in found)
+        rows = any(e is not None and e.of is None for e in operands)
         if name not in ("linear", "rsub") and name not in _MOVERS and func._can_decompose():
             with self:
                 return func.decompose(*args, **kwargs)
         inplace = name.endswith("_") and not name.startswith("_")
         base = name.rstrip("_") if inplace else name
-        both = base == "bmm" and all(e is not None and e.of is None for e in found)
+        both = base == "bmm" and all(e is not None and e.of is None for e in operands)
         written = _products if both else _WRITTEN_OUT.get(base)
         if written is not None:
             with self:
@@ -406,7 +406,7 @@ class _Recording(TorchDispatchMode):
         return result
 
     def _made(self, name: str, func: Any, args: Any, kwargs: Any, result: Any, rows: bool) -> list[Entries | None]:
-        """Where the entries of a function's results come from."""
+        """The sources of the entries of a function's results."""
         if name in _MOVERS and func.overloadpacket.__name__ == name:
             return self._moved(func, args, kwargs, rows, name)
         if not rows:
@@ -449,8 +449,8 @@ class _Recording(TorchDispatchMode):
         return Entries(torch.arange(tensor.numel()).reshape(tensor.shape), of)
 
     def _moved(self, func: Any, args: Any, kwargs: Any, rows: bool, name: str) -> list[Entries | None]:
-        given = tensors_of((args, kwargs))
-        sources = {id(e.of): e.of for t in given if (e := self.entries(t)) is not None}
+        tensors = tensors_of((args, kwargs))
+        sources = {id(e.of): e.of for t in tensors if (e := self.entries(t)) is not None}
         indexed = args[1] if name in ("index",) else [args[2]] if name == "index_select" else []
         indices = {id(t) for t in indexed if isinstance(t, Tensor)}
         of = None if rows or len(sources) > 1 else next(iter(sources.values()))
@@ -520,24 +520,24 @@ class _Recording(TorchDispatchMode):
 
     def _operands(self, tensors: Sequence[Any], shape: Sequence[int]) -> tuple[list[Columns], Tensor]:
         """Operands of one width from tensors that are broadcast to a shape, and the places of entries."""
-        found: list[Columns] = []
+        columns: list[Columns] = []
         first = next(e for t in tensors if isinstance(t, Tensor) and (e := self.entries(t)) and e.of is None)
         places, _ = self.lowering.order(first.codes.expand(list(shape)))
         for tensor in tensors:
             entries = self.entries(tensor)
             if entries is not None and entries.of is None:
-                own, numbers = self.lowering.order(entries.codes.expand(list(shape)))
-                if not torch.equal(own, places):
+                order, numbers = self.lowering.order(entries.codes.expand(list(shape)))
+                if not torch.equal(order, places):
                     raise NotAStep("it mixes samples")
-                found.append(self.lowering.operand(numbers))
+                columns.append(self.lowering.operand(numbers))
                 continue
             if entries is None:
                 entries = self._of_constant(tensor)
             by_sample = entries.codes.expand(list(shape)).flatten()[places]
             if not (by_sample == by_sample[:1]).all():
                 raise NotAStep("a constant with other numbers for each sample")
-            found.append(self.lowering.vector(entries, by_sample[0]))
-        return found, places
+            columns.append(self.lowering.vector(entries, by_sample[0]))
+        return columns, places
 
     def _binary(self, name: str, args: Any, kwargs: Any, result: Tensor) -> Entries:
         if (not result.is_floating_point() and result.dtype != torch.bool) or kwargs.get("rounding_mode"):
@@ -624,8 +624,8 @@ class _Recording(TorchDispatchMode):
             if added is not None or len(x) > _PRODUCTS:
                 raise NotAStep("a product of many matrices")
             each = [
-                self._rows_times(own, Entries(codes, matrix.of), None, result.shape[1:]).codes
-                for own, codes in zip(of_x.codes, matrix.codes, strict=True)
+                self._rows_times(row, Entries(codes, matrix.of), None, result.shape[1:]).codes
+                for row, codes in zip(of_x.codes, matrix.codes, strict=True)
             ]
             return Entries(torch.stack(each))
         return self._rows_times(of_x.codes, matrix, added, result.shape)
@@ -649,7 +649,7 @@ class _Recording(TorchDispatchMode):
         if m > _PRODUCTS or not (numbers == numbers[:1]).all():
             raise NotAStep("the samples of a tensor differ in more than their values")
         weight, (width, _) = self.lowering.parameter(matrix, matrix=True), matrix.codes.shape
-        found = torch.empty(len(flat), width, dtype=torch.int64)
+        table = torch.empty(len(flat), width, dtype=torch.int64)
         for i in range(m):
             add = None
             if bias is not None:
@@ -662,5 +662,5 @@ class _Recording(TorchDispatchMode):
             for x, at in parts:
                 add = self.b.linear(x, weight, width, at, add=add)
             assert add is not None
-            found[places[:, i]] = self.lowering._codes(add)
-        return Entries(found.reshape(list(shape)))
+            table[places[:, i]] = self.lowering._codes(add)
+        return Entries(table.reshape(list(shape)))

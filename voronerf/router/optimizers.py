@@ -94,8 +94,8 @@ def watch_optimizers(module: nn.Module, line: str) -> list[Any]:
             )
         watched.clear()  # torch does not let a hook remove itself
 
-    found = [item for item in gc.get_objects() if issubclass(type(item), torch.optim.Optimizer)]
-    return [optimizer.register_step_pre_hook(check) for optimizer in found if ours(optimizer)]
+    optimizers = [item for item in gc.get_objects() if issubclass(type(item), torch.optim.Optimizer)]
+    return [optimizer.register_step_pre_hook(check) for optimizer in optimizers if ours(optimizer)]
 
 
 class Untrained:
@@ -227,6 +227,6 @@ class FrozenRows:
 def trained_parts(parameters: Sequence[Tensor]) -> list[list[Any]]:
     """For each parameter the parts of its first dimension that an optimiser may change: those of cells not frozen."""
     parts: dict[int, list[Any]] = {}
-    for module, (_, own) in _FROZEN.items() if _FROZEN else ():
-        parts.update((id(parameter), own) for parameter in cell_parameters(module))
+    for module, (_, pieces) in _FROZEN.items() if _FROZEN else ():
+        parts.update((id(parameter), pieces) for parameter in cell_parameters(module))
     return [parts.get(id(parameter), [...]) for parameter in parameters]

@@ -60,10 +60,10 @@ class Probe:
 
         def leaf(value: Tensor) -> Tensor:
             """An argument with a gradient of its own, where it takes one."""
-            own = value.detach().to(dtype if value.is_floating_point() else None)
+            copied = value.detach().to(dtype if value.is_floating_point() else None)
             if value.requires_grad and torch.is_grad_enabled():
-                self._leaves.append(own.requires_grad_())
-            return own
+                self._leaves.append(copied.requires_grad_())
+            return copied
 
         args, kwargs = map_tensors((call.args, call.kwargs), leaf)
         self._call = replace(call, module=module, args=args, kwargs=kwargs)
@@ -171,10 +171,10 @@ class Probe:
         Autocast rounds more than ways may differ, and a deep network of fast sines makes its own rounding as large as
         its results.
         """
-        found, device = self._outcome(way), self._entries.device.type
-        if _same(found, expected):
+        outcome, device = self._outcome(way), self._entries.device.type
+        if _same(outcome, expected):
             return True
-        if _kinds(found) != _kinds(expected):
+        if _kinds(outcome) != _kinds(expected):
             return False
         dtypes = (None, torch.float64) if torch.is_autocast_enabled(device) else (torch.float64,)
         with torch.autocast(device, enabled=False):
@@ -190,9 +190,9 @@ class Probe:
         for tried in inputs:
             try:
                 with NoRandomness():
-                    module, given = self._made_of[0].module, self._call.arranged(self._entries)
-                    count = rows_for(module, given)
-                    way = Fused(replace(self._call, module=module), [rows[:count] for rows in given], tried)
+                    module, tensors = self._made_of[0].module, self._call.arranged(self._entries)
+                    count = rows_for(module, tensors)
+                    way = Fused(replace(self._call, module=module), [rows[:count] for rows in tensors], tried)
                 if not self._agrees(way, loop, expected):
                     raise Unfusable("the traced network gives other results than its forward")
                 return way
@@ -222,8 +222,8 @@ class Probe:
             )
 
 
-def _same(found: Outcome, expected: Outcome) -> bool:
-    (a, ours), (b, theirs) = found, expected
+def _same(outcome: Outcome, expected: Outcome) -> bool:
+    (a, ours), (b, theirs) = outcome, expected
     alike = len(a.tensors) == len(b.tensors) and len(ours) == len(theirs)
     return alike and all(map(agree, a.tensors, b.tensors)) and agree_gradients(ours, theirs)
 
@@ -263,14 +263,14 @@ def check_rays(call: Call) -> None:
 
 def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
     """What the first cell's module returns for a few samples as rays, and as the router passes them."""
-    found: list[Tensor] = []
+    tensors: list[Tensor] = []
 
     def first(tensor: Tensor, kind: str) -> Tensor:
-        found.append(tensor.detach()[tuple(slice(size) for size in (few[:-1] if kind == RAY else few))])
-        return found[-1]
+        tensors.append(tensor.detach()[tuple(slice(size) for size in (few[:-1] if kind == RAY else few))])
+        return tensors[-1]
 
     args, kwargs = call.changed(first)
     small = replace(call, layout=replace(call.layout, lead=few), args=args, kwargs=kwargs)
     cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
     with torch.no_grad(), NoRandomness():
-        return [tensors_of(Double(call.module).run(small, rows, cell)) for rows in (found, small.arranged(None))]
+        return [tensors_of(Double(call.module).run(small, rows, cell)) for rows in (tensors, small.arranged(None))]

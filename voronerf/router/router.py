@@ -33,7 +33,7 @@ from voronerf.router.cells import (
 )
 from voronerf.router.dispatch import Dispatch
 from voronerf.router.grouping import Assigned, Grouping
-from voronerf.router.known import Known, kind_of
+from voronerf.router.known import KnownCall, kind_of
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, doubt_of, find_positions, first_tensor
 from voronerf.router.optimizers import (
     FrozenRows,
@@ -158,17 +158,17 @@ class VoronoiRouter(nn.Module):
         lists = {"per_ray": per_ray, "shared": shared, "methods": methods, "share": share}
         _check_options(module, lists, **options, backend=backend)
         super().__init__()
-        own = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
+        cells = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
         first = next(module.parameters(), None)
-        self.diagram = own if first is None or first.is_meta else own.to(first.device)
+        self.diagram = cells if first is None or first.is_meta else cells.to(first.device)
         self.module: nn.Module = clone_module(module)
-        stack_parameters(self.module, own.num_cells, share)
+        stack_parameters(self.module, cells.num_cells, share)
         self.share, self.generator = tuple(share), cast("torch.Generator | None", None)
         self._watches: list[Any] = []  # of optimisers that hold the state of other cells
         self._doubts: list[Untrained | FrozenRows] = [Untrained(self.module)]  # asked in the first training calls
         self.assignment, self.temperature = assignment, temperature
         if coords is None and isinstance(module, LayeredField):
-            coords = cast(Coordinates, f"first{own.centres.shape[1]}")
+            coords = cast(Coordinates, f"first{cells.centres.shape[1]}")
         self.backend, self.coords, self.fuse, self.way, self.layout = backend, coords, fuse, way, layout
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
@@ -339,18 +339,18 @@ class VoronoiRouter(nn.Module):
         device, k = self.diagram.centres.device, self.num_cells
         if cells is None:
             return torch.ones(k, dtype=torch.bool, device=device)
-        given = torch.as_tensor(cells if len(cells) else torch.zeros(0, dtype=torch.int64), device=device)
+        chosen = torch.as_tensor(cells if len(cells) else torch.zeros(0, dtype=torch.int64), device=device)
         rule = f"VoronoiRouter.{method}: cells must be"
-        if given.dtype == torch.bool:
-            if given.shape != (k,):
-                raise ValueError(f"{rule} bool [{k}], got {list(given.shape)}")
-            return given
-        if given.is_floating_point() or given.is_complex() or given.dim() != 1:
-            raise TypeError(f"{rule} numbers of cells or bool [{k}], got {given.dtype} {list(given.shape)}")
-        for number in given.tolist():
+        if chosen.dtype == torch.bool:
+            if chosen.shape != (k,):
+                raise ValueError(f"{rule} bool [{k}], got {list(chosen.shape)}")
+            return chosen
+        if chosen.is_floating_point() or chosen.is_complex() or chosen.dim() != 1:
+            raise TypeError(f"{rule} numbers of cells or bool [{k}], got {chosen.dtype} {list(chosen.shape)}")
+        for number in chosen.tolist():
             if not 0 <= number < k:
                 raise ValueError(f"{rule} numbers below {k}, got {number}")
-        return torch.zeros(k, dtype=torch.bool, device=device).index_fill(0, given.long(), True)
+        return torch.zeros(k, dtype=torch.bool, device=device).index_fill(0, chosen.long(), True)
 
     def _set_frozen(self, frozen: Tensor | None) -> None:
         self._trust_frozen()
@@ -527,11 +527,11 @@ class VoronoiRouter(nn.Module):
         return d
 
     def _positions(self, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Tensor:
-        """Those that decide the cells of a call, [..., d]; coords are those that it was given."""
-        found = find_positions(self.coords if coords is None else coords, args, kwargs, self._d)
+        """The positions [..., d] that decide the cells of a call; coords as given to the call."""
+        positions = find_positions(self.coords if coords is None else coords, args, kwargs, self._d)
         if self._unseen:
-            self._look_at(found, args, kwargs, coords)
-        return found
+            self._look_at(positions, args, kwargs, coords)
+        return positions
 
     def _look_at(self, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> None:
         """Warns, at the first large batch of a training, if what was taken for positions may not be positions."""
@@ -549,7 +549,7 @@ class VoronoiRouter(nn.Module):
             self._dispatch.warn_once("positions", doubt)
 
     def places(self, positions: Tensor, coords: Tensor | None = None) -> dict[str, Any]:
-        """What tells the cells of samples, and which of them are frozen: arguments of `routed_mlp`.
+        """The arguments of `routed_mlp` that tell the cells of samples, and which are frozen.
 
         Args:
             positions: [n, 3] in scene units, or [n, 6] Gaussians.
@@ -579,7 +579,7 @@ class VoronoiRouter(nn.Module):
         return self.places(positions if positions.dim() == 2 else positions.flatten(0, -2))
 
     def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
-        """What ``forward`` computes of samples, as one program; or why that is not known.
+        """The program of ``forward``; or the reason why it is unknown.
 
         That of a field with a layer table is known at once; that of a module with ``fuse=True`` from a call with such
         arguments on, which traces it.
@@ -602,23 +602,23 @@ class VoronoiRouter(nn.Module):
             return "other positions than those of the samples decide the cells"
         k, dispatch = self.num_cells, self._dispatch
         if self._given is not None:
-            found = program_of_table(self.field, k, dispatch.activation(self.field))
+            program = program_of_table(self.field, k, dispatch.activation(self.field))
         elif self._table is not None and not self.fuse:
             return f"{type(self.module).__name__} does more than its layer table says"
         else:
-            given = args if self._table is None else (*args, None)
+            arguments = args if self._table is None else (*args, None)
             positions, device, grouping = args[0][:, : self._d], args[0].device, None
             if trace and self.fuse:
                 cells = None if k == 1 else self.diagram.locate(positions, backend=self.backend)
                 grouping = Grouping(cells, len(positions), k, device, self.backend)
-            call = self._call("forward", positions, given, {})
-            found = dispatch.program(call, grouping, device, k, self._options, self.backend)
-        if isinstance(found, str) or k == 1:
-            return found
-        own = zip(found.parameters, found.program.parameters)
+            call = self._call("forward", positions, arguments, {})
+            program = dispatch.program(call, grouping, device, k, self._options, self.backend)
+        if isinstance(program, str) or k == 1:
+            return program
+        shapes = zip(program.parameters, program.program.parameters)
         return (
-            found
-            if any(p.shape[0] == k and p.dim() > len(shape) for p, shape in own)
+            program
+            if any(p.shape[0] == k and p.dim() > len(shape) for p, shape in shapes)
             else "all cells share all parameters"
         )
 
@@ -632,26 +632,26 @@ class VoronoiRouter(nn.Module):
             >>> router.explain()
             'forward: not called yet'
         """
-        given = {"forward": self._given.name} if self._given is not None else {}
-        return self._dispatch.explain(("forward", *self.methods), given)
+        known = {"forward": self._given.name} if self._given is not None else {}
+        return self._dispatch.explain(("forward", *self.methods), known)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuses attributes of the module, which would have no effect here."""
-        own = self.__dict__
-        known = hasattr(type(self), name) or any(name in names for names in (own, self._modules, self._buffers))
-        if "_table" in own and not known and hasattr(self.module, name):
+        members = self.__dict__
+        known = hasattr(type(self), name) or any(name in names for names in (members, self._modules, self._buffers))
+        if "_table" in members and not known and hasattr(self.module, name):
             raise AttributeError(
                 f"VoronoiRouter: {name} belongs to {type(self.module).__name__}; set router.module.{name}"
             )
-        if name in _READ and "_dispatch" in own:
+        if name in _READ and "_dispatch" in members:
             self._dispatch.known = {}
         super().__setattr__(name, value)
 
     def __getattr__(self, name: str) -> Any:
         """The routed methods, beside what a module has."""
         for registry in ("_modules", "_buffers"):  # without the calls of ``super``, which each call would wait for
-            if name in (own := self.__dict__.get(registry, ())):
-                return own[name]
+            if name in (entries := self.__dict__.get(registry, ())):
+                return entries[name]
         methods = self.__dict__.get("methods", ())
         if name in methods:
             return functools.partial(self._routed, name)
@@ -676,7 +676,7 @@ class VoronoiRouter(nn.Module):
         """One call of a method of the module; one that is not known breaks a graph of ``torch.compile``."""
         if self._resized and not torch.compiler.is_compiling():
             self._check_wrapper()
-        known: Table | Known | None = self._given if method == "forward" else None
+        known: Table | KnownCall | None = self._given if method == "forward" else None
         if known is None and self.fuse:
             module: Any = self._modules["module"]
             kind = kind_of(method, module.training, args, kwargs, coords)

@@ -112,12 +112,12 @@ _CONTRACTION = re.compile(r"(\w+?)(\w+),(?:(\w)\2|\2(\w))->\1(?:\3|\4)")
 @rule(torch.einsum)
 def einsum(run: GroupedRun, equation: str, *operands: Any) -> Any:
     """Rows with a parameter, whose letters are contracted and a new one: ``"ni,oi->no"``, ``"nij,ijo->no"``."""
-    found = _CONTRACTION.fullmatch(equation.replace(" ", ""))
-    if found is None or len(operands) != 2 or not isinstance(operands[1], PerCell):
+    match = _CONTRACTION.fullmatch(equation.replace(" ", ""))
+    if match is None or len(operands) != 2 or not isinstance(operands[1], PerCell):
         return NotImplemented
     x, weight = operands[0], operands[1].stacked
-    weight = weight.flatten(2) if found[3] else weight.flatten(1, -2).transpose(1, 2)
-    return linear(run, run.mark(x.flatten(len(found[1]))) if run.is_rows(x) else x, PerCell(weight))
+    weight = weight.flatten(2) if match[3] else weight.flatten(1, -2).transpose(1, 2)
+    return linear(run, run.mark(x.flatten(len(match[1]))) if run.is_rows(x) else x, PerCell(weight))
 
 
 # Scales and shifts ----------------------------------------------------------------------------------------------------
@@ -237,8 +237,8 @@ def _found(run: GroupedRun, table: PerCell, c: int, index: Tensor) -> Tensor:
         source = _Source.apply(flat, buffer) if flat.requires_grad and torch.is_grad_enabled() else flat
         run.tables[key] = stacked, source, buffer  # ``stacked`` as well: nothing else may get its id
     _, source, buffer = run.tables[key]
-    found: Tensor = _LookUp.apply(source, start * (table.numel() // c), index, buffer)
-    return found
+    rows: Tensor = _LookUp.apply(source, start * (table.numel() // c), index, buffer)
+    return rows
 
 
 class _Source(torch.autograd.Function):
@@ -324,8 +324,8 @@ def grid_sample(run: GroupedRun, input: Tensor, grid: Tensor, **options: Any) ->
         return torch.cat([_bilinear(run, input, i, grid[i], cells, zeros, corners) for i in range(len(input))])
     occupied, planes = run.grouping.occupied, cells_of(input.stacked)
     points = grid.split([last - first for _, first, last in occupied], places[0])
-    found = [F.grid_sample(planes[cell], own, **options) for (cell, _, _), own in zip(occupied, points, strict=True)]
-    return torch.cat(found, places[0] + 1) if len(found) > 1 else found[0]
+    sampled = [F.grid_sample(planes[cell], at, **options) for (cell, _, _), at in zip(occupied, points, strict=True)]
+    return torch.cat(sampled, places[0] + 1) if len(sampled) > 1 else sampled[0]
 
 
 def _bilinear(
@@ -347,5 +347,5 @@ def _bilinear(
     channel = torch.arange(c, dtype=torch.int32, device=cells.device).view(-1, 1, 1)
     first = ((cells.int() * p + i) * c + channel) * (h * w)
     index = index + first  # [2 or 4, c, a, b], of values of all planes
-    found = _found(run, planes, 1, index.reshape(-1)).reshape(index.shape)
-    return (found * (share[:, None, 1] * share[:along, 0]).flatten(0, 1)[:, None]).sum(0)[None]
+    corners = _found(run, planes, 1, index.reshape(-1)).reshape(index.shape)
+    return (corners * (share[:, None, 1] * share[:along, 0]).flatten(0, 1)[:, None]).sum(0)[None]

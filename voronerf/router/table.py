@@ -91,15 +91,15 @@ class Table:
 
     def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """The results of a call; coords [..., d] are those that it was given."""
-        given = _arguments(*args, **kwargs)
-        field, positions = router.module, given.pop("positions")
+        arguments = _arguments(*args, **kwargs)
+        field, positions = router.module, arguments.pop("positions")
         features = 6 if field.layers.integrated else 3
         if positions.ndim != 2 or positions.shape[1] != features:
             raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
-        given = given if field.layers.uses_directions else {}
-        given |= parameters_of_table(field, router.num_cells)
-        given |= router.places(positions, router._positions(args, kwargs, coords))
-        return field.activate(routed_mlp(positions, **given, backend=router.backend)[0])
+        arguments = arguments if field.layers.uses_directions else {}
+        arguments |= parameters_of_table(field, router.num_cells)
+        arguments |= router.places(positions, router._positions(args, kwargs, coords))
+        return field.activate(routed_mlp(positions, **arguments, backend=router.backend)[0])
 
 
 def _arguments(positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> dict[str, Any]:

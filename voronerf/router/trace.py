@@ -51,10 +51,10 @@ class _Begun(NamedTuple):
     operands: list[Tensor]
 
 
-def rows_for(module: nn.Module, given: list[Tensor], primes: tuple[int, ...] = _PRIMES) -> int:
+def rows_for(module: nn.Module, tensors: list[Tensor], primes: tuple[int, ...] = _PRIMES) -> int:
     """A number of samples: one of the primes, of which no size of the module and its arguments is a multiple."""
     sizes = {size for tensor in (*module.parameters(), *module.buffers()) for size in tensor.shape}
-    sizes.update(size for tensor in given for size in tensor.shape[1:])
+    sizes.update(size for tensor in tensors for size in tensor.shape[1:])
     return next((rows for rows in primes if all(size % rows or not size for size in sizes)), primes[0])
 
 
@@ -69,7 +69,7 @@ class Trace(TorchFunctionMode):
     other samples.
     """
 
-    def __init__(self, call: Call, given: list[Tensor], inputs: Inputs) -> None:
+    def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
         super().__init__()
         module = call.module
         single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for p in cell_parameters(module)}
@@ -79,20 +79,20 @@ class Trace(TorchFunctionMode):
         self.parameters: dict[fx.Node, int] = {}  # with their place among ``owned_parameters``
         self._running, self._line = False, ""
         self._nodes: dict[int, fx.Node] = {}  # by the id of their tensor, which ``meta`` keeps
-        self.rows = rows_for(module, given)
+        self.rows = rows_for(module, tensors)
         self.n = self._new(self.rows)
-        self.inputs = [self._new(tensor) for tensor in given]
+        self.inputs = [self._new(tensor) for tensor in tensors]
         self.shared = [self._new(tensor, on=CONSTANTS) for tensor in call.shared()]
         self.reads = set[tuple[int, str]]()
         double, parts = Double(module, self.reads), list(parts_of(module).values())
         self.places = [source for source in inputs.sources if not isinstance(source, str)]
         for place, name in self.places:
-            value, part = inputs.tensor(lookup(parts[place], name), given[0].device), double.parts[place]
+            value, part = inputs.tensor(lookup(parts[place], name), tensors[0].device), double.parts[place]
             (vars(part) if name in vars(part) else part._buffers)[name] = value
             self.shared.append(self._new(value, on=CONSTANTS))
         self.reads.clear()
         with self._custom_functions(), self:
-            result = double.run(call, given, single)
+            result = double.run(call, tensors, single)
         self._part_from_gradients()
         self.result = rebuild(result, [tensor.detach() for tensor in tensors_of(result)])
         self.outputs = [self._argument(tensor) for tensor in tensors_of(result)]
@@ -157,8 +157,8 @@ class Trace(TorchFunctionMode):
             if frame.f_code is not code:
                 return
             if event == "call" and not self._running:
-                own, self._running = frame.f_locals, True
-                calls[frame] = self._begin(own["cls"].apply, own["args"], own["kwargs"])
+                members, self._running = frame.f_locals, True
+                calls[frame] = self._begin(members["cls"].apply, members["args"], members["kwargs"])
             elif event == "return" and frame in calls:
                 self._end(calls.pop(frame), value)
                 self._running = False
@@ -190,12 +190,12 @@ class Trace(TorchFunctionMode):
         """Records what a function has returned."""
         node, func, _, kwargs, operands = begun
         inplace, line = node.meta["inplace"], node.meta["line"]
-        found = operands[:1] if inplace else tensors_of(result)
+        outputs = operands[:1] if inplace else tensors_of(result)
         used = node.all_input_nodes
         idle = func is F.dropout and not (kwargs["training"] and kwargs["p"])
         if used and func in RANDOM and not idle:
             raise Unfusable(f"{name_of(func)} draws random numbers{line}; pass them as an argument")
-        if used and not found and result is not None:
+        if used and not outputs and result is not None:
             name = "the truth of a tensor" if isinstance(result, bool) else name_of(node.target)
             raise Unfusable(
                 f"{name} is read{line}, so the path of the module depends on values; write it with torch.where"
@@ -203,15 +203,15 @@ class Trace(TorchFunctionMode):
         for source in used:
             if "mixes" in source.meta and func is not torch.autograd.grad:
                 raise Unfusable(source.meta["mixes"])
-        alone = func in _LIKE and not any(size and size % self.rows == 0 for size in found[0].shape)
-        if not used or alone or not found or (not inplace and any(result is tensor for tensor in operands)):
+        alone = func in _LIKE and not any(size and size % self.rows == 0 for size in outputs[0].shape)
+        if not used or alone or not outputs or (not inplace and any(result is tensor for tensor in operands)):
             self.graph.erase_node(node)
             return
         nodes, on = [node], max(value.meta["on"] for value in used)
         if not inplace and not isinstance(result, Tensor):
-            nodes = [self.graph.call_function(operator.getitem, (node, i)) for i in range(len(found))]
+            nodes = [self.graph.call_function(operator.getitem, (node, i)) for i in range(len(outputs))]
         node.meta["results"] = nodes
-        for value, tensor in zip(nodes, found, strict=True):
+        for value, tensor in zip(nodes, outputs, strict=True):
             self._new(tensor, value, on)
         node.meta["on"] = on
 

@@ -63,10 +63,10 @@ def outside() -> Iterator[None]:
 
 def unwrapped(tensor: Tensor) -> Tensor:
     """A tensor that ``torch.func`` may have wrapped as it is :func:`outside`; a leaf where the wrapper learns."""
-    own = tensor
-    while torch._C._functorch.is_functorch_wrapped_tensor(own):
-        own = torch._C._functorch.get_unwrapped(own)
-    return own if own is tensor else own.detach().requires_grad_(tensor.requires_grad)
+    inner = tensor
+    while torch._C._functorch.is_functorch_wrapped_tensor(inner):
+        inner = torch._C._functorch.get_unwrapped(inner)
+    return inner if inner is tensor else inner.detach().requires_grad_(tensor.requires_grad)
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""What a traced ``forward`` took as fixed: attributes and buffers of its module, and arguments that are no tensors.
+"""The constants of a traced ``forward``: attributes and buffers of its module, and arguments that are no tensors.
 
 A trace holds their values. Each call compares them with what they are then, so that a schedule that sets
 ``module.progress`` is followed and not ignored.
@@ -29,7 +29,7 @@ _MISSING: Any = object()
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a trace takes as numbers of each call, and not as fixed."""
+    """Attributes that a trace reads anew at each call."""
 
     sources: frozenset[Source] = frozenset()
     dtype: torch.dtype = torch.float64  # of numbers, one of NUMBERS
@@ -46,8 +46,8 @@ def is_number(value: Any) -> bool:
 
 def lookup(part: nn.Module, name: str) -> Any:
     """An attribute or a buffer of a part of a module, without properties and the class."""
-    own = vars(part)
-    return own[name] if name in own else part._buffers.get(name, _MISSING)
+    members = vars(part)
+    return members[name] if name in members else part._buffers.get(name, _MISSING)
 
 
 @dataclass
@@ -83,7 +83,7 @@ class Watch:
 
     def _add(self, source: tuple[int, str], part: nn.Module) -> None:
         name = source[1]
-        registry = next((own for own in (vars(part), part._buffers, part._modules) if name in own), None)
+        registry = next((entries for entries in (vars(part), part._buffers, part._modules) if name in entries), None)
         if registry is None:
             if not isinstance(getattr(type(part), name, None), (bool, int, float, str)):
                 return  # a method, a property or none
@@ -103,21 +103,21 @@ class Watch:
     def changed(self) -> list[Source]:
         """The sources whose values have changed."""
         now = [registry.get(name, _MISSING) for registry, name in self._dicts]
-        found = list[Source]()
+        changed = list[Source]()
         if not all(map(operator.is_, now, self._values)):
-            found += [s for s, a, b in zip(self.sources, now, self._values, strict=True) if not same(a, b)]
+            changed += [s for s, a, b in zip(self.sources, now, self._values, strict=True) if not same(a, b)]
         if [tensor._version for tensor in self._tensors] != self._versions:
             pairs = zip(self._of_tensors, self._tensors, self._versions, strict=True)
-            found += [source for source, tensor, version in pairs if tensor._version != version]
+            changed += [source for source, tensor, version in pairs if tensor._version != version]
         for source, value, held in self._holders:
             items = _held(value) or ()
             if len(items) == len(held) and all(map(operator.is_, items, held)):
                 continue
             if len(items) != len(held) or not all(map(same, items, held)):
-                found.append(source)
+                changed.append(source)
         if [*map(len, self._hooks)] != self._counts:
-            found.append((0, "hooks"))
-        return found
+            changed.append((0, "hooks"))
+        return changed
 
 
 def _held(value: Any) -> tuple[Any, ...] | None:

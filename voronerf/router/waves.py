@@ -79,17 +79,17 @@ def _by_parts(step: Step, joined: Mapping[int, Step], new: int) -> list[Step]:
     if any(c.of != VALUE or c.spread for c in move.operands) or sum(c.width for c in move.operands) != move.width:
         return [step]
     matrix, start, _ = step.numbers
-    found, add = list[Step](), step.operands[1:]
+    steps, add = list[Step](), step.operands[1:]
     for part, (c, at) in enumerate(zip(move.operands, move.numbers, strict=True)):
         out = step.out if part == len(move.operands) - 1 else new + part
-        found.append(Step("linear", out, step.width, (c, *add), (matrix, start + at, 0)))
+        steps.append(Step("linear", out, step.width, (c, *add), (matrix, start + at, 0)))
         add = (Columns(VALUE, out, 0, step.width),)
-    return found
+    return steps
 
 
 def _waves(program: Program, made: Mapping[int, Step], constants: Mapping[int, Sequence[float]]) -> _Waves:
     """The waves of each column that is not itself a x + b of another one."""
-    found: _Waves = {}
+    waves: _Waves = {}
     for step in program.steps:
         if step.name != "sine" or step.numbers[0] or len(step.operands) > 1:
             continue
@@ -99,8 +99,8 @@ def _waves(program: Program, made: Mapping[int, Step], constants: Mapping[int, S
                 continue
             source, factor, phase = _source(of, made, constants, *step.numbers[1:])
             if (phase := _PHASES.get(round(phase, 6), -1)) >= 0:
-                found.setdefault(source, {}).setdefault(factor, {}).setdefault(phase, []).append((step.out, column))
-    return found
+                waves.setdefault(source, {}).setdefault(factor, {}).setdefault(phase, []).append((step.out, column))
+    return waves
 
 
 def _column(c: Columns, column: int) -> _Column | None:
@@ -112,20 +112,20 @@ def _source(
 ) -> tuple[_Column, float, float]:
     """The column x of which another one, times a factor and plus an offset, is a x + b; and a and b."""
     (value, column), by, plus = of, 1.0, 0.0
-    step, own = made[value], list[_Column | None]()
+    step, columns = made[value], list[_Column | None]()
     if step.op == "move":
         parts = [(c, int(at)) for c, at in zip(step.operands, step.numbers) if at <= column < at + c.width]
-        own = [_column(c, column - at) for c, at in parts]
+        columns = [_column(c, column - at) for c, at in parts]
     elif step.name == "affine" and step.numbers[0] == 0 and len(step.operands) == 1:
-        own, by, plus = [_column(step.operands[0], column)], *step.numbers[1:]
+        columns, by, plus = [_column(step.operands[0], column)], *step.numbers[1:]
     elif step.name == "mul":
         (x, y) = step.operands if step.operands[0].of == VALUE else step.operands[::-1]
         if y.of == PARAMETER and y.index in constants:
-            own, by = [_column(x, column)], constants[y.index][y.start + (0 if y.spread else column)]
-    found = own[0] if len(own) == 1 else None
-    if found is None:
+            columns, by = [_column(x, column)], constants[y.index][y.start + (0 if y.spread else column)]
+    read = columns[0] if len(columns) == 1 else None
+    if read is None:
         return of, factor, offset
-    return _source(found, made, constants, factor * by, factor * plus + offset)
+    return _source(read, made, constants, factor * by, factor * plus + offset)
 
 
 def _groups(waves: _Waves) -> Iterator[_Group]:
@@ -167,8 +167,8 @@ def _moved(step: Step, places: dict[_Column, _Column]) -> Step:
     """A move in as few pieces as may be; what it only puts elsewhere is noted in ``places``."""
     taken: dict[int, _Column] = {}
     for c, at in zip(step.operands, map(int, step.numbers), strict=True):
-        own = ((c.index, c.start + i) for i in range(c.width))
-        taken.update({at + i: places.get(column, column) for i, column in enumerate(own)})
+        columns = ((c.index, c.start + i) for i in range(c.width))
+        taken.update({at + i: places.get(column, column) for i, column in enumerate(columns)})
     if len(taken) != sum(c.width for c in step.operands):
         return step  # columns that are added up
     pieces: list[tuple[Columns, int]] = []

@@ -27,7 +27,7 @@ from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.occupancy import PICTURE_OPACITY, OccupancyGrid
 from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.network import Network, config_of
+from voronerf.town.network import StoredRouter, config_of
 from voronerf.town.parts import Part, Parts
 from voronerf.town.run import TOWN, is_town, open_parts, write_parts
 
@@ -61,11 +61,11 @@ class Source:
             return cls(name, config, scene, open_parts(run, checkpoint), grid)
         if config.field_type.cones:
             raise ConfigError(f"{name}: --field {config.field} cannot be joined or cut: its cones cross borders")
-        contraction, network = scene.space(config.contraction).contraction, Network(checkpoint)
+        contraction, network = scene.space(config.contraction).contraction, StoredRouter(checkpoint)
         if isinstance(contraction, Perspective):
             raise ConfigError(f"{name}: --contraction ndc cannot be joined or cut: it belongs to one camera")
         if config.sampling != "stratified":
-            network = Network.of(network.router, config)
+            network = StoredRouter.of(network.router, config)
         if contraction is not None:
             return cls(name, config, scene, Parts([Part([network], contraction=contraction)]), None)
         region = []
@@ -217,13 +217,13 @@ def _settings(sources: Sequence[Source], frames: Sequence[Similarity], scene: Sc
         diagonal = float((scene.box[1] - scene.box[0]).norm())
         for source, frame in zip(sources, frames, strict=True):
             assert source.scene.box is not None
-            own = float((source.scene.box[1] - source.scene.box[0]).norm()) * frame.scale
-            if not own >= SMALLEST * diagonal:
+            size = float((source.scene.box[1] - source.scene.box[0]).norm()) * frame.scale
+            if not size >= SMALLEST * diagonal:
                 raise ConfigError(
-                    f"{source.name}: must be at least {SMALLEST:g} times as large as all together, got {own:.3g} "
+                    f"{source.name}: must be at least {SMALLEST:g} times as large as all together, got {size:.3g} "
                     f"of {diagonal:.3g}"
                 )
-            samples = max(samples, math.ceil((source.config.samples or (64,))[0] * diagonal / own - 1e-6))
+            samples = max(samples, math.ceil((source.config.samples or (64,))[0] * diagonal / size - 1e-6))
     return replace(first, sampling="stratified", samples=(min(samples, 32_000),), out=None)
 
 
@@ -234,7 +234,7 @@ def _join_scenes(sources: Sequence[Source], frames: Sequence[Similarity]) -> Sce
     if box is not None:
         corners = torch.cat([frame.points(_corners(s.scene.box)) for s, frame in zip(sources, frames, strict=True)])
         boxes = [(s.scene.box, frame) for s, frame in zip(sources, frames, strict=True)]
-        same = all(frame.is_identity and own is not None and torch.equal(own, box) for own, frame in boxes)
+        same = all(frame.is_identity and other is not None and torch.equal(other, box) for other, frame in boxes)
         box = box if same else torch.stack((corners.amin(0), corners.amax(0)))
     for source, frame in zip(sources, frames, strict=True):
         key = (source.config.data, str(frame.to_values()))
@@ -319,13 +319,13 @@ def _join_grids(sources: Sequence[Source], frames: Sequence[Similarity]) -> Occu
             voxels = grid.voxels(frame.points(source.points(full, inside))).long()
             marked[voxels] = True
             density.scatter_reduce_(0, voxels, source.density.view(-1)[full] / frame.scale, "amax")
-        found, values = marked.view(grid.density.shape), density.view(grid.density.shape)
+        filled, values = marked.view(grid.density.shape), density.view(grid.density.shape)
         turned = frame.rotation.abs()
         if bool(((turned > 1e-6) & (turned < 1 - 1e-6)).any()):  # corners of turned voxels lie between the places
-            around = torch.nn.functional.max_pool3d(found.float()[None, None], 3, 1, 1)[0, 0] > 0
-            values = torch.where(around & ~found, threshold, values)
-            found = around
-        grid.occupied |= found
+            around = torch.nn.functional.max_pool3d(filled.float()[None, None], 3, 1, 1)[0, 0] > 0
+            values = torch.where(around & ~filled, threshold, values)
+            filled = around
+        grid.occupied |= filled
         grid.density = torch.maximum(grid.density, values)
     return grid
 
@@ -406,14 +406,14 @@ def cut_source(source: Source, kept: Solid | Tensor) -> Source:
 def keep_cells(parts: Parts, kept: Tensor) -> Parts:
     """Parts with some of the cells alone, bool [k]."""
     pieces = kept.split([part.num_cells for part in parts])
-    left = [part.keep(own.nonzero()[:, 0]) for part, own in zip(parts, pieces, strict=True)]
-    found = [part for part in left if part is not None]
-    if not found:
+    left = [part.keep(piece.nonzero()[:, 0]) for part, piece in zip(parts, pieces, strict=True)]
+    shown = [part for part in left if part is not None]
+    if not shown:
         raise ConfigError("nothing is left: all cells are cut away")
-    lowest = min(part.layer for part in found)
+    lowest = min(part.layer for part in shown)
     if lowest:
-        found = [part.changed(layer=part.layer - lowest) for part in found]
-    return Parts(found, backend=parts.backend)
+        shown = [part.changed(layer=part.layer - lowest) for part in shown]
+    return Parts(shown, backend=parts.backend)
 
 
 def _inside_ball(solid: Solid, contraction: Contraction) -> bool:
@@ -487,8 +487,8 @@ def align(fixed: Scene, moving: Scene, name: str) -> tuple[Similarity, float, in
     sign[2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(v))
     rotation = u @ torch.diag(sign) @ v
     scale = float((spread * sign).sum() / (at - at_mean).square().sum(1).mean())
-    found = Similarity(scale, rotation, to_mean - scale * rotation @ at_mean)
-    return found, float((found.points(at) - to).square().sum(1).mean().sqrt()), len(shared)
+    similarity = Similarity(scale, rotation, to_mean - scale * rotation @ at_mean)
+    return similarity, float((similarity.points(at) - to).square().sum(1).mean().sqrt()), len(shared)
 
 
 # Files ----------------------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from voronerf.diagram import VoronoiDiagram
 from voronerf.router import VoronoiRouter
 
 
-class Network:
+class StoredRouter:
     """The networks of cells: settings and tensors."""
 
     def __init__(self, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> None:
@@ -24,7 +24,7 @@ class Network:
         self.diagram = VoronoiDiagram.from_state(checkpoint.group("router"), "diagram.")
 
     @classmethod
-    def of(cls, router: VoronoiRouter, config: TrainConfig) -> Network:
+    def of(cls, router: VoronoiRouter, config: TrainConfig) -> StoredRouter:
         """Those of a router, and the settings that its network is made of."""
         tensors = {f"router.{name}": tensor for name, tensor in router.state_dict().items()}
         network = cls(Checkpoint(tensors, {"config": replace(config, sampling="stratified").to_values()}))
@@ -36,9 +36,9 @@ class Network:
         """With averaged weights, in evaluation mode."""
         return open_routers(config_of(self.checkpoint), self.checkpoint, self.device, self.backend)["field"]
 
-    def part(self, cells: Sequence[int] | Tensor) -> Network:
+    def part(self, cells: Sequence[int] | Tensor) -> StoredRouter:
         """Those of some of the cells."""
-        return Network.of(self.router.part(cells), config_of(self.checkpoint))
+        return StoredRouter.of(self.router.part(cells), config_of(self.checkpoint))
 
     def stored(self) -> Checkpoint:
         """The checkpoint without what only a training needs."""

@@ -23,7 +23,7 @@ from voronerf.app.train.build import as_field
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.contraction import Contraction
 from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.network import Network
+from voronerf.town.network import StoredRouter
 
 
 class Part(nn.Module):
@@ -33,7 +33,7 @@ class Part(nn.Module):
     leaves without a network where cells were cut away: nothing is seen there.
 
     Args:
-        networks: Network i has the leaves with ``owner == i``, in ascending order.
+        networks: Router i has the leaves with ``owner == i``, in ascending order.
         diagram: l leaves; None for that of the only router.
         owner: int [l], the network of each leaf, -1 for none; None for the only one.
         frame: From the part to the scene.
@@ -47,7 +47,7 @@ class Part(nn.Module):
 
     def __init__(
         self,
-        networks: Sequence[Network],
+        networks: Sequence[StoredRouter],
         diagram: VoronoiDiagram | None = None,
         owner: Tensor | None = None,
         *,
@@ -94,7 +94,7 @@ class Part(nn.Module):
             return self
         kept = torch.zeros(self.num_cells, dtype=torch.bool, device=self.owner.device)
         kept[cells] = True
-        owner, networks = torch.full_like(self.owner, -1), list[Network]()
+        owner, networks = torch.full_like(self.owner, -1), list[StoredRouter]()
         for index, network in enumerate(self.networks):
             mine = (self.owner == index).nonzero()[:, 0]
             inside = kept[self.number[mine].long()]

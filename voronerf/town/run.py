@@ -38,7 +38,7 @@ from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Occupancy, Sampler, Stratified
 from voronerf.nerf.volume import Space
 from voronerf.town.geometry import Similarity, Solid
-from voronerf.town.network import Network, config_of
+from voronerf.town.network import StoredRouter, config_of
 from voronerf.town.parts import Part, Parts
 
 #: The file by which the directory of a run of several parts is told.
@@ -98,7 +98,7 @@ def index_of(
 
 def open_parts(run: Path, checkpoint: Checkpoint, device: torch.device | str = "cpu", backend: str = "auto") -> Parts:
     """The parts that a checkpoint of a run names; a network that stands in several places is one object."""
-    made: dict[str, Network] = {}
+    made: dict[str, StoredRouter] = {}
     found = []
     for index, values in enumerate(checkpoint.values["parts"]):
         try:
@@ -107,7 +107,7 @@ def open_parts(run: Path, checkpoint: Checkpoint, device: torch.device | str = "
                     raise ValueError(f"networks must be files beside the checkpoint, got {name!r:.100}")
                 if name not in made:
                     stored = load_checkpoint(checkpoint_path(run).with_name(name), keep=is_shown)
-                    made[name] = Network(stored, device, backend)
+                    made[name] = StoredRouter(stored, device, backend)
             seen = values["contraction"]
             part = Part(
                 [made[name] for name in values["networks"]],

@@ -13,6 +13,7 @@ from cli_commands import TINY, words
 from voronerf import __version__
 from voronerf.app.cli import main
 from voronerf.app.cli.program import COMMANDS
+from voronerf.app.files import read_json
 from voronerf.app.train.config import TrainConfig
 
 
@@ -84,7 +85,7 @@ def test_help_is_whole(capsys, monkeypatch, command):
 
 def test_none_stands_for_the_default(tmp_path):
     assert main(words("train --out", tmp_path, TINY, "--max-cells None --samples 8 --lpips None")) == 0
-    config = TrainConfig.from_json((tmp_path / "config.json").read_text())
+    config = TrainConfig.from_values(read_json(tmp_path / "config.json"))
     assert config.max_cells is None and config.lpips is None and config.samples == (8,)
 
 

@@ -182,7 +182,7 @@ def test_options_reach_the_field(scene: Scene) -> None:
     nerf = TrainConfig(field="nerf", field_options=("density_scale=20",), depth=2)
     built = nerf.field_type.build({**nerf.network_options, "position_octaves": 3})
     assert isinstance(built, NeRF) and built.density_scale == 20 and len(built.trunk) == 2
-    assert TrainConfig.from_json(nerf.to_json()) == nerf
+    assert TrainConfig.from_values(nerf.to_values()) == nerf
     solved = build(TrainConfig(field="table", parameters=400, cells=()), scene).config
     assert solved.width == 49 and count_parameters(solved) == 8 * 49 + 4
 

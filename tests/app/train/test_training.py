@@ -44,7 +44,7 @@ def test_a_run_and_its_directory(tmp_path, scene):
     assert [line["step"] for line in metrics] == [12, 24]
     assert all(metrics[-1][name] == summary[name] for name in ("psnr", "psnr_of_mean_error"))
     assert summary["psnr_of_mean_error"] <= summary["psnr"] and 0 < summary["ssim"] <= 1
-    config = TrainConfig.from_json((tmp_path / "config.json").read_text())
+    config = TrainConfig.from_values(read_json(tmp_path / "config.json"))
     assert config == resolve(small(tmp_path), scene)
     opened = open_run(tmp_path, scene=scene)
     assert opened.config == config and summary["parameters"] == sum(p.numel() for p in opened.router.parameters())

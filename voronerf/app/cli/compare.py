@@ -19,7 +19,7 @@ FIGURES = (
     *(("cells", "cells", 0), ("parameters", "parameters", 0), ("steps", "steps", 0), ("seconds", "training [s]", 0)),
     *(("rays_per_second", "rays/s", 0), ("psnr", "PSNR [dB]", 2), ("ssim", "SSIM", 4), ("lpips", "LPIPS", 4)),
 )
-#: Those that are of test views, and the mark of them where only the middle of views was scored.
+#: Figures of test views, and their mark where only the middle of views was scored.
 SCORES, PARTLY = ("psnr", "ssim", "lpips"), "*"
 #: Settings that say where a run is, rather than what it is.
 PLACES = ("out", "resume", "allow_outside", "panels", "tensorboard")
@@ -35,19 +35,19 @@ def compare(runs: tuple[Path, ...], /) -> int:
     """
     if len(runs) < 2:
         raise ConfigError(f"compare needs at least two runs, got {len(runs)}")
-    found = [read_files(run) for run in runs]
+    read = [read_files(run) for run in runs]
     table = Table()
     table.add_column("", no_wrap=True)
     for run in runs:
         table.add_column(escape(printable(str(run))), justify="right", overflow="fold")
     for key, heading, places in FIGURES:
-        marks = [PARTLY * (key in SCORES and figures.get("part", 1) != 1) for figures, _ in found]
-        numbers = (shown(figures.get(key), places) for figures, _ in found)
+        marks = [PARTLY * (key in SCORES and figures.get("part", 1) != 1) for figures, _ in read]
+        numbers = (shown(figures.get(key), places) for figures, _ in read)
         table.add_row(escape(heading), *map("".join, zip(numbers, marks, strict=True)))
-    table.add_row("scores of", *(views_of(figures) or "-" for figures, _ in found))
+    table.add_row("scores of", *(views_of(figures) or "-" for figures, _ in read))
     table.add_section()
-    for name in dict.fromkeys(name for _, settings in found for name in settings if name not in PLACES):
-        values = [escape(printable(str(settings.get(name)))) for _, settings in found]
+    for name in dict.fromkeys(name for _, settings in read for name in settings if name not in PLACES):
+        values = [escape(printable(str(settings.get(name)))) for _, settings in read]
         if len(set(values)) > 1:
             table.add_row(escape(printable(name)), *values)
     console.print(table)

@@ -29,7 +29,7 @@ from voronerf.town import open_run as open_town
 #: Pixels along a side of the images, of the pictures and of the video.
 SIZE = 400
 FRAMES, FPS = 48, 16
-#: Where a copy of the scene stands in it, on the globe, and its size.
+#: Place of a copy of the scene in it, on the globe, and its size.
 TOP, SCALE = (0.0, 0.0, 1.0), 0.35
 
 

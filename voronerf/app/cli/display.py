@@ -1,4 +1,4 @@
-"""What commands print: plain lines, and bars of their progress on a terminal."""
+"""The output of commands: plain lines, and progress bars on a terminal."""
 
 from __future__ import annotations
 

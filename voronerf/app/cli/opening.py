@@ -18,7 +18,7 @@ from voronerf.app.train.config import ConfigError
 from voronerf.town.run import TOWN
 from voronerf.town.run import open_run as open_parts
 
-#: What opens a run directory with a file of that name; others are those of a training.
+#: Functions that open a run directory with a file of that name; others hold trainings.
 OPENERS: dict[str, Callable[..., Run]] = {TOWN: open_parts}
 #: Six numbers of a box, or the one that the viewer has saved.
 Crop = tuple[float, float, float, float, float, float] | Literal["saved"] | None

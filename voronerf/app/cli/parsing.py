@@ -28,11 +28,11 @@ from tyro.constructors import (
 from voronerf.app.train.config import ConfigError, TrainConfig, did_you_mean, either
 
 RULES = ConstructorRegistry()
-#: What a number must be.
+#: Words for the kinds of numbers.
 NUMBERS = {int: "a whole number", float: "a number"}
 #: Defaults that are none.
 NOTHING = (None, (), inspect.Parameter.empty)
-#: What sets the colours of a terminal.
+#: Codes that set the colours of a terminal.
 COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -44,11 +44,11 @@ def parse(name: str, command: Callable[..., int], words: Sequence[str]) -> Calla
     """
 
     @functools.wraps(command)
-    def later(*given: Any, **options: Any) -> Callable[[], int]:
-        return functools.partial(command, *given, **options)
+    def later(*arguments: Any, **options: Any) -> Callable[[], int]:
+        return functools.partial(command, *arguments, **options)
 
     hints, signature = get_type_hints(command, include_extras=True), inspect.signature(command)
-    later.__annotations__ = {k: _argument(hints[k], given.default) for k, given in signature.parameters.items()}
+    later.__annotations__ = {k: _argument(hints[k], part.default) for k, part in signature.parameters.items()}
     later.__doc__ = re.sub(r"\n {12}", " ", command.__doc__ or "")  # tyro would keep these breaks
     later.__signature__ = signature  # type: ignore[attr-defined]
     del later.__wrapped__  # tyro would read its annotations
@@ -65,12 +65,12 @@ def parse(name: str, command: Callable[..., int], words: Sequence[str]) -> Calla
 
 
 def in_a_line(box: str) -> str:
-    """What a box of tyro's says, and which options are similar to those that it does not know."""
+    """The message in a box of tyro's, and options similar to those that it does not know."""
     _, *rows = (line[2:].rstrip(" │") for line in COLOURS.sub("", box).splitlines())
     parts = [[*part] for is_rule, part in itertools.groupby(rows, lambda row: row[:1] in ("─", "-")) if not is_rule]
     message = re.sub("^Error parsing ([^:]+):", r"\1", " ".join(" ".join(parts[0]).split())).rstrip(".")
-    found = (row.split()[0].strip(",") for part in parts[1:] for row in part if row.startswith("    --"))
-    near = list(dict.fromkeys(found)) if message.startswith("Unrecognized") else []
+    similar = (row.split()[0].strip(",") for part in parts[1:] for row in part if row.startswith("    --"))
+    near = list(dict.fromkeys(similar)) if message.startswith("Unrecognized") else []
     return message + (f"; did you mean {either(near)}?" if near else "")
 
 
@@ -85,9 +85,9 @@ def _argument(hint: Any, default: Any) -> Any:
 def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Dataclasses: those of a training in a box for each group, and texts without the breaks of their source."""
     if info.type is TrainConfig:
-        given = vars(info.default) if isinstance(info.default, TrainConfig) else {}
+        defaults = vars(info.default) if isinstance(info.default, TrainConfig) else {}
         groups = {
-            base: base(**{field.name: given[field.name] for field in fields(base) if given})
+            base: base(**{field.name: defaults[field.name] for field in fields(base) if defaults})
             for base in reversed(TrainConfig.__bases__)
         }
         return StructConstructorSpec(
@@ -96,11 +96,11 @@ def settings(info: StructTypeInfo) -> StructConstructorSpec | None:
         )
     if not is_dataclass(info.type):
         return None
-    texts, hints, found = field_docs(info.type), get_type_hints(info.type), []
+    texts, hints, specs = field_docs(info.type), get_type_hints(info.type), []
     for field in fields(info.type):
         default = getattr(info.default, field.name, field.default)
-        found.append(StructFieldSpec(field.name, _argument(hints[field.name], default), default, texts[field.name]))
-    return StructConstructorSpec(info.type, tuple(found))
+        specs.append(StructFieldSpec(field.name, _argument(hints[field.name], default), default, texts[field.name]))
+    return StructConstructorSpec(info.type, tuple(specs))
 
 
 @RULES.primitive_rule
@@ -120,21 +120,21 @@ def values(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
         return _spec(1, f"{{{','.join(parts)}}}", either(parts), lambda words: dict(zip(parts, parts))[words[0]], parts)
     if origin in (Union, types.UnionType) and type(None) in parts:
         inner = functools.reduce(operator.or_, (part for part in parts if part is not type(None)))
-        found = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(inner, info.markers))
-        if not isinstance(found, PrimitiveConstructorSpec):
+        spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(inner, info.markers))
+        if not isinstance(spec, PrimitiveConstructorSpec):
             return None
-        read = found.instance_from_str
+        read = spec.instance_from_str
         if len(parts) > 2:
             read = _spec(
-                found.nargs,
-                found.metavar,
-                found.metavar.translate({ord(c): None for c in "{}"}).replace("|", " or "),
+                spec.nargs,
+                spec.metavar,
+                spec.metavar.translate({ord(c): None for c in "{}"}).replace("|", " or "),
                 read,
             ).instance_from_str
         return replace(
-            found,
+            spec,
             instance_from_str=lambda words: None if words == ["None"] else read(words),
-            str_from_instance=lambda value: [] if value is None else found.str_from_instance(value),
+            str_from_instance=lambda value: [] if value is None else spec.str_from_instance(value),
         )
     return None
 

@@ -68,7 +68,7 @@ def render(
 
 def _sides(size: str) -> tuple[int, int]:
     """Width and height of "1280x720"."""
-    found = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", size)
-    if not found or max(sides := (int(found[1]), int(found[2]))) > LONGEST_SIDE:
+    match = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", size)
+    if not match or max(sides := (int(match[1]), int(match[2]))) > LONGEST_SIDE:
         raise ConfigError(f"--size must be WIDTHxHEIGHT, such as 1280x720, at most {LONGEST_SIDE} each, got {size!r}")
     return sides

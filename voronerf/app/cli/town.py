@@ -82,20 +82,20 @@ def join(
 
 def given_frames(runs: int, move: Sequence[tuple[str, str]]) -> dict[int, Similarity]:
     """The transforms of --move, by the number of their run from 0."""
-    found: dict[int, Similarity] = {}
+    frames: dict[int, Similarity] = {}
     for number, text in move:
         if not number.isdecimal() or not 1 <= int(number) <= runs:
             raise ConfigError(f"--move {number}: must be the number of a run, 1 to {runs}")
-        if int(number) - 1 in found:
+        if int(number) - 1 in frames:
             raise ConfigError(f"--move {number}: must be given once")
         try:
             numbers = [float(word) for word in text.replace(",", " ").split()]
             if len(numbers) != 7:
                 raise ValueError(f"must be {MOVE}, seven numbers, got {len(numbers)}")
-            found[int(number) - 1] = Similarity.of(numbers[:3], numbers[3:6], numbers[6])
+            frames[int(number) - 1] = Similarity.of(numbers[:3], numbers[3:6], numbers[6])
         except ValueError as error:
             raise ConfigError(f"--move {number}: {error}") from None
-    return found
+    return frames
 
 
 def cut(
@@ -118,14 +118,14 @@ def cut(
         outside: Keep what lies outside.
     """
     check_out(out)
-    given = [name for name, value in (("box", box), ("sphere", sphere), ("cells", cells)) if value is not None]
-    if len(given) != 1:
-        came = " and ".join(f"--{name}" for name in given) or "none"
+    named = [name for name, value in (("box", box), ("sphere", sphere), ("cells", cells)) if value is not None]
+    if len(named) != 1:
+        came = " and ".join(f"--{name}" for name in named) or "none"
         raise ConfigError(f"cut needs one of --box, --sphere and --cells, got {came}")
     try:
         solid = Solid.box(box[:3], box[3:]) if box is not None else None if sphere is None else Solid(ball=sphere)
     except ValueError as error:
-        raise ConfigError(f"--{given[0]}: {error}") from None
+        raise ConfigError(f"--{named[0]}: {error}") from None
     kept = list(cells or ()) if solid is None else solid
     with busy("cutting"):
         made = editing.cut(run, kept, out, outside=outside)

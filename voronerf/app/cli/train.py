@@ -59,7 +59,7 @@ from voronerf.ops._core import backends
 LONGEST_NAME = 255 - len(".png")
 #: Panels of a training that is not told how many.
 PANELS = 4
-#: What ends a training with a checkpoint: Ctrl-C, kill, a closed terminal, and the warning that Slurm can send.
+#: Signals that end a training with a checkpoint: Ctrl-C, kill, a closed terminal, and the warning that Slurm can send.
 STOPPING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
 
 #: Printed before a training without any options.
@@ -308,6 +308,6 @@ def with_stored_settings(command: Callable[..., int], args: list[str]) -> Callab
 
 def _given_path(args: list[str], option: str) -> Path | None:
     """The value of an option that is a path, or None."""
-    found = next((after for word, after in itertools.pairwise(args) if word == option), None)
-    found = next((word.removeprefix(f"{option}=") for word in args if word.startswith(f"{option}=")), found)
-    return None if found is None else Path(found)
+    path = next((after for word, after in itertools.pairwise(args) if word == option), None)
+    path = next((word.removeprefix(f"{option}=") for word in args if word.startswith(f"{option}=")), path)
+    return None if path is None else Path(path)

@@ -132,5 +132,5 @@ def _middle(planes: NDArray[np.float64], extent: float) -> NDArray[np.float64] |
     from scipy.optimize import linprog
 
     rows = np.concatenate((planes[:, :3], np.ones((len(planes), 1))), 1)
-    found = linprog((0, 0, 0, -1), A_ub=rows, b_ub=-planes[:, 3], bounds=[(None, None)] * 3 + [(None, None)])
-    return found.x[:3] if found.status == 0 and found.x[3] > THINNEST * extent else None
+    solution = linprog((0, 0, 0, -1), A_ub=rows, b_ub=-planes[:, 3], bounds=[(None, None)] * 3 + [(None, None)])
+    return solution.x[:3] if solution.status == 0 and solution.x[3] > THINNEST * extent else None

@@ -19,8 +19,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool3d
 
 from voronerf.app.export.space import (
+    SurfaceView,
     Track,
-    View,
     box_of,
     check_export,
     in_silence,
@@ -103,7 +103,7 @@ def export_mesh(
     return mesh
 
 
-def looked_at(views: list[View]) -> Tensor | None:
+def looked_at(views: list[SurfaceView]) -> Tensor | None:
     """The box [2, 3] of what cameras look at: of the points that views show, those that lie in the pictures of half of
     the views, and nearer to what these look at than half of the cameras. None where there are none.
     """
@@ -126,7 +126,7 @@ def looked_at(views: list[View]) -> Tensor | None:
     return torch.stack((middle - half, middle + half))
 
 
-def _left_out(views: list[View], box: Tensor) -> str:
+def _left_out(views: list[SurfaceView], box: Tensor) -> str:
     """A line about the surfaces that lie outside of a box."""
     points = torch.cat([view.surface.reshape(-1, 3) for view in views])
     points = points[points.isfinite().all(-1)]
@@ -210,7 +210,7 @@ def _resolution(extent: Tensor, wanted: int | None) -> int:
 
 
 def _fused(
-    low: Tensor, side: float, blocks: Tensor, views: list[View], closed: bool, track: Track
+    low: Tensor, side: float, blocks: Tensor, views: list[SurfaceView], closed: bool, track: Track
 ) -> tuple[Tensor, Tensor]:
     """The truncated distances of blocks of nodes, positive before a surface, and which of the nodes were seen."""
     counts: list[int] = blocks.tolist()
@@ -237,7 +237,7 @@ def _fused(
     return value, seen
 
 
-def _distance(points: Tensor, views: list[View], reach: float) -> tuple[Tensor, Tensor]:
+def _distance(points: Tensor, views: list[SurfaceView], reach: float) -> tuple[Tensor, Tensor]:
     """Mean distances [n] of points [n, 3] from the surfaces behind them, in reaches and at most 1; and which were seen.
 
     Without a view that sees a point, or a surface shortly before it, it is -1 behind a surface and 1 outside of all
@@ -253,7 +253,7 @@ def _distance(points: Tensor, views: list[View], reach: float) -> tuple[Tensor, 
     return torch.where(count > 0, total / count.clamp_min(1), torch.where(inside > 0, -1.0, 1.0)), count > 0
 
 
-def _in_picture(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
+def _in_picture(points: Tensor, view: SurfaceView) -> tuple[Tensor, Tensor]:
     """Where a view has points [n, 3] in its picture, [n, 2], and which of them lie in it, bool [n]."""
     height, width = view.colour.shape[:2]
     pixels, depth = view.camera.project(points, 0)
@@ -261,7 +261,7 @@ def _in_picture(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
     return pixels, (depth > 0) & ((pixels >= 0) & (pixels < limit)).all(-1)
 
 
-def _gap(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
+def _gap(points: Tensor, view: SurfaceView) -> tuple[Tensor, Tensor]:
     """Where a view has points in its picture [n, 2], and how far behind them the surface is [n]; NaN outside of it."""
     width = view.colour.shape[1]
     pixels, inside = _in_picture(points, view)
@@ -270,7 +270,7 @@ def _gap(points: Tensor, view: View) -> tuple[Tensor, Tensor]:
     return pixels, torch.where(inside, gap, torch.nan)
 
 
-def _colours(points: Tensor, normals: Tensor, views: list[View], margin: float) -> Tensor:
+def _colours(points: Tensor, normals: Tensor, views: list[SurfaceView], margin: float) -> Tensor:
     """The colours [n, 3] that views show of points: means, in which what is near and frontal counts most."""
     from scipy.spatial import cKDTree
 

@@ -67,15 +67,15 @@ def _surface(run: Run, count: int, box: Tensor | None) -> Any:
         points.append(view.surface[shown])
         colours.append(view.colour[shown])
         towards.append(view.camera.origins.cpu() - view.surface[shown])
-    found = torch.cat(points)
-    if len(found) == 0:
+    positions = torch.cat(points)
+    if len(positions) == 0:
         raise ConfigError(f"{run.path}: the training views show no surface in the box")
-    chosen = torch.randperm(len(found), generator=torch.Generator().manual_seed(0))[:count]
-    found, colour, toward = found[chosen], torch.cat(colours)[chosen], torch.cat(towards)[chosen]
-    normals = spread_around(found, NEIGHBOURS)[0][..., 0]
+    chosen = torch.randperm(len(positions), generator=torch.Generator().manual_seed(0))[:count]
+    positions, colour, toward = positions[chosen], torch.cat(colours)[chosen], torch.cat(towards)[chosen]
+    normals = spread_around(positions, NEIGHBOURS)[0][..., 0]
     normals = torch.where((normals * toward).sum(-1, keepdim=True) < 0, -normals, normals)
     return trimesh.Trimesh(
-        found.numpy(),
+        positions.numpy(),
         vertex_normals=normals.numpy(),
         vertex_colors=(colour.clamp(0, 1) * 255).round().to(torch.uint8).numpy(),
         process=False,

@@ -1,4 +1,4 @@
-"""What exports share: their files, and what the training views show.
+"""Shared by exports: their files, and the surface that training views show.
 
 n points, h x w pixels. Positions are in scene units.
 """
@@ -74,8 +74,8 @@ def box_of(run: Run, box: Tensor | None = None) -> Tensor:
 
 
 @dataclass(frozen=True)
-class View:
-    """What one camera sees."""
+class SurfaceView:
+    """A rendered view and the surface in it."""
 
     camera: Cameras  # the camera alone
     colour: Tensor  # [h, w, 3]
@@ -87,7 +87,7 @@ class View:
         return (self.surface - self.camera.origins[0]).norm(dim=-1).nan_to_num(torch.inf)
 
 
-def views_of(run: Run, cameras: Cameras, track: Track = in_silence) -> list[View]:
+def views_of(run: Run, cameras: Cameras, track: Track = in_silence) -> list[SurfaceView]:
     """Renders cameras, or `VIEWS` of them, evenly spread."""
     views, contraction = [], run.renderer.contraction
     numbers = torch.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().long().tolist()
@@ -95,7 +95,9 @@ def views_of(run: Run, cameras: Cameras, track: Track = in_silence) -> list[View
         image = run.render(cameras, number)
         surface = image.heaviest.cpu() if contraction is None else contraction.inverse(image.heaviest.cpu())
         shown = (image.opacity.cpu() > SOLID) & (surface.abs().amax(-1) < FARTHEST)
-        views.append(View(cameras[[number]], image.colour.cpu(), torch.where(shown[..., None], surface, torch.nan)))
+        views.append(
+            SurfaceView(cameras[[number]], image.colour.cpu(), torch.where(shown[..., None], surface, torch.nan))
+        )
     return views
 
 

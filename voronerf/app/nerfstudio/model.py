@@ -98,7 +98,7 @@ class VoronerfModel(Model):
         self.strategy = SplitStrategy(
             self.routers, self.settings.plan, centres=self.settings.centres, generator=self.generator
         )
-        self._found: RenderOutput | None = None
+        self._output: RenderOutput | None = None
 
     @property
     def num_cells(self) -> int:
@@ -113,7 +113,7 @@ class VoronerfModel(Model):
     # --- training --------------------------------------------------------------------------------------------------
 
     def get_training_callbacks(self, training_callback_attributes: TrainingCallbackAttributes) -> list[Any]:
-        """What comes before and after each step of nerfstudio's trainer."""
+        """The callbacks before and after each step of nerfstudio's trainer."""
         trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
         assert trainer is not None and optimizers is not None
         steps, optimizer = trainer.config.max_num_iterations, optimizers.optimizers["fields"]
@@ -130,10 +130,10 @@ class VoronerfModel(Model):
                 self.renderer.train()
 
         def after(step: int) -> None:
-            found, self._found = self._found, None
-            assert found is not None
-            self.renderer.sampler.step_post_backward(found)
-            self.strategy.step_post_backward(found)
+            output, self._output = self._output, None
+            assert output is not None
+            self.renderer.sampler.step_post_backward(output)
+            self.strategy.step_post_backward(output)
 
         return [
             TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before, update_every_num_iters=1),
@@ -198,13 +198,13 @@ class VoronerfModel(Model):
 
     def _learn(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> RenderOutput:
         """What a training step finds, once for the outputs of a batch: losses and metrics ask for it."""
-        if "found" not in outputs:
+        if "render" not in outputs:
             rays, near, far = outputs["rays"]
             background = self.background if batch["image"].shape[-1] == 3 else torch.rand_like(rays.origins)
             target = self._truth(batch, background)
-            outputs["found"] = self._found = self.ray_loss(Batch(rays, near, far, target, background))
-        found: RenderOutput = outputs["found"]
-        return found
+            outputs["render"] = self._output = self.ray_loss(Batch(rays, near, far, target, background))
+        output: RenderOutput = outputs["render"]
+        return output
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """PSNR in dB of the rays of a batch, and the number of cells."""
@@ -245,7 +245,7 @@ class VoronerfModel(Model):
     # --- checkpoints -----------------------------------------------------------------------------------------------
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What nerfstudio's checkpoints hold beside the parameters and the diagram."""
+        """The state in nerfstudio's checkpoints beside the parameters and the diagram."""
         grid = self.renderer.occupancy
         return {
             "strategy": self.strategy.state_dict(),

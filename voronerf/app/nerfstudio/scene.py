@@ -1,4 +1,4 @@
-"""What voronerf has to know of a scene of nerfstudio before it makes its networks."""
+"""A scene of nerfstudio as one of voronerf."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a camera sees of a scene."""
+"""Renders a camera in a scene."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from voronerf.nerf.renderer import RenderedImage, Renderer
 def render_camera(
     renderer: Renderer, scene: Scene, cameras: Cameras, index: int, *, heaviest: bool = True
 ) -> RenderedImage:
-    """What one of several cameras sees of a scene, on its background, without randomness; on the renderer's device."""
+    """Renders one of several cameras on the background of a scene, without randomness; on the renderer's device."""
     device = renderer.device
     return renderer.train(False).image(
         cameras.to(device),

@@ -216,12 +216,12 @@ def capture_path(cameras: Cameras, count: int, *, near: float, far: float) -> Ca
 
 
 def like_most(cameras: Cameras) -> Cameras:
-    """Those of the cameras whose images have the commonest size, without their lenses."""
+    """The cameras whose images have the commonest size, without their lenses."""
     cameras = cameras.perspective()
     sizes = [cameras.size(index) for index in range(len(cameras))]
     width, height = max(sizes, key=sizes.count)
-    own = torch.tensor([size == (width, height) for size in sizes], device=cameras.poses.device)
-    return Cameras(cameras.poses[own], cameras.intrinsics[own], width, height)
+    alike = torch.tensor([size == (width, height) for size in sizes], device=cameras.poses.device)
+    return Cameras(cameras.poses[alike], cameras.intrinsics[alike], width, height)
 
 
 def resized(cameras: Cameras, size: tuple[int, int]) -> Cameras:

@@ -27,19 +27,19 @@ CACHED = 100  # pixels a side, from which on the built-in scene is kept
 MOST_PIXELS = 1600  # a side of the built-in scene
 
 
-#: Of files that `voronerf process` may read.
+#: Suffixes of videos that `voronerf process` may read.
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".mpg")
 
 
 class Format(NamedTuple):
-    """What shows that a folder has a format, how it is loaded, and how it is told if not by a file of that name."""
+    """A format of scenes: the file that shows it, its loader, and how it is found if not by a file of that name."""
 
     sign: str
     load: Callable[[Path, Reading], Scene]
     find: Callable[[Path], Path | None] | None = None
 
     def held(self, folder: Path) -> bool:
-        """Whether a folder has it."""
+        """Whether a folder has this format."""
         return (folder / self.sign).is_file() if self.find is None else self.find(folder) is not None
 
 
@@ -114,9 +114,9 @@ def load_scene(
     """
     if downscale is not None and downscale < 1:
         raise SceneError(f"{source}: downscale must be >= 1, got {downscale}")
-    for name, given, known in (("format", format, FORMATS), ("kind", kind, KINDS)):
-        if given != "auto" and given not in known:
-            raise SceneError(f"{source}: {name} must be auto, {' or '.join(known)}, got {given!r:.60}")
+    for name, word, known in (("format", format, FORMATS), ("kind", kind, KINDS)):
+        if word != "auto" and word not in known:
+            raise SceneError(f"{source}: {name} must be auto, {' or '.join(known)}, got {word!r:.60}")
     if images not in ("auto", "memory", "disk"):
         raise SceneError(f"{source}: images must be auto, memory or disk, got {images!r:.60}")
     if is_builtin(source):

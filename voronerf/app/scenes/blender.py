@@ -16,7 +16,7 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import read_images
 from voronerf.app.scenes.photographs import Reading, distinct_names
 from voronerf.app.scenes.scene import Scene, Split
-from voronerf.app.scenes.transforms import Frame, capture_scene, focal_length, has_lens, number, read_transforms
+from voronerf.app.scenes.transforms import ListedImage, capture_scene, focal_length, has_lens, number, read_transforms
 from voronerf.nerf.cameras import Cameras
 
 log = logging.getLogger(__name__)
@@ -69,7 +69,9 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     return Scene(name=name, train=train, test=test, near=near, far=far, box=box, background="white", notes=notes)
 
 
-def _split(frames: Sequence[Frame], images: torch.Tensor, sizes: torch.Tensor, downscale: int, on_disk: bool) -> Split:
+def _split(
+    frames: Sequence[ListedImage], images: torch.Tensor, sizes: torch.Tensor, downscale: int, on_disk: bool
+) -> Split:
     path, intrinsics = frames[0].source, []
     for frame, (width, height) in zip(frames, sizes.tolist()):
         focal = focal_length(frame.values, "camera_angle_x", width, path)

@@ -52,7 +52,7 @@ def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tenso
         return None
     shrink = max(1, min(visible.shape[1:]) // MASK_PIXELS, max(visible.shape[1:]) // MOST_MASK_PIXELS)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        views = list(pool.map(lambda index: _View(cameras, index, visible[index], shrink), range(len(cameras))))
+        views = list(pool.map(lambda index: _Silhouette(cameras, index, visible[index], shrink), range(len(cameras))))
         centre, half = focus.numpy(), np.float32((far - near) / 2)
         box = np.stack((centre - half, centre + half))
         for resolution in RESOLUTIONS:
@@ -63,7 +63,7 @@ def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tenso
     return torch.from_numpy(box) if _share_outside(cameras, visible, box) <= OUTSIDE else None
 
 
-class _View:
+class _Silhouette:
     """One camera and its mask, widened by each of GROWTHS."""
 
     def __init__(self, cameras: Cameras, index: int, visible: NDArray[np.bool_], shrink: int) -> None:
@@ -105,7 +105,7 @@ class _View:
         return seen, seen & ~self.masks.reshape(-1)[(level * height + row) * width + column]
 
 
-def _carve(views: list[_View], pool: ThreadPoolExecutor, box: Array, resolution: int) -> Array | None:
+def _carve(views: list[_Silhouette], pool: ThreadPoolExecutor, box: Array, resolution: int) -> Array | None:
     """Carves a grid of resolution^3 voxels in `box`; returns the box of the voxels that are left."""
     size = (box[1] - box[0]) / np.float32(resolution)
     steps = np.arange(resolution, dtype=np.float32) + np.float32(0.5)

@@ -129,9 +129,9 @@ class _Reader:
         end = self.at + struct.calcsize(layout)
         if end > len(self.data):
             raise SceneError(f"{self.path}: is cut short: it ends at byte {len(self.data)}, within a record")
-        found = struct.unpack_from(layout, self.data, self.at)
+        numbers = struct.unpack_from(layout, self.data, self.at)
         self.at = end
-        return found
+        return numbers
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.at)
@@ -142,9 +142,9 @@ class _Reader:
         return text
 
     def records(self, count: int, kind: np.dtype[Any]) -> Array:
-        found = np.frombuffer(self.data, kind, count, self.at)
+        rows = np.frombuffer(self.data, kind, count, self.at)
         self.at += count * kind.itemsize
-        return found
+        return rows
 
 
 def _cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
@@ -246,11 +246,11 @@ def _camera(path: Path, number: int, model: str, width: int, height: int, parame
 
 def _pose(values: tuple[float, ...], where: str) -> Array:
     """The pose of a unit quaternion (w, x, y, z) and a translation, both world to camera."""
-    found = np.array(values, dtype=np.float64)
-    length = np.linalg.norm(found[:4]) if len(found) == 7 else 0.0
-    if not ((np.abs(found) <= LARGEST).all() and abs(length - 1) < 0.01):
+    numbers = np.array(values, dtype=np.float64)
+    length = np.linalg.norm(numbers[:4]) if len(numbers) == 7 else 0.0
+    if not ((np.abs(numbers) <= LARGEST).all() and abs(length - 1) < 0.01):
         raise SceneError(f"{where}: its pose must be a unit quaternion and a translation of up to {LARGEST:.0e}")
-    w, x, y, z = found[:4] / length
+    w, x, y, z = numbers[:4] / length
     turn = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -260,7 +260,7 @@ def _pose(values: tuple[float, ...], where: str) -> Array:
     )
     pose = np.eye(4)
     pose[:3, :3] = turn.T * (1, -1, -1)
-    pose[:3, 3] = -turn.T @ found[4:]
+    pose[:3, 3] = -turn.T @ numbers[4:]
     return pose
 
 

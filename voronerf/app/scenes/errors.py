@@ -1,4 +1,4 @@
-"""What reading a scene raises."""
+"""The error of a scene that cannot be read."""
 
 
 class SceneError(ValueError):

@@ -60,17 +60,17 @@ def stay_inside(path: Path, folder: Path, allow_outside: bool) -> None:
 
 def named_images(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:
     """The files of names in a folder, None for those that are missing; with a warning that says how many."""
-    found: list[Path | None] = []
+    files: list[Path | None] = []
     for name in names:
         path = folder / name.replace("\\", "/")
         stay_inside(path, folder.parent, allow_outside)
-        found.append(path if path.is_file() else None)
-    missing = found.count(None)
-    if missing == len(found):
-        raise SceneError(f"{source}: none of its {len(found)} images exists, the first is {folder / names[0]}")
+        files.append(path if path.is_file() else None)
+    missing = files.count(None)
+    if missing == len(files):
+        raise SceneError(f"{source}: none of its {len(files)} images exists, the first is {folder / names[0]}")
     if missing:
-        log.warning("%s: %d of %d listed images are missing and are skipped", source, missing, len(found))
-    return found
+        log.warning("%s: %d of %d listed images are missing and are skipped", source, missing, len(files))
+    return files
 
 
 def listed_images(folder: Path) -> list[Path]:

@@ -40,7 +40,7 @@ BAND = 2**20
 
 
 class Header(NamedTuple):
-    """What an image file says of itself: (width, height), an alpha channel, bytes of a decoded pixel, whether
+    """The header of an image file: (width, height), an alpha channel, bytes of a decoded pixel, whether
     it is JPEG, and by how many quarters its orientation tag turns it anticlockwise."""
 
     size: tuple[int, int]
@@ -114,7 +114,7 @@ def read_image(path: Path, factor: int) -> NDArray[np.uint8]:
 
 
 class Decoded(NamedTuple):
-    """What `read_images` gives.
+    """The result of `read_images`.
 
     Attributes:
         images: uint8 [c, h, w, 3], or [c, h, w, 4] where any image has an alpha channel, with the smaller ones in the
@@ -167,13 +167,13 @@ def read_images(
     needed, free = len(paths) * pixels * channels + max(decoded, pixels * VIEW), available_memory()
 
     def make(index: int) -> NDArray[np.uint8]:
-        found = np.rot90(read_image(paths[index], factor), turns[index])
-        if found.shape == shape[1:]:
-            return found
+        turned = np.rot90(read_image(paths[index], factor), turns[index])
+        if turned.shape == shape[1:]:
+            return turned
         image = np.zeros(shape[1:], dtype=np.uint8)
-        place = image[: found.shape[0], : found.shape[1]]
+        place = image[: turned.shape[0], : turned.shape[1]]
         place[..., 3:] = 255
-        place[..., : found.shape[2]] = found[..., :channels]
+        place[..., : turned.shape[2]] = turned[..., :channels]
         return image
 
     if keep == "disk" or (keep == "auto" and needed > SHARE * free):
@@ -202,8 +202,8 @@ def _turned(sizes: Tensor, turns: Sequence[int]) -> Tensor:
 
 def _times(paths: Sequence[Path | None]) -> list[tuple[int, int, int] | None]:
     """Size and times of each file: that of its content, which can be set, and that of its last change in any way."""
-    found = [None if path is None else path.stat() for path in paths]
-    return [None if stat is None else (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for stat in found]
+    stats = [None if path is None else path.stat() for path in paths]
+    return [None if stat is None else (stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for stat in stats]
 
 
 def read_masks(

@@ -53,10 +53,15 @@ def colmap_lens(model: str, parameters: Sequence[float]) -> Lens:
         raise ValueError(f"camera model {model!s:.60} is not supported, only {', '.join(names)}")
     if len(parameters) != len(names[model]):
         raise ValueError(f"{model} must have {len(names[model])} parameters, got {len(parameters)}")
-    given = dict(zip(names[model], parameters))
+    values = dict(zip(names[model], parameters))
     kind = FISHEYE if "FISHEYE" in model else FOV if model == "FOV" else PERSPECTIVE
-    intrinsics = (given.get("fx", given.get("f", 0)), given.get("fy", given.get("f", 0)), given["cx"], given["cy"])
-    return Lens(intrinsics, tuple(given.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
+    intrinsics = (
+        values.get("fx", values.get("f", 0)),
+        values.get("fy", values.get("f", 0)),
+        values["cx"],
+        values["cy"],
+    )
+    return Lens(intrinsics, tuple(values.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
 
 
 def lens_inverts(cameras: Cameras) -> Tensor:
@@ -67,11 +72,11 @@ def lens_inverts(cameras: Cameras) -> Tensor:
     edge = torch.linspace(0, 1, 33, dtype=torch.float64)
     low, high = torch.zeros(33), torch.ones(33)
     x, y = torch.cat((edge, edge, low, high)), torch.cat((low, high, edge, edge))
-    found = torch.ones(len(cameras), dtype=torch.bool)
+    inverts = torch.ones(len(cameras), dtype=torch.bool)
     for index in range(len(cameras)):
         width, height = cameras.size(index)
-        found[index] = _has_ray(cameras, index, x * width, y * height).all()
-    return found
+        inverts[index] = _has_ray(cameras, index, x * width, y * height).all()
+    return inverts
 
 
 def pixels_with_rays(cameras: Cameras, index: int) -> Tensor:

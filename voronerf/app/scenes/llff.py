@@ -45,8 +45,8 @@ def load_llff(folder: Path, reading: Reading) -> Scene:
         if np.abs(turn.T @ turn - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(turn) < 0:
             raise SceneError(f"{path}: row {number} is not a pose, its axes are no rotation")
         if not (min(height, width, focal) >= 1 and 0 < near < far):
-            given = ", ".join(f"{value:g}" for value in row[[4, 9, 14, 15, 16]])
-            raise SceneError(f"{path}: row {number} must have a size, a focal length and 0 < near < far, got {given}")
+            came = ", ".join(f"{value:g}" for value in row[[4, 9, 14, 15, 16]])
+            raise SceneError(f"{path}: row {number} must have a size, a focal length and 0 < near < far, got {came}")
         lens = Lens((focal, focal, width / 2, height / 2), (0.0,) * 8, PERSPECTIVE)
         views.append(View(file, torch.from_numpy(pose), lens, (width, height), bounds=(float(near), float(far))))
     about = (f"LLFF's {FILE} of {len(views)} images", *chosen.notes)

@@ -225,7 +225,7 @@ def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
 
 
 def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDepth | None:
-    """Where the views of a split see their points: those that lie in the image, and where the mask counts."""
+    """The pixels in which views of a split see their points, inside the image and the mask."""
     pixels, distances = [], []
     for index, view in enumerate(views):
         if view.points is None:
@@ -245,7 +245,7 @@ def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDept
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a scene lies: a similarity, and what is measured in the space behind it.
+    """The frame of a scene: a similarity, and bounds that are measured after it.
 
     Attributes:
         matrix: float64 [4, 4], from the coordinates of the files to those of the scene.
@@ -320,7 +320,7 @@ def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normal
 
 
 def _contraction(kind: str, frame: Frame, cameras: Cameras) -> Contraction | Perspective | None:
-    """Of a scene without a box: a cube around all that forward-facing cameras see, or a ball."""
+    """The contraction of a scene without a box: a cube around all that forward-facing cameras see, or a ball."""
     centre = frame.centre.float()
     if kind == "object":
         return None
@@ -403,15 +403,15 @@ def _turned(cameras: Cameras, turns: Sequence[int]) -> Cameras:
     prism = torch.zeros(len(cameras), dtype=torch.bool) if cameras.models is None else cameras.models == FISHEYE
     sizes = torch.tensor([cameras.size(index) for index in range(len(cameras))])
     for step in range(3):
-        own = torch.tensor(turns) > step
-        right, up = poses[own, :3, :2].unbind(-1)
-        poses[own, :3, :2] = torch.stack((-up, right), -1)
-        fx, fy, cx, cy = intrinsics[own].unbind(-1)
-        intrinsics[own] = torch.stack((fy, fx, cy, sizes[own, 0] - cx), -1)
-        bent[own, 2:4] = torch.stack((-bent[own, 3], bent[own, 2]), -1)  # p1 and p2
-        both = own & prism
+        turning = torch.tensor(turns) > step
+        right, up = poses[turning, :3, :2].unbind(-1)
+        poses[turning, :3, :2] = torch.stack((-up, right), -1)
+        fx, fy, cx, cy = intrinsics[turning].unbind(-1)
+        intrinsics[turning] = torch.stack((fy, fx, cy, sizes[turning, 0] - cx), -1)
+        bent[turning, 2:4] = torch.stack((-bent[turning, 3], bent[turning, 2]), -1)  # p1 and p2
+        both = turning & prism
         bent[both, 6:8] = torch.stack((bent[both, 7], -bent[both, 6]), -1)  # s1 and s2
-        sizes[own] = sizes[own].flip(1)
+        sizes[turning] = sizes[turning].flip(1)
     distortion = None if cameras.distortion is None else bent
     return Cameras.of_images(poses, intrinsics, sizes, distortion, cameras.models)
 

@@ -41,7 +41,7 @@ from voronerf.app.scenes.lenses import MODELS
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
 from voronerf.app.scenes.transforms import Shot, write_transforms
 
-#: Of a video. A playlist would name other files.
+#: Formats of a video. A playlist would name other files.
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
 LEAST_IMAGES = 3
 MATCHINGS = ("auto", "exhaustive", "sequential")
@@ -80,7 +80,7 @@ Item = TypeVar("Item")
 
 
 class Settings(NamedTuple):
-    """What the stages are asked to do; a folder of other settings is not gone on with."""
+    """The settings of all stages; a folder that was begun with others is refused."""
 
     source: str
     frames: int
@@ -92,7 +92,7 @@ class Settings(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """What a mapper found."""
+    """The model that a mapper made."""
 
     folder: Path  # of its files
     mapper: str  # "global" or "incremental"
@@ -208,11 +208,11 @@ def _begin(out: Path, settings: Settings) -> Path:
     work = out / "colmap"
     noted = work / "settings.json"
     if noted.is_file():
-        found, asked = json.loads(noted.read_text()), settings._asdict()
-        if other := [name for name, value in asked.items() if found.get(name) != value]:
+        before, asked = json.loads(noted.read_text()), settings._asdict()
+        if other := [name for name, value in asked.items() if before.get(name) != value]:
             name = other[0]
             raise SceneError(
-                f"{work}: was begun with --{name.replace('_', '-')} {found.get(name)}, not {asked[name]}; give the "
+                f"{work}: was begun with --{name.replace('_', '-')} {before.get(name)}, not {asked[name]}; give the "
                 "same, or another folder"
             )
         if (out / "sparse" / "0").exists():
@@ -303,7 +303,7 @@ def _take_frames(video: Path, folder: Path, count: int) -> None:
 
 @dataclass(frozen=True)
 class Stages:
-    """What all stages work on."""
+    """The files and settings that all stages work on."""
 
     colmap: Any  # the module pycolmap
     work: Path  # the folder of what the stages leave
@@ -466,10 +466,10 @@ def _map(stages: Stages, name: str) -> Model | None:
             for failure in errors:
                 raise failure
         os.replace(part, folder)
-    found = [path for path in folder.iterdir() if (path / "images.bin").is_file()]
-    if not found:
+    models = [path for path in folder.iterdir() if (path / "images.bin").is_file()]
+    if not models:
         return None
-    largest = max(found, key=lambda path: len(read_model(path).images))
+    largest = max(models, key=lambda path: len(read_model(path).images))
     model = read_model(largest)
     lost = _lost(model)
     images = [image for image in model.images if image.name not in lost]
@@ -508,12 +508,12 @@ def _described(model: Model | None, images: int) -> str:
 
 def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
     """Writes the cameras, images and points of a model, without what is lost."""
-    found = colmap.Reconstruction(model.folder)
-    for image in list(found.images.values()):
+    reconstruction = colmap.Reconstruction(model.folder)
+    for image in list(reconstruction.images.values()):
         if image.name in model.lost:
-            found.deregister_frame(image.frame_id)
+            reconstruction.deregister_frame(image.frame_id)
     part = _emptied(folder.with_name(f".{folder.name}"))
-    found.write_binary(part)
+    reconstruction.write_binary(part)
     for path in part.iterdir():
         if path.stem not in FILES:  # of rigs: each image has its pose
             path.unlink()

@@ -19,7 +19,7 @@ from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 
 CONTRACTIONS = {"sphere": Contraction, "perspective": Perspective}
-#: What a text of a scene may be.
+#: Values that a text of a scene may have.
 WORDS = {"background": ("white", None), "kind": KINDS}
 INTEGERS = {"sizes": torch.int64, "models": torch.int32}
 
@@ -106,10 +106,10 @@ def _plain(value: Any) -> Any:
 
 def _made(kind: type, values: dict[str, Any]) -> Any:
     """A dataclass of tensors and numbers."""
-    given = {name: _tensor(name, value) if isinstance(value, list) else value for name, value in values.items()}
-    if "slopes" in given:
-        given["slopes"] = tuple(values["slopes"])
-    return kind(**given)
+    members = {name: _tensor(name, value) if isinstance(value, list) else value for name, value in values.items()}
+    if "slopes" in members:
+        members["slopes"] = tuple(values["slopes"])
+    return kind(**members)
 
 
 def _tensor(name: str, value: Any, dtype: torch.dtype = torch.float32) -> Tensor | None:

@@ -22,7 +22,7 @@ KINDS = ("object", "forward", "inside-out", "unbounded")
 
 
 class SparseDepth(NamedTuple):
-    """Where images show points that are known, and how far from the camera they are.
+    """The pixels that show points of a sparse model, and the distances of these points.
 
     Attributes:
         pixels: int64 [s], numbered through all images: image * h * w + row * w + column.
@@ -121,7 +121,7 @@ class Scene:
 
     @property
     def spacing(self) -> str:
-        """Of the samples along a ray: "linear" through an object, else "disparity"."""
+        """How samples are spaced along a ray: "linear" through an object, else by "disparity"."""
         return "linear" if self.kind == "object" else "disparity"
 
     def background_colour(self, device: torch.device | str = "cpu") -> Tensor | None:
@@ -142,19 +142,23 @@ class Scene:
             SceneError: For ndc without forward-facing cameras, or when all cameras are at the origin, so that there is
                 no sphere.
         """
-        own, found = self.contraction, contraction
+        known, chosen = self.contraction, contraction
         if contraction == "auto":
-            found = "none" if self.box is not None else "ndc" if isinstance(own, Perspective) else "sphere"
-        if found == "none":
+            chosen = "none" if self.box is not None else "ndc" if isinstance(known, Perspective) else "sphere"
+        if chosen == "none":
             return Space(None, self.spacing, cones)
-        if found == "ndc":
-            if not isinstance(own, Perspective):
+        if chosen == "ndc":
+            if not isinstance(known, Perspective):
                 raise SceneError(f"{self.name}: contraction ndc needs forward-facing cameras, the scene is {self.kind}")
-            return Space(replace(own, centre=own.centre.to(device), axes=own.axes.to(device)), self.spacing, cones)
+            return Space(
+                replace(known, centre=known.centre.to(device), axes=known.axes.to(device)), self.spacing, cones
+            )
         if self.box is not None:
             sphere = Contraction(self.box.mean(0).to(device), float((self.box[1] - self.box[0]).norm()) / 2)
-        elif own is not None:
-            sphere = Contraction(own.centre.to(device), own.near if isinstance(own, Perspective) else own.radius)
+        elif known is not None:
+            sphere = Contraction(
+                known.centre.to(device), known.near if isinstance(known, Perspective) else known.radius
+            )
         else:
             radius = float(self.train.cameras.origins.norm(dim=-1).max())
             if radius == 0:

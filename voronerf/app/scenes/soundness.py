@@ -1,4 +1,4 @@
-"""What is wrong with the cameras that were found for photographs: signs of a reconstruction that has collapsed.
+"""Checks of the cameras of photographs: signs of a reconstruction that has collapsed.
 
 c cameras, in any coordinates.
 """
@@ -20,9 +20,9 @@ LOST, EXTENT = 8.0, 1 / 3
 #: Cameras that are lost together are neighbours of each other. So lost are also those that are this many times as far
 #: from the middle of all as this share of the cameras is at the most.
 APART, MOST = 10.0, 0.8
-#: Where one camera or at most this share is lost, the others are judged alone. More may be those that a collapse left.
+#: Up to this share of lost cameras, or one, the others are judged alone. More may be what a collapse left.
 FEW = 0.1
-#: So many cameras tell the distances between all.
+#: Cameras that are drawn to measure the distances between all.
 MOST_CAMERAS = 1000
 #: Cameras have collapsed if their median distance to the nearest other one, times their number, is below this share of
 #: their mean distance to the middle. Cameras that are spread evenly on a circle have 6.
@@ -50,7 +50,7 @@ def lost_cameras(origins: Tensor) -> Tensor:
 def camera_faults(
     origins: Tensor, bounds: Tensor | None = None, lenses: Iterable[tuple[Lens, float]] = ()
 ) -> list[str]:
-    """What is wrong with cameras, as parts of a line; empty if they are sound.
+    """The faults of cameras, as parts of a line; empty if they are sound.
 
     Args:
         origins: [c, 3], their positions.
@@ -87,9 +87,9 @@ def camera_faults(
 
 def _nearest(origins: Tensor) -> Tensor:
     """The distance of each camera to the nearest other one, [c]."""
-    found = torch.empty(len(origins), dtype=origins.dtype)
+    nearest = torch.empty(len(origins), dtype=origins.dtype)
     for rows in torch.arange(len(origins)).split(1024):
         distances = torch.cdist(origins[rows], origins)
         distances[torch.arange(len(rows)), rows] = float("inf")
-        found[rows] = distances.amin(1)
-    return found
+        nearest[rows] = distances.amin(1)
+    return nearest

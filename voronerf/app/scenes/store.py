@@ -126,7 +126,7 @@ def _allocate(file: int, size: int) -> None:
 
 
 def _undamaged(folder: Path, mapped: mmap.mmap, sums: list[int], each: int, threads: int) -> list[int]:
-    """The checksums up to the first image that is not as it was written; says which that is."""
+    """The checksums up to the first damaged image; says which that is."""
     view = memoryview(mapped)
 
     def is_damaged(number: int) -> bool:

@@ -29,9 +29,9 @@ log = logging.getLogger(__name__)
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 ORTHONORMAL = 2e-3
-#: Of numbers and, where they are positive, its inverse the smallest; far from where float32 ends, even squared.
+#: Largest number and, of positive ones, the inverse of the smallest: float32 holds even its square.
 LARGEST = 1e9
-#: Of a focal length, in sides of the image, and its inverse the smallest: fields of view of 0.06 to 179.9 degrees.
+#: Longest focal length in sides of the image, and the inverse of the shortest: fields of view of 0.06 to 179.9 degrees.
 LONGEST = 1000
 SPLITS = ("train_filenames", "test_filenames", "val_filenames")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV", "PERSPECTIVE")
@@ -49,7 +49,7 @@ KNOWN = {
 }
 
 
-class Frame(NamedTuple):
+class ListedImage(NamedTuple):
     """One image of a transforms file: its path, its pose float64 [4, 4], the file that lists it, the entries of that
     file where the frame has no others, and the path of its mask."""
 
@@ -60,7 +60,7 @@ class Frame(NamedTuple):
     mask: Path | None = None
 
 
-def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, Any], list[Frame]]:
+def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, Any], list[ListedImage]]:
     """Reads a transforms file and finds its images.
 
     Images that are listed but missing are left out, with a warning that says how many.
@@ -78,7 +78,7 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path}: has no frames")
     shared = _named_distortion(entries, path)
-    found = []
+    present = []
     for position, frame in enumerate(frames):
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or "\0" in name:
@@ -90,14 +90,14 @@ def read_transforms(path: Path, allow_outside: bool = False) -> tuple[dict[str, 
         image = _find_image(path.parent, name, allow_outside, where)
         if image is not None:
             mask = _mask(path.parent, frame.get("mask_path"), allow_outside, where)
-            found.append(Frame(image, pose, path, {**shared, **_named_distortion(frame, path)}, mask))
-    if not found:
+            present.append(ListedImage(image, pose, path, {**shared, **_named_distortion(frame, path)}, mask))
+    if not present:
         raise SceneError(
             f"{path}: none of its {len(frames)} images exists, the first is {path.parent / frames[0]['file_path']}"
         )
-    if missing := len(frames) - len(found):
+    if missing := len(frames) - len(present):
         log.warning("%s: %d of %d listed images are missing and are skipped", path, missing, len(frames))
-    return entries, found
+    return entries, present
 
 
 def number(entries: dict[str, Any], key: str, path: Path, *, positive: bool = False) -> float | None:
@@ -145,7 +145,7 @@ def focal_length(entries: dict[str, Any], key: str, side: int, path: Path) -> fl
 
 
 def is_text(name: str) -> bool:
-    """Whether a name has no half of a pair of UTF-16, which JSON may hold and no file is called."""
+    """Whether a name is free of lone surrogates, which JSON allows and file names do not."""
     return not any("\ud800" <= char <= "\udfff" for char in name)
 
 
@@ -221,7 +221,9 @@ def load_transforms(folder: Path, reading: Reading) -> Scene:
     return capture_scene(folder, entries, frames, held_out, reading)
 
 
-def _declared_split(path: Path, entries: dict[str, Any], frames: list[Frame]) -> tuple[list[Frame], Tensor] | None:
+def _declared_split(
+    path: Path, entries: dict[str, Any], frames: list[ListedImage]
+) -> tuple[list[ListedImage], Tensor] | None:
     """The frames that nerfstudio's lists of file names choose, and which are held out; None without such lists.
 
     Where one list is missing or empty, the images of no other list take its place.
@@ -259,13 +261,13 @@ def _plain(name: str) -> str:
     return posixpath.normpath(name.replace("\\", "/"))
 
 
-def has_lens(frames: Sequence[Frame]) -> bool:
+def has_lens(frames: Sequence[ListedImage]) -> bool:
     """Whether a transforms file describes lenses as captures do; Blender's files give the field of view alone."""
     return any(frame.values.get(key) is not None for frame in frames for key in LENS)
 
 
 def capture_scene(
-    folder: Path, entries: dict[str, Any], frames: Sequence[Frame], held_out: Tensor | None, reading: Reading
+    folder: Path, entries: dict[str, Any], frames: Sequence[ListedImage], held_out: Tensor | None, reading: Reading
 ) -> Scene:
     """Makes the scene of a capture from its frames, see `load_transforms`."""
     path = frames[0].source
@@ -279,7 +281,7 @@ def capture_scene(
     return photograph_scene(path, folder, views, held_out, reading, factor=factor, notes=notes, transform=transform)
 
 
-def _view(frame: Frame) -> View:
+def _view(frame: ListedImage) -> View:
     """The view of a frame, with its lens; checks that all of its model is used."""
     values, path = frame.values, frame.source
     model = values.get("camera_model", "OPENCV")
@@ -311,19 +313,19 @@ def _view(frame: Frame) -> View:
         raise SceneError(f"{path}: has no focal length (fl_x or camera_angle_x)")
     cx, cy = number(values, "cx", path), number(values, "cy", path)
     intrinsics = (fx or fy or 0, fy or fx or 0, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    given = {key: number(values, key, path) or 0.0 for key in DISTORTION}
-    lens = Lens(intrinsics, tuple(given.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
+    distortion = {key: number(values, key, path) or 0.0 for key in DISTORTION}
+    lens = Lens(intrinsics, tuple(distortion.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
     return View(frame.path, frame.pose, lens, size, frame.mask, header=header)
 
 
 def _named_distortion(entries: dict[str, Any], path: Path) -> dict[str, Any]:
     """The entries with k1, k2... in the place of nerfstudio's distortion_params."""
-    given = entries.get("distortion_params")
-    if given is None or given == []:
+    numbers = entries.get("distortion_params")
+    if numbers is None or numbers == []:
         return entries
-    if not isinstance(given, list) or len(given) != len(DISTORTION):
-        raise SceneError(f"{path}: distortion_params must be six numbers, {', '.join(DISTORTION)}, got {given!r:.60}")
-    return {**entries, **dict(zip(DISTORTION, given))}
+    if not isinstance(numbers, list) or len(numbers) != len(DISTORTION):
+        raise SceneError(f"{path}: distortion_params must be six numbers, {', '.join(DISTORTION)}, got {numbers!r:.60}")
+    return {**entries, **dict(zip(DISTORTION, numbers))}
 
 
 class Shot(NamedTuple):

@@ -33,7 +33,7 @@ from voronerf.router import VoronoiRouter
 
 #: Temperature of the stochastic assignment, in scene units.
 TEMPERATURE = 0.05
-#: Of a grid made for pictures alone: voxels along each axis, and points evaluated in each.
+#: Voxels along each axis of a grid for pictures alone, and points evaluated in each.
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 #: Scale of the robust loss of photographs, whose exposure and highlights differ; pictures that are computed have none.
 ROBUST = 0.05
@@ -217,8 +217,8 @@ def make_grid(
     contraction = scene.space(config.contraction, device=device).contraction
     if contraction is None and scene.box is None:
         raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
-    samples, given = (config.samples or (0,))[0], {"resolution": resolution, "opacity": opacity, "device": device}
-    return OccupancyGrid.for_training(scene.box, samples, contraction=contraction, **given)  # type: ignore[arg-type]
+    samples, options = (config.samples or (0,))[0], {"resolution": resolution, "opacity": opacity, "device": device}
+    return OccupancyGrid.for_training(scene.box, samples, contraction=contraction, **options)  # type: ignore[arg-type]
 
 
 def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> OccupancyGrid:

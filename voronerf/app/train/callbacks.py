@@ -1,4 +1,4 @@
-"""What goes on beside a training: checkpoints, scores, a check that it goes well, TensorBoard."""
+"""Callbacks of a training: checkpoints, scores, a check for divergence, TensorBoard."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class Divergence(Callback):
 
 def diverged(out: Path, reason: str, step: int) -> TrainingError:
     """The error of a training that cannot continue."""
-    kept = "the last checkpoint is as it was" if checkpoint_paths(out) else "there is no checkpoint"
+    kept = "the last checkpoint is unchanged" if checkpoint_paths(out) else "there is no checkpoint"
     return TrainingError(f"{out}: {reason} at step {step}, try a smaller --lr; {kept}")
 
 
@@ -246,7 +246,7 @@ class Scores(Callback):
         return most if budget is None else max(1, min(most, int(SHARE * budget / max(self.view_seconds, 1e-9))))
 
     def _seconds_of(self, lpips: Lpips, state: State) -> float:
-        """What LPIPS takes of a view, from a corner of it."""
+        """The seconds of LPIPS for a view, measured on a corner of it."""
         truth = state.scene.test.truth(0, state.scene.background_colour()).to(state.device)
         corner, started = truth[:LPIPS_PROBE, :LPIPS_PROBE], self.clock()
         float(lpips(corner, corner))
@@ -291,7 +291,7 @@ class Scores(Callback):
 
 
 def views_of(scores: Mapping[str, Any]) -> str:
-    """What scores are of, such as "3 views" or "the middle 6% of 1 view"; nothing where they do not say it."""
+    """The views behind scores, such as "3 views" or "the middle 6% of 1 view"; empty if unknown."""
     views, part = scores.get("views"), scores.get("part", 1)
     if not isinstance(views, int) or not isinstance(part, int | float):
         return ""
@@ -313,7 +313,7 @@ def one_colour_psnr(scene: Scene) -> float:
 def why_scores_are_poor(
     metrics: Sequence[Mapping[str, Any]], config: TrainConfig, one_colour: float, *, settled: bool
 ) -> str | None:
-    """What is wrong with the last evaluation of a run and probably its cause, in a line; None if nothing is.
+    """The fault of the last evaluation of a run and its probable cause, in a line; None if it is good.
 
     Args:
         metrics: All evaluations.
@@ -340,7 +340,7 @@ def why_scores_are_poor(
 
 
 def tensorboard_writer() -> Any:
-    """What writes the files of TensorBoard; raises ImportError where it is not installed."""
+    """The class that writes files of TensorBoard; raises ImportError where it is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:

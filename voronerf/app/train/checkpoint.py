@@ -137,13 +137,13 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
     errors = []
     for path in paths:
         try:
-            found = load_checkpoint(path, keep=keep)
+            checkpoint = load_checkpoint(path, keep=keep)
         except CheckpointError as error:
             errors.append(error)
             continue
         if errors:
             warnings.warn(f"{errors[0]}; {path.name} takes its place", stacklevel=2)
-        return found
+        return checkpoint
     raise errors[0]
 
 
@@ -192,7 +192,7 @@ def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkp
 
 
 def _checksum(tensor: Tensor) -> int:
-    """Of the elements, the shape and the dtype; it differs wherever a single bit does."""
+    """The checksum of elements, shape and dtype."""
     kind = zlib.crc32(f"{tensor.dtype} {list(tensor.shape)}".encode())
     return zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, kind)
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from voronerf.app.files import parse_json
 from voronerf.app.train.schema import check_types
 from voronerf.nerf.fields import FIELDS, FieldType
 from voronerf.nerf.samplers import SAMPLERS
@@ -34,7 +33,7 @@ class ConfigError(Exception):
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """What is learnt."""
+    """The scene that is learnt."""
 
     data: str = "builtin"
     """Scene folder (--format says which there are), or a built-in scene: "builtin", "builtin:400" of so many
@@ -63,7 +62,7 @@ class SceneSettings:
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Where, how long, and by what."""
+    """The run directory, the length of the run, and the device."""
 
     out: Path | None = None
     """Run directory, which must not hold a run unless --resume is given; default: runs/SCENE, or the first free
@@ -165,7 +164,7 @@ class OptimiserSettings:
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """What is measured on the way."""
+    """Evaluations on the way."""
 
     evaluations: int = 8
     """Evaluations during the run, evenly spaced; the last one is at the end."""
@@ -191,7 +190,7 @@ class TrainConfig(
         >>> config = TrainConfig(data="builtin", steps=1000, cells=(4, 4), width=32)
         >>> config.final_cells
         16
-        >>> TrainConfig.from_json(config.to_json()) == config
+        >>> TrainConfig.from_values(config.to_values()) == config
         True
     """
 
@@ -212,10 +211,10 @@ class TrainConfig(
 
     @property
     def network_options(self) -> dict[str, Any]:
-        """What the field is made with: the settings that it has options for, and ``field_options``."""
+        """The arguments of the field: settings that it has options for, and ``field_options``."""
         settings = {name: getattr(self, name) for name in NETWORK_SETTINGS if name in self.field_type.options}
-        given = {name: value for name, value in settings.items() if value is not None}
-        return given | dict(parse_option(text) for text in self.field_options)
+        chosen = {name: value for name, value in settings.items() if value is not None}
+        return chosen | dict(parse_option(text) for text in self.field_options)
 
     @property
     def plan(self) -> tuple[PlannedSplit, ...]:
@@ -234,21 +233,8 @@ class TrainConfig(
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def to_json(self) -> str:
-        """The settings as JSON text, which :meth:`from_json` reads."""
+        """The settings as the text of a JSON file."""
         return json.dumps(self.to_values(), indent=2) + "\n"
-
-    @staticmethod
-    def from_json(text: str, source: str = "config.json") -> TrainConfig:
-        """Reads what :meth:`to_json` wrote.
-
-        Raises:
-            ConfigError: For text that is not a configuration, or one of another version; names ``source``.
-        """
-        try:
-            values = parse_json(text)
-        except ValueError as error:
-            raise ConfigError(f"{source}: not a configuration of this version: {error}") from None
-        return TrainConfig.from_values(values, source)
 
     @staticmethod
     def from_values(values: Any, source: str = "config.json") -> TrainConfig:
@@ -286,7 +272,7 @@ RESUMABLE = frozenset(
 
 
 def differences(a: TrainConfig, b: TrainConfig) -> list[str]:
-    """What keeps a checkpoint of ``a`` from being continued under ``b``: "--width 64 -> 128" and so on."""
+    """The settings in which ``b`` must not differ to continue ``a``: "--width 64 -> 128" and so on."""
     return [
         f"--{f.name.replace('_', '-')} {getattr(a, f.name)} -> {getattr(b, f.name)}"
         for f in dataclasses.fields(TrainConfig)
@@ -366,18 +352,18 @@ def check_config(config: TrainConfig) -> None:
 def _check_field_options(config: TrainConfig) -> None:
     options = config.field_type.options
     for name in NETWORK_SETTINGS:
-        given = getattr(config, name)
-        if name not in options and given is not None:
-            raise ConfigError(f"--{name.replace('_', '-')} must not come with --field {config.field}, got {given!r}")
-    own = [name for name in options if name not in NETWORK_SETTINGS]
+        setting = getattr(config, name)
+        if name not in options and setting is not None:
+            raise ConfigError(f"--{name.replace('_', '-')} must not come with --field {config.field}, got {setting!r}")
+    known = [name for name in options if name not in NETWORK_SETTINGS]
     for text in config.field_options:
         if "=" not in text:
             raise ConfigError(f"--field-options must be NAME=VALUE, got {text!r}")
         name, value = parse_option(text)
         if name in NETWORK_SETTINGS:
             raise ConfigError(f"--field-options must not hold {name}, use --{name.replace('_', '-')}; got {text!r}")
-        if name not in own:
-            raise ConfigError(f"--field-options of {config.field} are {', '.join(own) or 'none'}; got {text!r}")
+        if name not in known:
+            raise ConfigError(f"--field-options of {config.field} are {', '.join(known) or 'none'}; got {text!r}")
         is_number = isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
         if isinstance(options[name], (int, float)) and not (is_number or value is None):
             raise ConfigError(f"--field-options must give {name} a finite number, got {text!r:.60}")

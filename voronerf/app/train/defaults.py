@@ -97,7 +97,7 @@ def machine_speed() -> float:
 
 
 def why_no_occupancy(config: TrainConfig) -> str | None:
-    """What keeps a run from skipping samples in empty space, whatever its scene; None if nothing does."""
+    """The reason why a run cannot skip empty space in any scene; None if it can."""
     if config.field_type.cones:
         return f"--field {config.field}, which takes cones"
     return None if SAMPLERS[config.sampling].skips else f"--sampling {config.sampling}"

@@ -22,7 +22,7 @@ from voronerf.router import VoronoiRouter
 
 @dataclass(frozen=True)
 class Stored:
-    """What a checkpoint keeps beside its tensors, by the names of a state."""
+    """The values of a checkpoint beside its tensors, by the names of a state."""
 
     config: dict[str, Any]
     step: int
@@ -108,7 +108,7 @@ def load(state: State, checkpoint: Checkpoint) -> None:
 
 
 def _threads(state: State) -> int:
-    """Those of torch, on which its sums depend; 0 where native operations compute the networks."""
+    """The threads of torch, on which its sums depend; 0 where native operations compute the networks."""
     return 0 if state.thread_deterministic else torch.get_num_threads()
 
 
@@ -148,9 +148,11 @@ def check_shapes(config: TrainConfig, checkpoint: Checkpoint) -> None:
             raise CheckpointError(f"{checkpoint.source}: {error}") from None
         for key, (shape, shared) in shapes.items():
             wanted = [*([] if shared else [diagram.num_cells]), *shape]
-            found = tensors.get(f"module.{key}")
-            if found is None or list(found.shape) != wanted or found.dtype != torch.float32:
-                came = "nothing" if found is None else f"{str(found.dtype).removeprefix('torch.')} {list(found.shape)}"
+            tensor = tensors.get(f"module.{key}")
+            if tensor is None or list(tensor.shape) != wanted or tensor.dtype != torch.float32:
+                came = (
+                    "nothing" if tensor is None else f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
+                )
                 raise CheckpointError(
                     f"{checkpoint.source}: the checkpoint is of another architecture: {group(name)}.module.{key} "
                     f"must be float32 {wanted}, got {came}"

@@ -65,7 +65,7 @@ def _judged_at(state: State) -> int:
 
 
 def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:
-    """What is wrong with a start, from a step of it; None if nothing is. Waits for the device.
+    """The fault of a start, from one of its steps; None if it is good. Waits for the device.
 
     Args:
         batch: Of the step, r rays.
@@ -81,7 +81,7 @@ def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:
         return "all space is empty"
     seen = light > 0.5
     if int(seen.sum()) > 1:
-        own = (output.colour - (1 - light)[:, None] * background)[seen] / light[seen, None]
-        if bool((own.std(0) < ONE_COLOUR).all()) and bool((batch.target[seen].std(0) > COLOURED).any()):
+        colour = (output.colour - (1 - light)[:, None] * background)[seen] / light[seen, None]
+        if bool((colour.std(0) < ONE_COLOUR).all()) and bool((batch.target[seen].std(0) > COLOURED).any()):
             return "all has one colour"
     return None

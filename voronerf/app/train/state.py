@@ -104,7 +104,6 @@ class State:
     stages: list[Stage] = field(default_factory=lambda: [Stage(1, 0.0, 0, None, None, 0)])
     stopped: bool = False
     training_step: TrainingStep = field(init=False)
-    _began: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
         self.training_step = TrainingStep(
@@ -187,11 +186,7 @@ class State:
     @property
     def began(self) -> int:
         """The step at which the coarse stage began, for the last time: see `voronerf.app.train.start`."""
-        return self._began
-
-    def _enter(self, *stages: Stage) -> None:
-        self.stages.extend(stages)
-        self._began = max((stage.started_at_step for stage in self.stages if stage.cells == 1), default=0)
+        return max((stage.started_at_step for stage in self.stages if stage.cells == 1), default=0)
 
     def averaged(self) -> AbstractContextManager[None]:
         """A context in which the networks have their averaged weights, for pictures; not for training."""
@@ -221,12 +216,12 @@ class State:
             float(torch.tensor([getattr(balance, name) for balance in balances]).median()) if balances else None
             for name in ("imbalance_before", "imbalance_after")
         )
-        self._enter(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
+        self.stages.append(Stage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
 
     def begin_again(self) -> None:
         """Counts a new start of the coarse stage."""
         self.rays = int(self.config.rays or 0)
-        self._enter(Stage(1, self.seconds, self.step, None, None, 0))
+        self.stages.append(Stage(1, self.seconds, self.step, None, None, 0))
 
     def count_steps(self, count: int, rays: int) -> None:
         """Counts steps with so many rays each."""
@@ -240,8 +235,7 @@ class State:
     def restore(self, skipped: int, stages: Sequence[Mapping[str, Any]], **counters: float) -> None:
         """Takes the counters of a checkpoint, by their names here."""
         self.guard = self.training_step.guard = Guard.on(self.device, skipped)
-        self.stages.clear()
-        self._enter(*(Stage(**stage) for stage in stages))
+        self.stages[:] = (Stage(**stage) for stage in stages)
         for name, value in counters.items():
             setattr(self, name, value)
 

@@ -231,9 +231,9 @@ class Client:
     def pick(self, x: float, y: float) -> None:
         """Describes the cell at a position in the picture, 0..1 from the left and from the top."""
         subject = self.viewer.subject
-        found = cell_at(subject, self.camera(self.longest), self.look, x, y)
-        self.change(picked=found)
-        self.info.content = NO_CELL if found is None else describe_cell(subject.diagram, found, self.look.level)
+        cell = cell_at(subject, self.camera(self.longest), self.look, x, y)
+        self.change(picked=cell)
+        self.info.content = NO_CELL if cell is None else describe_cell(subject.diagram, cell, self.look.level)
 
     def _hide(self, what: str) -> None:
         if what == "show all":

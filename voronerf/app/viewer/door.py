@@ -117,7 +117,7 @@ def _say(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
 
 
 def why_refused(headers: Mapping[str, str], host: str) -> str | None:
-    """Why a request to what listens at `host` is refused; None if it is not.
+    """The reason why a request to a server at `host` is refused; None if it is not.
 
     A page must come from where it connects to, as for Jupyter. And it must ask by an address, or by a name that is
     known to be this machine's: the owner of any other name can have it lead here after the page is loaded (DNS
@@ -141,8 +141,8 @@ def why_refused(headers: Mapping[str, str], host: str) -> str | None:
         site = None if origin is None else urlsplit(origin).netloc
     except (ValueError, LookupError):  # an address that is none, or a header twice
         return "its headers cannot be read"
-    own = socket.gethostname().lower()
-    if not (name in ("localhost", own, f"{own}.local", host.lower()) or _is_address(name)):
+    machine = socket.gethostname().lower()
+    if not (name in ("localhost", machine, f"{machine}.local", host.lower()) or _is_address(name)):
         return f"the viewer must be opened by an address or as localhost, not as {name}; --host {name} allows it"
     if site is not None and site != asked:
         return f"a page of {origin} must not use the viewer at {asked}"

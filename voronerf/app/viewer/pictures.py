@@ -1,4 +1,4 @@
-"""What a viewer shows: the panes of a rendered camera, hidden cells, the cell behind a pixel.
+"""The pictures of a viewer: the panes of a rendered camera, hidden cells, the cell behind a pixel.
 
 h x w pixels, k cells. Pictures are uint8 [h, w, 3].
 """
@@ -35,7 +35,7 @@ OUTLINE = (255, 0, 255)
 
 @dataclass(frozen=True)
 class Look:
-    """What one browser shows, besides its camera.
+    """The choices of one browser, besides its camera.
 
     Attributes:
         pane: One of `PANES`.
@@ -56,7 +56,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Subject:
-    """What is viewed: a trained run, or one in training.
+    """A run in a viewer, trained or in training.
 
     Attributes:
         name: For titles.
@@ -169,8 +169,8 @@ def _picture_of_pane(subject: Subject, image: RenderedImage, look: Look) -> Tens
     if look.pane == "cells":
         groups = groups_of(subject.diagram, look.level)[cells_of(subject, image.heaviest)]
         return picture_of_cells(groups, image.opacity, image.colour)
-    own = subject.scene.background_colour()
-    other = BACKGROUNDS[look.background] - (image.colour.new_zeros(3) if own is None else own)
+    background = subject.scene.background_colour()
+    other = BACKGROUNDS[look.background] - (image.colour.new_zeros(3) if background is None else background)
     return picture_of_colour(image.colour + (1 - image.opacity)[..., None] * other)
 
 

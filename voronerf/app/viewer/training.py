@@ -32,7 +32,7 @@ def watch(state: State, scores: Scores, *, host: str = "127.0.0.1", port: int = 
 
 
 def subject_of(state: State, scores: Scores) -> Subject:
-    """What is viewed of a training: pictures have the averaged weights."""
+    """The run in training, shown with its averaged weights."""
     out = scores.out or Path()
     return Subject(out.name, out, state.scene, state.router, state.renderer, state.averaged)
 

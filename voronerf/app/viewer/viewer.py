@@ -45,7 +45,7 @@ SMALLEST = 96
 REFRESH = 0.05
 #: Hosts that stand for all addresses of this machine.
 EVERYWHERE = ("0.0.0.0", "::", "")
-#: Where the page is that draws the scene in the browser itself.
+#: Path of the page that draws the scene in the browser itself.
 PAGE = "/scene.html"
 #: Depth of empty pixels in scene units, the largest that viser takes.
 NOWHERE = 160.0

@@ -1,4 +1,4 @@
-"""What a page holds of a run: bytes in the order in which the shader reads them, and a description in JSON.
+"""The contents of a page: bytes in the order in which the shader reads them, and a description in JSON.
 
 The parts, one after another, each from a multiple of 16 bytes on:
 
@@ -38,7 +38,7 @@ LARGEST = 2**27
 MOST_CAMERAS = 240
 #: Points on which a module that was not is traced.
 TRACED = 16
-#: Of float16.
+#: Largest float16.
 GREATEST = 65504.0
 
 
@@ -58,7 +58,7 @@ class Packed:
 
     @property
     def summary(self) -> str:
-        """What the page holds, in a line."""
+        """Describes the contents of the page in a line."""
         sizes = {name: size for name, (_, size) in self.scene["parts"].items()}
         table = f"a table of {sizes['table'] / 1e6:.2f} MB, " if sizes["table"] > 16 else ""
         networks = f"networks of {sizes['parameters'] / 1e6:.2f} MB, "
@@ -99,10 +99,10 @@ def pack(run: Run) -> Packed:
     }
     data, places = bytearray(), {}
     for name, part in parts.items():
-        own = part.tobytes()
-        own += bytes(-len(own) % 16)
-        places[name] = [len(data), len(own)]
-        data += own
+        piece = part.tobytes()
+        piece += bytes(-len(piece) % 16)
+        places[name] = [len(data), len(piece)]
+        data += piece
     per_cell = table is not None and table.dim() == 3 and table.shape[0] == k and k > 1
     constants = _constants(run, sampler, diagram.depth, table.shape[-2] if per_cell and table is not None else 0)
     scene = {
@@ -144,7 +144,7 @@ def _parameters(
     parameters: list[Tensor], shapes: tuple[tuple[int, ...], ...], layout: Layout, k: int
 ) -> NDArray[np.float16]:
     """[k, size], the blocks and biases of every cell."""
-    own = np.zeros((k, layout.size), "<f2")
+    rows = np.zeros((k, layout.size), "<f2")
 
     def of_cells(number: int) -> NDArray[np.float16]:
         values, shape = parameters[number].detach().float().cpu().numpy(), shapes[number]
@@ -155,10 +155,10 @@ def _parameters(
         padded[:, :o, :i] = of_cells(number)[:, :, start : start + i]
         # [k, o / 4, i / 4, of four inputs, four outputs]: the columns of a mat4x4f.
         blocks = padded.reshape(k, fours(o), 4, fours(i), 4).transpose(0, 1, 3, 4, 2)
-        own[:, place : place + fours(o) * fours(i) * BLOCK] = blocks.reshape(k, -1)
+        rows[:, place : place + fours(o) * fours(i) * BLOCK] = blocks.reshape(k, -1)
     for number, start, width, place in layout.vectors:
-        own[:, place : place + width] = of_cells(number).reshape(k, -1)[:, start : start + width]
-    return own
+        rows[:, place : place + width] = of_cells(number).reshape(k, -1)[:, start : start + width]
+    return rows
 
 
 def _centres(diagram: Any) -> NDArray[np.float32]:

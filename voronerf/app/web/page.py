@@ -36,7 +36,7 @@ def export_web(run: Run, path: Path | str) -> tuple[Packed, int]:
         What the page holds, and the bytes of the file.
 
     Raises:
-        ConfigError: The run is none that a page can draw.
+        ConfigError: A page cannot draw the run.
         ValueError: Another suffix.
         OSError: The file cannot be written.
 

@@ -140,13 +140,13 @@ def _step(
     if step.op == "linear":
         return [declare, *_linear(program, step, name, layout, made)]
     if step.op == "function" and step.numbers[0] == 0 and name in FUNCTIONS:
-        before, given = _whole(step.operands[0], made, f"{out}_of")
+        before, operand = _whole(step.operands[0], made, f"{out}_of")
         a, b = (_number(value) for value in step.numbers[1:])
         value = f"({FUNCTIONS[name].format(a=a, b=b)})"
         for factor in step.operands[1:]:
             more, by = _whole(factor, made, f"{out}_by")
             before, value = [*before, *more], f"{value} * {by}[o]"
-        return [*before, declare, f"{every} {{ let x = {given}[o]; {out}[o] = {value}; }}  // {name}"]
+        return [*before, declare, f"{every} {{ let x = {operand}[o]; {out}[o] = {value}; }}  // {name}"]
     if step.op == "binary" and name in BINARY:
         (before, left), (also, right) = (_whole(columns, made, f"{out}_{n}") for n, columns in enumerate(step.operands))
         return [*before, *also, declare, f"{every} {{ {out}[o] = {left}[o] {BINARY[name]} {right}[o]; }}"]

@@ -132,12 +132,12 @@ class HashGridField(RadianceField):
         pixels = max(high - low for low, high in zip(*box)) / pixel
         finest, entries = round((1 if contracted else 2) * pixels), round(1.5 * math.log2(pixels) + 5.3)
         large = LONG_ENTRIES if seconds >= LONG else CONTRACTED_ENTRIES
-        found = {
+        options = {
             "box": box,
             "finest": max(finest, 32),
             "log2_entries": large if contracted else min(max(entries, 14), 19),
         }
-        return {**found, "density_scale": CONTRACTED_DENSITY} if contracted else found
+        return {**options, "density_scale": CONTRACTED_DENSITY} if contracted else options
 
     def reset_parameters(self) -> None:
         """Features near zero, as published; the layers as in :func:`voronerf.nerf.fields.radiance.reset_layers`."""

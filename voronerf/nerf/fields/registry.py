@@ -118,12 +118,12 @@ class FieldType:
         Raises:
             ValueError: for an option without a value, and for what the constructor refuses.
         """
-        given = {**getattr(self.network, "training_defaults", {}), **options}
-        missing = [name for name, value in {**self.options, **given}.items() if value is inspect.Parameter.empty]
+        arguments = {**getattr(self.network, "training_defaults", {}), **options}
+        missing = [name for name, value in {**self.options, **arguments}.items() if value is inspect.Parameter.empty]
         if missing:
             raise ValueError(f"field {self.name}: {', '.join(missing)} must be given")
         try:
-            return self.network(**given)
+            return self.network(**arguments)
         except TypeError as error:
             raise ValueError(f"field {self.name}: {error}") from error
 
@@ -178,16 +178,16 @@ def _options(network: Callable[..., nn.Module]) -> dict[str, Any]:
     """Named parameters and their defaults; those of the base classes too where ``**options`` passes them on."""
     if not isinstance(network, type):
         return _named(network)[0]
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for base in network.__mro__:
         if base is nn.Module:
             break
         if "__init__" in vars(base):
-            own, passes_on = _named(base.__init__)  # type: ignore[misc]
-            found = {**own, **found}
+            named, passes_on = _named(base.__init__)  # type: ignore[misc]
+            options = {**named, **options}
             if not passes_on:
                 break
-    return found
+    return options
 
 
 def _named(function: Callable[..., Any]) -> tuple[dict[str, Any], bool]:

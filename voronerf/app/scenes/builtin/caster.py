@@ -76,9 +76,9 @@ class Caster:
         ends = np.cumsum(lengths)
         cuts = np.searchsorted(ends, np.arange(PAIRS, ends[-1] if len(ends) else 0, PAIRS))
         for part in np.split(np.arange(len(solid)), np.unique(cuts)):
-            own = lengths[part]
-            candidate = np.repeat(part, own)
-            ray = np.arange(own.sum()) + np.repeat(start[part] - (np.cumsum(own) - own), own)
+            counts = lengths[part]
+            candidate = np.repeat(part, counts)
+            ray = np.arange(counts.sum()) + np.repeat(start[part] - (np.cumsum(counts) - counts), counts)
             kept = (depth[ray] > near[candidate]).nonzero()[0]
             ray, number = ray[kept], solid[candidate[kept]]
             self._test(origins, directions, ray, number, keys)
@@ -100,8 +100,8 @@ class Caster:
                 away, along = turned(away, turns), turned(along, turns)
             distance = solid.distance(away, along, self._measures.take(number, 1))
             hit = np.isfinite(distance).nonzero()[0]
-            found = distance[hit].view(np.uint32).astype(np.uint64) << np.uint64(32) | number[hit].astype(np.uint64)
-            np.minimum.at(keys, ray[hit], found)
+            hits = distance[hit].view(np.uint32).astype(np.uint64) << np.uint64(32) | number[hit].astype(np.uint64)
+            np.minimum.at(keys, ray[hit], hits)
 
     def seen(
         self, poses: Numbers, scale: Numbers, size: tuple[int, int], origins: Array, directions: Array

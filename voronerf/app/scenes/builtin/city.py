@@ -85,11 +85,11 @@ def city_views(cameras: Cameras, blocks: tuple[int, int]) -> Split:
 
 def city_of(size: int, text: str, images: str) -> Scene:
     """The city of blocks such as "4x4" or "4x8"; in the cache if it is larger than one block."""
-    found = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", text)
-    if found is None or max(int(found[1]), int(found[2])) > MOST:
+    match = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", text)
+    if match is None or max(int(match[1]), int(match[2])) > MOST:
         raise SceneError(f"builtin-city: blocks must be 1x1, 2x2, 2x4, ... or {MOST}x{MOST}, got {text!r:.60}")
     where = "disk" if images == "disk" else "memory" if text == "1x1" else "cached"
-    return city_scene(size, blocks=(int(found[1]), int(found[2])), images=where)
+    return city_scene(size, blocks=(int(match[1]), int(match[2])), images=where)
 
 
 def city_cameras(size: int, blocks: tuple[int, int], views: int, seed: int) -> Cameras:

@@ -138,11 +138,11 @@ def _body(colour: Colour) -> Texture:
 
     def texture(points: Array, normals: Array) -> Array:
         x, y, z = points.T
-        found = np.repeat(paint[None], len(points), axis=0)
-        found[z < -0.003] = paint * 0.35
+        colours = np.repeat(paint[None], len(points), axis=0)
+        colours[z < -0.003] = paint * 0.35
         lamp = (np.abs(normals[:, 0]) > 0.5) & (np.abs(y) > 0.012) & (z > -0.003)
-        found[lamp] = np.where(x[lamp, None] > 0, np.array((0.98, 0.96, 0.8)), np.array((0.8, 0.05, 0.05)))
-        return found
+        colours[lamp] = np.where(x[lamp, None] > 0, np.array((0.98, 0.96, 0.8)), np.array((0.8, 0.05, 0.05)))
+        return colours
 
     return texture
 
@@ -235,7 +235,7 @@ def city(blocks: tuple[int, int]) -> list[Solid]:
     across, along = blocks[0] / 2, blocks[1] / 2
     corner = np.array((across, along, 0), dtype=np.float32)
     half = (across, along, DEPTH / 2)
-    found: list[Solid] = [
+    solids: list[Solid] = [
         Box((0, 0, -DEPTH / 2), lambda points, normals: ground(points + corner, normals), 0.03, 8, half=half)
     ]
     for row in range(blocks[1]):
@@ -243,5 +243,5 @@ def city(blocks: tuple[int, int]) -> list[Solid]:
             x, y = column + 0.5 - across, row + 0.5 - along
             for solid in block(column, row):
                 place = (solid.centre[0] + x, solid.centre[1] + y, solid.centre[2])
-                found.append(replace(solid, centre=place))
-    return found
+                solids.append(replace(solid, centre=place))
+    return solids

@@ -40,8 +40,8 @@ def keep_in_store(name: str, sources: Sequence[Any], formula: int, images: str) 
     """What keeps images in a store of the cache, and for "cached" copies them into memory; None for "memory"."""
 
     def keep(shape: tuple[int, int, int, int], make: Make) -> Tensor:
-        found = stored(name, sources, formula, shape, make, os.cpu_count() or 1)
-        return found if images == "disk" else found.clone()
+        computed = stored(name, sources, formula, shape, make, os.cpu_count() or 1)
+        return computed if images == "disk" else computed.clone()
 
     return None if images == "memory" else keep
 

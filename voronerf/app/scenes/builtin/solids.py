@@ -203,18 +203,18 @@ class Torus(Solid):
     def distance(origins: Axes, directions: Axes, measures: Array) -> Array:  # noqa: D102
         ring, tube, outer = measures
         t, leave = slab(origins, directions, np.stack((outer, outer, tube)))
-        found = np.full_like(t, np.inf)
+        nearest = np.full_like(t, np.inf)
         rows = ((leave > t) & (t > 0)).nonzero()[0]
         state = np.stack([each[rows] for each in (t, leave, *origins, *directions, ring, tube)])
         for _ in range(TRACE_STEPS):
             t, leave, ox, oy, oz, dx, dy, dz, ring, tube = state
             gap = np.hypot(np.hypot(ox + t * dx, oy + t * dy) - ring, oz + t * dz) - tube
             arrived = gap < SURFACE
-            found[rows[arrived]] = t[arrived]
+            nearest[rows[arrived]] = t[arrived]
             state[0] = t + gap
             on = ~arrived & (state[0] < leave)
             rows, state = rows[on], state[:, on]
-        return found
+        return nearest
 
     def normal(self, points: Array) -> Array:  # noqa: D102
         x, y, z = points.T
