@@ -23,8 +23,8 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -178,43 +178,64 @@ def kernels(dtype: torch.dtype) -> tuple[Any, Any]:
     return forward, backward
 
 
-@custom_op("grouped_mlp_warp")
-def _run(x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, plan: str) -> Iterator[Tensor]:
-    """Sums of the columns put out, [t * ROWS, outputs * WIDTH], from those of the inputs, float32 x [t * ROWS, inputs *
-    WIDTH], blocks [k, products, WIDTH, WIDTH], biases float32 [k, columns, WIDTH] and the cells of tiles, int32 [t]."""
-    outputs = json.loads(plan)[-1]
-    out = x.new_empty(x.shape[0], len(outputs) * WIDTH)
-    yield out
-    columns = _columns(x, blocks, biases, cells, _products(plan, x.device))
-    torch.cat([columns[:, o * WIDTH : (o + 1) * WIDTH] for o in outputs], dim=1, out=out)
+class _Tiles(NamedTuple):
+    """Float32 x [t * ROWS, inputs * WIDTH], blocks [k, products, WIDTH, WIDTH], biases float32 [k, columns, WIDTH], the
+    cells of tiles, int32 [t], and the plan."""
+
+    x: Tensor
+    blocks: Tensor
+    biases: Tensor
+    cells: Tensor
+    plan: str
+
+    def results(self: _Tiles) -> Tensor:
+        """Memory for the sums of the columns put out, [t * ROWS, outputs * WIDTH]."""
+        return self.x.new_empty(self.x.shape[0], len(json.loads(self.plan)[-1]) * WIDTH)
+
+    def columns(self) -> Tensor:
+        """All columns [t * ROWS, c * WIDTH]."""
+        x, blocks, biases, cells, plan = self
+        products = _products(plan, x.device)
+        columns = x.new_zeros(x.shape[0], products.activation.shape[0] * WIDTH)
+        columns[:, : x.shape[1]] = x
+        given = [array(cells, x), array(blocks.view(-1, WIDTH), x), array(biases.view(-1), x), products]
+        launch_tiles(kernels(blocks.dtype)[0], len(cells), THREADS, [*given, array(columns, x)], x)
+        return columns
 
 
-@custom_op("grouped_mlp_warp_backward")
-def _run_backward(
-    gradient: Tensor, x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, plan: str, wanted: Sequence[bool]
-) -> Iterator[list[Tensor]]:
-    """Gradients of x, blocks and biases. The columns are made again, so nothing is kept but the inputs."""
-    of_x, of_blocks, of_biases = results = [x.new_zeros(part.shape) for part in (x, blocks, biases)]
-    yield results
-    products = _products(plan, x.device)
-    columns = _columns(x, blocks, biases, cells, products)
+class _TilesGradient(NamedTuple):
+    gradient: Tensor
+    x: Tensor
+    blocks: Tensor
+    biases: Tensor
+    cells: Tensor
+    plan: str
+    wanted: Sequence[bool]
+
+    def results(self: _TilesGradient) -> list[Tensor]:
+        """Memory for the gradients of x, blocks and biases."""
+        return [self.x.new_zeros(part.shape) for part in self[1:4]]
+
+
+@custom_op("grouped_mlp_warp", _Tiles.results)
+def _run(given: _Tiles, out: Tensor) -> None:
+    columns = given.columns()
+    torch.cat([columns[:, o * WIDTH : (o + 1) * WIDTH] for o in json.loads(given.plan)[-1]], dim=1, out=out)
+
+
+@custom_op("grouped_mlp_warp_backward", _TilesGradient.results)
+def _run_backward(arriving: _TilesGradient, found: list[Tensor]) -> None:
+    """The columns are made again, so nothing is kept but the inputs."""
+    (gradient, x, blocks, _, cells, plan, wanted), (of_x, of_blocks, of_biases) = arriving, found
+    products, columns = _products(plan, x.device), _Tiles(*arriving[1:6]).columns()
     gradients = torch.zeros_like(columns)
     for o, part in zip(json.loads(plan)[-1], gradient.split(WIDTH, dim=1)):
         gradients[:, o * WIDTH : (o + 1) * WIDTH] += part
     lowest = 0 if wanted[0] else x.shape[1] // WIDTH
-    given = [array(cells, x), array(blocks.view(-1, WIDTH), x), products, array(columns, x), lowest]
-    given += [array(gradients, x), array(of_blocks.view(-1, WIDTH), x), array(of_biases.view(-1), x)]
-    launch_tiles(kernels(blocks.dtype)[1], len(cells), THREADS, given, x)
+    inputs = [array(cells, x), array(blocks.view(-1, WIDTH), x), products, array(columns, x), lowest]
+    inputs += [array(gradients, x), array(of_blocks.view(-1, WIDTH), x), array(of_biases.view(-1), x)]
+    launch_tiles(kernels(blocks.dtype)[1], len(cells), THREADS, inputs, x)
     of_x.copy_(gradients[:, : x.shape[1]])
-
-
-def _columns(x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, products: Any) -> Tensor:
-    """All columns [t * ROWS, c * WIDTH]."""
-    columns = x.new_zeros(x.shape[0], products.activation.shape[0] * WIDTH)
-    columns[:, : x.shape[1]] = x
-    given = [array(cells, x), array(blocks.view(-1, WIDTH), x), array(biases.view(-1), x), products, array(columns, x)]
-    launch_tiles(kernels(blocks.dtype)[0], len(cells), THREADS, given, x)
-    return columns
 
 
 def _formula(x: Tensor, blocks: Tensor, biases: Tensor, cells: Tensor, plan: str) -> Tensor:

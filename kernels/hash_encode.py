@@ -8,7 +8,6 @@ directions, the weights of the corners are replaced by their derivatives along t
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 
 import torch
 import warp as wp
@@ -18,7 +17,7 @@ from voronerf.kernels._launch import array, launch
 from voronerf.ops._core.checks import check_range
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.grids import HashGrid
-from voronerf.ops.hash_encode.autograd import HashDerivatives, Hashed
+from voronerf.ops.hash_encode.autograd import HashDerivatives, Hashed, HashedGradient
 
 wp.set_module_options({"enable_backward": False})
 
@@ -217,14 +216,12 @@ def _positions_kernel(
 
 def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor | None = None) -> Tensor:
     """Features of points [n, levels * f] from a table [e, f] or [k, e, f]; see ``voronerf.ops.hash_encode``."""
-    encoded: Tensor = _encode(Hashed(positions.float(), table.float(), None, cells, grid.text))
+    encoded: Tensor = _encode(positions.float(), table.float(), None, cells, grid.text)
     return encoded
 
 
-@custom_op("hash_encode_warp")
-def _encode(given: Hashed) -> Iterator[Tensor]:
-    out = given.result()
-    yield out
+@custom_op("hash_encode_warp", Hashed.result)
+def _encode(given: Hashed, out: Tensor) -> None:
     points, tables, rows = _inputs(given, given.table)
     levels = HashGrid.parse(given.grid).levels
     if given.cells is not None:
@@ -232,10 +229,9 @@ def _encode(given: Hashed) -> Iterator[Tensor]:
     launch(_encode_kernel, (len(out), levels), [*points, rows, *tables, array(out, out)], out)
 
 
-@custom_op("hash_encode_warp_backward")
-def _backward(gradient: Tensor, given: Hashed, to_positions: bool, to_table: bool) -> Iterator[list[Tensor]]:
-    of_positions, of_table = results = given.gradients(to_positions, to_table)
-    yield results
+@custom_op("hash_encode_warp_backward", HashedGradient.results)
+def _backward(taken: HashedGradient, found: list[Tensor]) -> None:
+    (gradient, given, to_positions, to_table), (of_positions, of_table) = taken, found
     n, levels, arriving = len(gradient), HashGrid.parse(given.grid).levels, array(gradient, gradient)
     if to_table:
         points, tables, rows = _inputs(given, of_table.zero_())

@@ -211,8 +211,9 @@ def _march_kernel(given: Given, counting: wp.bool, offsets: wp.array(dtype=wp.in
         out.stop[ray] = given.samples
 
 
-def _march_rays(*flat: Any) -> March:
-    given = _OP.Inputs._make(flat)
+@_OP.custom_op("march_rays_warp", fake=March.fake)
+def march_rays(given: Any) -> March:
+    """Samples in occupied cells; see ``voronerf.ops.march_rays``."""
     near, r, capacity, inputs = given.near, given.r, given.capacity, _inputs(given)
     counts = near.new_zeros(r + 1, dtype=torch.int32)
     out = filled(Samples(), counts=counts[1:], positions=given.origins[:0])
@@ -230,9 +231,6 @@ def _march_rays(*flat: Any) -> March:
 def _samples(found: March) -> Any:
     out = filled(Samples(), counts=found.ray_offsets[:0], ray_index=found.ray_index, depths=found.depths)
     return filled(out, deltas=found.deltas, positions=found.positions, stop=found.stop)
-
-
-march_rays = _OP.make_op("march_rays_warp", _march_rays, March.fake, _march_rays)
 
 
 def _inputs(rays: Any) -> Any:

@@ -125,8 +125,8 @@ def _compare_kernel(
     occupied[cells[i]] = wp.where(density[cells[i]] >= threshold, wp.uint8(1), wp.uint8(0))
 
 
-@declared("observe_occupancy").plain
-def observe_occupancy(given: Any) -> None:
+@declared("observe_occupancy").custom_op("observe_occupancy_warp")
+def observe_occupancy(given: Any, _: None) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
     density, m = given.density, given.positions.shape[0]
     cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)

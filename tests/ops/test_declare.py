@@ -46,7 +46,7 @@ def test_a_struct_with_other_members_is_refused_at_once():
     ):
         op.inputs(kind)
     cells = torch.zeros(5, dtype=torch.int32)
-    assert op.inputs(kind, threads="2 * k")(op.Inputs(cells, 3)) == (cells, 5, 6)
+    assert op.inputs(kind, threads=lambda given: 2 * given.k)(op.Inputs(cells, 3)) == (cells, 5, 6)
 
 
 def test_what_is_no_shape_is_refused():

@@ -251,6 +251,25 @@ def test_every_output_is_written(request, name):
     assert len(guards) >= 8
 
 
+@pytest.mark.parametrize("name", [op for op, case in CASES.items() if case.in_place and op != "adam"])
+def test_what_writes_into_its_arguments_compiles(name):
+    """As a custom op that says what it writes into."""
+    torch.compiler.reset()
+    case = CASES[name]
+
+    def run(given):
+        getattr(ops, name)(**given, backend="native")
+        return {key: value for key, value in given.items() if isinstance(value, Tensor)}
+
+    expected, (found, again) = run(case.make(Draw(), 6)), (case.make(Draw(), 6) for _ in range(2))
+    compiled = torch.compile(run, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(found), expected, equal_nan=True)
+    with Calls() as calls:
+        run(again)
+    (called,) = calls.found.values()
+    torch.library.opcheck(*called)
+
+
 class Calls(TorchFunctionMode):
     """Notes the custom ops of the library that are called, and once for each kind of arguments what with."""
 

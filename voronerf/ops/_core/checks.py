@@ -62,7 +62,7 @@ def check_shape(
 
     Raises:
         TypeError: not a tensor.
-        ValueError: another shape.
+        ValueError: another shape, or more rows than an int32 can number.
     """
     check_tensor(op, name, tensor)
     known = {} if sizes is None else sizes
@@ -90,6 +90,8 @@ def check_shape(
         values = ", ".join(f"{letter} = {known[letter]}" for letter in letters if letter in list(known)[:before])
         rule = f"[{', '.join(wanted)}]" + (f" with {values}" if values else "")
         raise ValueError(f"{op}: {name} must have shape {rule}, got {list(tensor.shape)}")
+    if came and came[0] > MAX_COUNT:
+        check_count(op, name, came[0])
 
 
 def check_dtype(op: str, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype] = FLOATING) -> None:
@@ -142,7 +144,7 @@ class Checked:
         self.op = op
         self.sizes: dict[str, int] = {}
         self.tensors: dict[str, Tensor] = {}
-        self._first: tuple[str, Tensor] | None = None
+        self._device: torch.device | None = None
         self._float: tuple[str, Tensor] | None = None
 
     def tensor(self, name: str, tensor: Tensor, dtypes: Sequence[torch.dtype], *shape: int | str) -> None:
@@ -159,19 +161,18 @@ class Checked:
             ValueError: another shape or device, too many rows.
         """
         check_shape(self.op, name, tensor, shape, self.sizes)
+        dtype = tensor.dtype
         if not dtypes and self._float is not None:
-            if tensor.dtype != self._float[1].dtype:
+            if dtype != self._float[1].dtype:
                 check_same_dtype(self.op, **{self._float[0]: self._float[1], name: tensor})
-        else:
+        elif dtype not in dtypes:
             check_dtype(self.op, name, tensor, dtypes)
-        if self._float is None and tensor.dtype in FLOATING:
+        if self._float is None and dtype in FLOATING:
             self._float = name, tensor
-        if self._first is None:
-            self._first = name, tensor
-        elif tensor.device != self._first[1].device:
-            check_same_device(self.op, **{self._first[0]: self._first[1], name: tensor})
-        if shape and tensor.shape[0] > MAX_COUNT:
-            check_count(self.op, name, tensor.shape[0])
+        if self._device is None:
+            self._device = tensor.device
+        elif tensor.device != self._device:
+            check_same_device(self.op, **self.tensors, **{name: tensor})
         self.tensors[name] = tensor
 
     def first_float(self) -> Tensor:
@@ -194,7 +195,7 @@ def check_writable(op: str, name: str, tensor: Tensor) -> None:
     """
     if not tensor.is_contiguous():
         raise ValueError(f"{op}: {name} must be contiguous, got strides {tensor.stride()}")
-    if tensor.is_neg():
+    if not torch.compiler.is_compiling() and tensor.is_neg():  # which cannot be traced
         raise ValueError(f"{op}: {name} must be a tensor of its own (clone), got a negative view")
 
 

@@ -1,18 +1,16 @@
-"""One declaration of an op of the compiled module or of Warp: its custom op, its fake and its direct call, from one
-function."""
+"""The custom op of an implementation: its schema, its fake and its gradients from one declaration, and its direct call
+where nothing listens."""
 
 from __future__ import annotations
 
-import functools
 import inspect
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.library import CustomOpDef
 
 from voronerf.ops._core.active import active
 
@@ -24,133 +22,100 @@ _LISTENERS = [
     getattr(torch.autograd, "_profiler_enabled", lambda: True),
 ]
 _PLAIN = (Tensor, torch.nn.Parameter)
+_is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor
 
 
 def is_watched() -> bool:
     """Whether modes, transforms, tracers or profilers of torch are to see what is called."""
-    return any(listens() for listens in _LISTENERS)
+    for listens in _LISTENERS:  # noqa: SIM110  # a generator takes twice the time
+        if listens():
+            return True
+    return False
 
 
-def custom_op(name: str, *, devices: tuple[str, ...] = ("cpu", "cuda")) -> Callable[[Callable[..., Iterator[Any]]], Op]:
-    """Makes a function that allocates, yields its results, and then fills them the custom op ``voronerf::name``.
+def custom_op(
+    name: str,
+    memory: Callable[[Any], Any],
+    *,
+    devices: tuple[str, ...] = ("cpu", "cuda"),
+    mutates: Sequence[str] = (),
+    counted: bool = False,
+) -> Callable[[Callable[..., Any]], Op]:
+    """Makes a function that fills memory with its results the custom op ``voronerf::name``.
 
     ::
 
-        @custom_op("nearest_centre")
-        def _nearest_centre(points: Tensor, centres: Tensor, weights: Tensor | None) -> Iterator[Tensor]:
-            cells = points.new_empty(points.shape[0], dtype=torch.int32)
-            yield cells
-            native.compiled.nearest_centre(points, centres, weights, cells, ...)
+        class Given(NamedTuple):
+            points: Tensor
+            centres: Tensor
 
-    The op's fake, with which torch traces, ends at the ``yield``: up to there shapes alone are known. The op is
-    functional; what it may get and what it returns is said by the annotations. An argument may be a named tuple, whose
-    fields are arguments of the custom op one by one. The compiled functions check dtypes and
-    make their inputs contiguous (csrc/bindings/load.h).
+        def memory(given: Given) -> Tensor:
+            return given.points.new_empty(given.points.shape[0], dtype=torch.int32)
 
-    Args:
-        name: of the op.
-        devices: device types that it runs on.
-    """
+        @custom_op("nearest_centre", memory)
+        def nearest_centre(given: Given, found: Tensor) -> None:
+            native.compiled.nearest_centre(*given, found, ...)
 
-    def declare(steps: Callable[..., Iterator[Any]]) -> Op:
-        def run(*arguments: Any) -> Any:
-            going = steps(*arguments)
-            results = next(going)
-            for _ in going:
-                raise AssertionError(f"{name} yields twice")
-            return results
+        cells = nearest_centre(points, centres)
 
-        signature = inspect.signature(steps, eval_str=True)
-        (results,) = typing.get_args(signature.return_annotation)
-        structs = Structs(signature.replace(return_annotation=results))
-        return make_op(name, run, lambda *flat: next(steps(*structs.packed(flat))), structs, steps, devices=devices)
-
-    return declare
-
-
-def make_op(
-    name: str,
-    run: Callable[..., Any],
-    fake: Callable[..., Any],
-    structs: Structs,
-    described: Callable[..., Any],
-    *,
-    devices: tuple[str, ...] = ("cpu", "cuda"),
-) -> Op:
-    """The custom op ``voronerf::name``.
+    The compiled functions check dtypes and make their inputs contiguous (csrc/bindings/load.h).
 
     Args:
         name: of the op.
-        run: gives its results, from its arguments with named tuples.
-        fake: gives memory for them, from its arguments one by one.
-        structs: its arguments and results.
-        described: the function whose module, name and docstring it gets.
+        memory: gives memory for the results, of shapes alone, which is also the op's fake, with which torch traces. By
+            its annotations the arguments are a named tuple, some of whose members may be named tuples, which the custom
+            op takes apart. An optional one begins with what is never None.
         devices: device types that it runs on.
+        mutates: the arguments that it writes into.
+        counted: whether only the kernels know how many rows there are: the function then gets the arguments alone, and
+            makes its results, and ``memory`` is nothing but the fake.
     """
-
-    def flat(*arguments: Any) -> Any:
-        return run(*structs.packed(arguments))
-
-    flat.__signature__ = signature = structs.flat_signature()  # type: ignore[attr-defined]
-    schema = torch.library.infer_schema(flat, mutates_args=())
-    op = torch.library.custom_op(f"voronerf::{name}", flat, mutates_args=(), device_types=devices, schema=schema)
-    op.register_fake(fake)
-    made = Op(op, run, devices, structs, listed=typing.get_origin(signature.return_annotation) is list)
-    made.__module__, made.__name__, made.__doc__ = described.__module__, described.__name__, described.__doc__
-    return made
+    return lambda fill: Op(name, memory, fill, devices, mutates, counted)
 
 
-class Structs:
-    """The arguments of a function of which some are named tuples, and those of its custom op, which knows none.
+class _Fields:
+    """The arguments of an op, of which some are named tuples, and those of its custom op, which knows none.
 
     Attributes:
-        kinds: the named tuple of each argument, None for others.
-        tensors: places of the arguments of the custom op that are tensors, or None.
-        lists: of those that are lists of them.
+        hints: the types of those of the custom op, by name.
+        nested: whether any is a named tuple.
     """
 
-    def __init__(self, signature: inspect.Signature) -> None:
-        self._parameters, self._results = list(signature.parameters.values()), signature.return_annotation
-        self.kinds = [kind if hasattr(kind := given.annotation, "_fields") else None for given in self._parameters]
-        self._widths = [1 if kind is None else len(kind._fields) for kind in self.kinds]
-        self._any = any(kind is not None for kind in self.kinds)
-        self._alone = self._any and len(self.kinds) == 1
-        hints = [given.annotation for given in self.flat_signature().parameters.values()]
-        kinds = (Tensor, Tensor | None)
-        self.tensors = [place for place, hint in enumerate(hints) if hint in kinds]
-        self.lists = [place for place, hint in enumerate(hints) if any(of in kinds for of in typing.get_args(hint))]
-        self.lists = [place for place in self.lists if place not in self.tensors]
-
-    def flat_signature(self) -> inspect.Signature:
-        """The signature with the fields of named tuples in their place."""
-        found = []
-        for given, kind in zip(self._parameters, self.kinds):
-            hints = {given.name: given.annotation} if kind is None else typing.get_type_hints(kind)
-            found += [inspect.Parameter(name, given.kind, annotation=hint) for name, hint in hints.items()]
-        return inspect.Signature(found, return_annotation=self._results)
+    def __init__(self, kind: Any) -> None:
+        self.hints: dict[str, Any] = {}
+        self._kinds: list[Any] = []  # of each argument the named tuple, or None
+        self._optional: list[bool] = []
+        for name, hint in typing.get_type_hints(kind).items():
+            tuples = [each for each in (hint, *typing.get_args(hint)) if hasattr(each, "_fields")]
+            own = typing.get_type_hints(tuples[0]) if tuples else {name: hint}
+            optional = bool(tuples) and hint is not tuples[0]
+            self.hints |= {key: each | None for key, each in own.items()} if optional else own
+            self._kinds.append(tuples[0] if tuples else None)
+            self._optional.append(optional)
+        self.nested = any(kind is not None for kind in self._kinds)
 
     def packed(self, flat: Sequence[Any]) -> Sequence[Any]:
-        """The arguments of the function."""
-        if not self._any:
+        """The arguments of the op."""
+        if not self.nested:
             return flat
-        if self._alone:
-            return (self.kinds[0]._make(flat),)  # type: ignore[union-attr]
         found, at = [], 0
-        for kind, width in zip(self.kinds, self._widths):
-            found.append(flat[at] if kind is None else kind._make(flat[at : at + width]))
-            at += width
+        for kind, optional in zip(self._kinds, self._optional):
+            end = at + (1 if kind is None else len(kind._fields))
+            missing = kind is None or (optional and flat[at] is None)
+            found.append(flat[at] if missing else kind._make(flat[at:end]))
+            at = end
         return found
 
     def flat(self, packed: Sequence[Any]) -> Sequence[Any]:
-        """The arguments of the custom op."""
-        if not self._any or self._alone:
-            return packed[0] if self._alone else packed
+        """Those of the custom op."""
+        if not self.nested:
+            return packed
         found: list[Any] = []
-        for given, kind in zip(packed, self.kinds):
+        for kind, given in zip(self._kinds, packed):
             if kind is None:
                 found.append(given)
             else:
-                found += given
+                found += (None,) * len(kind._fields) if given is None else given
         return found
 
 
@@ -160,27 +125,64 @@ class Op:
     The dispatcher and the autograd of ``torch.library`` take some 130 us for a forward and a backward pass, as long as
     a layer of width 64 takes for a thousand samples, and more for lists of tensors. Modes, transforms, tracers and
     profilers are given the custom op.
+
+    Attributes:
+        tensors: places of the arguments of the custom op that are tensors, or None.
     """
 
     def __init__(
-        self, op: CustomOpDef, run: Callable[..., Any], devices: tuple[str, ...], structs: Structs, listed: bool
+        self,
+        name: str,
+        memory: Callable[[Any], Any],
+        fill: Callable[..., Any],
+        devices: tuple[str, ...],
+        mutates: Sequence[str],
+        counted: bool,
     ) -> None:
-        self._op, self._run, self._on_cuda, self.structs, self._listed = op, run, "cuda" in devices, structs, listed
-        self._function: Any = None
-        self._setup: Any = None
-        self.__name__ = ""
+        hints = typing.get_type_hints(memory)
+        result, (kind,) = hints.pop("return"), hints.values()
+        self._name, self._fields, self._on_cuda = name, _Fields(kind), "cuda" in devices
+        self._listed = typing.get_origin(result) is list
+        kinds, new = (Tensor, Tensor | None), tuple.__new__
+        fields = list(self._fields.hints.values())
+        self.tensors = [place for place, hint in enumerate(fields) if hint in kinds]
+        lists = [place for place, hint in enumerate(fields) if any(of in kinds for of in typing.get_args(hint))]
+        self._lists = [place for place in lists if place not in self.tensors]
+        self._backward: Callable[..., Any] | None = None
+        self.set_up: Any = None
+
+        def run(arguments: Sequence[Any]) -> Any:
+            given = new(kind, arguments)
+            if counted:
+                return fill(given)
+            found = memory(given)
+            fill(given, found)
+            return found
+
+        self._run, self._nested, self._flat, packed = run, self._fields.nested, self._fields.flat, self._fields.packed
+
+        def flat(*arguments: Any) -> Any:
+            return run(packed(arguments))
+
+        either = inspect.Parameter.POSITIONAL_OR_KEYWORD
+        parameters = [inspect.Parameter(name, either, annotation=hint) for name, hint in self._fields.hints.items()]
+        returned = None if result is type(None) else result
+        flat.__signature__ = inspect.Signature(parameters, return_annotation=returned)  # type: ignore[attr-defined]
+        self._op = torch.library.custom_op(f"voronerf::{name}", flat, mutates_args=mutates, device_types=devices)
+        self._op.register_fake(lambda *flat: memory(new(kind, packed(flat))))
+        self.__module__, self.__name__, self.__doc__ = fill.__module__, fill.__name__, fill.__doc__
 
     def __call__(self, *arguments: Any) -> Any:
         """What the op gives."""
-        flat = self.structs.flat(arguments)
+        flat = self._flat(arguments) if self._nested else arguments
         if torch.compiler.is_dynamo_compiling():
             return self._op(*flat)
         if forward_ad._current_level >= 0:
             self._refuse_tangents(flat)
         if active.recording is None and is_watched():
-            return self._listened(flat)
-        tensors = [flat[place] for place in self.structs.tensors]
-        for place in self.structs.lists:
+            return self._transformed(flat) if torch._C._are_functorch_transforms_active() else self._op(*flat)
+        tensors = [flat[place] for place in self.tensors]
+        for place in self._lists:
             tensors += flat[place]
         learns = False
         for tensor in tensors:
@@ -188,47 +190,31 @@ class Op:
                 here = tensor.is_cpu or (tensor.is_cuda and self._on_cuda)
                 if not here or type(tensor) not in _PLAIN:  # fake tensors of other tracers among them
                     return self._op(*flat)
+                if _is_wrapped(tensor):  # by a transform that has ended, such as the arguments that vjp keeps
+                    return self._transformed(flat)
                 learns = learns or tensor.requires_grad
         if not (learns and torch.is_grad_enabled()):
-            return self._run(*arguments)
-        if self._function is None or active.recording is not None:
+            return self._run(arguments)
+        if self._backward is None or active.recording is not None:
             return self._op(*flat)
-        entries, lengths = _flattened(flat) if self.structs.lists else (flat, None)
-        results = self._function.apply(*entries, lengths)
-        return list(results) if self._listed else results
+        entries, lengths = _flattened(flat) if self._lists else (flat, None)
+        return self._given(_apply_directly(*entries, lengths, self, arguments))
 
-    def _listened(self, flat: Sequence[Any]) -> Any:
-        """The custom op; for torch.func, which does not differentiate those, a function that it does."""
-        if self._setup is None or not torch._C._are_functorch_transforms_active():
+    def _transformed(self, flat: Sequence[Any]) -> Any:
+        """The op for ``torch.func``, which does not differentiate custom ops."""
+        if self._backward is None:
             return self._op(*flat)
         entries, lengths = _flattened(flat)
-        results = self._transformed.apply(*entries, lengths)
-        return list(results) if self._listed else results
+        return self._given(_Differentiable.apply(*entries, lengths, self, None))
 
-    @functools.cached_property
-    def _transformed(self) -> Any:
-        """The op with its gradients, as ``torch.func`` takes it."""
-
-        def forward(*flat: Any) -> Any:
-            *given, lengths = flat
-            result = self._run(*self.structs.packed(_nested(given, lengths)))
-            return tuple(result) if self._listed else result
-
-        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-            *given, ctx.lengths = inputs
-            self._setup(ctx, self.structs.packed(_nested(given, ctx.lengths)), output)
-
-        def vmap(*_: Any) -> Any:
-            raise NotImplementedError(self._no_batches)
-
-        parts = {"forward": forward, "setup_context": setup_context, "vmap": vmap}
-        parts = {name: staticmethod(part) for name, part in parts.items()}
-        return type("Transformed", (torch.autograd.Function,), {**parts, "backward": self._function.backward})
+    def _given(self, results: Any) -> Any:
+        return list(results) if self._listed else results  # autograd.Function knows no lists
 
     @property
-    def _no_batches(self) -> str:
-        return (
-            f"{self._op._name.removesuffix('_native')}: torch.func.vmap, jacrev, hessian, is_grads_batched=True and "
+    def no_batches(self) -> NotImplementedError:
+        """The error of batches of gradients."""
+        return NotImplementedError(
+            f"{self._name.removesuffix('_native')}: torch.func.vmap, jacrev, hessian, is_grads_batched=True and "
             "vectorize=True are not supported; ask torch.autograd.grad for one gradient at a time"
         )
 
@@ -237,42 +223,68 @@ class Op:
         for tensor in _flattened(flat)[0]:
             if isinstance(tensor, Tensor) and forward_ad.unpack_dual(tensor).tangent is not None:
                 raise NotImplementedError(
-                    f"{self._op._name.removesuffix('_native')}: has no forward-mode derivative (jvp, jacfwd, dual "
+                    f"{self._name.removesuffix('_native')}: has no forward-mode derivative (jvp, jacfwd, dual "
                     "numbers); take torch.func.vjp or torch.autograd.grad"
                 )
 
     def register_autograd(self, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
         """The op's backward, as of ``torch.library.custom_op``; inputs and gradients are packed like the arguments."""
-        structs = self.structs
+        packed, self._backward, self.set_up = self._fields.packed, backward, setup_context
+        self._op.register_autograd(
+            self.gradients, setup_context=lambda ctx, inputs, output: setup_context(ctx, packed(inputs), output)
+        )
 
-        def setup(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-            setup_context(ctx, structs.packed(inputs), output)
+    def gradients(self, ctx: Any, *of_results: Any) -> tuple[Any, ...]:
+        """The gradients to the arguments of the custom op."""
+        assert self._backward is not None
+        found = self._backward(ctx, *of_results)
+        return tuple(self._fields.flat(found if isinstance(found, tuple) else (found,)))
 
-        def unpacked(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
-            found = backward(ctx, *of_results)
-            return tuple(structs.flat(found if isinstance(found, tuple) else (found,)))
+    def results(self, arguments: Sequence[Any]) -> Any:
+        """What is computed, as ``torch.autograd.Function`` knows it."""
+        found = self._run(arguments)
+        return tuple(found) if self._listed else found
 
-        self._op.register_autograd(unpacked, setup_context=setup)
-        self._setup = setup_context
+    def arguments(self, entries: Sequence[Any], lengths: Sequence[int]) -> Sequence[Any]:
+        """The arguments of the op, from those of the custom op with lists taken apart."""
+        return self._fields.packed(_nested(entries, lengths))
 
-        def forward(ctx: Any, *flat: Any) -> Any:  # with a setup_context of its own it takes 20 us longer
-            *given, lengths = flat
-            arguments, ctx.lengths = structs.packed(_nested(given, lengths) if lengths else given), lengths
-            result = self._run(*arguments)
-            setup_context(ctx, arguments, result)
-            return tuple(result) if self._listed else result  # autograd.Function knows no lists
 
-        def gradients(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
-            if any(own is not None and torch._C._functorch.is_legacy_batchedtensor(own) for own in of_results):
-                raise NotImplementedError(self._no_batches)
-            found = unpacked(ctx, of_results) if self._listed else unpacked(ctx, *of_results)
-            if ctx.lengths is None:
-                return (*found, None)
+class _Differentiable(torch.autograd.Function):
+    """An op with gradients, as PyTorch's autograd and ``torch.func`` take it.
+
+    Its arguments are those of the custom op, lists of tensors taken apart; the lengths of these lists, or None where
+    there are none; the op; and its arguments once more, where ``torch.func`` does not replace their tensors by its own.
+    """
+
+    @staticmethod
+    def forward(*flat: Any) -> Any:
+        *entries, lengths, op, arguments = flat
+        return op.results(arguments or op.arguments(entries, lengths))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        *entries, ctx.lengths, ctx.op, arguments = inputs
+        ctx.op.set_up(ctx, arguments or ctx.op.arguments(entries, ctx.lengths), output)
+
+    @staticmethod
+    def backward(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
+        op: Op = ctx.op
+        if any(own is not None and torch._C._functorch.is_legacy_batchedtensor(own) for own in of_results):
+            raise op.no_batches
+        found = op.gradients(ctx, of_results) if op._listed else op.gradients(ctx, *of_results)
+        if ctx.lengths:
             lists = zip(found, ctx.lengths, strict=True)
-            return (*_flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0], None)
+            found = tuple(_flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0])
+        return *found, None, None, None
 
-        parts = {"forward": staticmethod(forward), "backward": staticmethod(gradients)}
-        self._function = type("Direct", (torch.autograd.Function,), parts)
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, *flat: Any) -> Any:
+        raise flat[-2].no_batches
+
+
+#: `_Differentiable.apply` without its look at ``torch.func`` and at the signature of ``forward``, which takes 20 us.
+_apply_directly = super(torch.autograd.Function, _Differentiable).apply
 
 
 def _flattened(arguments: Sequence[Any]) -> tuple[list[Any], list[int]]:
@@ -289,7 +301,7 @@ def _flattened(arguments: Sequence[Any]) -> tuple[list[Any], list[int]]:
     return flat, lengths
 
 
-def _nested(flat: list[Any], lengths: list[int]) -> tuple[Any, ...]:
+def _nested(flat: Sequence[Any], lengths: Sequence[int]) -> tuple[Any, ...]:
     """The arguments that `_flattened` took."""
     entries = iter(flat)
     return tuple(next(entries) if n < 0 else [next(entries) for _ in range(n)] for n in lengths)

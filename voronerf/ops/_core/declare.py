@@ -19,10 +19,10 @@ their fake), their gradients (`Declaration.backward_op`), and the members of com
 A tensor is written as its dtypes and its shape. The dtypes are ``floating``, names of some (``float32|float64``),
 ``same`` as the first floating-point tensor, or ``wide``, the same but at least float32. The shape has numbers, letters,
 a letter plus one, and arguments that are integers. Of ``[3] or [r, 3]`` the first holds for a tensor of as many
-dimensions, of ``[m] if ray_offsets else [r, s]`` where that argument is given. In the shape of a result an entry is
-any expression of letters and arguments. An int is written as a range (``1..4``, ``0..``), a float as ``positive``, or
-an interval (``[0, 1)``, ``0 to 1``), a str as its choices (``linear|disparity``). What is written by its class alone is
-an instance of it.
+dimensions, of ``[m] if ray_offsets else [r, s]`` where that argument is given. The shape of a result may also have
+letters that functions of the arguments give (``sizes``). An int is written as a range (``1..4``, ``0..``), a float as
+``positive``, or an interval (``[0, 1)``, ``0 to 1``), a str as its choices (``linear|disparity``). What is written by
+its class alone is an instance of it.
 """
 
 from __future__ import annotations
@@ -30,10 +30,12 @@ from __future__ import annotations
 import collections
 import functools
 import inspect
+import operator
 import re
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -42,7 +44,7 @@ from torch import Tensor
 from voronerf.ops._core import backends, checks
 from voronerf.ops._core.backends import Implementation
 from voronerf.ops._core.checks import FLOATING, LIKE_FIRST, MAX_COUNT
-from voronerf.ops._core.custom_op import Op, Structs, make_op
+from voronerf.ops._core.custom_op import Op, custom_op
 from voronerf.ops._core.derivatives import register_derivatives
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -52,32 +54,11 @@ _DECLARED: dict[str, Declaration] = {}
 _DTYPES = {"floating": FLOATING, "same": LIKE_FIRST, "wide": LIKE_FIRST}
 
 
-def declare(
-    *,
-    native: Implementation | None = None,
-    warp: Implementation | None = None,
-    reference: Implementation | None = None,
-    smooth: Sequence[str] = (),
-    small: Sequence[str] = (),
-    prepare: Callable[[Any], Any] | None = None,
-    composed: bool = False,
-) -> Callable[[F], F]:
-    """Makes the public function of an op from its signature, and puts its row into the table of backends.
-
-    Args:
-        native: of csrc/.
-        warp: of kernels/.
-        reference: in plain PyTorch.
-        smooth: the arguments that have gradients. The others are detached.
-        small: the arguments whose elements an int32 must number.
-        prepare: takes the checked arguments, as a named tuple, and gives those of the implementations; it checks what
-            the signature cannot say.
-        composed: whether the reference takes the ``backend`` of other ops that it calls (`resolve_composed`).
-    """
+def declare(**options: Any) -> Callable[[F], F]:
+    """Makes the public function of an op from its signature, with the options of `Declaration`."""
 
     def of(function: F) -> F:
-        name = backends.declare(function.__name__, native=native, warp=warp, reference=reference or Implementation())
-        made: F = Declaration(name, function, smooth, small, prepare, composed).public(function)
+        made: F = Declaration(function, **options).public()
         return made
 
     return of
@@ -115,8 +96,21 @@ class Shaped(NamedTuple):
 
 
 def _entries(text: str) -> tuple[int | str, ...]:
-    parts = [part.strip() for part in text.split(",") if part.strip()]
+    parts = [part for part in text.replace(" ", "").split(",") if part]
     return tuple(int(part) if part.isdigit() else part for part in parts)
+
+
+def _check_kind(op: str, name: str, value: Any, rule: Any) -> None:
+    if isinstance(rule, type):
+        checks.check_kind(op, name, value, rule)
+
+
+_CHECKS: dict[Any, Callable[[str, str, Any, Any], None]] = {
+    int: lambda op, name, value, rule: checks.check_integer(op, name, value, *rule),
+    float: lambda op, name, value, rule: rule(op, name, value),
+    bool: lambda op, name, value, rule: checks.check_flag(op, name, value),
+    str: checks.check_choice,
+}
 
 
 class Argument(NamedTuple):
@@ -138,34 +132,14 @@ class Argument(NamedTuple):
         name, kind, rule = self.name, self.kind, self.rule
         if kind is Tensor:
             return self._check_tensor(op, detach and (not rule.dtypes or bool({*rule.dtypes} & {*FLOATING})))
-        if kind is int:
+        own = _CHECKS.get(kind, _check_kind)
 
-            def check(given: checks.Checked, values: dict[str, Any]) -> None:
-                checks.check_integer(op, name, values[name], *rule)
-                if bind:
-                    given.sizes[name] = values[name]
-
-        elif kind is float:
-
-            def check(given: checks.Checked, values: dict[str, Any]) -> None:
-                rule(op, name, values[name])
+        def check(given: checks.Checked, values: dict[str, Any]) -> None:
+            own(op, name, values[name], rule)
+            if kind is float:
                 values[name] = float(values[name])
-
-        elif kind is bool:
-
-            def check(given: checks.Checked, values: dict[str, Any]) -> None:
-                checks.check_flag(op, name, values[name])
-
-        elif kind is str:
-
-            def check(given: checks.Checked, values: dict[str, Any]) -> None:
-                checks.check_choice(op, name, values[name], rule)
-
-        else:
-
-            def check(given: checks.Checked, values: dict[str, Any]) -> None:
-                if isinstance(kind, type):
-                    checks.check_kind(op, name, values[name], kind)
+            elif bind:
+                given.sizes[name] = values[name]
 
         return check
 
@@ -187,8 +161,22 @@ class Argument(NamedTuple):
         return check
 
 
+@dataclass(eq=False)
 class Declaration:
     """What the signature of an op says.
+
+    Args:
+        function: which has the signature.
+        native: of csrc/, as the row of the table of backends has it.
+        warp: of kernels/.
+        reference: in plain PyTorch.
+        smooth: the arguments that have gradients. The others are detached.
+        small: the arguments whose elements an int32 must number.
+        writes: the arguments that it writes into.
+        sizes: letters of the results that are no argument's, as functions of the arguments.
+        prepare: takes the checked arguments, as a named tuple, and gives those of the implementations; it checks what
+            the signature cannot say.
+        composed: whether the reference takes the ``backend`` of other ops that it calls (`resolve_composed`).
 
     Attributes:
         name: of the op.
@@ -198,91 +186,92 @@ class Declaration:
         Inputs: the arguments as a named tuple, which has the letters of their shapes as attributes.
     """
 
-    def __init__(
-        self,
-        name: str,
-        function: Callable[..., Any],
-        smooth: Sequence[str],
-        small: Sequence[str],
-        prepare: Callable[[Any], Any] | None,
-        composed: bool,
-    ) -> None:
-        self.name, self.smooth, self._small, self._prepare = name, smooth, small, prepare
-        self._resolve = backends.resolve_composed if composed else backends.resolve
-        hints = typing.get_type_hints(function, include_extras=True)
+    function: Callable[..., Any]
+    native: Implementation | None = None
+    warp: Implementation | None = None
+    reference: Implementation = field(default_factory=Implementation)
+    smooth: Sequence[str] = ()
+    small: Sequence[str] = ()
+    writes: Sequence[str] = ()
+    sizes: Mapping[str, Callable[[Any], int]] = field(default_factory=dict)
+    prepare: Callable[[Any], Any] | None = None
+    composed: bool = False
+
+    def __post_init__(self) -> None:
+        self.name = self.function.__name__
+        backends.declare(self.name, native=self.native, warp=self.warp, reference=self.reference)
+        hints = typing.get_type_hints(self.function, include_extras=True)
         of_result = hints.pop("return")
         hints.pop("backend")
         self.arguments = [_argument(name, hint) for name, hint in hints.items()]
-        self.Inputs = _named(f"{name}_inputs", list(hints))
-        for letter, place in self._letters().items():
-            setattr(self.Inputs, letter, property(eval(f"lambda given: {place}")))
+        kinds = {each.name: each.kind | None if each.optional else each.kind for each in self.arguments}
+        self._places = {name: place for place, name in enumerate(kinds)}
+        self.Inputs = _named(f"{self.name}_inputs", kinds)
+        for letter, size in {**self._letters(), **self.sizes}.items():
+            setattr(self.Inputs, letter, property(size))
         self._pack, self.results = _results(of_result)
-        self._Results = _named("results", list(self.results))
-        self._hint: Any = Tensor if len(self.results) == 1 else tuple[(Tensor,) * len(self.results)]  # type: ignore[misc]
-        text = ", ".join(map(self._memory, self.results.values()))
-        if len(self.results) != 1:  # a named tuple where the results have names
-            text = f"({text})" if "result0" in self.results else f"make({text})"
-        self.allocate = eval(f"lambda given: {text}", {"make": self._Results, "torch": torch})
-        _DECLARED[name] = self
+        self._Results = _named("results", dict.fromkeys(self.results, Tensor))
+        self.allocate = self._memory()
+        hint: Any = Tensor if len(self.results) == 1 else tuple[(Tensor,) * len(self.results)]  # type: ignore[misc]
+        self.allocate.__annotations__ = {"given": self.Inputs, "return": hint if self.results else None}
+        _DECLARED[self.name] = self
 
     def _tensors(self) -> list[Argument]:
         return [argument for argument in self.arguments if argument.kind is Tensor]
 
-    def _letters(self) -> dict[str, str]:
-        """The expression of each letter that shapes speak of."""
-        names, found = [each.name for each in self.arguments], dict[str, list[tuple[str, str]]]()
+    def _letters(self) -> dict[str, Callable[[Any], Any]]:
+        """What gives each letter that shapes speak of, and of a tensor of either form whether it has one per ray."""
+        ways, found = dict[str, list[_Way]](), dict[str, Callable[[Any], Any]]()
         for name, _, optional, rule in self._tensors():
-            forms = [(rule.shape, f"given.{name} is not None" if optional else "")]
-            if rule.condition:
-                there = f"given.{rule.condition} is"
-                forms = [(rule.shape, f"{there} not None"), (rule.otherwise, f"{there} None")]
-            for shape, known in [] if rule.either else forms:
-                for place, entry in enumerate(shape):
-                    if isinstance(entry, str) and entry not in names:
+            own, told = self._places[name], self._places.get(rule.condition)
+            if rule.either:
+                found[f"{name}_per_ray"] = _is_per_ray(own)
+                continue
+            for shape, condition, there in [
+                (rule.shape, own if optional else told, True),
+                (rule.otherwise, told, False),
+            ]:
+                for dimension, entry in enumerate(shape):
+                    if isinstance(entry, str) and entry not in self._places:
                         letter, _, one = entry.partition("+")
-                        size = f"given.{name}.shape[{place}]{' - 1' if one else ''}"
-                        found.setdefault(letter, []).append((size, known))
-        sure = {letter: size for letter, ways in found.items() for size, known in reversed(ways) if not known}
-        asked = {letter: [f"{size} if {known}" for size, known in ways] for letter, ways in found.items()}
-        return {letter: sure.get(letter, " else ".join([*asked[letter], "0"])) for letter in found}
+                        ways.setdefault(letter, []).append(_Way(own, dimension, len(one), condition, there))
+        return {**found, **{letter: _size_of(each) for letter, each in ways.items()}}
 
-    def _memory(self, result: Shaped) -> str:
-        """The expression of new memory for a result."""
-        tensors = [each for each in self._tensors() if not each.optional]
-        same = [each for each in tensors if {*each.rule.dtypes} <= {*(result.dtypes or FLOATING)}]
-        first, dtype = (same[0], "") if same else (tensors[0], f", dtype={result.dtypes[0]}")
-        return f"given.{first.name}.new_empty({self._shape(result)}{dtype})"
+    def _memory(self) -> Callable[[Any], Any]:
+        """What gives new memory for the results: a named tuple where they have names."""
+        tensors, parts = [each for each in self._tensors() if not each.optional], []
+        sizes = dict.fromkeys(entry for each in self.results.values() for entry in (*each.shape, *each.otherwise))
+        names = [entry for entry in sizes if isinstance(entry, str)]
+        numbers = [entry for entry in sizes if isinstance(entry, int)]
+        for name in names:
+            if name.endswith("+1"):
+                setattr(self.Inputs, name, property(_one_more(name[:-2])))
+        places, known = {entry: place for place, entry in enumerate([*names, *numbers])}, _getter(names)
+        for result in self.results.values():
+            same = [each for each in tensors if {*each.rule.dtypes} <= {*(result.dtypes or FLOATING)}]
+            like, dtype = (same[0], None) if same else (tensors[0], result.dtypes[0])
+            shapes = [_picker([places[entry] for entry in shape]) for shape in (result.shape, result.otherwise)]
+            parts.append(_new(self._places[like.name], dtype, self._places.get(result.condition), *shapes))
+        if len(parts) < 2:
+            return (lambda given: parts[0](given, (*known(given), *numbers))) if parts else lambda given: None
+        new, kind = tuple.__new__, tuple if "result0" in self.results else self._Results
 
-    def _values(self) -> dict[str, str]:
-        """The expressions of arguments and letters."""
-        found = {**{each.name: f"given.{each.name}" for each in self.arguments}, **self._letters()}
-        for name in [each.name for each in self._tensors() if each.rule.either]:
-            found[f"{name}_per_ray"] = f"(given.{name} is not None and given.{name}.dim() > 1)"
-        return found
+        def allocate(given: Any) -> Any:
+            sizes = (*known(given), *numbers)
+            return new(kind, [part(given, sizes) for part in parts])
 
-    def _given(self, text: str) -> str:
-        """An expression of arguments and letters, as one of ``given``."""
-        values = self._values()
-        return re.sub(rf"\b({'|'.join(values)})\b", lambda found: f"({values[found[1]]})", text)
+        return allocate
 
-    def _shape(self, result: Shaped) -> str:
-        first, second = (
-            "(" + "".join(self._given(str(entry)) + ", " for entry in shape) + ")"
-            for shape in (result.shape, result.otherwise)
-        )
-        return f"{first} if given.{result.condition} is not None else {second}" if result.condition else first
-
-    def public(self, function: Callable[..., Any]) -> Any:
+    def public(self) -> Any:
         """The public function: it checks its arguments, chooses a backend and calls its implementation."""
-        op, parameters = self.name, inspect.signature(function).parameters
+        function, op, parameters = self.function, self.name, inspect.signature(self.function).parameters
         defaults = {name: each.default for name, each in parameters.items() if each.default is not each.empty}
-        ordered, positional = (
-            dict.fromkeys(parameters),
-            sum(each.kind is not each.KEYWORD_ONLY for each in parameters.values()),
-        )
-        names, sizes = [each.name for each in self.arguments], {e for each in self._tensors() for e in each.rule.shape}
+        ordered, sizes = dict.fromkeys(parameters), {e for each in self._tensors() for e in each.rule.shape}
+        positional = sum(each.kind is not each.KEYWORD_ONLY for each in parameters.values())
+        names = [*self._places]
         every = [(e.name, e.optional, e.check(op, e.name not in self.smooth, e.name in sizes)) for e in self.arguments]
-        prepare, pack, resolve, smooth, small = self._prepare, self._pack, self._resolve, bool(self.smooth), self._small
+        prepare, pack, smooth, small, writes = self.prepare, self._pack, bool(self.smooth), self.small, self.writes
+        resolve = backends.resolve_composed if self.composed else backends.resolve
 
         @functools.wraps(function)
         def public(*args: Any, **options: Any) -> Any:
@@ -296,6 +285,8 @@ class Declaration:
                     check(given, values)
             if smooth:
                 given.no_inference()
+            for name in writes:
+                checks.check_writable(op, name, values[name])
             for name in small:
                 checks.check_count(op, name, values[name].numel())
             flat = [values[name] for name in names]
@@ -306,35 +297,18 @@ class Declaration:
 
         return public
 
-    def plain(self, fill: Callable[..., None]) -> Callable[..., Any]:
-        """An implementation that is no custom op, as nothing traces or differentiates it: `custom_op`, but for that."""
-        new, inputs, allocate = tuple.__new__, self.Inputs, self.allocate
-
-        def run(*flat: Any) -> Any:
-            given = new(inputs, flat)
-            if not self.results:
-                return fill(given)
-            found = allocate(given)
-            fill(given, found)
-            return found
-
-        return run
-
-    def custom_op(self, name: str = "", **options: Any) -> Callable[[Callable[..., None]], Op]:
+    def custom_op(self, name: str = "", **options: Any) -> Callable[[Callable[..., Any]], Op]:
         """Makes ``fill(given, found)`` a custom op: it is handed the arguments, and memory for the results.
 
         Args:
             name: of the custom op; without it that of the op.
-            options: of `make_op`.
+            options: of `custom_op`; with ``fake`` only the kernels know how many rows there are, and ``fill(given)``
+                makes its results.
         """
-        return lambda fill: self.make_op(name or self.name, self.plain(fill), self.allocate, fill, **options)
-
-    def make_op(
-        self, name: str, run: Callable[..., Any], fake: Callable[[Any], Any], described: Any, **options: Any
-    ) -> Op:
-        """The custom op that ``run`` is of the arguments; ``fake`` gives memory for its results, from a named tuple."""
-        structs = Structs(inspect.Signature(self._flat(), return_annotation=self._hint))
-        return make_op(name, run, lambda *flat: fake(self.Inputs._make(flat)), structs, described, **options)
+        memory, fake = self.allocate, options.pop("fake", None)
+        if fake is not None:
+            memory = functools.wraps(self.allocate)(lambda given: fake(given))
+        return custom_op(name or self.name, memory, mutates=self.writes, counted=fake is not None, **options)
 
     def backward_op(self, name: str, forward: Op, formula: Callable[..., Any]) -> Callable[[Callable[..., None]], Op]:
         """Makes ``fill(given, arriving, gradients)`` the gradients of a custom op.
@@ -347,51 +321,43 @@ class Declaration:
             forward: the op that it is the backward of, made by `custom_op`.
             formula: the reference, whose derivatives are the further ones.
         """
-        count, width = len(self.results), len(self.arguments)
+        count, width, new = len(self.results), len(self.arguments), tuple.__new__
         places = [place for place, each in enumerate(self.arguments) if each.name in self.smooth]
-        gradients = _named("gradients", [self.arguments[place].name for place in places])
+        gradients = _named("gradients", dict.fromkeys(self.smooth, Tensor | None))
+        arriving = {f"of_{each}": Tensor | None for each in self.results}
+        kind = _named("given", {**arriving, **typing.get_type_hints(self.Inputs), "wanted": Sequence[bool]})
 
-        new, inputs = tuple.__new__, self.Inputs
-
-        def memory(*flat: Any) -> list[Tensor]:
+        def memory(flat: Any) -> list[Tensor]:
             empty, parts = flat[count].new_empty, zip(flat[-1], [flat[count + place] for place in places])
             return [empty(part.shape if want and part is not None else 0) for want, part in parts]
 
-        def of(fill: Callable[..., None]) -> Op:
-            def run(*flat: Any) -> list[Tensor]:
-                given, found = new(inputs, flat[count:-1]), memory(*flat)
-                parts = zip(found, flat[-1], places)
-                there = [part if want and given[place] is not None else None for part, want, place in parts]
-                fill(given, self._Results._make(flat[:count]), gradients._make(there))
-                return found
+        memory.__annotations__["flat"] = kind
 
-            arriving = [_parameter(f"of_{each}", Tensor | None) for each in self.results]
-            wanted = _parameter("wanted", Sequence[bool])
-            signature = inspect.Signature([*arriving, *self._flat(), wanted], return_annotation=list[Tensor])
-            op = make_op(name, run, memory, Structs(signature), fill)
+        def of(fill: Callable[..., None]) -> Op:
+            @functools.wraps(fill)
+            def run(flat: Any, found: list[Tensor]) -> None:
+                given, parts = new(self.Inputs, flat[count:-1]), zip(found, flat[-1], places)
+                there = [part if want and given[place] is not None else None for part, want, place in parts]
+                fill(given, new(self._Results, flat[:count]), new(gradients, there))
+
+            op = custom_op(name, memory)(run)
             register_derivatives(forward, op, formula, places, width, count)
             return op
 
         return of
 
-    def _flat(self) -> list[inspect.Parameter]:
-        return [_parameter(each.name, each.kind | None if each.optional else each.kind) for each in self.arguments]
-
-    def inputs(self, kind: Any, **others: str | Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def inputs(self, kind: Any, **others: Any) -> Callable[[Any], Any]:
         """What makes a struct of the compiled module of the arguments.
 
         Args:
             kind: the struct, whose members are arguments or letters of their shapes.
-            others: expressions of these, for members that are neither; or functions of the arguments.
+            others: for members that are neither, or have another name: the name, a function of the arguments, or what
+                the member is in every call.
 
         Raises:
             NameError: a member that is none of this.
         """
-        values = self._values()
-        for name, other in others.items():
-            values[name] = self._given(other) if isinstance(other, str) else f"{name}_of(given)"
-        scope = {f"{name}_of": other for name, other in others.items() if not isinstance(other, str)}
-        return self._struct(kind, "given", values, scope)
+        return self._struct(kind, {name: others.get(name, name) for name in kind._fields}, self.Inputs)
 
     def outputs(self, kind: Any, **others: str) -> Callable[[Any], Any]:
         """What makes a struct of the compiled module, whose members are the results, of memory for these.
@@ -400,25 +366,89 @@ class Declaration:
             kind: the struct.
             others: results by the names of members, where they have another.
         """
-        values = {name: f"found.{others.get(name, name)}" for name in [*self.results, *others]}
-        return self._struct(kind, "found", values, {})
+        return self._struct(kind, {name: others.get(name, name) for name in kind._fields}, self._Results)
 
-    def _struct(self, kind: Any, source: str, values: dict[str, str], scope: dict[str, Any]) -> Callable[[Any], Any]:
-        if unknown := [name for name in kind._fields if name not in values]:
+    def _struct(self, kind: Any, members: dict[str, Any], source: Any) -> Callable[[Any], Any]:
+        names = [value for value in members.values() if isinstance(value, str)]
+        if unknown := [name for name in names if not hasattr(source, name.partition(".")[0])]:
             raise NameError(f"{self.name}: {kind.__name__} must have members of its declaration, got {unknown}")
-        members = ", ".join(values[name] for name in kind._fields)
-        scope |= {"new": tuple.__new__, "kind": kind, "torch": torch}
-        made: Callable[[Any], Any] = eval(f"lambda {source}: new(kind, ({members},))", scope)
-        return made
+        others = [(place, value) for place, value in enumerate(members.values()) if not isinstance(value, str)]
+        known, new = _getter(names), tuple.__new__
+
+        def made(given: Any) -> Any:
+            values = [*known(given)]
+            for place, value in others:
+                values.insert(place, value(given) if callable(value) else value)
+            return new(kind, values)
+
+        return made if others else lambda given: new(kind, known(given))
 
 
-def _named(name: str, fields: Sequence[str]) -> Any:
+class _Way(NamedTuple):
+    """A dimension of an argument that a letter stands for, less one or not; ``told`` is the place of an argument that
+    must be ``there``, or must not, for the argument to have this dimension, None for always."""
+
+    place: int
+    dimension: int
+    less: int
+    told: int | None
+    there: bool
+
+
+def _size_of(ways: Sequence[_Way]) -> Callable[[Any], int]:
+    """What gives a letter in the first of these ways that there is, or 0."""
+    sure = [way for way in ways if way.told is None]
+    place, dimension, less, told, there = (sure or ways)[0]
+    if told is None:
+        return lambda given: given[place].shape[dimension] - less
+    rest = [way for way in ways if way[3:] != (told, there)]
+    otherwise: Callable[[Any], int] = _size_of(rest) if rest else lambda given: 0
+    return lambda given: (
+        given[place].shape[dimension] - less if (given[told] is not None) is there else otherwise(given)
+    )
+
+
+def _is_per_ray(place: int) -> Callable[[Any], bool]:
+    return lambda given: given[place] is not None and given[place].dim() > 1
+
+
+def _one_more(letter: str) -> Callable[[Any], int]:
+    return lambda given: getattr(given, letter) + 1
+
+
+def _getter(names: Sequence[str]) -> Callable[[Any], Sequence[Any]]:
+    """What gives attributes of these names."""
+    if len(names) > 1:
+        return operator.attrgetter(*names)
+    return lambda given: [getattr(given, name) for name in names]
+
+
+def _new(
+    like: int, dtype: torch.dtype | None, told: int | None, shape: Callable[[Any], Any], otherwise: Callable[[Any], Any]
+) -> Callable[[Any, Sequence[int]], Tensor]:
+    """What gives new memory of a dtype, beside the tensor at a place, and of one shape where another argument is there.
+
+    Its arguments are those of the op, and all sizes.
+    """
+
+    def memory(given: Any, sizes: Sequence[int]) -> Tensor:
+        own = shape if told is None or given[told] is not None else otherwise
+        found: Tensor = given[like].new_empty(own(sizes), dtype=dtype)
+        return found
+
+    return memory
+
+
+def _picker(places: Sequence[int]) -> Callable[[Any], Any]:
+    """What gives entries of a sequence at these places, a single one alone."""
+    return operator.itemgetter(*places) if places else lambda given: ()
+
+
+def _named(name: str, hints: dict[str, Any]) -> Any:
     make: Any = collections.namedtuple  # whose fields a type checker wants to read
-    return make(name, fields)
-
-
-def _parameter(name: str, kind: Any) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=kind)
+    found = make(name, hints)
+    found.__annotations__ = hints
+    return found
 
 
 def _argument(name: str, hint: Any) -> Argument:
@@ -427,7 +457,7 @@ def _argument(name: str, hint: Any) -> Argument:
         hint, rule = typing.get_args(hint)
     options = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else [hint]
     (kind,) = (kind for kind in options if kind is not type(None))
-    made: Any = rule
+    made: Any = kind
     if kind is Tensor:
         made = Shaped.parse(rule)
     elif kind is int:

@@ -149,8 +149,8 @@ def _keeping(op: Op) -> Callable[..., None]:
     def keep(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
         rest = list(inputs)
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*[rest[place] for place in op.structs.tensors])
-        for place in op.structs.tensors:
+        ctx.save_for_backward(*[rest[place] for place in op.tensors])
+        for place in op.tensors:
             rest[place] = None
         ctx.rest = rest
 
@@ -159,6 +159,6 @@ def _keeping(op: Op) -> Callable[..., None]:
 
 def _kept(ctx: Any, op: Op) -> list[Any]:
     found = list(ctx.rest)
-    for place, tensor in zip(op.structs.tensors, ctx.saved_tensors):
+    for place, tensor in zip(op.tensors, ctx.saved_tensors):
         found[place] = tensor
     return found

@@ -11,7 +11,7 @@ from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 
 _OP = declared("balance_centres")
-_inputs = _OP.inputs(native.compiled.BalanceInputs, neighbours="min(neighbours, k - 1)")
+_inputs = _OP.inputs(native.compiled.BalanceInputs, neighbours=lambda given: min(given.neighbours, given.k - 1))
 
 
 @_OP.custom_op("balance_centres_native", devices=("cpu",))

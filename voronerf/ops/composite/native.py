@@ -14,7 +14,7 @@ from voronerf.ops._core.declare import declared
 from voronerf.ops.composite import reference
 
 _OP = declared("composite")
-_inputs = _OP.inputs(native.compiled.CompositeInputs, offsets="ray_offsets", m="sigma.numel()")
+_inputs = _OP.inputs(native.compiled.CompositeInputs, offsets="ray_offsets", m=lambda given: given.sigma.numel())
 _outputs = _OP.outputs(native.compiled.CompositeOutputs)
 
 

@@ -37,7 +37,12 @@ def _prepare(given: Any) -> Any:
     return given
 
 
-@declare(native=Implementation(EVERYWHERE, (torch.int32,)), warp=PLAIN, prepare=_prepare)
+@declare(
+    native=Implementation(EVERYWHERE, (torch.int32,)),
+    warp=PLAIN,
+    sizes={"several": lambda given: 0 if given.known is None else given.known.several},
+    prepare=_prepare,
+)
 def draw_pixels(
     seed: Annotated[Tensor, "int32 [1]"],
     count: Annotated[int, "1..134217728"],
@@ -49,7 +54,7 @@ def draw_pixels(
 ) -> tuple[
     Annotated[Tensor, "int64 [count]"],
     Annotated[Tensor, "float32 [count, 3]"],
-    Annotated[Tensor, "float32 [known.several if known else 0]"],
+    Annotated[Tensor, "float32 [several]"],
 ]:
     """Pixels, and three uniform numbers for each; all are hashes of the seed and of the number in the batch.
 

@@ -1,4 +1,4 @@
-"""``draw_pixels`` of the compiled module: no custom op, because nothing is traced or differentiated through a draw."""
+"""``draw_pixels`` of the compiled module."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 
 
-@declared("draw_pixels").plain
+@declared("draw_pixels").custom_op("draw_pixels_native")
 def draw_pixels(given: Any, found: tuple[Tensor, Tensor, Tensor]) -> None:
     """Pixels, and three uniform numbers for each; see ``voronerf.ops.draw_pixels.reference``."""
     seed, count, below, runs, known = given

@@ -1,4 +1,4 @@
-"""``draw_points`` of the compiled module: no custom op, because nothing is traced or differentiated through a draw."""
+"""``draw_points`` of the compiled module."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 
 
-@declared("draw_points").plain
+@declared("draw_points").custom_op("draw_points_native")
 def draw_points(given: Any, found: Tensor) -> None:
     """Points in a box; see ``voronerf.ops.draw_points``."""
     native.compiled.draw_points(given.seed, given.box, given.count, found, native.machine(given.seed))

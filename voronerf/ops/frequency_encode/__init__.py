@@ -10,14 +10,19 @@ from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops._core.declare import declare
 
 
-@declare(native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS), smooth=["x"])
+@declare(
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+    smooth=["x"],
+    sizes={"w": lambda given: given.d * (given.include_input + 2 * given.octaves)},
+)
 def frequency_encode(
     x: Annotated[Tensor, "floating [n, d]"],
     octaves: Annotated[int, "0..127"],  # 2^128 is beyond float32
     *,
     include_input: bool = True,
     backend: str = "auto",
-) -> Annotated[Tensor, "same [n, d * (include_input + 2 * octaves)]"]:
+) -> Annotated[Tensor, "same [n, w]"]:
     """``[x, sin x, cos x, sin 2x, cos 2x, ..., sin 2^(L-1) x, cos 2^(L-1) x]``, each a block of d features.
 
     The layout of nerf-pytorch: no factor of pi, and x itself first. Mildenhall et al. 2020, equation 4. Angles are

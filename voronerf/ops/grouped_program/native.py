@@ -7,7 +7,7 @@ derivatives than the compiled module has runs in PyTorch.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -107,38 +107,56 @@ def program_of(rows: Rows, how: How) -> Program:
     )
 
 
-@custom_op("grouped_program_native")
-def run(rows: Rows, how: How) -> Iterator[list[Tensor]]:
-    """The outputs of a program, its sums, and what is kept."""
-    program, (inputs, parameters, offsets, order, ray_index, kept) = program_of(rows, how), rows
-    first, k, new = inputs[0], offsets.shape[0] - 1, torch.empty
-    n = (first if ray_index is None else ray_index).shape[0]
-    r = inputs[program.rays[0]].shape[0] if program.rays else 0
-    counts = [r if i in program.by_ray else n for i in range(len(program.outputs))]
-    outputs = [first.new_empty((count, columns.width)) for count, columns in zip(counts, program.outputs)]
-    float32: dict[str, Any] = {"dtype": torch.float32, "device": first.device}
-    counts = program.cells_of_sums(parameters, k)
-    sums = [new((count, *shape), **float32) for count, shape in zip(counts, program.sums)]
-    lowered = lower(program.text, _layout(how.products, first)) if compiled_runs(program.text) else None
-    keeps = [new((n, width), **float32) for width in lowered.widths] if how.keep and lowered else []
-    yield [*outputs, *sums, *keeps]
+class _Call(NamedTuple("_Call", [("rows", Rows), ("how", How)])):
+    """What a program runs on, and how. Unlike a named tuple of its own it keeps what was found once."""
+
+    @functools.cached_property
+    def plan(self) -> tuple[Program, Lowered | None, int, int]:
+        """The program, for the compiled module if that runs it, rows and rays."""
+        (inputs, _, _, _, index, _), how = self
+        program = program_of(*self)
+        lowered = lower(program.text, _layout(how.products, inputs[0])) if compiled_runs(program.text) else None
+        n = (inputs[0] if index is None else index).shape[0]
+        return program, lowered, n, inputs[program.rays[0]].shape[0] if program.rays else 0
+
+
+def _memory(given: _Call) -> list[Tensor]:
+    """For the outputs of a program, its sums, and what is kept."""
+    (program, lowered, n, r), rows = given.plan, given.rows
+    new = rows.inputs[0].new_empty
+    found = [new((r if i in program.by_ray else n, columns.width)) for i, columns in enumerate(program.outputs)]
+    if program.sums:
+        counts = program.cells_of_sums(rows.parameters, rows.offsets.shape[0] - 1)
+        found += [new((count, *shape), dtype=torch.float32) for count, shape in zip(counts, program.sums)]
+    if given.how.keep and lowered:
+        found += [new((n, width), dtype=torch.float32) for width in lowered.widths]
+    return found
+
+
+@custom_op("grouped_program_native", _memory)
+def run(given: _Call, found: list[Tensor]) -> None:
+    """A program."""
+    (program, lowered, n, r), (rows, how) = given.plan, given
+    inputs, parameters, offsets, order, ray_index, kept = rows
     if lowered is None:
         made = in_torch([x.float() for x in inputs], parameters, offsets, order, ray_index, program.text)
-        for to, result in zip((*outputs, *sums), made, strict=True):
+        for to, result in zip(found, made, strict=True):
             to.copy_(result)
         return
+    split, end = len(program.outputs), len(program.outputs) + len(program.sums)
+    outputs, sums, keeps = found[:split], found[split:end], found[end:]
     gradients = -1 if keeps else how.gradients  # what is kept is of all rows
     looked = keeps or kept or None
-    given = program_inputs(lowered, rows, n, r, kept=looked, ready=not keeps, gradients=gradients, caller=how.caller)
-    if native.on_cuda(first):
-        _run_on_cuda(program, rows, how, given, outputs, sums)
+    taken = program_inputs(lowered, rows, n, r, kept=looked, ready=not keeps, gradients=gradients, caller=how.caller)
+    if native.on_cuda(offsets):
+        _run_on_cuda(program, rows, how, taken, outputs, sums)
         return
     results = native.compiled.ProgramResults(
-        outputs=outputs, output_types=[given.input_types[0]] * len(outputs), sums=sums
+        outputs=outputs, output_types=[taken.input_types[0]] * len(outputs), sums=sums
     )
-    for result in (*outputs, *sums, *keeps):
+    for result in found:
         on_huge_pages(result)
-    native.compiled.grouped_program(lowered.program, given, results, native.cpu())
+    native.compiled.grouped_program(lowered.program, taken, results, native.cpu())
 
 
 def _run_on_cuda(

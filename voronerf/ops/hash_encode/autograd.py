@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -22,14 +23,24 @@ class Hashed(NamedTuple):
     cells: Tensor | None
     grid: str
 
-    def result(self) -> Tensor:
+    def result(self: Hashed) -> Tensor:
         """Memory for the features."""
         return self.positions.new_empty(self.positions.shape[0], HashGrid.parse(self.grid).out_features)
 
-    def gradients(self, to_positions: bool, to_table: bool) -> list[Tensor]:
+
+class HashedGradient(NamedTuple):
+    """What has arrived at the features of points, and what is wanted of it."""
+
+    gradient: Tensor
+    given: Hashed
+    to_positions: bool
+    to_table: bool
+
+    def results(self: HashedGradient) -> list[Tensor]:
         """Memory for the gradients to positions and table, in float32, empty where not wanted."""
-        new = self.positions.new_empty
-        return [new(self.positions.shape if to_positions else 0), new(self.table.shape if to_table else 0)]
+        positions, table = self.given.positions, self.given.table
+        shapes = positions.shape if self.to_positions else 0, table.shape if self.to_table else 0
+        return [positions.new_empty(shape) for shape in shapes]
 
 
 _NONE = Hashed._make([None] * 5)
@@ -38,8 +49,8 @@ _NONE = Hashed._make([None] * 5)
 class HashDerivatives:
     """Registers the derivatives of the hash encoding by a backend's two ops.
 
-    ``encode(given)`` gives features or, with directions, their derivatives along them. ``backward(gradient, given,
-    to_positions, to_table)`` gives the gradients of that to positions and table. With g the gradient that arrives, p
+    ``encode`` of the members of `Hashed` gives features or, with directions, their derivatives along them. ``backward``
+    of those of `HashedGradient` gives the gradients of that to positions and table. With g the gradient that arrives, p
     and t the cotangents of the two gradients, the sum whose gradients are wanted is ``g * encode(t as the table) +
     g * encode(along p)``: the same two ops again.
     """
@@ -49,12 +60,12 @@ class HashDerivatives:
         encode.register_autograd(self.encode, setup_context=self.encode_setup)
         backward.register_autograd(self.backward, setup_context=self.backward_setup)
 
-    def encode_setup(self, ctx: Any, inputs: tuple[Hashed], output: Tensor) -> None:
+    def encode_setup(self, ctx: Any, inputs: Sequence[Any], output: Tensor) -> None:
         """Keeps the arguments of ``encode``."""
-        *tensors, ctx.grid = inputs[0]
+        *tensors, ctx.grid = inputs
         ctx.save_for_backward(*tensors)
 
-    def encode(self, ctx: Any, gradient: Tensor) -> tuple[Hashed]:
+    def encode(self, ctx: Any, gradient: Tensor) -> Hashed:
         """Gradients to positions, table and direction."""
         given = Hashed._make([*ctx.saved_tensors, ctx.grid])
         to_positions, to_table, to_direction, _ = asked_for(ctx, given[:4])
@@ -67,9 +78,9 @@ class HashDerivatives:
                 found = found._replace(table=of_table.to(given.table.dtype))
         if to_direction:
             found = found._replace(direction=self._backward(gradient, given._replace(direction=None), True, False)[0])
-        return (found,)
+        return found
 
-    def backward_setup(self, ctx: Any, inputs: tuple[Any, ...], output: list[Tensor]) -> None:
+    def backward_setup(self, ctx: Any, inputs: Sequence[Any], output: Sequence[Tensor]) -> None:
         """Keeps the arguments of ``backward``."""
         gradient, (*tensors, ctx.grid), ctx.to_positions, ctx.to_table = inputs
         ctx.save_for_backward(gradient, *tensors)
@@ -94,7 +105,7 @@ class HashDerivatives:
                 continue
             term = given._replace(table=features, direction=along)
             if to_gradient:
-                add(0, self._encode(term))
+                add(0, self._encode(*term))
             # The sum is linear in the table, which the first of its terms does not read.
             of_table = to_table and along is not None
             if to_positions or of_table:

@@ -7,7 +7,6 @@ ones from the reference formula.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 
 from torch import Tensor
 
@@ -15,27 +14,24 @@ from voronerf.ops._core import native
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.memory import on_huge_pages
-from voronerf.ops.hash_encode.autograd import HashDerivatives, Hashed
+from voronerf.ops.hash_encode.autograd import HashDerivatives, Hashed, HashedGradient
 
 
 def hash_encode(positions: Tensor, table: Tensor, grid: HashGrid, cells: Tensor | None = None) -> Tensor:
     """Features of points [n, levels * f] from a table [e, f] or [k, e, f]; see ``voronerf.ops.hash_encode``."""
-    encoded: Tensor = _encode(Hashed(positions.float(), table, None, cells, grid.text))
+    encoded: Tensor = _encode(positions.float(), table, None, cells, grid.text)
     return encoded
 
 
-@custom_op("hash_encode_native")
-def _encode(given: Hashed) -> Iterator[Tensor]:
-    out = given.result()
-    yield out
+@custom_op("hash_encode_native", Hashed.result)
+def _encode(given: Hashed, out: Tensor) -> None:
     on_huge_pages(out)
     native.compiled.hash_encode(_inputs(given), compiled_grid(given.grid), out, native.machine(out))
 
 
-@custom_op("hash_encode_native_backward")
-def _backward(gradient: Tensor, given: Hashed, to_positions: bool, to_table: bool) -> Iterator[list[Tensor]]:
-    of_positions, of_table = results = given.gradients(to_positions, to_table)
-    yield results
+@custom_op("hash_encode_native_backward", HashedGradient.results)
+def _backward(arriving: HashedGradient, found: list[Tensor]) -> None:
+    (gradient, given, to_positions, to_table), (of_positions, of_table) = arriving, found
     on_huge_pages(of_table)
     if to_table:
         native.refuse_where_deterministic("hash_encode", given.positions)

@@ -14,6 +14,7 @@ from voronerf.ops._core.declare import declare
     native=Implementation(EVERYWHERE, FLOATS),
     warp=PLAIN,
     smooth=["means", "variances"],
+    sizes={"w": lambda given: 6 * given.octaves},
 )
 def integrated_encode(
     means: Annotated[Tensor, "floating [n, 3]"],
@@ -21,7 +22,7 @@ def integrated_encode(
     octaves: Annotated[int, "0..127"],  # 2^128 is beyond float32
     *,
     backend: str = "auto",
-) -> Annotated[Tensor, "same [n, 6 * octaves]"]:
+) -> Annotated[Tensor, "same [n, w]"]:
     """Expectation of the frequency encoding over a Gaussian with diagonal covariance.
 
     Block l holds ``sin(2^l mu) exp(-4^l var / 2)`` and then ``cos(2^l mu) exp(-4^l var / 2)``, three features each: the

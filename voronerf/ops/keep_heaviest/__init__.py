@@ -8,13 +8,10 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import PLAIN, Implementation
-from voronerf.ops._core.checks import check_writable
 from voronerf.ops._core.declare import declare
 
 
 def _prepare(given: Any) -> Any:
-    for name in ("kept_points", "kept_importance", "added"):
-        check_writable("keep_heaviest", name, getattr(given, name))
     if given.kept_importance.numel() < 1:
         shape = list(given.kept_importance.shape)
         raise ValueError(f"keep_heaviest: kept_importance must have at least one place, got {shape}")
@@ -28,6 +25,7 @@ def _prepare(given: Any) -> Any:
     native=Implementation(("cpu",), (torch.float32,)),
     warp=PLAIN,
     small=["weights"],
+    writes=["kept_points", "kept_importance", "added"],
     prepare=_prepare,
 )
 def keep_heaviest(

@@ -1,5 +1,4 @@
-"""``keep_heaviest`` of the compiled module, on the CPU: no custom op, because it works in place on what no graph
-holds."""
+"""``keep_heaviest`` of the compiled module, on the CPU."""
 
 from __future__ import annotations
 
@@ -13,8 +12,8 @@ _samples = _OP.inputs(native.compiled.WeighedSamples)
 _kept = _OP.inputs(native.compiled.KeptSamples, points="kept_points", importance="kept_importance")
 
 
-@_OP.plain
-def keep_heaviest(given: Any) -> None:
+@_OP.custom_op("keep_heaviest_native", devices=("cpu",))
+def keep_heaviest(given: Any, _: None) -> None:
     """Keeps the heaviest samples of a batch; see ``voronerf.ops.keep_heaviest``."""
-    found = given.added.new_empty(native.compiled.keep_heaviest_workspace(given.q))
-    native.compiled.keep_heaviest(_samples(given), _kept(given), found, native.cpu())
+    workspace = given.added.new_empty(native.compiled.keep_heaviest_workspace(given.q))
+    native.compiled.keep_heaviest(_samples(given), _kept(given), workspace, native.cpu())

@@ -28,18 +28,19 @@ def space_of(given: Any) -> native.compiled.MarchSpace:
 
 _OP = declared("march_rays")
 INPUTS: dict[str, Any] = {
-    "occupied": "occupied.view(torch.uint8)",
+    "occupied": lambda given: given.occupied.view(torch.uint8),
     "s": "samples",
-    "disparity": "spacing == 'disparity'",
-    "most": "samples if most is None else most",
+    "disparity": lambda given: given.spacing == "disparity",
+    "most": lambda given: given.samples if given.most is None else given.most,
     "space": space_of,
 }
 """Members of the struct that are no arguments."""
 inputs_of = _OP.inputs(native.compiled.MarchInputs, **INPUTS)
 
 
-def _march_rays(*flat: Any) -> March:
-    given = _OP.Inputs._make(flat)
+@_OP.custom_op("march_rays_native", fake=March.fake)
+def march_rays(given: Any) -> March:
+    """Samples in occupied cells; see ``voronerf.ops.march_rays``."""
     near, capacity, inputs, machine = given.near, given.capacity, inputs_of(given), native.machine(given.near)
     mask = near.new_empty(given.r, -(-given.samples // 32), dtype=torch.int32)
     offsets = near.new_empty(given.r + 1, dtype=torch.int32)
@@ -53,6 +54,3 @@ def _march_rays(*flat: Any) -> March:
     found = March.memory(near, offsets, rows)
     native.compiled.march_rays_fill(inputs, mask, offsets, rows, *found[1:], machine)
     return found
-
-
-march_rays = _OP.make_op("march_rays_native", _march_rays, March.fake, _march_rays)

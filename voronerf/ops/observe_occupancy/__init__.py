@@ -8,13 +8,10 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import EVERYWHERE, Implementation
-from voronerf.ops._core.checks import check_writable
 from voronerf.ops._core.declare import declare
 
 
 def _prepare(given: Any) -> Any:
-    check_writable("observe_occupancy", "density", given.density)
-    check_writable("observe_occupancy", "occupied", given.occupied)
     if given.density.numel() < 1:
         raise ValueError(f"observe_occupancy: density must have at least one cell, got {list(given.density.shape)}")
     if (given.deltas is None) != (given.weights is None):
@@ -27,6 +24,7 @@ def _prepare(given: Any) -> Any:
     native=Implementation(EVERYWHERE, (torch.float32,)),
     warp=Implementation(EVERYWHERE, (torch.float32,)),
     small=["density"],
+    writes=["density", "occupied"],
     prepare=_prepare,
 )
 def observe_occupancy(

@@ -1,4 +1,4 @@
-"""``observe_occupancy`` of the compiled module: no custom op, because it works in place on what no graph holds."""
+"""``observe_occupancy`` of the compiled module."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from voronerf.ops.march_rays.native import space_of
 
 _OP = declared("observe_occupancy")
 _samples = _OP.inputs(
-    native.compiled.ObservedSamples, fixed="None if fixed is None else fixed.view(torch.uint8)", space=space_of
+    native.compiled.ObservedSamples,
+    fixed=lambda given: None if given.fixed is None else given.fixed.view(torch.uint8),
+    space=space_of,
 )
 
 
-@_OP.plain
-def observe_occupancy(given: Any) -> None:
+@_OP.custom_op("observe_occupancy_native")
+def observe_occupancy(given: Any, _: None) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
     density, occupied, m = given.density, given.occupied.view(torch.uint8), given.m
     memory = density.new_empty(m, dtype=torch.int32), density.new_empty(m)  # cells, and the densities that these had

@@ -71,14 +71,19 @@ def own_samples(
     """
 
 
-@declare(native=_NATIVE, reference=_REFERENCE, prepare=lambda given: _check_samples("run_sums", given))
+@declare(
+    native=_NATIVE,
+    reference=_REFERENCE,
+    sizes={"q": lambda given: len(given.samples.run_offsets) - 1},
+    prepare=lambda given: _check_samples("run_sums", given),
+)
 def run_sums(
     raw: Annotated[Tensor, "float32|float64 [m, 4]"],
     samples: OwnSamples,
     *,
     density_scale: Annotated[float, "positive"],
     backend: str = "auto",
-) -> tuple[Annotated[Tensor, "same [len(samples.run_offsets) - 1, 6]"], Annotated[Tensor, "same [m]"]]:
+) -> tuple[Annotated[Tensor, "same [q, 6]"], Annotated[Tensor, "same [m]"]]:
     """Partial sums of runs, from what the networks put out for their samples.
 
     Args:

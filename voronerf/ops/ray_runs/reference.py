@@ -8,7 +8,7 @@ colour of run`` (NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -46,6 +46,13 @@ class OwnSamples(NamedTuple):
     deltas: Annotated[Tensor, "same [n]"]
     cells: Annotated[Tensor, "int32 [n]"]
     run_offsets: Annotated[Tensor, "int32 [n + 1]"]
+
+    @staticmethod
+    def fake(given: Any) -> OwnSamples:
+        """Which samples are own ones, and where runs end, depends on values."""
+        m, q = (torch.library.get_ctx().new_dynamic_size() for _ in range(2))
+        kept = [part.new_empty((m, *part.shape[1:])) for part in given[:5]]
+        return OwnSamples._make([*kept, given.cells.new_empty(q + 1)])
 
 
 class Runs(NamedTuple):

@@ -1,6 +1,6 @@
 """``render_opaque`` of the compiled module: a wave of some thousand samples goes from grid to colours in the cache.
 
-No custom op: nothing that is traced or differentiated renders pictures.
+No custom op, whose arguments could not be a network as it is given, a dictionary.
 """
 
 from __future__ import annotations
@@ -24,10 +24,9 @@ from voronerf.ops.routed_mlp.program import cells_of
 
 _OP = declared("render_opaque")
 _rays = _OP.inputs(
-    native.compiled.MarchInputs, **{**INPUTS, "uniforms": "None", "seed": "None", "start": "None", "most": "samples"}
+    native.compiled.MarchInputs, **{**INPUTS, "uniforms": None, "seed": None, "start": None, "most": "samples"}
 )
-_PER_RAY = "background is not None and background.dim() == 2"
-_rule = _OP.inputs(native.compiled.SeeRule, background_per_ray=_PER_RAY)
+_rule = _OP.inputs(native.compiled.SeeRule)
 _outputs = _OP.outputs(native.compiled.SeeOutputs)
 
 

@@ -8,7 +8,7 @@ Shapes and dtypes have been validated by ``voronerf.ops``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -126,16 +126,26 @@ def find(positions: Tensor, where: Where, k: int) -> Route:
     return Route(cells if where.cells is None else where.cells, order if order.numel() else None, offsets)
 
 
-@custom_op("routed_mlp_native")
-def locate_and_sort(positions: Tensor, where: Where, k: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+class _Samples(NamedTuple):
+    positions: Tensor
+    where: Where
+    k: int
+
+
+def _memory(given: _Samples) -> tuple[Tensor, Tensor, Tensor]:
     """Cells (empty where they are given), the order (empty where there is one cell) and offsets."""
-    centres, child_offsets, child, depth, cells, coords, rows = where
-    n, alone = positions.shape[0], cells is None and centres is None
-    found = positions.new_empty(n if cells is None else 0, dtype=torch.int32)
-    order = positions.new_empty(0 if alone else n, dtype=torch.int32)
-    offsets = positions.new_empty(k + 1, dtype=torch.int32)
-    yield found, order, offsets
-    if alone:
+    positions, where, k = given
+    n, new, alone = positions.shape[0], positions.new_empty, where.cells is None and where.centres is None
+    cells, order = new(n if where.cells is None else 0, dtype=torch.int32), new(0 if alone else n, dtype=torch.int32)
+    return cells, order, new(k + 1, dtype=torch.int32)
+
+
+@custom_op("routed_mlp_native", _memory)
+def locate_and_sort(given: _Samples, results: tuple[Tensor, Tensor, Tensor]) -> None:
+    """Where samples are, and their order by cell."""
+    positions, (centres, child_offsets, child, depth, cells, coords, rows), _ = given
+    n, (found, order, offsets) = positions.shape[0], results
+    if cells is None and centres is None:  # one cell
         if not native.on_cuda(positions):
             native.compiled.one_cell(found, offsets, n, native.cpu())
         elif rows is None:

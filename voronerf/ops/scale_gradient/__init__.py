@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
-from voronerf.ops._core.checks import check_writable
 from voronerf.ops._core.declare import declare
 
 
-def _prepare(given: Any) -> Any:
-    check_writable("scale_gradient", "gradient", given.gradient)
-    return given
-
-
-@declare(native=Implementation(EVERYWHERE, (torch.float32,)), warp=PLAIN, small=["gradient"], prepare=_prepare)
+@declare(native=Implementation(EVERYWHERE, (torch.float32,)), warp=PLAIN, small=["gradient"], writes=["gradient"])
 def scale_gradient(
     gradient: Annotated[Tensor, "float32|float64 [m, c]"],
     depths: Annotated[Tensor, "same [m]"],

@@ -8,20 +8,23 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import PLAIN, Implementation
-from voronerf.ops._core.checks import check_writable
 from voronerf.ops._core.declare import declare
 from voronerf.ops.render_loss.reference import scaled
 
 
 def _prepare(given: Any) -> Any:
-    check_writable("sparse_depth_gradient", "loss", given.loss)
-    check_writable("sparse_depth_gradient", "gradient", given.gradient)
     if given.s > given.r:
         raise ValueError(f"sparse_depth_gradient: distances must be of at most the {given.r} rays, got {given.s}")
     return scaled("sparse_depth_gradient", given)
 
 
-@declare(native=Implementation(("cpu",), (torch.float32,)), warp=PLAIN, small=["gradient"], prepare=_prepare)
+@declare(
+    native=Implementation(("cpu",), (torch.float32,)),
+    warp=PLAIN,
+    small=["gradient"],
+    writes=["loss", "gradient"],
+    prepare=_prepare,
+)
 def sparse_depth_gradient(
     loss: Annotated[Tensor, "float32|float64 []"],
     gradient: Annotated[Tensor, "same [m, 4]"],

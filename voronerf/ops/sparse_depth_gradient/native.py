@@ -1,4 +1,4 @@
-"""``sparse_depth_gradient`` of the compiled module, on the CPU: no custom op, as it adds to what no graph holds."""
+"""``sparse_depth_gradient`` of the compiled module, on the CPU."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from voronerf.ops._core.declare import declared
 from voronerf.ops.sparse_depth_gradient.reference import NEARBY
 
 _OP = declared("sparse_depth_gradient")
-_inputs = _OP.inputs(native.compiled.SparseDepth, offsets="ray_offsets", nearby=str(NEARBY))
+_inputs = _OP.inputs(native.compiled.SparseDepth, offsets="ray_offsets", nearby=NEARBY)
 
 
-@_OP.plain
-def sparse_depth_gradient(given: Any) -> None:
+@_OP.custom_op("sparse_depth_gradient_native", devices=("cpu",))
+def sparse_depth_gradient(given: Any, _: None) -> None:
     """Adds the loss and its gradient; see ``voronerf.ops.sparse_depth_gradient``."""
     loss, gradient, of_rays = given.loss, given.gradient, given.density.new_empty(given.s)
     native.compiled.sparse_depth_gradient(_inputs(given), loss, gradient, of_rays, native.cpu())

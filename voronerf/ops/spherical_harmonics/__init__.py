@@ -10,10 +10,15 @@ from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops._core.declare import declare
 
 
-@declare(native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS), smooth=["directions"])
+@declare(
+    native=Implementation(EVERYWHERE, FLOATS),
+    warp=Implementation(EVERYWHERE, FLOATS),
+    smooth=["directions"],
+    sizes={"w": lambda given: given.degree**2},
+)
 def spherical_harmonics(
     directions: Annotated[Tensor, "floating [n, 3]"], degree: Annotated[int, "1..4"], *, backend: str = "auto"
-) -> Annotated[Tensor, "same [n, degree**2]"]:
+) -> Annotated[Tensor, "same [n, w]"]:
     """The real spherical harmonics of bands 0 to degree - 1, an orthonormal basis of functions of a direction.
 
     Order, signs and constants are those of tiny-cuda-nn's ``SphericalHarmonics`` and torch-ngp's ``SHEncoder`` (Müller
