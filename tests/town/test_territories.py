@@ -125,7 +125,9 @@ def run(own, batches):
         member.step.generator.manual_seed(3)
         member.step.batches.batch = batches.get(number, none)
     rays = {number: len(member.step.batches.batch.near) for number, member in own.items()}
-    return step_together(Group(torch.device("cpu")), own, [0] * len(own), line(len(own)).boxes, rays, at=1)
+    return step_together(
+        Group(torch.device("cpu")), own, [0] * len(own), line(len(own)).boxes, rays, dict.fromkeys(own, 1)
+    )
 
 
 def fill(own, densities, colours):
@@ -183,6 +185,9 @@ def test_colours_are_those_of_all_territories_in_turn():
     batch = Batch(Rays(origins, directions), torch.zeros(2), torch.full((2,), 9.0), expected, torch.ones(3))
     found = run(own, {0: batch})
     assert float(found[0].loss) < 1e-5 and found[1].samples == 128
+    whole = found[0].whole().output
+    assert torch.allclose(whole.colour, expected, atol=1e-3)
+    assert torch.allclose(whole.weights, torch.full((2,), 1 - light[0] * light[1]), atol=1e-3)
 
 
 def test_a_ray_that_has_ended_goes_no_further():

@@ -239,6 +239,23 @@ def test_parts_of_steps_are_replayed(tmp_path, monkeypatch):
     assert all(one.equal(other) for one, other in zip(*found, strict=True))
 
 
+def test_a_start_that_failed_begins_again(tmp_path, monkeypatch):
+    """Of all territories here; light that rays meet in others counts, too."""
+    monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 20)
+    monkeypatch.setattr("voronerf.app.train.start.JUDGED", 30)
+    town, said = build_some(tmp_path, 70), []
+    for state in town.states.values():
+        state.on_event = said.append
+        with torch.no_grad():
+            state.router.module.density.bias.fill_(-30.0)
+    train.train(town)
+    assert len(said) == 3 and "nothing is learnt by step 50: all space is empty" in said[0]
+    for number, state in town.states.items():
+        assert state.began == 50 and state.strategy.splits == 1
+        outside = town.members[number].place.outside(state.sampler.grid)
+        assert state.sampler.grid.occupied.view(-1).equal(~outside)
+
+
 def test_photographs_have_a_robust_loss(tmp_path):
     losses = []
     for robust in (0.0, 0.05):

@@ -27,6 +27,7 @@ from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.nerf.volume import Samples
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.ray_runs import OwnSamples, compose_runs, own_samples, run_gradients, run_sums
+from voronerf.ops.ray_runs.reference import along_rays, compose
 from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.town.group import Group, Key
 from voronerf.town.territories import Place
@@ -170,6 +171,24 @@ class Pass:
         return Learnt(weights, [(each, each.grad) for each in parameters if each.grad is not None])
 
 
+class Crossing(StepOutput):
+    """What a step of a territory has found, whose rays pass through others, too."""
+
+    def __init__(self, batch: Batch, output: RenderOutput, sums: Tensor) -> None:
+        super().__init__(batch, output)
+        self._sums = sums
+
+    def whole(self) -> StepOutput:
+        """The same rays through all territories, as if each had one sample."""
+        batch, sums = self.batch, self._sums[along_rays(self._sums[:, 5].long(), self._sums[:, 4])]
+        found = compose(sums[:, :3], sums[:, 3], sums[:, 5].long(), len(batch.rays))
+        behind = torch.zeros_like(batch.target) if batch.background is None else batch.background
+        index = torch.arange(len(batch.rays), device=sums.device)
+        samples = self.output.samples._replace(ray_index=index)
+        colour = found.colour + found.through[:, None] * behind
+        return StepOutput(batch, self.output._replace(weights=1 - found.through, samples=samples, colour=colour))
+
+
 def meet(bounds: Tensor, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
     """Which rays [r] meet which boxes [T, 2, 3] between near and far: bool [T, r]; swapped corners are an empty box."""
     inverse = 1 / torch.where(rays.directions == 0, 1e-12, rays.directions)
@@ -185,8 +204,8 @@ def step_together(
     owner: Sequence[int],
     bounds: Tensor,
     rays: Mapping[int, int],
-    at: int,
-) -> dict[int, StepOutput]:
+    at: Mapping[int, int],
+) -> dict[int, Crossing]:
     """A step of all territories; all ranks call it together.
 
     Args:
@@ -195,7 +214,7 @@ def step_together(
         owner: The rank of each territory, [T].
         bounds: [T, 2, 3], around what of each is not empty.
         rays: How many each own territory draws.
-        at: Steps done.
+        at: Steps that it has done since it began.
 
     Returns:
         What each own territory has found: on its own rays, and on those of others. A loss is that of its own rays.
@@ -205,7 +224,7 @@ def step_together(
     gone: dict[Key, Tensor] = {}  # the rays that go from one territory to another
     sizes = torch.zeros(count, count, dtype=torch.int64)
     for number, territory in territories.items():
-        territory.step.begin(at)
+        territory.step.begin(at[number])
         batch = batches[number] = territory.step.draw(rays[number])
         home = homes[number] = Pass("own rays", territory, batch.rays, batch.near, batch.far)
         met = meet(bounds, batch.rays, batch.near, torch.minimum(batch.far, home.end()))
@@ -231,11 +250,13 @@ def step_together(
     came = group.send(sums, found, owner, SUM, back=True)
     answers: dict[Key, Tensor] = {}
     outputs: dict[int, RenderOutput] = {}
+    whole: dict[int, Tensor] = {}
     for number, home in homes.items():
         keys, batch = [key for key in came if key[0] == number], batches[number]
         rows = [home.sums[:, -1].long(), *(gone[key][came[key][:, -1].long()] for key in keys)]
         every = torch.cat([home.sums, *(came[key] for key in keys)])
         every[:, -1] = torch.cat(rows).to(every.dtype)
+        whole[number] = every
         told, loss = compose_runs(
             every,
             batch.target,
@@ -249,15 +270,15 @@ def step_together(
         answers |= zip(keys, rest, strict=True)
         outputs[number] = home.learn(own, loss) or _nothing(loss)
     came = group.send(answers, found, owner, SUM)
-    made = dict[int, StepOutput]()
+    made = dict[int, Crossing]()
     for number, output in outputs.items():
         learnt = homes[number].learnt
         if number in guests and len(guests[number].sums):
             own = torch.cat([came[key] for key in came if key[1] == number])
             also = guests[number].learn(own, own.new_zeros(()), *learnt)
             output, learnt = output if also is None else _both(output, also), learnt + guests[number].learnt
-        territories[number].step.end(at + 1, output, *learnt)
-        made[number] = StepOutput(batches[number], output)
+        territories[number].step.end(at[number] + 1, output, *learnt)
+        made[number] = Crossing(batches[number], output, whole[number])
     return made
 
 

@@ -35,6 +35,7 @@ from voronerf.app.train.defaults import resolve
 from voronerf.app.train.loop import count, prepare
 from voronerf.app.train.loop import train as train_alone
 from voronerf.app.train.resume import snapshot
+from voronerf.app.train.start import judge_start, judged_at
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf import Occupancy, OccupancyGrid, Perspective
 from voronerf.nerf.radiance import Radiance, radiance_of
@@ -230,9 +231,12 @@ def train(
             for state in town.states.values():
                 prepare(state, patient=True)
             rays = {number: state.rays for number, state in town.states.items()}
-            made = step_together(group, town.members, town.owner, town.bounds, rays, first.step)
+            at = {number: state.step - state.began for number, state in town.states.items()}
+            made = step_together(group, town.members, town.owner, town.bounds, rays, at)
             for number, state in town.states.items():
                 count(state, 1, made[number])
+                if state.step == judged_at(state):
+                    judge_start(state, made[number].whole())
         passed += clock() - started
         if group.size == 1 or first.step % AGREE_EVERY == 0 or first.step == town.config.steps:
             agreed = torch.tensor([passed * (group.rank == 0), float(town.stopping)], dtype=torch.float64)
