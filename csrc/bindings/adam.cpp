@@ -11,6 +11,7 @@ VN_BINDINGS(module) {
   module.cpu("adam", VN_CPU(adam_cpu));
   module.cuda("adam", VN_CUDA(adam_cuda));
   module.cpu("average", VN_CPU(average_cpu));
+  module.cpu("add", VN_CPU(add_cpu));
 }
 
 }  // namespace voronerf

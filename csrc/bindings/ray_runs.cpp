@@ -6,7 +6,7 @@ namespace voronerf {
 
 VN_STRUCT(KnownSamples, positions, ray_index, depths, deltas, cells, own, n, bent);
 VN_STRUCT(OwnSamples, positions, ray_index, depths, deltas, cells, offsets);
-VN_STRUCT(RunsOfRays, sums, target, background, background_per_ray, q, first, r, rays);
+VN_STRUCT(RunsOfRays, sums, target, background, background_per_ray, q, first, r, rays, robust);
 
 VN_BINDINGS(module) {
   module.cpu("own_samples", VN_CPU(own_samples_cpu));

@@ -35,6 +35,9 @@ void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const 
 void average_cpu(const float* share, const float* const* parameters, float* const* averages,
                  const std::vector<int64_t>& sizes, int threads);
 
+// Gradients are added to totals.
+void add_cpu(const float* const* gradients, float* const* totals, const std::vector<int64_t>& sizes, int threads);
+
 // A step on CUDA, in two launches. corrected: [2, number of parameters], working memory.
 void adam_cuda(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
                float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,

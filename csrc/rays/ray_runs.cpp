@@ -9,6 +9,8 @@
 #include <utility>
 #include <vector>
 
+#include "rays/render_loss_math.h"
+
 namespace voronerf {
 
 int64_t own_samples_cpu(const KnownSamples& in, const OwnSamples& out, int) {
@@ -67,15 +69,18 @@ float compose_runs_cpu(const RunsOfRays& in, float* answers, int) {
       for (int k = 0; k < 3; ++k) light[k] += std::exp(-front) * static_cast<double>(sum[k]);
       front += static_cast<double>(sum[3]);
     }
-    float error = 0.0f;
+    double left[3] = {};
+    float off[3], error = 0.0f;
     for (int k = 0; k < 3; ++k) {
-      const double left = background == nullptr ? 0.0 : std::exp(-front) * static_cast<double>(background[k]);
-      const float off = static_cast<float>(light[k] + left) - in.target[3 * ray + k];
-      slopes[k] = static_cast<double>(off * share);
-      behind += slopes[k] * left;
-      error += off * off;
+      if (background != nullptr) left[k] = std::exp(-front) * static_cast<double>(background[k]);
+      off[k] = static_cast<float>(light[k] + left[k]) - in.target[3 * ray + k];
+      error += off[k] * off[k];
     }
-    loss += static_cast<double>(error);
+    for (int k = 0; k < 3; ++k) {
+      slopes[k] = static_cast<double>(off[k] * (share * ray_loss_slope(error, in.robust)));
+      behind += slopes[k] * left[k];
+    }
+    loss += static_cast<double>(ray_loss(error, in.robust));
     for (int64_t i = ends[ray]; i-- > begin;) {
       const float* sum = in.sums + 6 * order[i];
       float* answer = answers + 6 * order[i];

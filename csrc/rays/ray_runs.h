@@ -39,6 +39,7 @@ struct RunsOfRays {
   bool background_per_ray;
   int64_t q, first, r;
   int64_t rays;  // of all ranks
+  float robust;  // as of RenderLossInputs
 };
 
 // Answers [q,6] to the sums; returns what these rays add to the loss. Throws std::invalid_argument for other rays.

@@ -148,7 +148,7 @@ def test_steps_in_one_call_are_the_same_bits(cells, threads, monkeypatch):
             training.optimizer.set_learning_rate(0.01 / (1 + done // 16))
             made = training.step(40 + done // 16, steps, at=done)
             done += steps
-        assert "replayed" in training.step.explain() and set(training.step._between) == {"before", "after"}
+        assert "replayed" in training.step.explain() and set(training.step._parts) == {"before", "after"}
         with training.optimizer.averaged():
             shown = [p.detach().clone() for p in training.router.parameters()]
         found.append([made.loss, made.output.weights, *shown, *training.everything()])

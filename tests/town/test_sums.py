@@ -52,8 +52,8 @@ def test_partial_sums_are_one_composite(ranks):
 
 
 @pytest.mark.parametrize("backend", ["native", "reference"])
-@pytest.mark.parametrize("ranks", [1, 3])
-def test_partial_sums_are_one_loss(ranks, backend):
+@pytest.mark.parametrize(("ranks", "robust"), [(1, 0.05), (3, 0.0), (3, 0.05)])
+def test_partial_sums_are_one_loss(ranks, robust, backend):
     """Loss, gradients and weights of `render_loss`, whatever rank has which sample; long and empty rays."""
     reason = backends.why_not("run_sums", backend, torch.device("cpu"))
     if reason is not None:
@@ -69,7 +69,7 @@ def test_partial_sums_are_one_loss(ranks, backend):
     cells = torch.randint(ranks, (n,), generator=generator).int()
     rest = {"density_scale": 2.0, "hidden": 1e-3}
     leaf = raw.clone().requires_grad_()
-    expected = render_loss(leaf, deltas, offsets, target, background=background, **rest)
+    expected = render_loss(leaf, deltas, offsets, target, background=background, robust=robust, **rest)
     expected.loss.backward()
     positions = torch.rand(n, 3, generator=generator)
 
@@ -78,7 +78,7 @@ def test_partial_sums_are_one_loss(ranks, backend):
     samples = [keep_own(positions, index, depths, deltas, cells, numbers, **given) for numbers in own]
     assert all(mine.positions.equal(positions[rows]) for mine, rows in zip(samples, kept, strict=True))
     sums = [run_sums(raw[rows], mine, density_scale=2.0, **given)[0] for mine, rows in zip(samples, kept, strict=True)]
-    shown = {"background": background, "first": 0, "rays": rays}
+    shown = {"background": background, "first": 0, "rays": rays, "robust": robust}
     answers, loss = compose_runs(torch.cat(sums), target, **shown, **given)
     assert torch.allclose(loss, expected.loss, rtol=1e-6)
     for mine, rows, told in zip(samples, kept, answers.split(list(map(len, sums))), strict=True):

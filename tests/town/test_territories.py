@@ -9,8 +9,9 @@ from helpers import refuses, seeded
 
 from voronerf import NeRF, OccupancyGrid, VoronoiDiagram, VoronoiRouter
 from voronerf.app.scenes import builtin_scene, city_scene
-from voronerf.nerf import Batch, Occupancy, Rays, Renderer
+from voronerf.nerf import Adam, Batch, Occupancy, RayLoss, Rays, Renderer, TrainingStep
 from voronerf.nerf.contraction import Contraction
+from voronerf.nerf.samplers import SETTLING_PART
 from voronerf.town.group import Group
 from voronerf.town.rays import Territory, meet, step_together
 from voronerf.town.territories import Territories, cut_space, halve
@@ -99,17 +100,34 @@ def members(count):
         torch.manual_seed(number)
         router = VoronoiRouter(NeRF(width=16, depth=2, density_scale=1.0), torch.zeros(1, 3), coords="first3")
         grid = OccupancyGrid(line(count).boxes[number], 4, threshold=1e-6)
-        renderer = Renderer({"field": router}, Occupancy(grid, 64))
-        found[number] = Territory(line(count).place(number), renderer, torch.Generator())
+        loss = RayLoss(Renderer({"field": router}, Occupancy(grid, 64 * SETTLING_PART)))
+        optimizer = Adam.of({"field": router}, lr=0.0)  # so that nothing moves
+        step = TrainingStep(Drawn(), loss, optimizer, generator=torch.Generator())
+        found[number] = Territory(line(count).place(number), step)
     return found
 
 
+class Drawn:
+    """In the place of `RayBatches`: the same rays in each step."""
+
+    device = place = torch.device("cpu")
+    fetch = None
+
+    def draw(self, rays, generator):
+        return self.batch
+
+
 def run(own, batches):
-    """The losses and gradients of all territories, with the same random samples whenever it is called."""
-    for member in own.values():
-        member.generator.manual_seed(3)
-        member.renderer.field.zero_grad()
-    return step_together(Group(torch.device("cpu")), own, [0] * len(own), line(len(own)).boxes, batches)
+    """What all territories find, and gradients, with the same random samples whenever it is called."""
+    away = torch.tensor([[-1.0, 1, 1]]), torch.tensor([[-1.0, 0, 0]])  # of those without rays
+    none = Batch(Rays(*away), torch.zeros(1), torch.full((1,), 9.0), torch.zeros(1, 3))
+    for number, member in own.items():
+        member.step.generator.manual_seed(3)
+        member.step.batches.batch = batches.get(number, none)
+    rays = {number: len(member.step.batches.batch.near) for number, member in own.items()}
+    return step_together(
+        Group(torch.device("cpu")), own, [0] * len(own), line(len(own)).boxes, rays, dict.fromkeys(own, 1)
+    )
 
 
 def fill(own, densities, colours):
@@ -166,11 +184,14 @@ def test_colours_are_those_of_all_territories_in_turn():
     expected = torch.stack((mine[0] + light[0] * mine[1], mine[1] + light[1] * mine[0])) + light[0] * light[1]
     batch = Batch(Rays(origins, directions), torch.zeros(2), torch.full((2,), 9.0), expected, torch.ones(3))
     found = run(own, {0: batch})
-    assert float(found[0].loss) < 1e-5 and len(found[1].weights) == 128
+    assert float(found[0].loss) < 1e-5 and found[1].samples == 128
+    whole = found[0].whole().output
+    assert torch.allclose(whole.colour, expected, atol=1e-3)
+    assert torch.allclose(whole.weights, torch.full((2,), 1 - light[0] * light[1]), atol=1e-3)
 
 
 def test_a_ray_that_has_ended_goes_no_further():
     own = members(3)
     fill(own, (100.0,) * 3, torch.full((3, 3), 0.5))
     found = run(own, {0: rays_through(30)})
-    assert len(found[0].weights) and not found.keys() - {0}
+    assert [each.samples > 0 for each in found.values()] == [True, False, False]

@@ -11,7 +11,10 @@ from ranks import complaints, network_files, new_store, on_ranks, town_tensors
 
 from voronerf.app.cli import main
 from voronerf.app.scenes import builtin_scene
+from voronerf.app.train import State, TrainConfig
 from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
+from voronerf.app.train.resume import snapshot
+from voronerf.nerf import TrainingStep
 from voronerf.town import group, open_run, rays, train
 
 ARGUMENTS = """
@@ -55,6 +58,19 @@ def dies_at_the_start(args):
 
 def is_asked_to_stop(args, step):
     with in_step(step, lambda: os.kill(os.getpid(), signal.SIGTERM)):
+        return main(args)
+
+
+def is_stopped(args):
+    """After some steps, by a signal."""
+    real = State.count_steps
+
+    def count_steps(state, *of):
+        real(state, *of)
+        if state.step < 12:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with mock.patch.object(State, "count_steps", count_steps):
         return main(args)
 
 
@@ -198,3 +214,67 @@ def test_a_training_learns(whole):
         assert found.values["step"] == 24 and found.values["skipped"] == 0
         assert any(bool(t.any()) for name, t in found.tensors.items() if name.endswith("exp_avg"))
         assert torch.isfinite(found.tensors["router.module.features"]).all()
+
+
+def build_some(out, steps, **more):
+    """Three small territories in this process."""
+    options = ("levels=4", "log2_entries=10")
+    given = {"width": 8, "rays": 24, "cells": (2,), "split_at": (0.85,), "field_options": options, **more}
+    config = TrainConfig(steps=steps, out=out, lpips=False, **given)
+    scene = builtin_scene(16, train_views=9, test_views=1)
+    return train.build_town(config, scene, 3, group.Group(torch.device("cpu")))
+
+
+def test_parts_of_steps_are_replayed(tmp_path, monkeypatch):
+    """With the same bits as steps that run as they are, beyond a split and looks at empty space."""
+    found = []
+    for expected in ("parts of it are recorded", "a test"):
+        if found:
+            monkeypatch.setattr(TrainingStep, "_standing_obstacle", lambda *of, **how: "a test")
+        town = build_some(tmp_path / expected, 120)
+        train.train(town)
+        found.append([v for state in town.states.values() for v in snapshot(state).tensors.values()])
+        for state in town.states.values():
+            assert expected in state.training_step.explain()
+    assert all(one.equal(other) for one, other in zip(*found, strict=True))
+
+
+def test_a_start_that_failed_begins_again(tmp_path, monkeypatch):
+    """Of all territories here; light that rays meet in others counts, too."""
+    monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 20)
+    monkeypatch.setattr("voronerf.app.train.start.JUDGED", 30)
+    town, said = build_some(tmp_path, 70), []
+    for state in town.states.values():
+        state.on_event = said.append
+        with torch.no_grad():
+            state.router.module.density.bias.fill_(-30.0)
+    train.train(town)
+    assert len(said) == 3 and "nothing is learnt by step 50: all space is empty" in said[0]
+    for number, state in town.states.items():
+        assert state.began == 50 and state.strategy.splits == 1
+        outside = town.members[number].place.outside(state.sampler.grid)
+        assert state.sampler.grid.occupied.view(-1).equal(~outside)
+
+
+def test_photographs_have_a_robust_loss(tmp_path):
+    losses = []
+    for robust in (0.0, 0.05):
+        town = build_some(tmp_path / str(robust), 1)
+        for state in town.states.values():
+            assert state.ray_loss.robust == 0  # of pictures that are computed
+            state.ray_loss.robust = robust
+        train.train(town)
+        losses.append([state.loss for state in town.states.values()])
+    assert all(0 < robust < 0.7 * squared for squared, robust in zip(*losses, strict=True)), losses
+
+
+def test_one_territory_is_an_ordinary_training(tmp_path):
+    """Recorded as a whole, with checkpoints that are opened, stopped and continued."""
+    args = ["train-territories", "--resume", "--panels", "0", "--out"]
+    first, second = tmp_path / "first", tmp_path / "second"
+    one = [*command(first), "--territories", "1"]
+    assert on_ranks(main, one, folder=tmp_path, size=1)[0] == [0]
+    one[one.index(str(first))] = str(second)
+    assert on_ranks(is_stopped, one, folder=tmp_path, size=1)[0] == [130]
+    assert on_ranks(main, [*args, str(second)], folder=tmp_path, size=1)[0] == [0]
+    assert same(first, second)

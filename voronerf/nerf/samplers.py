@@ -350,6 +350,8 @@ class Occupancy(Sampler):
     def step_pre_backward(self, field: Field, step: int, generator: torch.Generator) -> None:
         """Evaluates random voxels; see :meth:`Sampler.step_pre_backward`."""
         self.settling = step < self.settling_steps
+        if step == 0:
+            self._leave_empty()  # of a grid that begins again
         if not self.asks_at(step):
             return
         every = self.grid.occupied.numel()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
 
@@ -15,6 +15,7 @@ from voronerf.nerf import schedule
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.loss import Batch, RayLoss, RenderOutput
+from voronerf.nerf.part import LONGEST_WAIT, Made, Part
 from voronerf.nerf.radiance import Radiance
 from voronerf.nerf.split import Strategy
 from voronerf.ops import Guard
@@ -23,9 +24,6 @@ from voronerf.ops._core.capture import Capture
 from voronerf.ops._core.custom_op import is_watched
 from voronerf.ops._core.recording import Recording
 from voronerf.ops.adam.reference import judge
-
-#: After a recording that no step has replayed, the next 1, 2, 4, ... steps run as they are, so many at most.
-LONGEST_WAIT = 64
 
 
 class StepOutput:
@@ -66,24 +64,12 @@ class StepOutput:
     @property
     def batch(self) -> Batch:
         """The rays."""
-        return self._now(self._batch)
+        return self._batch if self._recording is None else cast(Batch, self._recording.now(self._batch))
 
     @property
     def output(self) -> RenderOutput:
         """What :class:`RayLoss` gave; its tensors are the step's own memory."""
-        return self._now(self._output)
-
-    def _now(self, recorded: Any) -> Any:
-        """Tensors of the recorded step as they are now, in whatever holds them."""
-        if self._recording is None:
-            return recorded
-        if isinstance(recorded, Tensor):
-            return self._recording.now(recorded)
-        if isinstance(recorded, tuple):
-            return type(recorded)(*map(self._now, recorded))
-        if hasattr(recorded, "__dataclass_fields__"):
-            return type(recorded)(**{name: self._now(value) for name, value in vars(recorded).items()})
-        return recorded
+        return self._output if self._recording is None else cast(RenderOutput, self._recording.now(self._output))
 
 
 class TrainingStep:
@@ -149,9 +135,9 @@ class TrainingStep:
         self._guards: Any = None
         self._cpu: Callable[[], Any]
         self._known: Radiance | None = None
-        self._between = dict[str, Recording]()
+        self._parts = dict[str, Part]()
         self._objects, self._values = list[Any](), list[Any]()
-        self._obstacle = ""
+        self._obstacle, self._same = "", False
 
     def explain(self) -> str:
         """Whether steps are replayed, and what keeps them from it."""
@@ -159,6 +145,8 @@ class TrainingStep:
             return "step: captured and replayed as a CUDA graph"
         if self._recording is not None:
             return f"step: recorded and replayed, {len(self._recording)} calls"
+        if parts := sum(part.recorded for part in self._parts.values()):
+            return f"step: {parts} parts of it are recorded and replayed"
         obstacle = self._obstacle or self._standing_obstacle()
         return "step: will be recorded" if obstacle is None else f"step: runs as it is, since {obstacle}"
 
@@ -190,6 +178,84 @@ class TrainingStep:
         if at is not None:
             self._after(at + steps, same)
         return output
+
+    def begin(self, at: int) -> None:
+        """Begins a step that another loop makes of parts, since the host computes something in between.
+
+        The sampler's ``step_pre_backward`` is called; then come parts (:meth:`part`), and :meth:`end`.
+
+        Args:
+            at: Steps done before.
+        """
+        asks, ask = self.loss.renderer.sampler.asks_at(at), self._asking(at)
+        if not asks:
+            ask()  # which may change the sampler
+        self._same = self._is_same()
+        if not self._same:
+            self.forget()
+            self._obstacle = self._standing_obstacle(draws=False) or ("it runs on a GPU" if self._on_gpu() else "")
+        if asks:
+            self.part("before", ask)
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def draw(self, rays: int) -> Batch:
+        """The part of a step that draws so many rays."""
+        draw = functools.partial(self.batches.draw, rays, self.generator)
+        if self.batches.fetch is not None:
+            return draw()
+        made = self.part("rays", draw, rows=(rays,))
+        return cast(Batch, made.now(made.value))
+
+    def part(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        *made: Made,
+        tensors: Sequence[Tensor] = (),
+        rows: Sequence[int] = (),
+    ) -> Made:
+        """A part of a step; it is recorded by itself, and replayed.
+
+        Args:
+            name: The same in each step.
+            function: Of the values of other parts, and of tensors, as of these objects.
+            made: What it reads of other parts of this step.
+            tensors: What it reads else.
+            rows: Numbers of rows that these have, and that change from step to step.
+        """
+        if self._obstacle:
+            return Made(function(*(each.now(each.value) for each in made), *tensors))
+        return self._parts.setdefault(name, Part())(function, made, tensors, rows)
+
+    def end(self, at: int, output: RenderOutput, *gradients: Made) -> None:
+        """Ends a step of parts: optimiser, sampler and splits learn.
+
+        Args:
+            at: Steps done, with this one.
+            output: What was found, with the loss.
+            gradients: The parts that have left gradients at the parameters; without any there is nothing to learn.
+        """
+        if gradients:
+            self.part(f"update of {len(gradients)}", self._update, *gradients, tensors=(output.loss,))
+        self._tell(output)
+        if not self._same and not self._obstacle:
+            self._guard()
+        self.optimizer.steps_done = at
+        if at % schedule.GROUP == 0:
+            self.part("after", functools.partial(self.optimizer.after_step, at))
+
+    def _update(self, *given: Any) -> None:
+        self.optimizer.update(self.guard, None if self.guard is None else given[-1])
+
+    def _asking(self, step: int) -> Callable[[], None]:
+        renderer = self.loss.renderer
+        return functools.partial(renderer.sampler.step_pre_backward, renderer.field, step, self.generator)
+
+    def _tell(self, output: RenderOutput) -> None:
+        """What sampler and splits learn of a step."""
+        self.loss.renderer.sampler.step_post_backward(output)
+        if self.strategy is not None:
+            self.strategy.step_post_backward(output)
 
     def _make(self, steps: int, same: bool | None) -> tuple[int, StepOutput, bool | None]:
         """Makes the next of so many steps, or more of them.
@@ -223,9 +289,8 @@ class TrainingStep:
 
     def _before(self, step: int) -> bool | None:
         """The sampler before a step, replayed where it asks the field; gives what :meth:`_beside` gives."""
-        sampler, field = self.loss.renderer.sampler, self.loss.renderer.field
-        ask = functools.partial(sampler.step_pre_backward, field, step, self.generator)
-        if sampler.asks_at(step):
+        ask = self._asking(step)
+        if self.loss.renderer.sampler.asks_at(step):
             return self._beside("before", ask, self._is_same())
         ask()
         return None
@@ -242,14 +307,9 @@ class TrainingStep:
         if not same or not isinstance(self._recording, Recording):
             function()
             return None
-        if name in self._between:
-            self._between[name].replay(backends.threads())
-            return True
-        with Recording() as recording:
-            function()
-        if recording.obstacle is None:
-            self._between[name] = recording
-        return None
+        part = self._parts.setdefault(name, Part())
+        part(function)
+        return True if part.replayed else None
 
     def _is_same(self) -> bool:
         """Whether all is as it was noted, and nothing of torch watches."""
@@ -264,9 +324,9 @@ class TrainingStep:
         before, on_gpu = self._recording, self._on_gpu()
         if not on_gpu or known:
             self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
-        between = self._between if known else {}
+        parts = self._parts if known else {}
         self.forget()
-        self._between = between
+        self._parts = parts
         if not on_gpu:
             with Recording() as recording:
                 made = self._run(recording.count(lambda: self._rays))
@@ -321,9 +381,7 @@ class TrainingStep:
             with torch.autocast(self.batches.device.type, self.autocast, cache_enabled=False):
                 output = self.loss(batch, self.generator)
             self._learn_scaled(output.loss)
-        self.loss.renderer.sampler.step_post_backward(output)
-        if self.strategy is not None:
-            self.strategy.step_post_backward(output)
+        self._tell(output)
         return batch, output
 
     def _learn_scaled(self, loss: Tensor) -> None:
@@ -339,8 +397,8 @@ class TrainingStep:
         scaler.step(self.optimizer)
         scaler.update()
 
-    def _standing_obstacle(self) -> str | None:
-        """What keeps any step from being replayed, whatever it computes."""
+    def _standing_obstacle(self, draws: bool = True) -> str | None:
+        """What keeps any step from being replayed, whatever it computes; one that draws its rays, or not."""
         if is_watched():
             return "a mode, a transform or a profiler of torch watches"
         renderer, device, place = self.loss.renderer, self.batches.device, self.batches.place
@@ -354,7 +412,7 @@ class TrainingStep:
             return f"it runs on the {chosen} backend"
         if self.autocast is not None:
             return "it runs under autocast"
-        if self.batches.fetch is not None:
+        if draws and self.batches.fetch is not None:
             return "its pictures are read from disk"
         for part in (self.batches, self.loss, self.loss.term, renderer.sampler, self.optimizer, self.strategy):
             if part is not None and not type(part).__module__.startswith("voronerf."):

@@ -8,11 +8,10 @@ What a territory computes does not depend on which rank has it. r rays, m sample
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,12 +19,15 @@ from torch import Tensor
 from voronerf.nerf.cameras import Rays
 from voronerf.nerf.loss import Batch, RenderOutput
 from voronerf.nerf.occupancy import HIDDEN
-from voronerf.nerf.radiance import radiance_of
+from voronerf.nerf.part import Made
+from voronerf.nerf.radiance import Radiance, radiance_of
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import Renderer
+from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.nerf.volume import Samples
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.ray_runs import OwnSamples, compose_runs, own_samples, run_gradients, run_sums
+from voronerf.ops.ray_runs.reference import along_rays, compose
 from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.town.group import Group, Key
 from voronerf.town.territories import Place
@@ -41,76 +43,150 @@ class Territory:
     """A territory of this rank."""
 
     place: Place
-    renderer: Renderer
-    generator: torch.Generator
+    step: TrainingStep
+
+    @property
+    def renderer(self) -> Renderer:
+        """Networks and sampler."""
+        return self.step.loss.renderer
+
+
+class Looked(NamedTuple):
+    """What the networks of a territory put out for its samples of rays."""
+
+    samples: OwnSamples
+    tape: Tape
+    sums: Tensor
+    density: Tensor
+
+
+class Learnt(NamedTuple):
+    """What a territory has learnt of the answers to its sums."""
+
+    weights: Tensor
+    gradients: list[tuple[torch.nn.Parameter, Tensor]]
 
 
 class Pass:
     """Rays [r] in one territory: its sums of them, and from the answers to these its gradients.
 
     Attributes:
-        ids: int64, the numbers of the rays that meet the territory's box.
-        sums: [q, 6] of its runs; the last column is a number in ``ids``.
-        end: [r], the depth at which a ray has ended here, or infinity.
+        sums: [q, 6] of its runs.
+        learnt: The part of the step that has left gradients at the parameters, if it had samples.
 
     Args:
+        name: Of its parts of the step.
         territory: Whose networks are asked.
         rays: r rays.
         near: [r].
         far: [r].
     """
 
-    def __init__(self, territory: Territory, rays: Rays, near: Tensor, far: Tensor) -> None:
-        renderer, place = territory.renderer, territory.place
-        self.renderer, self.ids = renderer, torch.arange(len(near), device=near.device)
-        self.end, bent = torch.full_like(near, math.inf), renderer.contraction is not None
-        if not bent:
+    def __init__(self, name: str, territory: Territory, rays: Rays, near: Tensor, far: Tensor) -> None:
+        self.name, self.territory, self.rays = name, territory, len(near)
+        self.found: Made | None = None
+        self.learnt: list[Made] = []
+        step, place, renderer = territory.step, territory.place, territory.renderer
+        if renderer.contraction is None:
             first, last, _ = intersect_box(rays.origins, rays.directions, place.box.to(near.device), 0.0, math.inf)
-            near, far = torch.maximum(near, first), torch.minimum(far, last)
-            self.ids = (far > near).nonzero()[:, 0]
-            rays, near, far = rays[self.ids], near[self.ids], far[self.ids]
+            near, far = torch.maximum(near, first), torch.minimum(far, last)  # without samples where the box is missed
         self.sums = near.new_empty(0, SUM)
         if not len(near):
             return
-        known = renderer.sampler.sample(rays, near, far, jitter=True, generator=territory.generator).counted()
-        cells = place.cells(known.positions, renderer.backend)
-        along = known.ray_index, known.depths, known.deltas, cells, place.own.to(cells.device)
-        self.own: OwnSamples = own_samples(known.positions, *along, bent=bent, backend=renderer.backend)
-        if not len(self.own.depths):
+        given = rays.origins, rays.directions, near, far
+        drawn = step.part(f"{name}: samples", self._draw, tensors=given, rows=(len(near),))
+        positions, ray_index, depths, deltas, cells = drawn.now(drawn.value)
+        along = ray_index, depths, deltas, cells, place.own.to(near.device)
+        bent = renderer.contraction is not None
+        own: OwnSamples = own_samples(positions, *along, bent=bent, backend=renderer.backend)
+        if not len(own.depths):
             return
+        rows = self.rays, len(own.depths), len(own.run_offsets) - 1
+        self.found = step.part(f"{name}: networks", self._look, tensors=(rays.directions, *own), rows=rows)
+        self.sums, self.own = self.found.now(self.found.value.sums), own
+
+    def _draw(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, ...]:
+        step, renderer = self.territory.step, self.territory.renderer
+        rays = Rays(origins, directions)
+        known = renderer.sampler.sample(rays, near, far, jitter=True, generator=step.generator).counted()
+        cells = self.territory.place.cells(known.positions, renderer.backend)
+        return known.positions, known.ray_index, known.depths, known.deltas, cells
+
+    def _look(self, directions: Tensor, *given: Tensor) -> Looked:
+        samples, backend, field = OwnSamples(*given), self.territory.renderer.backend, self._field()
+        tape = forward_with_tape(
+            field.arguments(samples.positions, directions, samples.ray_index, backend), backend=backend
+        )
+        return Looked(samples, tape, *run_sums(tape.raw, samples, **field.rule, backend=backend))
+
+    def _field(self) -> Radiance:
+        renderer = self.territory.renderer
         field = radiance_of(renderer.field, backend=renderer.backend)
         if isinstance(field, str) or field.networks.density_scale is None:
             raise ValueError(f"Pass: field must put out what comes before its activations, got {field}")
-        self.scale = field.networks.density_scale
-        network = field.arguments(self.own.positions, rays.directions, self.own.ray_index, renderer.backend)
-        self.tape: Tape = forward_with_tape(network, backend=renderer.backend)
-        self.sums, self.density = run_sums(self.tape.raw, self.own, density_scale=self.scale, backend=renderer.backend)
-        ray = self.sums[:, -1].long()
-        optical = torch.zeros_like(near).index_add_(0, ray, self.sums[:, 3])
-        last = torch.zeros_like(near).scatter_reduce_(
-            0, ray, self.own.depths[self.own.run_offsets[1:].long() - 1], "amax"
-        )
-        self.end[self.ids] = torch.where(optical > -math.log(FAINT), last, math.inf)
+        return field
 
-    def learn(self, answers: Tensor, loss: Tensor) -> RenderOutput | None:
+    def end(self) -> Tensor:
+        """[r], the depth at which a ray has ended here, or infinity."""
+        sums = self.sums
+        if not len(sums):
+            return sums.new_full((self.rays,), math.inf)
+        ray, last = sums[:, -1].long(), self.own.depths[self.own.run_offsets[1:].long() - 1]
+        optical = sums.new_zeros(self.rays).index_add_(0, ray, sums[:, 3])
+        deepest = sums.new_zeros(self.rays).scatter_reduce_(0, ray, last, "amax")
+        return torch.where(optical > -math.log(FAINT), deepest, math.inf)
+
+    def learn(self, answers: Tensor, loss: Tensor, *before: Made) -> RenderOutput | None:
         """Adds gradients to those of the parameters; returns what was found, None without samples.
 
         Args:
             answers: [q, 6], to the sums.
             loss: [], of the rays.
+            before: The parts that have left gradients before.
         """
-        if not len(self.sums):
+        if self.found is None:
             return None
-        rule: dict[str, Any] = {"density_scale": self.scale, "hidden": HIDDEN, "backend": self.renderer.backend}
-        gradient, weights = run_gradients(self.tape.raw, self.own, answers, **rule)
-        if (full := self.renderer.sampler.space.full_gradient) is not None:
-            scale_gradient(gradient, self.own.depths, full, backend=self.renderer.backend)
-        error = weights.new_zeros(len(self.ids))
+        rows, given = (self.rays, len(self.own.depths), len(answers)), (answers, loss)
+        name = f"{self.name}: gradients beside {len(before)}"
+        made = self.territory.step.part(name, self._learn, self.found, *before, tensors=given, rows=rows)
+        for parameter, gradient in made.value.gradients:
+            parameter.grad = gradient
+        self.learnt = [made]
+        own, weights = self.own, made.now(made.value.weights)
+        error = weights.new_zeros(self.rays)
         error[self.sums[:, -1].long()] = answers[:, -1]
-        own = self.own
         samples = Samples(own.positions, own.ray_index, own.run_offsets, own.depths, own.deltas)
-        loss = self.tape.backward(loss, gradient)
-        return RenderOutput(loss, error, weights, self.density, samples, weights.new_empty(0, 3))
+        density = self.found.now(self.found.value.density)
+        return RenderOutput(loss, error, weights, density, samples, weights.new_empty(0, 3))
+
+    def _learn(self, found: Looked, *given: Any) -> Learnt:
+        *_, answers, loss = given
+        renderer, optimizer = self.territory.renderer, self.territory.step.optimizer
+        rule: dict[str, Any] = {**self._field().rule, "hidden": HIDDEN, "backend": renderer.backend}
+        gradient, weights = run_gradients(found.tape.raw, found.samples, answers, **rule)
+        if (full := renderer.sampler.space.full_gradient) is not None:
+            scale_gradient(gradient, found.samples.depths, full, backend=renderer.backend)
+        found.tape.backward(loss, gradient)
+        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        return Learnt(weights, [(each, each.grad) for each in parameters if each.grad is not None])
+
+
+class Crossing(StepOutput):
+    """What a step of a territory has found, whose rays pass through others, too."""
+
+    def __init__(self, batch: Batch, output: RenderOutput, sums: Tensor) -> None:
+        super().__init__(batch, output)
+        self._sums = sums
+
+    def whole(self) -> StepOutput:
+        """The same rays through all territories, as if each had one sample."""
+        batch, sums = self.batch, self._sums[along_rays(self._sums[:, 5].long(), self._sums[:, 4])]
+        found = compose(sums[:, :3], sums[:, 3], sums[:, 5].long(), len(batch.rays))
+        behind = torch.zeros_like(batch.target) if batch.background is None else batch.background
+        index = torch.arange(len(batch.rays), device=sums.device)
+        samples = self.output.samples._replace(ray_index=index)
+        colour = found.colour + found.through[:, None] * behind
+        return StepOutput(batch, self.output._replace(weights=1 - found.through, samples=samples, colour=colour))
 
 
 def meet(bounds: Tensor, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
@@ -127,27 +203,31 @@ def step_together(
     territories: Mapping[int, Territory],
     owner: Sequence[int],
     bounds: Tensor,
-    batches: Mapping[int, Batch],
-) -> dict[int, RenderOutput]:
-    """The loss of the batches of all territories, and its gradients; all ranks call it together.
+    rays: Mapping[int, int],
+    at: Mapping[int, int],
+) -> dict[int, Crossing]:
+    """A step of all territories; all ranks call it together.
 
     Args:
         group: The ranks.
         territories: Of this rank, by their numbers.
         owner: The rank of each territory, [T].
         bounds: [T, 2, 3], around what of each is not empty.
-        batches: The rays that each own territory draws.
+        rays: How many each own territory draws.
+        at: Steps that it has done since it began.
 
     Returns:
-        What was found, for each own territory: on its own rays, and on those of others. A loss is that of its own rays.
+        What each own territory has found: on its own rays, and on those of others. A loss is that of its own rays.
     """
     count, bounds = len(owner), bounds.to(group.device)
-    homes: dict[int, Pass] = {}
+    batches, homes = dict[int, Batch](), dict[int, Pass]()
     gone: dict[Key, Tensor] = {}  # the rays that go from one territory to another
     sizes = torch.zeros(count, count, dtype=torch.int64)
-    for number, batch in batches.items():
-        home = homes[number] = Pass(territories[number], batch.rays, batch.near, batch.far)
-        met = meet(bounds, batch.rays, batch.near, torch.minimum(batch.far, home.end))
+    for number, territory in territories.items():
+        territory.step.begin(at[number])
+        batch = batches[number] = territory.step.draw(rays[number])
+        home = homes[number] = Pass("own rays", territory, batch.rays, batch.near, batch.far)
+        met = meet(bounds, batch.rays, batch.near, torch.minimum(batch.far, home.end()))
         for other in range(count):
             if other != number:
                 gone[number, other] = met[other].nonzero()[:, 0]
@@ -162,31 +242,44 @@ def step_together(
         keys = [key for key in came if key[1] == number]
         if keys:
             table = torch.cat([came[key] for key in keys])
-            rays = Rays(table[:, :3].contiguous(), table[:, 3:6].contiguous())
-            guest = guests[number] = Pass(territories[number], rays, *table[:, 6:].T.contiguous())
+            given = Rays(table[:, :3].contiguous(), table[:, 3:6].contiguous()), *table[:, 6:].T.contiguous()
+            guest = guests[number] = Pass("others' rays", territories[number], *given)
             for key, part in zip(keys, _parted(guest, [int(sizes[key]) for key in keys]), strict=True):
                 sums[key], found[key] = part, len(part)
     found = group.total(found)
     came = group.send(sums, found, owner, SUM, back=True)
     answers: dict[Key, Tensor] = {}
-    outputs: dict[int, list[RenderOutput]] = {number: [] for number in territories}
+    outputs: dict[int, RenderOutput] = {}
+    whole: dict[int, Tensor] = {}
     for number, home in homes.items():
         keys, batch = [key for key in came if key[0] == number], batches[number]
-        rows = [home.ids[home.sums[:, -1].long()], *(gone[key][came[key][:, -1].long()] for key in keys)]
+        rows = [home.sums[:, -1].long(), *(gone[key][came[key][:, -1].long()] for key in keys)]
         every = torch.cat([home.sums, *(came[key] for key in keys)])
         every[:, -1] = torch.cat(rows).to(every.dtype)
-        given: dict[str, Any] = {"background": batch.background, "first": 0, "rays": len(batch.target)}
-        told, loss = compose_runs(every, batch.target, **given, backend=home.renderer.backend)
+        whole[number] = every
+        told, loss = compose_runs(
+            every,
+            batch.target,
+            background=batch.background,
+            first=0,
+            rays=len(batch.target),
+            robust=territories[number].step.loss.robust,
+            backend=territories[number].renderer.backend,
+        )
         own, *rest = told.split([len(each) for each in rows])
         answers |= zip(keys, rest, strict=True)
-        learnt = home.learn(own, loss)
-        outputs[number].append(_nothing(loss) if learnt is None else learnt)
+        outputs[number] = home.learn(own, loss) or _nothing(loss)
     came = group.send(answers, found, owner, SUM)
-    for number, guest in guests.items():
-        own = torch.cat([guest.sums[:0], *(came[key] for key in came if key[1] == number)])
-        if (learnt := guest.learn(own, own.new_zeros(()))) is not None:
-            outputs[number].append(learnt)
-    return {number: functools.reduce(_both, each) for number, each in outputs.items() if each}
+    made = dict[int, Crossing]()
+    for number, output in outputs.items():
+        learnt = homes[number].learnt
+        if number in guests and len(guests[number].sums):
+            own = torch.cat([came[key] for key in came if key[1] == number])
+            also = guests[number].learn(own, own.new_zeros(()), *learnt)
+            output, learnt = output if also is None else _both(output, also), learnt + guests[number].learnt
+        territories[number].step.end(at[number] + 1, output, *learnt)
+        made[number] = Crossing(batches[number], output, whole[number])
+    return made
 
 
 def _table(batch: Batch, rows: Tensor) -> Tensor:
@@ -197,7 +290,7 @@ def _table(batch: Batch, rows: Tensor) -> Tensor:
 
 def _parted(guest: Pass, sizes: Sequence[int]) -> list[Tensor]:
     """The sums of rays that came in parts of these sizes, rays numbered in each."""
-    number = guest.ids[guest.sums[:, -1].long()]
+    number = guest.sums[:, -1].long()
     ends = torch.tensor([0, *sizes], device=number.device).cumsum(0)
     each = torch.searchsorted(number, ends).diff()
     sums = guest.sums.clone()

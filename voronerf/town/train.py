@@ -23,7 +23,7 @@ from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import write_scene
 from voronerf.app.train import Callback, Checkpoint, CheckpointError, ConfigError, State, TrainConfig, build, load
 from voronerf.app.train.build import make_batches, make_grid
-from voronerf.app.train.callbacks import KEPT, PATIENCE, all_finite, diverged
+from voronerf.app.train.callbacks import KEPT, PATIENCE, Divergence, all_finite, diverged
 from voronerf.app.train.checkpoint import (
     checkpoint_path,
     checkpoint_paths,
@@ -32,11 +32,14 @@ from voronerf.app.train.checkpoint import (
     save_checkpoint,
 )
 from voronerf.app.train.defaults import resolve
-from voronerf.app.train.loop import make_split
+from voronerf.app.train.loop import count, prepare
+from voronerf.app.train.loop import train as train_alone
 from voronerf.app.train.resume import snapshot
+from voronerf.app.train.start import judge_start, judged_at
 from voronerf.diagram import VoronoiDiagram
-from voronerf.nerf import Batch, Occupancy, OccupancyGrid, Perspective, RenderOutput, StepOutput
+from voronerf.nerf import Occupancy, OccupancyGrid, Perspective
 from voronerf.nerf.radiance import Radiance, radiance_of
+from voronerf.nerf.schedule import GROUP
 from voronerf.ops._core import backends
 from voronerf.town.geometry import Similarity
 from voronerf.town.group import Group, RankLost
@@ -94,6 +97,8 @@ class Town:
     def stop(self) -> None:
         """Ends the training on all ranks some steps later, with a checkpoint."""
         self.stopping = True
+        if len(self.owner) == 1:
+            self.first.stop()
 
     def exchange_bounds(self) -> None:
         """Exchanges the bounds of occupied space between ranks."""
@@ -170,13 +175,27 @@ def build_town(
                 empty=place.outside(grid),
                 backend=sampler.backend,
             )
-        members[number] = Territory(place, state.renderer, state.draws)
+        members[number] = Territory(place, state.training_step)
     render_config = whole
     if contraction is None and scene.box is not None:
         lengths = [float((box[1] - box[0]).norm()) for box in (scene.box, territories.boxes[0])]
         samples = resolve(config, territories.scene(scene, 0)).samples or (64,)
         render_config = replace(whole, samples=(math.ceil(samples[0] * lengths[0] / lengths[1]),))
     return Town(config, render_config, scene, group, territories, owner, states, members, territories.boxes.clone())
+
+
+class _Keep(Callback):
+    """Writes checkpoints of a training in one territory."""
+
+    group = GROUP
+
+    def __init__(self, town: Town, every: float) -> None:
+        self.town, self.every, self.saved_at = town, every, town.first.seconds
+
+    def after_step(self, state: State) -> None:
+        if state.seconds - self.saved_at >= self.every:
+            save(self.town)
+            self.saved_at = state.seconds
 
 
 def train(
@@ -200,16 +219,24 @@ def train(
         RankLost: When another rank has ended.
     """
     group, first, passed, saved_at = town.group, town.first, 0.0, town.first.seconds
+    if len(town.owner) == 1:  # nothing crosses a border
+        train_alone(first, [*callbacks, Divergence(town.out), _Keep(town, checkpoint_every)], clock=clock)
+        return save(town)
     alone = all(state.thread_deterministic for state in town.states.values())
     while first.fraction < 1 and not first.stopped:
         started = clock()
         with backends.torch_on_one_thread() if alone else nullcontext():
             if first.step % EXCHANGE_EVERY == 0 or (first.step < EXCHANGE_EVERY and first.step & (first.step - 1) == 0):
                 town.exchange_bounds()
-            batches = {number: _prepare(state) for number, state in town.states.items()}
-            outputs = step_together(group, town.members, town.owner, town.bounds, batches)
+            for state in town.states.values():
+                prepare(state, patient=True)
+            rays = {number: state.rays for number, state in town.states.items()}
+            at = {number: state.step - state.began for number, state in town.states.items()}
+            made = step_together(group, town.members, town.owner, town.bounds, rays, at)
             for number, state in town.states.items():
-                _learn(state, batches[number], outputs[number])
+                count(state, 1, made[number])
+                if state.step == judged_at(state):
+                    judge_start(state, made[number].whole())
         passed += clock() - started
         if group.size == 1 or first.step % AGREE_EVERY == 0 or first.step == town.config.steps:
             agreed = torch.tensor([passed * (group.rank == 0), float(town.stopping)], dtype=torch.float64)
@@ -233,28 +260,6 @@ def train(
             with state.averaged():
                 state.sampler.finish(state.renderer.field, state.config.seed)
     save(town)
-
-
-def _prepare(state: State) -> Batch:
-    """What comes before the loss of a step: splits, empty space, rays."""
-    optimizer = state.optimizer
-    if state.strategy.has_samples():
-        make_split(state)
-    optimizer.set_learning_rate(state.learning_rate())
-    state.sampler.step_pre_backward(state.renderer.field, state.step, state.generator)
-    state.renderer.train()
-    optimizer.zero_grad(set_to_none=True)
-    return state.batches.draw(state.rays, state.draws)
-
-
-def _learn(state: State, batch: Batch, output: RenderOutput) -> None:
-    """What comes after the loss of a step has left its gradients."""
-    state.sampler.step_post_backward(output)
-    state.optimizer.update(state.guard, output.loss)
-    state.strategy.step_post_backward(output)
-    state.count_steps(1, len(batch.rays))
-    state.optimizer.after_step(state.step - state.began)
-    state.read_output(StepOutput(batch, output))
 
 
 # Files ----------------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from voronerf.app.train.start import judge_start, steps_to_judgement
 from voronerf.app.train.state import State
 from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.split import SplitDone
+from voronerf.nerf.step import StepOutput
 from voronerf.ops._core import backends
 
 #: On a GPU, steps between two times that the host reads the loss and thereby waits for the device.
@@ -73,23 +74,16 @@ def train(
         until: Training seconds.
         clock: Counts seconds.
     """
-    strategy, sampler, optimizer = state.strategy, state.sampler, state.optimizer
     before, one_thread = state.step, backends.torch_on_one_thread if state.thread_deterministic else nullcontext
     state.training_step.as_it_is, quick = one_thread, GROUP
     while state.fraction < 1 and state.seconds < until and not state.stopped:
         started = clock()
-        if strategy.is_due(state.fraction, state.step):
-            with one_thread():
-                make_split(state, callbacks)
-        optimizer.set_learning_rate(state.learning_rate())
-        if not state.router.training:
-            state.renderer.train()
+        with one_thread():
+            prepare(state, callbacks)
         group = min((callback.group for callback in callbacks), default=GROUP)
         steps = min(state.steps_alike(), steps_to_judgement(state), group, quick)
         made = state.training_step(state.rays, steps, at=state.step - state.began)
-        state.count_steps(steps, made.rays)
-        if state.device.type == "cpu" or state.step % READ_EVERY == 0:
-            state.read_output(made)
+        count(state, steps, made)
         judge_start(state, made)
         taken = clock() - started
         state.add_seconds(taken)
@@ -99,21 +93,37 @@ def train(
     if state.fraction >= 1 and state.step > before:  # once, however often this is called
         started = clock()
         with state.averaged():
-            sampler.finish(state.renderer.field, state.config.seed)
+            state.sampler.finish(state.renderer.field, state.config.seed)
         state.add_seconds(clock() - started)
 
 
-def make_split(state: State, callbacks: Sequence[Callback] = ()) -> None:
-    """Makes a split that is due, if there are enough samples for it."""
+def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool = False) -> None:
+    """What comes before steps: a split that is due, the learning rate.
+
+    Args:
+        state: Between two steps.
+        callbacks: Told of a split.
+        patient: Whether a split waits for samples that it lacks, which is an error else.
+    """
     strategy, optimizer = state.strategy, state.optimizer
-    done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
-    if done is None:
-        return
-    state.begin_stage(done)
-    if not strategy.inherit:  # the averages are of networks that are no more
-        optimizer.drop_averages()
-    for callback in callbacks:
-        callback.after_split(state, done)
+    if strategy.is_due(state.fraction, state.step) and (not patient or strategy.has_samples()):
+        done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
+        if done is not None:
+            state.begin_stage(done)
+            if not strategy.inherit:  # the averages are of networks that are no more
+                optimizer.drop_averages()
+            for callback in callbacks:
+                callback.after_split(state, done)
+    optimizer.set_learning_rate(state.learning_rate())
+    if not state.router.training:
+        state.renderer.train()
+
+
+def count(state: State, steps: int, made: StepOutput) -> None:
+    """Counts steps, and reads what the last of them has found."""
+    state.count_steps(steps, made.rays)
+    if state.device.type == "cpu" or state.step % READ_EVERY == 0:
+        state.read_output(made)
 
 
 def run(state: State, callbacks: Sequence[Callback] = (), *, clock: Callable[[], float] = time.perf_counter) -> None:

@@ -34,7 +34,7 @@ def judge_start(state: State, made: StepOutput) -> None:
         state: After a step.
         made: That step.
     """
-    if state.step != _judged_at(state):
+    if state.step != judged_at(state):
         return
     draw = sum(stage.cells == 1 for stage in state.stages)
     if state.router.num_cells > 1 or draw > DRAWS:
@@ -56,11 +56,12 @@ def judge_start(state: State, made: StepOutput) -> None:
 
 def steps_to_judgement(state: State) -> int:
     """How many steps can be made before :func:`judge_start` may judge; `GROUP` where it will not."""
-    left = _judged_at(state) - state.step
+    left = judged_at(state) - state.step
     return left if left > 0 else GROUP
 
 
-def _judged_at(state: State) -> int:
+def judged_at(state: State) -> int:
+    """After which step a start is judged; 0 for none."""
     return 0 if state.sampler.grid is None else state.began + state.sampler.settling_steps + JUDGED
 
 

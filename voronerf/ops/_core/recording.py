@@ -16,7 +16,7 @@ from __future__ import annotations
 import ctypes
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -77,9 +77,10 @@ class Recording(TorchDispatchMode):
         self._compiled, self._calls = native.compiled, native.compiled.Recording()
         self._counts = list[Count]()
         self._numbers = list[tuple[Tensor, Callable[[], float]]]()
-        self._drawn = list[Tensor]()
+        self._drawn, self._taken = list[Tensor](), list[Tensor]()
         self._range: tuple[int, int, torch.Generator, torch.dtype, int] | None = None  # that all are drawn from
         self._memory: dict[int, Tensor] = {}  # of rows, by address
+        self._places: dict[Tensor, tuple[Tensor, int] | None] = {}
         self.obstacle: str | None = None
 
     @classmethod
@@ -116,6 +117,14 @@ class Recording(TorchDispatchMode):
         self._numbers.append((number, value))
         return number
 
+    def take(self, given: Tensor) -> Tensor:
+        """Memory for a tensor that each run is given, with rows that were counted; it holds that of this run."""
+        memory = given.new_empty(given.shape)
+        with _disable_current_modes():
+            memory.copy_(given)
+        self._taken.append(self._memory.get(memory.untyped_storage().data_ptr(), memory))  # for the most rows
+        return memory
+
     def _add(self, memory: Tensor, rows: int, given: Callable[[], int] | None) -> None:
         if any(abs(rows - other.rows) <= 1 for other in self._counts):  # a tensor has one more of them, or not
             self._refuse(f"two numbers of rows are much the same, {rows}")
@@ -127,12 +136,13 @@ class Recording(TorchDispatchMode):
     def _refuse(self, why: str) -> None:
         self.obstacle = self.obstacle or why or None
 
-    def replay(self, threads: int, times: int = 1) -> int:
+    def replay(self, threads: int, times: int = 1, taken: Sequence[Tensor] = ()) -> int:
         """Makes the calls again.
 
         Args:
             threads: Of the calls.
             times: How often, in a row.
+            taken: What :meth:`take` was given, for this run.
 
         Returns:
             How often they were made: less where there is no memory for the rows.
@@ -148,6 +158,8 @@ class Recording(TorchDispatchMode):
                 count.memory.fill_(rows)
         for number, value in self._numbers:
             number.fill_(value())
+        for memory, given in zip(self._taken, taken, strict=True):
+            (memory[: len(given)] if given.dim() else memory).copy_(given)
         if self._range is None:
             return self._calls.replay(threads, times, 0, [], 0)
         low, high, generator, dtype, size = self._range
@@ -171,14 +183,33 @@ class Recording(TorchDispatchMode):
                 return int(memory)
         return tensor.shape[0]
 
-    def now(self, tensor: Tensor) -> Tensor:
-        """A tensor of the recorded run, with as many rows as the last run has filled."""
+    def now(self, found: Any) -> Any:
+        """Tensors of the recorded run, in whatever holds them, with as many rows as the last run has filled."""
+        if isinstance(found, Tensor):
+            return self._tensor_now(found)
+        if isinstance(found, (list, tuple)):
+            own = map(self.now, found)
+            return type(found)(*own) if hasattr(found, "_fields") else type(found)(own)
+        if hasattr(found, "__dataclass_fields__"):
+            return type(found)(**{name: self.now(value) for name, value in vars(found).items()})
+        return found
+
+    def _tensor_now(self, tensor: Tensor) -> Tensor:
+        if tensor not in self._places:
+            self._places[tensor] = self._place(tensor)
+        place = self._places[tensor]
+        if place is None:
+            return tensor
+        memory, more = place
+        return tensor.as_strided((int(memory) + more, *tensor.shape[1:]), tensor.stride(), tensor.storage_offset())
+
+    def _place(self, tensor: Tensor) -> tuple[Tensor, int] | None:
+        """Where the number of its rows lies, and how many more it has; None for a number that stays."""
         for memory, rows, _, _ in self._counts if self._is_counted(tensor) else ():
             for more in (0, 1):
                 if tensor.shape[:1] == (rows + more,):
-                    shape = (int(memory) + more, *tensor.shape[1:])
-                    return tensor.as_strided(shape, tensor.stride(), tensor.storage_offset())
-        return tensor
+                    return memory, more
+        return None
 
     def _is_counted(self, tensor: Tensor) -> bool:
         return tensor.untyped_storage().data_ptr() in self._memory

@@ -1,8 +1,8 @@
 """``forward_with_tape`` of the compiled module, in float32.
 
-Checks and nodes of ``routed_mlp``, a loss and their backward passes take a tenth of a step of a few thousand samples.
-Here the gradients of the parameters are computed as soon as that of the outputs is known, and given to the parameters
-themselves, where autograd would do no more; or one node of autograd hands them over.
+The gradients of the parameters are computed as soon as that of the outputs is known, and given to the parameters
+themselves, where autograd would do no more: its own operations would keep a step from being recorded
+(voronerf/ops/_core/recording.py). Else one node of autograd hands them over.
 """
 
 from __future__ import annotations
@@ -66,8 +66,7 @@ class _Kept(Tape):
             pairs = zip(found, learning, strict=True)
             found = [slope if slope.shape == tensor.shape else slope.view_as(tensor) for slope, tensor in pairs]
             if not defer and all(map(_takes_gradients, learning)):
-                for parameter, slope in zip(learning, found, strict=True):
-                    parameter.grad = slope if parameter.grad is None else parameter.grad.add_(slope)
+                _give(learning, found)
                 return loss
         return learnt(with_gradients(loss, learning, found), defer)
 
@@ -80,6 +79,21 @@ class _Kept(Tape):
         if self.frozen is not None:  # rows of zeros leave the backward pass
             gradient = gradient.masked_fill(of_samples(self.frozen, self.cells), 0)
         return run_gradient(self.taken, self.how, [gradient], wanted)
+
+
+def _give(parameters: Sequence[Tensor], slopes: Sequence[Tensor]) -> None:
+    totals, added = list[Tensor](), list[Tensor]()
+    for parameter, slope in zip(parameters, slopes, strict=True):
+        total = parameter.grad
+        if total is None:
+            parameter.grad = slope
+        elif total.is_cpu and total.is_contiguous():
+            totals.append(total)
+            added.append(slope)
+        else:
+            total.add_(slope)
+    if totals:  # not by torch, so that a recording can do it again
+        native.compiled.add(added, totals, [total.numel() for total in totals], native.cpu())
 
 
 def _takes_gradients(parameter: Tensor) -> bool:

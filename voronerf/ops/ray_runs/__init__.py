@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import Implementation
-from voronerf.ops._core.checks import INDEX, LIKE_FIRST, MAX_GROUPS, Checked, check_range, check_shape
+from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_range, check_shape
 from voronerf.ops._core.declare import declare
 from voronerf.ops.ray_runs.reference import OwnSamples
 
@@ -114,6 +114,7 @@ def compose_runs(
     background: Annotated[Tensor | None, "same [3] or [r, 3]"] = None,
     first: Annotated[int, "0.."],
     rays: Annotated[int, "1.."],
+    robust: Annotated[float, "[0, 1)"] = 0.0,
     backend: str = "auto",
 ) -> tuple[Annotated[Tensor, "same [q, 6]"], Annotated[Tensor, "same []"]]:
     """Puts rays together from the runs of all ranks, and says what each run must know of its ray.
@@ -124,6 +125,7 @@ def compose_runs(
         background: [3] or [r, 3], what is behind them, or None.
         first: The number of the first of these rays.
         rays: How many all ranks have.
+        robust: As in `render_loss`.
         backend: "auto", "reference" or "native".
 
     Returns:
@@ -186,30 +188,17 @@ def run_gradients(
 
 
 def _check_samples(op: str, given: Any) -> Any:
-    raw, samples = given.raw, given.samples
-    floats, whole = (samples.deltas, samples.depths), (samples.ray_index, samples.run_offsets)
-    rows = len(raw), len(raw), len(raw), None
-    if not raw.is_cpu or not all(map(_is_plain, (*floats, *whole), (raw.dtype,) * 2 + INDEX * 2, rows)):
-        checked = Checked(op)  # which says what is wrong
-        checked.tensor("raw", raw, (raw.dtype,), "m", 4)
-        checked.tensor("deltas", samples.deltas, LIKE_FIRST, "m")
-        checked.tensor("depths", samples.depths, LIKE_FIRST, "m")
-        checked.tensor("ray_index", samples.ray_index, INDEX, "m")
-        checked.tensor("run_offsets", samples.run_offsets, INDEX, "q+1")
+    raw, samples, checked = given.raw, given.samples, Checked(op)
+    checked.tensor("raw", raw, (raw.dtype,), "m", 4)
+    checked.tensor("deltas", samples.deltas, LIKE_FIRST, "m")
+    checked.tensor("depths", samples.depths, LIKE_FIRST, "m")
+    checked.tensor("ray_index", samples.ray_index, INDEX, "m")
+    checked.tensor("run_offsets", samples.run_offsets, INDEX, "q+1")
     if not raw.is_cpu or torch.compiler.is_compiling():
         return given
-    m, offsets = len(raw), samples.run_offsets.numpy()  # whose operations take a tenth of the time of torch's
+    m, offsets = len(raw), samples.run_offsets.numpy()  # without a call of torch's, which no recording could replay
     if offsets[0] != 0 or offsets[-1] != m or not (offsets[1:] > offsets[:-1]).all():
         raise ValueError(
             f"{op}: run_offsets must rise from 0 to the {m} samples, a run having one at least, got others"
         )
     return given
-
-
-def _is_plain(tensor: Tensor, dtype: torch.dtype, rows: int | None) -> bool:
-    """Whether it is a CPU tensor of this type and so many rows, or of one at least."""
-    if type(tensor) is not Tensor or tensor.dtype is not dtype or not tensor.is_cpu or tensor.dim() != 1:
-        return False
-    return tensor.layout is torch.strided and (
-        1 <= len(tensor) <= MAX_GROUPS + 1 if rows is None else len(tensor) == rows
-    )

@@ -27,7 +27,14 @@ def _make_outputs(draw: Draw, n: int) -> Arguments:
 def _make_sums(draw: Draw, n: int) -> Arguments:
     sums, _ = run_sums(**_make_outputs(draw, n), backend="reference")
     background = draw.among("background", draw.uniform(3, 3), draw.uniform(3), None)
-    return {"sums": sums, "target": draw.uniform(3, 3), "background": background, "first": 0, "rays": 3}
+    return {
+        "sums": sums,
+        "target": draw.uniform(3, 3),
+        "background": background,
+        "first": 0,
+        "rays": 3,
+        "robust": draw.among("robust", 0.0, 0.05),
+    }
 
 
 def _make_answers(draw: Draw, n: int) -> Arguments:

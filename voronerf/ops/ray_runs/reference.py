@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from voronerf.ops.composite.reference import Composite, composite
-from voronerf.ops.render_loss.reference import kept
+from voronerf.ops.render_loss.reference import kept, robust_error
 
 #: Stands for infinite density, as in `composite`.
 _OPAQUE = 1e30
@@ -183,7 +183,7 @@ def run_sums(raw: Tensor, samples: OwnSamples, density_scale: float) -> tuple[Te
 
 
 def compose_runs(
-    sums: Tensor, target: Tensor, background: Tensor | None, first: int, rays: int
+    sums: Tensor, target: Tensor, background: Tensor | None, first: int, rays: int, robust: float
 ) -> tuple[Tensor, Tensor]:
     """Answers [q, 6] to the sums, and the part [] of the loss; see ``voronerf.ops.compose_runs``."""
     number = sums[:, 5].double()
@@ -197,10 +197,10 @@ def compose_runs(
     whole = compose(part, optical, ray, len(target))
     behind = torch.zeros_like(target) if background is None else background.expand_as(target)
     off = whole.colour + whole.through[:, None] * behind - target
-    error, slopes = off.square().sum(-1), off * (2 / (3 * rays))
-    return answer(order, whole, whole.behind(part, ray, slopes, behind), slopes[ray], error[ray]), error.sum() / (
-        3 * rays
-    )
+    error = off.square().sum(-1)
+    slope = robust / (error + robust**2).sqrt() if robust else torch.ones_like(error)
+    slopes, loss = off * (2 / (3 * rays) * slope)[:, None], robust_error(error, robust).sum() / (3 * rays)
+    return answer(order, whole, whole.behind(part, ray, slopes, behind), slopes[ray], error[ray]), loss
 
 
 def answer(order: Tensor, whole: Composed, behind: Tensor, slopes: Tensor, error: Tensor) -> Tensor:
