@@ -14,7 +14,7 @@ from voronerf.app.evaluate.metrics import psnr, ssim
 from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene
 from voronerf.nerf.cameras import Cameras
-from voronerf.nerf.renderer import RenderedImage, Renderer
+from voronerf.nerf.renderer import Renderer
 
 #: Shows progress: yields the items of a sequence, and is given its name.
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
@@ -46,11 +46,6 @@ def view_numbers(count: int, views: int | None) -> list[int]:
     if views is None or views >= count:
         return list(range(count))
     return [i * count // views for i in range(views)]
-
-
-def render_view(renderer: Renderer, scene: Scene, view: int, *, heaviest: bool = True) -> RenderedImage:
-    """A test view of a scene, see :func:`render_camera`."""
-    return render_camera(renderer, scene, scene.test.cameras, view, heaviest=heaviest)
 
 
 def evaluate(
