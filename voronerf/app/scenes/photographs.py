@@ -20,7 +20,7 @@ from torch import Tensor
 
 from voronerf.app.scenes.carving import carve_box
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.images import Header, read_images, read_masks
+from voronerf.app.scenes.images import Decoded, Header, read_images, read_masks
 from voronerf.app.scenes.lenses import FISHEYE, PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
 from voronerf.app.scenes.scene import Scene, SparseDepth, Split
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras
@@ -130,9 +130,9 @@ def photograph_scene(
         held_out = None if held_out is None else held_out[~lost]
     views, count = _training_first(views, held_out, source)
     name = folder.resolve().name
-    pictures = _read_pictures(views, factor, reading, source, name)
+    poses = torch.stack([view.pose for view in views])
+    pictures, masks, kind = _read_pictures(views, poses, factor, reading, source, name)
     bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64)
-    poses, kind = _poses(views), pictures.kind
     upright = _turned(Cameras(poses, torch.ones(len(poses), 4), 1, 1), pictures.turns).poses
     frame = find_frame(upright, kind, bounds if len(bounds) else None, normalise=reading.normalise)
     cameras = _cameras(frame.poses(poses), views, pictures.sizes, source)
@@ -143,7 +143,7 @@ def photograph_scene(
         _ = cameras.lenses
     except ValueError as error:
         raise SceneError(f"{source}: {error}") from None
-    masks = _without_dark_corners(cameras, pictures.masks, source, views)
+    masks = _without_dark_corners(cameras, masks, source, views)
     names = tuple(distinct_names([view.path for view in views], folder))
     train, test = (
         Split(
@@ -183,33 +183,22 @@ def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path
     return [views[index] for index in order], count
 
 
-class Pictures(NamedTuple):
-    """The images and masks of views, see `read_images`, and the kind of scene that they show."""
-
-    images: Tensor
-    masks: Tensor | None
-    sizes: Tensor
-    turns: list[int]
-    on_disk: bool
-    kind: str
-
-
-def _read_pictures(views: Sequence[View], factor: int, reading: Reading, source: Path, name: str) -> Pictures:
-    """Reads the image files of views; alpha stays where an object stands on white."""
+def _read_pictures(
+    views: Sequence[View], poses: Tensor, factor: int, reading: Reading, source: Path, name: str
+) -> tuple[Decoded, Tensor | None, str]:
+    """Reads images and masks of views, and tells the kind of scene; only an object keeps its alpha."""
     paths, headers = [view.path for view in views], [view.header for view in views]
     read = functools.partial(read_images, paths, factor, headers=headers, name=name, upright=True)
-    images, sizes, on_disk, turns = read(keep=reading.images)
-    masks = read_masks([view.mask for view in views], paths, sizes, factor, on_disk=on_disk, name=name, turns=turns)
-    alpha = images.shape[-1] == 4 and any(bool((image[..., 3] < 255).any()) for image in images)
-    kind = _kind(_poses(views), alpha, reading.kind, source)
-    if kind != "object" and images.shape[-1] == 4:
+    pictures = read(keep=reading.images)
+    masks = read_masks([view.mask for view in views], paths, pictures, factor, name=name)
+    has_alpha = pictures.images.shape[-1] == 4
+    transparent = has_alpha and any(bool((image[..., 3] < 255).any()) for image in pictures.images)
+    kind = _kind(poses, transparent, reading, source)
+    if kind != "object" and has_alpha:
         # On disk they are stored again: a part of each pixel cannot be drawn from a mapped file without a copy.
-        images = read(keep="disk", most_channels=3).images if on_disk else images[..., :3].contiguous()
-    return Pictures(images, masks, sizes, turns, on_disk, kind)
-
-
-def _poses(views: Sequence[View]) -> Tensor:
-    return torch.stack([view.pose for view in views])
+        again = read(keep="disk", most_channels=3) if pictures.on_disk else None
+        pictures = again or pictures._replace(images=pictures.images[..., :3].contiguous())
+    return pictures, masks, kind
 
 
 def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
@@ -353,13 +342,13 @@ def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
     return torch.stack((x, torch.linalg.cross(z, x), z))
 
 
-def _kind(poses: Tensor, alpha: bool, asked: str, source: Path) -> str:
-    """The kind that was asked for, or the one that alpha and cameras show."""
-    if asked == "object" and not alpha:
+def _kind(poses: Tensor, transparent: bool, reading: Reading, source: Path) -> str:
+    """The kind that was asked for, or the one that transparent pixels and cameras show."""
+    if reading.kind == "object" and not transparent:
         raise SceneError(f"{source}: --kind object needs images with transparent pixels, these are opaque")
-    if asked != "auto":
-        return asked
-    if alpha:
+    if reading.kind != "auto":
+        return reading.kind
+    if transparent:
         return "object"
     cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
     forward = cameras.forward
