@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 
 from voronerf.app.evaluate.lpips import Lpips
 from voronerf.app.evaluate.metrics import psnr, ssim
-from voronerf.app.render.camera import render_camera
+from voronerf.app.render.camera import crop_camera, render_camera
 from voronerf.app.scenes import Scene
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.renderer import Renderer
@@ -108,9 +108,7 @@ def _middle_of(cameras: Cameras, view: int, factor: int) -> tuple[Cameras, slice
     (width, height), camera = cameras.size(view), cameras[[view]]
     part = max(width // factor, 1), max(height // factor, 1)
     left, top = (width - part[0]) // 2, (height - part[1]) // 2
-    if factor > 1:
-        moved = camera.intrinsics - camera.intrinsics.new_tensor((0, 0, left, top))
-        camera = replace(camera, intrinsics=moved, width=part[0], height=part[1], sizes=None)
+    camera = crop_camera(camera, left, top, *part) if factor > 1 else camera
     return camera, slice(top, top + part[1]), slice(left, left + part[0])
 
 

@@ -11,7 +11,6 @@ import concurrent.futures
 import contextlib
 import io
 import logging
-import math
 import queue
 import socket
 import threading
@@ -26,7 +25,7 @@ import viser
 from voronerf.app.run import Run
 from voronerf.app.train.config import ConfigError
 from voronerf.app.train.run_directory import read_curve
-from voronerf.app.viewer.cameras import axial_depth, look_point
+from voronerf.app.viewer.cameras import axial_depth, frustum, look_point
 from voronerf.app.viewer.client import Client
 from voronerf.app.viewer.door import guarded
 from voronerf.app.viewer.pictures import Look, Subject, picture_of, render_bands, render_look, stack_bands
@@ -108,10 +107,9 @@ class Viewer:
     def _stand(self) -> None:
         """Starts new browsers at the first test view."""
         start, scene = self.server.initial_camera, self.subject.scene
-        cameras = scene.test.cameras
-        start.position = cameras.origins[0].numpy()
-        start.look_at = look_point(scene, cameras, 0).numpy()
-        start.fov = 2 * math.atan(cameras.size(0)[1] / 2 / float(cameras.intrinsics[0, 1]))
+        seen = frustum(scene.test.cameras, 0)
+        start.position, start.fov = seen["position"], seen["fov"]
+        start.look_at = look_point(scene, scene.test.cameras, 0).numpy()
 
     def show(self, subject: Subject, points: Sequence[tuple[float, float]] = ()) -> None:
         """Shows another subject to every browser, with its curve; see :meth:`show_curve`."""
