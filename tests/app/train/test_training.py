@@ -170,7 +170,7 @@ def test_parameters_decide_the_width(scene, field):
     state = build(small(width=None, depth=None, field=field, parameters=30_000), scene)
     config = state.config
     assert config.width == solve_width(config, 30_000) and config.lr == 0.02
-    assert count_parameters(config) <= 30_000 < count_parameters(config, config.width + 1)
+    assert count_parameters(config) <= 30_000 < count_parameters(config, width=config.width + 1)
     steps_of(state, 13)
     assert count_parameters(config) == state.parameter_count
     again = build(replace(small(field=field, parameters=30_000, width=None, depth=None), **HIERARCHICAL), scene)
