@@ -23,7 +23,7 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.images import Decoded, Header, read_images, read_masks
 from voronerf.app.scenes.lenses import FISHEYE, PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
 from voronerf.app.scenes.scene import Scene, SparseDepth, Split
-from voronerf.app.scenes.soundness import camera_faults, lost_cameras
+from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
 from voronerf.nerf.cameras import Cameras, focus_point
 from voronerf.nerf.contraction import Contraction, Perspective
 
@@ -40,8 +40,6 @@ FAR = 4.0
 LEAST_NEAR = 0.02
 # Of the bounds of the views: things may be a little nearer than the nearest point, and farther than the farthest.
 NEARER, FARTHER = 0.75, 1.5
-# Cameras that a line names.
-MOST_NAMED = 8
 # Mean of the viewing directions, a unit vector each, from which on they count as one direction.
 PARALLEL = 0.95
 KIND_LINES = {
@@ -204,13 +202,9 @@ def _read_pictures(
 def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
     """A line about the views whose cameras lie far from the others, bool [c]: one would give the scene its scale."""
     names = [view.path.name for view, apart in zip(views, far.tolist()) if apart]
-    if not names:
-        return []
-    if len(names) > MOST_NAMED:
-        names[MOST_NAMED:] = [f"{len(names) - MOST_NAMED} more"]
-    which = f"{int(far.sum())} of {len(views)} cameras lie far from the others"
+    which = f"{len(names)} of {len(views)} cameras lie far from the others"
     done = "and are kept, as asked" if kept else "and are left out (--keep-far keeps them)"
-    return [f"{which} {done}: {', '.join(names)}"]
+    return [f"{which} {done}: {some_of(names)}"] if names else []
 
 
 def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDepth | None:
