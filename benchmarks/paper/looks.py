@@ -17,8 +17,8 @@ from turns import Training
 
 from paper.slices import slice_density, slice_points
 from voronerf.app.evaluate.metrics import psnr
-from voronerf.app.evaluate.scores import render_view
 from voronerf.app.files import write_bytes
+from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene
 from voronerf.app.train import State
 
@@ -67,7 +67,7 @@ def picture(state: State) -> dict[str, Any]:
     scene, router = state.scene, state.router
     view = held_out_view(scene)
     with state.averaged():
-        image = render_view(state.renderer, scene, view)
+        image = render_camera(state.renderer, scene, scene.test.cameras, view)
     cells = router.diagram.locate(image.heaviest.reshape(-1, 3), backend=state.config.backend)
     found = {
         "colour": (image.colour.clamp(0, 1) * 255).round().to(torch.uint8),

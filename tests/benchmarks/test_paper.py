@@ -219,8 +219,8 @@ def test_matched_parameters(settings):
     for name in ("12 cells", "4 cells, matched", "32 cells, matched", "one network, matched"):
         run = runs.make_run(runs.Variant(name, variants[name]), "builtin", 0, settings)
         config = resolve(run.config, scene)
-        width = None if config.parameters is None else solve_width(config, config.parameters)
-        counts[name] = count_parameters(config, width)
+        options = {} if config.parameters is None else {"width": solve_width(config, config.parameters)}
+        counts[name] = count_parameters(config, **options)
     assert all(0.9 * counts["12 cells"] < count <= counts["12 cells"] for count in counts.values())
 
 

@@ -13,12 +13,11 @@ from voronerf.nerf.cameras import Rays
 from voronerf.nerf.occupancy import HIDDEN
 from voronerf.nerf.radiance import Radiance, radiance_of, router_of
 from voronerf.nerf.renderer import Renderer
-from voronerf.nerf.sampling import colour_loss
 from voronerf.nerf.volume import Rendered, Samples, composed
 from voronerf.ops._core import backends
 from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.ops.render_loss import render_loss_gradient
-from voronerf.ops.render_loss.reference import activate
+from voronerf.ops.render_loss.reference import activate, robust_error
 from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.sparse_depth_gradient.reference import sparse_depth_loss
@@ -210,7 +209,8 @@ class RayLoss:
         *before, last = self.renderer.render(
             batch.rays, batch.near, batch.far, background=batch.background, jitter=True, generator=generator
         )
-        loss, samples = colour_loss(last.colour, batch.target, self.robust), last.samples
+        samples, error = last.samples, (last.colour - batch.target).square().sum(-1)
+        loss = robust_error(error, self.robust).mean() / 3
         if self.sparse_depth and batch.sparse_depths is not None:
             along = last.weights, samples.depths, samples.deltas, samples.ray_offsets
             loss = loss + self.sparse_depth * sparse_depth_loss(*along, batch.sparse_depths).mean()
@@ -218,30 +218,24 @@ class RayLoss:
             loss = loss + self.term(last, batch)
         for first in before:
             loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
-        error = (last.colour.detach() - batch.target).square().sum(-1)
         if backward:
             loss.backward()
             loss = loss.detach()
-        return RenderOutput(loss, error, last.weights.detach(), last.density.detach(), samples, last.colour.detach())
+        error, weights, density, colour = (x.detach() for x in (error, last.weights, last.density, last.colour))
+        return RenderOutput(loss, error, weights, density, samples, colour)
 
     def explain(self) -> str:
         """How a step is computed, and what keeps it from a faster way: some lines."""
         renderer = self.renderer
         lines = [f"samples: {renderer.sampler.explain()}"]
-        obstacle = self.why_not_fused()
-        separate = obstacle is not None
-        if not separate:
-            device, dtype = renderer.device, torch.float32
-            chosen = backends.chosen("forward_with_tape", device, dtype, backend=renderer.backend)
-            lines.append(f"loss: networks, colours, loss and gradients in one operation, on the {chosen} backend")
-            if chosen != "native":
-                reason = backends.why_not("forward_with_tape", "native", device, dtype)
-                obstacle = reason or f"--backend {renderer.backend}"
-        else:
-            lines.append("loss: networks, colours and loss are separate operations")
-        if obstacle is not None:
-            lines.append(f"not faster: {obstacle}")
-        for name, field in renderer.fields.items():
-            if separate and (router := router_of(field)) is not None:
-                lines.append(f"{name}: {router.explain()}")
+        if (obstacle := self.why_not_fused()) is not None:
+            lines += ["loss: networks, colours and loss are separate operations", f"not faster: {obstacle}"]
+            routers = ((name, router_of(field)) for name, field in renderer.fields.items())
+            return "\n".join([*lines, *(f"{name}: {router.explain()}" for name, router in routers if router)])
+        where = renderer.device, torch.float32
+        chosen = backends.chosen("forward_with_tape", *where, backend=renderer.backend)
+        lines.append(f"loss: networks, colours, loss and gradients in one operation, on the {chosen} backend")
+        if chosen != "native":
+            reason = backends.why_not("forward_with_tape", "native", *where)
+            lines.append(f"not faster: {reason or f'--backend {renderer.backend}'}")
         return "\n".join(lines)

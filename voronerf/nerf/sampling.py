@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf.ops.render_loss.reference import robust_error
 from voronerf.ops.resample import resample
 
 SPACINGS = ("linear", "disparity")
@@ -151,9 +150,9 @@ def union_depths(
     return every, torch.cat((edges[:, :1], (every[:, 1:] + every[:, :-1]) / 2, edges[:, -1:]), dim=1)
 
 
-def colour_loss(colour: Tensor, target: Tensor, robust: float = 0.0) -> Tensor:
-    """The mean squared error of colours [r, 3] (NeRF, equation 6), or the robust one of `voronerf.ops.render_loss`."""
-    return robust_error((colour - target).square().sum(-1), robust).mean() / 3
+def colour_loss(colour: Tensor, target: Tensor) -> Tensor:
+    """The mean squared error of colours [r, 3] (NeRF, equation 6)."""
+    return (colour - target).square().mean()
 
 
 def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:

@@ -20,7 +20,7 @@ from voronerf.app.files import json_text, write_text
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import read_scene, write_scene
 from voronerf.app.scenes.scene import Split
-from voronerf.app.train.build import PICTURE_POINTS, PICTURE_RESOLUTION, make_picture_grid, make_renderer
+from voronerf.app.train.build import PICTURE_RESOLUTION, ask_everywhere, make_picture_grid, make_renderer
 from voronerf.app.train.checkpoint import checkpoint_paths, is_shown, last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.nerf.cameras import Cameras
@@ -453,11 +453,7 @@ def _trimmed(grid: OccupancyGrid, parts: Parts, full: Tensor) -> OccupancyGrid |
 def _found_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
     """What is empty in a box of a run that has no grid, by asking the field in every voxel."""
     threshold = -math.log1p(-PICTURE_OPACITY) * (source.config.samples or (64,))[0] / float((box[1] - box[0]).norm())
-    grid = OccupancyGrid(box, PICTURE_RESOLUTION, threshold=threshold)
-    generator = torch.Generator().manual_seed(0)
-    for points in range(PICTURE_POINTS):
-        grid.update(parts.eval(), decay=float(points > 0), generator=generator)
-    return grid
+    return ask_everywhere(OccupancyGrid(box, PICTURE_RESOLUTION, threshold=threshold), parts.eval())
 
 
 # Finding where runs belong --------------------------------------------------------------------------------------------

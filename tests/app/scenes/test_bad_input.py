@@ -248,7 +248,7 @@ def test_images_outside_of_the_folder(tmp_path, kind):
     name = named.get(kind, "1.png")
     (scene / "a").mkdir()
     rewrite(scene, lambda contents: contents["frames"][1].update(file_path=name))
-    fails(scene, f"transforms.json: frame 1 ({name}): file_path must lead to a file in the folder of the scene")
+    fails(scene, f"transforms.json: frame 1 ({name}): file_path: must lie in the folder of the scene")
     assert len(load_scene(scene, allow_outside=True).train.names) == 2
     (tmp_path / "link").symlink_to(scene)  # how the folder itself is named does not matter
     (scene / "1.png.JPG").unlink(missing_ok=True)

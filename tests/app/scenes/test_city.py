@@ -7,9 +7,9 @@ from helpers import refuses
 
 from voronerf.app.scenes import SceneError, city_scene, load_scene
 from voronerf.app.scenes.builtin.caster import Caster
-from voronerf.app.scenes.builtin.city import city_cameras, city_views
+from voronerf.app.scenes.builtin.city import city_cameras
 from voronerf.app.scenes.builtin.city_solids import TALLEST, block, city
-from voronerf.app.scenes.builtin.pictures import LIGHT, _images
+from voronerf.app.scenes.builtin.pictures import LIGHT, _images, render_views
 from voronerf.app.scenes.builtin.solids import Sphere
 
 
@@ -20,7 +20,8 @@ def scene():
 
 def test_other_cameras_see_the_same_city(scene):
     cameras = scene.test.cameras[[0]]
-    assert torch.equal(city_views(cameras, (2, 2)).images[0], scene.test.images[0])
+    views = render_views(cameras, "view", Caster(city((2, 2)), LIGHT))
+    assert torch.equal(views.images[0], scene.test.images[0])
 
 
 def test_rays_meet_the_first_of_all_solids(monkeypatch):

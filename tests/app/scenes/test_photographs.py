@@ -155,7 +155,7 @@ def test_masks_leave_pixels_out_of_training_and_scores(tmp_path):
     assert torch.equal(scene.test.mask(0), torch.from_numpy(mask > 0))
     assert int(load_scene(tmp_path, downscale=4).train.masks[0].sum()) == 2  # a block with a black pixel is left out
     for change, reason in (
-        ({"mask_path": "../mask.png"}, "mask_path must lead to a file in the folder of the scene"),
+        ({"mask_path": "../mask.png"}, "mask_path: must lie in the folder of the scene"),
         ({"mask_path": "none.png"}, "does not exist"),
         ({"mask_path": 3}, "mask_path must be a file name, got 3"),
         ({"mask_path": "small.png"}, "small.png: is 3 x 2 pixels"),

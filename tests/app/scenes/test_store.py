@@ -66,10 +66,11 @@ def test_sizes_and_masks(tmp_path):
     Image.fromarray(np.eye(11, 8, dtype=np.uint8) * 255).save(mask)
     found = [read_images(paths, 1, keep=keep) for keep in ("memory", "disk")]
     assert torch.equal(found[0].images, found[1].images) and torch.equal(found[0].sizes, found[1].sizes)
-    masks = [read_masks([None, mask, None], paths, found[0].sizes, 1, on_disk=on_disk) for on_disk in (False, True)]
+    masks = [read_masks([None, mask, None], paths, read, 1) for read in found]
     assert torch.equal(*masks) and int(masks[0][1].sum()) == 8
-    for on_disk in (False, True):
-        turned = read_masks([None, mask, None], paths, found[0].sizes, 1, on_disk=on_disk, turns=[0, 3, 2])
+    for read in found:
+        upright = read._replace(images=read.images[:, :10], turns=[0, 3, 2])
+        turned = read_masks([None, mask, None], paths, upright, 1)
         assert turned.shape == (3, 10, 12) and torch.equal(turned[1, :8, :11], torch.rot90(masks[0][1, :11, :8], 3))
         assert torch.equal(turned[::2], masks[0][::2, :10])
 

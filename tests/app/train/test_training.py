@@ -13,8 +13,9 @@ from helpers import read_json, refuses, same, script, trained
 from tiny_runs import HIERARCHICAL, Each, small, started, steps_of
 
 from voronerf.app import open_run
-from voronerf.app.evaluate.scores import evaluate, render_view
+from voronerf.app.evaluate.scores import evaluate
 from voronerf.app.files import read_json_lines
+from voronerf.app.render.camera import render_camera
 from voronerf.app.train import ConfigError, TrainConfig, build, run, train
 from voronerf.app.train.build import count_parameters, solve_width
 from voronerf.app.train.defaults import octaves_for, resolve
@@ -71,7 +72,7 @@ def test_the_middle_of_a_view_is_that_of_the_whole_view(scene):
     test = replace(scene.test, cameras=replace(cameras, distortion=distortion, sizes=sizes), masks=masks)
     scene = replace(scene, test=test)
     for view, rows, columns in ((0, slice(5, 10), slice(5, 10)), (1, slice(4, 8), slice(5, 10))):
-        whole = render_view(state.renderer, scene, view).colour.clamp(0, 1)[rows, columns]
+        whole = render_camera(state.renderer, scene, scene.test.cameras, view).colour.clamp(0, 1)[rows, columns]
         kept = test.mask(view)[rows, columns]
         error = (whole - test.truth(view, torch.ones(3))[rows, columns])[kept].double().square().mean()
         (score,) = evaluate(state.renderer, scene, views=[view], middle=3)
@@ -82,7 +83,7 @@ def test_the_middle_of_a_view_is_that_of_the_whole_view(scene):
 def test_no_collapse_to_white(scene, seed):
     """A NeRF that gives up paints every ray white; its opacity is then 0 and no gradient brings it back."""
     state = started(scene, 100, steps=100, seed=seed, rays=256, samples=(24,), width=32, cells=())
-    image = render_view(state.renderer, scene, 0)
+    image = render_camera(state.renderer, scene, scene.test.cameras, 0)
     alpha = scene.test.images[0][..., 3].float() / 255
     assert image.opacity[alpha > 0.99].mean() > 0.5
 
@@ -169,7 +170,7 @@ def test_parameters_decide_the_width(scene, field):
     state = build(small(width=None, depth=None, field=field, parameters=30_000), scene)
     config = state.config
     assert config.width == solve_width(config, 30_000) and config.lr == 0.02
-    assert count_parameters(config) <= 30_000 < count_parameters(config, config.width + 1)
+    assert count_parameters(config) <= 30_000 < count_parameters(config, width=config.width + 1)
     steps_of(state, 13)
     assert count_parameters(config) == state.parameter_count
     again = build(replace(small(field=field, parameters=30_000, width=None, depth=None), **HIERARCHICAL), scene)

@@ -15,11 +15,9 @@ from voronerf.app.run import Run, open_run, read_crop
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import read_scene
 from voronerf.app.train.config import ConfigError
-from voronerf.town.run import TOWN
+from voronerf.town.run import is_town
 from voronerf.town.run import open_run as open_parts
 
-#: Functions that open a run directory with a file of that name; others hold trainings.
-OPENERS: dict[str, Callable[..., Run]] = {TOWN: open_parts}
 #: Six numbers of a box, or the one that the viewer has saved.
 Crop = tuple[float, float, float, float, float, float] | Literal["saved"] | None
 
@@ -53,7 +51,7 @@ class Opening:
     def open(self, run: Path, *, scene: Scene | None = None) -> Run:
         """Opens a run of any kind."""
         check_counts(samples=None if self.samples is None else min(self.samples), downscale=self.downscale)
-        opener = next((opener for file, opener in OPENERS.items() if (run / file).is_file()), open_run)
+        opener: Callable[..., Run] = open_parts if is_town(run) else open_run
         kept = inspect.signature(opener).parameters
         with busy(f"opening {run}"):
             return opener(run, scene=scene, **{name: value for name, value in vars(self).items() if name in kept})

@@ -15,8 +15,9 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from voronerf.app.evaluate.scores import Track, in_silence, render_view, view_numbers
+from voronerf.app.evaluate.scores import Track, in_silence, view_numbers
 from voronerf.app.files import write_bytes
+from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.renderer import RenderedImage, Renderer
@@ -157,7 +158,7 @@ def write_panels(
     """Draws truth, render, error, depth and cells of evenly spread test views, a PNG each; returns the paths."""
     paths = []
     for view in track(view_numbers(len(scene.test), views), "panels"):
-        image = render_view(renderer, scene, view)
+        image = render_camera(renderer, scene, scene.test.cameras, view)
         # Each pixel in the colour of the cell of its heaviest sample, as in figure 1 of the paper.
         cells = diagram.locate(image.heaviest.reshape(-1, 3), backend=renderer.backend)
         paths.append(folder / f"{scene.test.names[view]}.png")

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 
 from voronerf.app.evaluate.lpips import Lpips
 from voronerf.app.evaluate.metrics import psnr, ssim
-from voronerf.app.render.camera import render_camera
+from voronerf.app.render.camera import crop_camera, render_camera
 from voronerf.app.scenes import Scene
 from voronerf.nerf.cameras import Cameras
-from voronerf.nerf.renderer import RenderedImage, Renderer
+from voronerf.nerf.renderer import Renderer
 
 #: Shows progress: yields the items of a sequence, and is given its name.
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
@@ -46,11 +46,6 @@ def view_numbers(count: int, views: int | None) -> list[int]:
     if views is None or views >= count:
         return list(range(count))
     return [i * count // views for i in range(views)]
-
-
-def render_view(renderer: Renderer, scene: Scene, view: int, *, heaviest: bool = True) -> RenderedImage:
-    """A test view of a scene, see :func:`render_camera`."""
-    return render_camera(renderer, scene, scene.test.cameras, view, heaviest=heaviest)
 
 
 def evaluate(
@@ -113,9 +108,7 @@ def _middle_of(cameras: Cameras, view: int, factor: int) -> tuple[Cameras, slice
     (width, height), camera = cameras.size(view), cameras[[view]]
     part = max(width // factor, 1), max(height // factor, 1)
     left, top = (width - part[0]) // 2, (height - part[1]) // 2
-    if factor > 1:
-        moved = camera.intrinsics - camera.intrinsics.new_tensor((0, 0, left, top))
-        camera = replace(camera, intrinsics=moved, width=part[0], height=part[1], sizes=None)
+    camera = crop_camera(camera, left, top, *part) if factor > 1 else camera
     return camera, slice(top, top + part[1]), slice(left, left + part[0])
 
 

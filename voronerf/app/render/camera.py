@@ -1,6 +1,8 @@
-"""Renders a camera in a scene."""
+"""Renders a camera in a scene, or a part of its picture."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from voronerf.app.scenes import Scene
 from voronerf.nerf.cameras import Cameras
@@ -21,3 +23,9 @@ def render_camera(
         background=scene.background_colour(device),
         heaviest=heaviest,
     )
+
+
+def crop_camera(camera: Cameras, left: int, top: int, width: int, height: int) -> Cameras:
+    """A camera that sees `width` x `height` pixels of another."""
+    moved = camera.intrinsics - camera.intrinsics.new_tensor((0, 0, left, top))
+    return replace(camera, intrinsics=moved, width=width, height=height, sizes=None)

@@ -52,10 +52,13 @@ def choose_images(folder: Path, downscale: int | None, longest: float) -> ImageF
     return ImageFolder(sizes[chosen], factor, notes)
 
 
-def stay_inside(path: Path, folder: Path, allow_outside: bool) -> None:
-    """Raises SceneError for a path that leads out of the scene's folder by `..` or a link, unless that is allowed."""
+def stay_inside(path: Path, folder: Path, allow_outside: bool, name: str = "") -> None:
+    """Raises SceneError for a path that leads out of the scene's folder by `..` or a link, unless that is allowed.
+
+    The error calls it by a name, or by itself.
+    """
     if not allow_outside and leads_outside(path, folder):
-        raise SceneError(f"{path}: must lie in the folder of the scene; --allow-outside reads others")
+        raise SceneError(f"{name or path}: must lie in the folder of the scene; --allow-outside reads others")
 
 
 def named_images(source: Path, folder: Path, names: Sequence[str], allow_outside: bool) -> list[Path | None]:

@@ -157,7 +157,7 @@ def read_images(
             raise SceneError(f"{path}: downscaling by {factor} leaves no pixel of {header.size[0]} x {header.size[1]}")
     sizes = torch.tensor([header.size for header in seen])
     turns = [header.turns if upright else 0 for header in seen]
-    size = _turned(sizes, turns).amax(0).tolist()
+    size = torch.where((torch.tensor(turns) % 2 == 1)[:, None], sizes.flip(1), sizes).amax(0).tolist()
     differ = bool((sizes != sizes[:1]).any())
     channels = min(4 if any(header.alpha for header in seen) else 3, most_channels)
     shape = (len(paths), size[1] // factor, size[0] // factor, channels)
@@ -195,11 +195,6 @@ def read_images(
     return Decoded(torch.from_numpy(images), sizes, False, turns)
 
 
-def _turned(sizes: Tensor, turns: Sequence[int]) -> Tensor:
-    """(width, height) of images, int64 [c, 2], after so many quarters."""
-    return torch.where((torch.tensor(turns) % 2 == 1)[:, None], sizes.flip(1), sizes)
-
-
 def _times(paths: Sequence[Path | None]) -> list[tuple[int, int, int] | None]:
     """Size and times of each file: that of its content, which can be set, and that of its last change in any way."""
     stats = [None if path is None else path.stat() for path in paths]
@@ -209,35 +204,30 @@ def _times(paths: Sequence[Path | None]) -> list[tuple[int, int, int] | None]:
 def read_masks(
     masks: Sequence[Path | None],
     paths: Sequence[Path],
-    sizes: Tensor,
+    images: Decoded,
     factor: int,
     *,
-    on_disk: bool = False,
     name: str = "images",
-    turns: Sequence[int] | None = None,
 ) -> Tensor | None:
     """Decodes the masks of images: black pixels do not count, nor does a block that has one.
 
     Args:
         masks: the mask file of each image, or None if the whole image counts.
         paths: of the images.
-        sizes: int64 [c, 2], (width, height) of the images, and of their masks.
+        images: which have the sizes of their masks, and are turned as these will be; where they are on disk, so are
+            these.
         factor: of the reduction.
-        on_disk: map them from a file of the cache, as the images.
         name: of the scene.
-        turns: by how many quarters each image was turned, and its mask will be.
 
     Returns:
         bool [c, h, w], False around smaller images; None if no image has a mask.
     """
     if not any(masks):
         return None
-    turns = turns or [0] * len(masks)
-    width, height = (_turned(sizes, turns).amax(0) // factor).tolist()
-    shape = (len(masks), height, width)
+    turns, shape = images.turns, (len(masks), *images.images.shape[1:3])
 
     def make(index: int) -> NDArray[np.uint8]:
-        mask, path, size = masks[index], paths[index], sizes[index].tolist()
+        mask, path, size = masks[index], paths[index], images.sizes[index].tolist()
         width, height = (side // factor for side in size)
         kept: Any = np.ones((height, width), dtype=bool)
         if mask is not None:
@@ -255,7 +245,7 @@ def read_masks(
         place[: kept.shape[0], : kept.shape[1]] = kept
         return place
 
-    if on_disk:
+    if images.on_disk:
         sources = [None if mask is None else str(mask.absolute()) for mask in masks]
         return stored(f"{name}-masks", [sources, factor, turns], _times(masks), shape, make, 1).view(torch.bool)
     return torch.from_numpy(np.stack([make(index) for index in range(len(masks))])).view(torch.bool)

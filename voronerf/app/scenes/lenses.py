@@ -55,12 +55,8 @@ def colmap_lens(model: str, parameters: Sequence[float]) -> Lens:
         raise ValueError(f"{model} must have {len(names[model])} parameters, got {len(parameters)}")
     values = dict(zip(names[model], parameters))
     kind = FISHEYE if "FISHEYE" in model else FOV if model == "FOV" else PERSPECTIVE
-    intrinsics = (
-        values.get("fx", values.get("f", 0)),
-        values.get("fy", values.get("f", 0)),
-        values["cx"],
-        values["cy"],
-    )
+    focal = values.get("f", 0)
+    intrinsics = (values.get("fx", focal), values.get("fy", focal), values["cx"], values["cy"])
     return Lens(intrinsics, tuple(values.get(key, 0.0) for key in COEFFICIENTS[kind]), kind)
 
 

@@ -20,10 +20,10 @@ from torch import Tensor
 
 from voronerf.app.scenes.carving import carve_box
 from voronerf.app.scenes.errors import SceneError
-from voronerf.app.scenes.images import Header, read_images, read_masks
+from voronerf.app.scenes.images import Decoded, Header, read_images, read_masks
 from voronerf.app.scenes.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Lens, lens_inverts, pixels_with_rays
 from voronerf.app.scenes.scene import Scene, SparseDepth, Split
-from voronerf.app.scenes.soundness import camera_faults, lost_cameras
+from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
 from voronerf.nerf.cameras import Cameras, focus_point
 from voronerf.nerf.contraction import Contraction, Perspective
 
@@ -40,8 +40,6 @@ FAR = 4.0
 LEAST_NEAR = 0.02
 # Of the bounds of the views: things may be a little nearer than the nearest point, and farther than the farthest.
 NEARER, FARTHER = 0.75, 1.5
-# Cameras that a line names.
-MOST_NAMED = 8
 # Mean of the viewing directions, a unit vector each, from which on they count as one direction.
 PARALLEL = 0.95
 KIND_LINES = {
@@ -130,9 +128,9 @@ def photograph_scene(
         held_out = None if held_out is None else held_out[~lost]
     views, count = _training_first(views, held_out, source)
     name = folder.resolve().name
-    pictures = _read_pictures(views, factor, reading, source, name)
+    poses = torch.stack([view.pose for view in views])
+    pictures, masks, kind = _read_pictures(views, poses, factor, reading, source, name)
     bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64)
-    poses, kind = _poses(views), pictures.kind
     upright = _turned(Cameras(poses, torch.ones(len(poses), 4), 1, 1), pictures.turns).poses
     frame = find_frame(upright, kind, bounds if len(bounds) else None, normalise=reading.normalise)
     cameras = _cameras(frame.poses(poses), views, pictures.sizes, source)
@@ -143,7 +141,7 @@ def photograph_scene(
         _ = cameras.lenses
     except ValueError as error:
         raise SceneError(f"{source}: {error}") from None
-    masks = _without_dark_corners(cameras, pictures.masks, source, views)
+    masks = _without_dark_corners(cameras, masks, source, views)
     names = tuple(distinct_names([view.path for view in views], folder))
     train, test = (
         Split(
@@ -183,45 +181,31 @@ def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path
     return [views[index] for index in order], count
 
 
-class Pictures(NamedTuple):
-    """The images and masks of views, see `read_images`, and the kind of scene that they show."""
-
-    images: Tensor
-    masks: Tensor | None
-    sizes: Tensor
-    turns: list[int]
-    on_disk: bool
-    kind: str
-
-
-def _read_pictures(views: Sequence[View], factor: int, reading: Reading, source: Path, name: str) -> Pictures:
-    """Reads the image files of views; alpha stays where an object stands on white."""
+def _read_pictures(
+    views: Sequence[View], poses: Tensor, factor: int, reading: Reading, source: Path, name: str
+) -> tuple[Decoded, Tensor | None, str]:
+    """Reads images and masks of views, and tells the kind of scene; only an object keeps its alpha."""
     paths, headers = [view.path for view in views], [view.header for view in views]
     read = functools.partial(read_images, paths, factor, headers=headers, name=name, upright=True)
-    images, sizes, on_disk, turns = read(keep=reading.images)
-    masks = read_masks([view.mask for view in views], paths, sizes, factor, on_disk=on_disk, name=name, turns=turns)
-    alpha = images.shape[-1] == 4 and any(bool((image[..., 3] < 255).any()) for image in images)
-    kind = _kind(views, alpha, reading.kind, source)
-    if kind != "object" and images.shape[-1] == 4:
+    pictures = read(keep=reading.images)
+    masks = read_masks([view.mask for view in views], paths, pictures, factor, name=name)
+    has_alpha = pictures.images.shape[-1] == 4
+    transparent = has_alpha and any(bool((image[..., 3] < 255).any()) for image in pictures.images)
+    around = any(view.lens.model == EQUIRECTANGULAR for view in views)
+    kind = _kind(poses, transparent, around, reading, source)
+    if kind != "object" and has_alpha:
         # On disk they are stored again: a part of each pixel cannot be drawn from a mapped file without a copy.
-        images = read(keep="disk", most_channels=3).images if on_disk else images[..., :3].contiguous()
-    return Pictures(images, masks, sizes, turns, on_disk, kind)
-
-
-def _poses(views: Sequence[View]) -> Tensor:
-    return torch.stack([view.pose for view in views])
+        again = read(keep="disk", most_channels=3) if pictures.on_disk else None
+        pictures = again or pictures._replace(images=pictures.images[..., :3].contiguous())
+    return pictures, masks, kind
 
 
 def _far_notes(views: Sequence[View], far: Tensor, kept: bool) -> list[str]:
     """A line about the views whose cameras lie far from the others, bool [c]: one would give the scene its scale."""
     names = [view.path.name for view, apart in zip(views, far.tolist()) if apart]
-    if not names:
-        return []
-    if len(names) > MOST_NAMED:
-        names[MOST_NAMED:] = [f"{len(names) - MOST_NAMED} more"]
-    which = f"{int(far.sum())} of {len(views)} cameras lie far from the others"
+    which = f"{len(names)} of {len(views)} cameras lie far from the others"
     done = "and are kept, as asked" if kept else "and are left out (--keep-far keeps them)"
-    return [f"{which} {done}: {', '.join(names)}"]
+    return [f"{which} {done}: {some_of(names)}"] if names else []
 
 
 def find_depths(split: Split, views: Sequence[View], frame: Frame) -> SparseDepth | None:
@@ -353,17 +337,16 @@ def _upright(up: Tensor, forward: Tensor | None) -> Tensor:
     return torch.stack((x, torch.linalg.cross(z, x), z))
 
 
-def _kind(views: Sequence[View], alpha: bool, asked: str, source: Path) -> str:
-    """The kind that was asked for, or the one that alpha and cameras show."""
-    if asked == "object" and not alpha:
+def _kind(poses: Tensor, transparent: bool, around: bool, reading: Reading, source: Path) -> str:
+    """The kind that was asked for, or the one that transparent pixels and cameras show; some may see all around."""
+    if reading.kind == "object" and not transparent:
         raise SceneError(f"{source}: --kind object needs images with transparent pixels, these are opaque")
-    if asked != "auto":
-        return asked
-    if alpha:
+    if reading.kind != "auto":
+        return reading.kind
+    if transparent:
         return "object"
-    if any(view.lens.model == EQUIRECTANGULAR for view in views):
+    if around:
         return "inside-out"
-    poses = _poses(views)
     cameras = Cameras(poses, torch.ones(len(poses), 4), 1, 1)
     forward = cameras.forward
     if float(forward.mean(0).norm()) > PARALLEL:

@@ -38,7 +38,7 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import HEIF, listed_images
 from voronerf.app.scenes.images import UNREADABLE, read_header, read_image
 from voronerf.app.scenes.lenses import MODELS
-from voronerf.app.scenes.soundness import camera_faults, lost_cameras
+from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
 from voronerf.app.scenes.transforms import Shot, write_transforms
 
 #: Formats of a video. A playlist would name other files.
@@ -62,8 +62,6 @@ SEQUENTIAL = 10
 LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
 #: A camera is held by so many points that at least three images see. COLMAP asks for as many matches of two images.
 LEAST_HELD = 15
-#: Cameras that a line names.
-MOST_NAMED = 8
 #: Mean error of the points of a sound model, in pixels.
 LARGEST_ERROR = 2.0
 #: The global mapper places cameras by the longest tracks, until each image has so many; triangulation adds the others.
@@ -500,9 +498,7 @@ def _described(model: Model | None, images: int) -> str:
         return "no model"
     rest = "".join(f"; {fault}" for fault in model.faults)
     if model.lost:
-        named = [f"{name} ({why})" for name, why in model.lost.items()]
-        more = [f"{len(named) - MOST_NAMED} more"] * (len(named) > MOST_NAMED)
-        rest += f"; without the cameras of {', '.join(named[:MOST_NAMED] + more)}"
+        rest += f"; without the cameras of {some_of([f'{name} ({why})' for name, why in model.lost.items()])}"
     return f"{len(model.images)} of {images} images, points off by {model.error:.2f} pixels{rest}"
 
 

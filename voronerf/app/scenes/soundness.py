@@ -36,6 +36,10 @@ FOCAL_LENGTHS = (0.25, 15.0)
 ASPECT, BENT, TILTED = 0.05, 1.0, 0.05
 
 
+#: Cameras that a line names.
+MOST_NAMED = 8
+
+
 def lost_cameras(origins: Tensor) -> Tensor:
     """Which cameras [c, 3] lie far away from the others, bool [c]; of two, none."""
     if len(origins) < 3:
@@ -83,6 +87,12 @@ def camera_faults(
         elif max(abs(tilt) for tilt in lens.coefficients[2:4]) > TILTED:
             faults.append(f"a lens is tilted, p1 {lens.coefficients[2]:.3g} and p2 {lens.coefficients[3]:.3g}")
     return list(dict.fromkeys(faults))
+
+
+def some_of(names: list[str]) -> str:
+    """The first `MOST_NAMED` of some names, and how many more there are."""
+    more = [f"{len(names) - MOST_NAMED} more"] * (len(names) > MOST_NAMED)
+    return ", ".join(names[:MOST_NAMED] + more)
 
 
 def _nearest(origins: Tensor) -> Tensor:

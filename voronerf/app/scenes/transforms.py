@@ -18,8 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from voronerf.app.files import leads_outside, read_json, write_text
+from voronerf.app.files import read_json, write_text
 from voronerf.app.scenes.errors import SceneError
+from voronerf.app.scenes.folders import stay_inside
 from voronerf.app.scenes.images import read_header
 from voronerf.app.scenes.lenses import COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, FOV, PERSPECTIVE, Lens
 from voronerf.app.scenes.photographs import Reading, View, least_factor, photograph_scene
@@ -154,7 +155,7 @@ def _find_image(folder: Path, name: str, allow_outside: bool, where: str) -> Pat
     for spelt in dict.fromkeys((name, name.replace("\\", "/"))):
         for suffix in SUFFIXES:
             path = Path(f"{folder / spelt}{suffix}")
-            _check_inside(path, folder, allow_outside, f"{where}: file_path")
+            stay_inside(path, folder, allow_outside, f"{where}: file_path")
             if os.path.isfile(path):
                 return path
     return None
@@ -167,15 +168,10 @@ def _mask(folder: Path, name: object, allow_outside: bool, where: str) -> Path |
     if not isinstance(name, str) or "\0" in name or not is_text(name):
         raise SceneError(f"{where}: mask_path must be a file name, got {name!r:.60}")
     mask = folder / name.replace("\\", "/")
-    _check_inside(mask, folder, allow_outside, f"{where}: mask_path")
+    stay_inside(mask, folder, allow_outside, f"{where}: mask_path")
     if not mask.is_file():
         raise SceneError(f"{where}: its mask {mask} does not exist")
     return mask
-
-
-def _check_inside(path: Path, folder: Path, allow_outside: bool, what: str) -> None:
-    if not allow_outside and leads_outside(path, folder):
-        raise SceneError(f"{what} must lead to a file in the folder of the scene; --allow-outside reads others")
 
 
 def pose_of(matrix: object, where: str, key: str = "transform_matrix") -> Tensor:

@@ -227,19 +227,20 @@ def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> 
     if obstacle is not None:
         raise ConfigError(f"--occupancy does not work with {obstacle}")
     grid = make_grid(config, scene, renderer.device, PICTURE_RESOLUTION, PICTURE_OPACITY)
+    return ask_everywhere(grid, renderer.field, renderer.backend)
+
+
+def ask_everywhere(grid: OccupancyGrid, field: Field, backend: str = "auto") -> OccupancyGrid:
+    """A grid after a field was asked in every voxel; the same one."""
     generator = torch.Generator().manual_seed(0)
     for points in range(PICTURE_POINTS):
-        grid.update(renderer.field, decay=float(points > 0), generator=generator, backend=renderer.backend)
+        grid.update(field, decay=float(points > 0), generator=generator, backend=backend)
     return grid
 
 
 def parameter_shapes(config: TrainConfig, **options: Any) -> dict[str, tuple[torch.Size, bool]]:
-    """The shape of each parameter of a network, and whether all cells share it; without memory for any of them.
-
-    Args:
-        config: The settings.
-        options: Of the network, in the place of those of the settings.
-    """
+    """The shape of each parameter of a network, with other options than those of the settings where they are given,
+    and whether all cells share it; takes no memory for any of them."""
     kind = config.field_type
     make, share = functools.partial(kind.build, {**config.network_options, **options}), kind.router_options
     network: nn.Module
@@ -255,9 +256,8 @@ def parameter_shapes(config: TrainConfig, **options: Any) -> dict[str, tuple[tor
     }
 
 
-def count_parameters(config: TrainConfig, width: int | None = None) -> int:
-    """Parameters of all networks of all final cells, with another width than the configured one where given."""
-    options = {} if width is None else {"width": width}
+def count_parameters(config: TrainConfig, **options: Any) -> int:
+    """Parameters of all networks of all final cells; options as for `parameter_shapes`."""
     shapes, cells = parameter_shapes(config, **options).values(), config.final_cells
     each = sum((1 if shared else cells) * shape.numel() for shape, shared in shapes)
     return each * len(SAMPLERS[config.sampling].networks(config.field_type.cones))
@@ -269,14 +269,13 @@ def solve_width(config: TrainConfig, total: int) -> int:
         raise ConfigError(f"--parameters needs a field with an option width, {config.field} has none")
     _check_fits(config, f"--parameters {total}", _parameter_bytes(config) * total)
     low, high = 2, 4
-    if count_parameters(config, low) > total:
-        least = count_parameters(config, low)
+    if (least := count_parameters(config, width=low)) > total:
         raise ConfigError(f"--parameters must be at least {least} for {config.final_cells} cells, got {total}")
-    while count_parameters(config, high) <= total:
+    while count_parameters(config, width=high) <= total:
         low, high = high, 2 * high
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if count_parameters(config, middle) <= total else (low, middle)
+        low, high = (middle, high) if count_parameters(config, width=middle) <= total else (low, middle)
     return low
 
 

@@ -19,6 +19,9 @@ from voronerf.nerf.adam import parameter_groups
 from voronerf.nerf.samplers import SAMPLERS
 from voronerf.router import VoronoiRouter
 
+#: What is counted, by the names of a state and of a checkpoint.
+COUNTERS = ("step", "seconds", "evaluation_seconds", "reserved_seconds", "rays", "rays_done", "skipped")
+
 
 @dataclass(frozen=True)
 class Stored:
@@ -38,8 +41,7 @@ class Stored:
 
 def snapshot(state: State) -> Checkpoint:
     """All that a training needs to go on bit for bit: parameters, moments, samples, random numbers, counters."""
-    names = ("step", "seconds", "evaluation_seconds", "reserved_seconds", "rays", "rays_done", "skipped")
-    values = {name: getattr(state, name) for name in names}
+    values = {name: getattr(state, name) for name in COUNTERS}
     values |= {"config": state.config.to_values(), "threads": _threads(state)}
     values |= {"stages": [asdict(stage) for stage in state.stages]}
     groups: dict[str, Mapping[str, Any]] = {group(name): r.state_dict() for name, r in state.routers.items()}
@@ -103,8 +105,7 @@ def load(state: State, checkpoint: Checkpoint) -> None:
     before, now = (f"torch on {n} thread{'s' * (n > 1)}" if n else "native operations" for n in counts)
     if before != now and state.device.type == "cpu":
         state.report(f"not bit for bit: {checkpoint.source} was computed by {before}, what follows by {now}")
-    names = ("step", "seconds", "evaluation_seconds", "reserved_seconds", "rays", "rays_done", "skipped", "stages")
-    state.restore(**{name: getattr(stored, name) for name in names})
+    state.restore(**{name: getattr(stored, name) for name in (*COUNTERS, "stages")})
 
 
 def _threads(state: State) -> int:

@@ -6,7 +6,6 @@ A browser's camera has OpenCV's axes (x right, y down, z forward), its canvas sq
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -65,12 +64,6 @@ def angle_of_view(cameras: Cameras, number: int, aspect: float) -> float:
     """The vertical angle in radians at which a canvas of an aspect shows all that one of several cameras sees."""
     of = frustum(cameras, number)
     return 2 * math.atan(math.tan(of["fov"] / 2) * max(1.0, of["aspect"] / aspect))
-
-
-def crop_camera(camera: Cameras, left: int, top: int, width: int, height: int) -> Cameras:
-    """A camera that sees `width` x `height` pixels of another."""
-    offset = camera.intrinsics.new_tensor((0, 0, left, top))
-    return replace(camera, intrinsics=camera.intrinsics - offset, width=width, height=height)
 
 
 def axial_depth(camera: Cameras, depth: Tensor) -> Tensor:

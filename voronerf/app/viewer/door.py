@@ -45,13 +45,7 @@ def chosen(part: Any) -> Any:
         ValueError: a page of the viewer cannot have sent it.
     """
     value = part.value
-    if hasattr(part, "options"):
-        fits = value in part.options
-    elif isinstance(value, tuple):
-        fits = len(value) == 2 and part.min <= value[0] <= value[1] <= part.max
-    else:
-        fits = part.min <= value <= part.max
-    if not fits:
+    if not (value in part.options if hasattr(part, "options") else part.min <= value <= part.max):
         raise ValueError(f"{part.label} cannot be {value!r}")
     return value
 

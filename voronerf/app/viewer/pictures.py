@@ -15,10 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.app.evaluate.panels import picture_of_cells, picture_of_colour, picture_of_depth
-from voronerf.app.render.camera import render_camera
+from voronerf.app.render.camera import crop_camera, render_camera
 from voronerf.app.run import HasCells, Run
 from voronerf.app.scenes import Scene
-from voronerf.app.viewer.cameras import crop_camera
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.field import Field

@@ -107,10 +107,9 @@ class Viewer:
     def _stand(self) -> None:
         """Starts new browsers at the first test view."""
         start, scene = self.server.initial_camera, self.subject.scene
-        cameras = scene.test.cameras
-        start.position = cameras.origins[0].numpy()
-        start.look_at = look_point(scene, cameras, 0).numpy()
-        start.fov = frustum(cameras, 0)["fov"]
+        seen = frustum(scene.test.cameras, 0)
+        start.position, start.fov = seen["position"], seen["fov"]
+        start.look_at = look_point(scene, scene.test.cameras, 0).numpy()
 
     def show(self, subject: Subject, points: Sequence[tuple[float, float]] = ()) -> None:
         """Shows another subject to every browser, with its curve; see :meth:`show_curve`."""

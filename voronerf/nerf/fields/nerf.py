@@ -89,9 +89,7 @@ class NeRF(RadianceField):
             raise ValueError(f"NeRF: skips must be trunk layers with another behind, 0..{depth - 2}, got {skips}")
         if not density_scale > 0:
             raise ValueError(f"NeRF: density_scale must be positive, got {density_scale}")
-        self.width = width
-        self.view_directions = view_directions
-        self.density_scale = density_scale
+        self.width, self.view_directions, self.density_scale = width, view_directions, density_scale
         table = [Layer(("positions",), width, "relu")]
         for i in range(1, depth):
             table.append(Layer(("positions", i - 1) if i - 1 in skips else (i - 1,), width, "relu"))
@@ -110,8 +108,7 @@ class NeRF(RadianceField):
         )
         shapes = self.layers.weight_shapes(6 if self.layers.integrated else 3, 3)
         linears = [nn.Linear(i, o) for o, i in shapes]
-        self.trunk = nn.ModuleList(linears[:depth])
-        self.density = linears[depth]
+        self.trunk, self.density = nn.ModuleList(linears[:depth]), linears[depth]
         self.feature = linears[depth + 1] if view_directions else None
         self.view = linears[depth + 2] if view_directions else None
         self.colour = linears[-1]

@@ -78,11 +78,6 @@ def city_scene(
     return Scene(name=name, train=train, test=test, near=NEAR, far=far, box=box, background="white")
 
 
-def city_views(cameras: Cameras, blocks: tuple[int, int]) -> Split:
-    """The city from other cameras, which are square and have one focal length; in memory."""
-    return render_views(cameras, "view", Caster(city(blocks), LIGHT))
-
-
 def city_of(size: int, text: str, images: str) -> Scene:
     """The city of blocks such as "4x4" or "4x8"; in the cache if it is larger than one block."""
     match = re.fullmatch(r"([1-9]\d?)x([1-9]\d?)", text)
