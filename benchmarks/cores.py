@@ -228,7 +228,7 @@ def region(cores: int) -> dict[str, Any]:
             n, machine = recording.count(lambda: len(points)), native.cpu()
             for _ in range(CALLS):
                 native.compiled.nearest_centre(points, centres, cells, n, k, machine)  # one run of points
-                native.compiled.average(share, *pair, [1, 1], machine)  # two runs of one number
+                native.compiled.average(*pair, share, [1, 1], machine)  # two runs of one number
         if recording.obstacle is not None:
             raise RuntimeError(recording.obstacle)
         return recording

@@ -65,8 +65,8 @@ void for_blocks(const std::vector<int64_t>& sizes, int threads, const Body& body
 
 }  // namespace
 
-void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
-              float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
+void adam_cpu(const std::vector<AdamRule>& rules, float* const* parameters, const float* const* gradients,
+              float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,
               Isa isa, int threads) {
   if (left_out(rules, guard, gradients, sizes, isa)) return;
   std::vector<AdamStep> steps;
@@ -76,7 +76,7 @@ void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const 
   });
 }
 
-void average_cpu(const float* share, const float* const* parameters, float* const* averages,
+void average_cpu(float* const* averages, const float* const* parameters, const float* share,
                  const std::vector<int64_t>& sizes, int threads) {
   for_blocks(sizes, threads, [&, share = *share](size_t i, int64_t begin, int64_t end) {
     float* __restrict__ average = averages[i];

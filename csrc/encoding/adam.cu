@@ -94,8 +94,8 @@ __global__ void __launch_bounds__(kThreads)
 
 }  // namespace
 
-void adam_cuda(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
-               float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
+void adam_cuda(const std::vector<AdamRule>& rules, float* const* parameters, const float* const* gradients,
+               float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,
                float* corrected, void* stream) {
   const size_t count = rules.size();
   const auto each = [&](const auto& run) {

@@ -27,20 +27,20 @@ struct AdamGuard {
   const float* scale;         // [1], of which the gradients are multiples, or null; on CUDA
 };
 
-void adam_cpu(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
-              float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
+void adam_cpu(const std::vector<AdamRule>& rules, float* const* parameters, const float* const* gradients,
+              float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,
               Isa isa, int threads);
 
 // Averages go a share [1] of the way to parameters, or to 0 where there are none.
-void average_cpu(const float* share, const float* const* parameters, float* const* averages,
+void average_cpu(float* const* averages, const float* const* parameters, const float* share,
                  const std::vector<int64_t>& sizes, int threads);
 
 // Gradients are added to totals.
 void add_cpu(const float* const* gradients, float* const* totals, const std::vector<int64_t>& sizes, int threads);
 
 // A step on CUDA, in two launches. corrected: [2, number of parameters], working memory.
-void adam_cuda(const std::vector<AdamRule>& rules, const AdamGuard& guard, const float* const* gradients,
-               float* const* parameters, float* const* means, float* const* squares, const std::vector<int64_t>& sizes,
+void adam_cuda(const std::vector<AdamRule>& rules, float* const* parameters, const float* const* gradients,
+               float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,
                float* corrected, void* stream);
 
 }  // namespace voronerf

@@ -281,7 +281,7 @@ void adam(Isa isa) {
     const std::vector<voronerf::AdamRule> rules = {{1e-2, nullptr, &step, 0.9, 0.99, 1e-8, every}};
     const float* gradients[] = {gradient.data()};
     float *parameters[] = {parameter.data()}, *means[] = {mean.data()}, *squares[] = {square.data()};
-    voronerf::adam_cpu(rules, {}, gradients, parameters, means, squares, {n}, isa, 1 + 2 * i);
+    voronerf::adam_cpu(rules, parameters, gradients, means, squares, {}, {n}, isa, 1 + 2 * i);
     like_portable(parameter, "adam");
     like_portable(mean, "adam");
   }

@@ -10,7 +10,7 @@ Each raises ValueError for shapes, devices, numbers out of range and an unknown 
 
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import MLP, Layer
-from voronerf.ops.adam import Guard, Rule, adam
+from voronerf.ops.adam import Guard, Rule, adam, average
 from voronerf.ops.balance_centres import balance_centres
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.composite import Composite, composite
@@ -56,6 +56,7 @@ __all__ = [
     "Runs",
     "Tape",
     "adam",
+    "average",
     "balance_centres",
     "cell_sort",
     "compose_runs",

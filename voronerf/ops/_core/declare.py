@@ -22,7 +22,8 @@ a letter plus one, and arguments that are integers. Of ``[3] or [r, 3]`` the fir
 dimensions, of ``[m] if ray_offsets else [r, s]`` where that argument is given. The shape of a result may also have
 letters that functions of the arguments give (``sizes``). An int is written as a range (``1..4``, ``0..``), a float as
 ``positive``, or an interval (``[0, 1)``, ``0 to 1``), a str as its choices (``linear|disparity``). What is written by
-its class alone is an instance of it.
+its class alone is an instance of it. The docstring says what arguments mean; what the signature says of tensors is put
+before it.
 """
 
 from __future__ import annotations
@@ -77,6 +78,7 @@ class Shaped(NamedTuple):
     wide: bool = False
     condition: str = ""
     otherwise: tuple[int | str, ...] = ()
+    text: str = ""
 
     @property
     def either(self) -> bool:
@@ -92,7 +94,7 @@ class Shaped(NamedTuple):
         known = _DTYPES.get(dtypes)
         if known is None:
             known = tuple(getattr(torch, name) for name in dtypes.split("|"))
-        return Shaped(known, _entries(shape), dtypes == "wide", condition or "", _entries(otherwise or ""))
+        return Shaped(known, _entries(shape), dtypes == "wide", condition or "", _entries(otherwise or ""), text)
 
 
 def _entries(text: str) -> tuple[int | str, ...]:
@@ -144,7 +146,7 @@ class Argument(NamedTuple):
         return check
 
     def _check_tensor(self, op: str, detach: bool) -> Check:
-        name, (dtypes, first, wide, condition, second), either = self.name, self.rule, self.rule.either
+        name, (dtypes, first, wide, condition, second, _), either = self.name, self.rule, self.rule.either
 
         def check(given: checks.Checked, values: dict[str, Any]) -> None:
             tensor, shape = values[name], first
@@ -295,7 +297,16 @@ class Declaration:
             run = resolve(op, backend=values["backend"], device=flat[0].device, dtype=flat[0].dtype)
             return run(*flat) if pack is None else pack(run(*flat))
 
+        public.__doc__ = self._described()
         return public
+
+    def _described(self) -> str:
+        """The docstring, with the dtypes and the shape of each tensor, which the signature has."""
+        text = self.function.__doc__ or ""
+        for name, _, optional, rule in self._tensors():
+            form = f"{rule.text} or None" if optional else rule.text
+            text = re.sub(rf"^( +{name}: )", rf"\g<1>{form}, ", text, count=1, flags=re.MULTILINE)
+        return text
 
     def custom_op(self, name: str = "", **options: Any) -> Callable[[Callable[..., Any]], Op]:
         """Makes ``fill(given, found)`` a custom op: it is handed the arguments, and memory for the results.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
 from voronerf.ops._core.checks import (
     check_dtype,
     check_flag,
+    check_interval,
     check_number,
     check_same_device,
     check_shape,
@@ -22,6 +23,12 @@ from voronerf.ops._core.checks import (
 from voronerf.ops.adam.reference import Guard, Rule
 
 _OP = backends.declare("adam", native=Implementation(EVERYWHERE, (torch.float32,)), warp=PLAIN)
+_AVERAGE = backends.declare(
+    "average",
+    native=Implementation(EVERYWHERE, (torch.float32,), file="adam"),
+    warp=PLAIN,
+    reference=Implementation(file="adam"),
+)
 
 
 def adam(
@@ -81,27 +88,38 @@ def adam(
     run(rules, parameters, [gradient.contiguous() for gradient in gradients], means, squares, guard, loss)
 
 
-@torch.no_grad()
 def average(
     averages: Sequence[Tensor], parameters: Sequence[Tensor] | None, share: float | Tensor, *, backend: str = "auto"
 ) -> None:
-    """Moves averages a share of the way to parameters, or to zero, in place; tensors and backends as of `adam`.
+    """Moves averages a share of the way to parameters, or to zero, in place.
 
     Args:
-        averages: What is moved.
-        parameters: Of the same shapes; None for zero.
-        share: 0..1; or float32 [].
-        backend: As of `adam`.
-    """
-    device = averages[0].device
-    if device.type == "cpu" and backends.chosen(_OP, device, torch.float32, backend=backend) == "native":
-        from voronerf.ops.adam.native import average as run
+        averages: float32, any shapes, contiguous.
+        parameters: float32, of the same shapes, contiguous; None for zero. Not differentiable.
+        share: 0 to 1; or float32 [].
+        backend: "auto", "reference", "native" or "warp".
 
-        run(averages, parameters, share)
-    elif parameters is None:
-        torch._foreach_mul_(list(averages), 1 - share)
+    Raises:
+        ValueError: a tensor that is not contiguous, lists of other lengths.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import average
+        >>> mean = torch.zeros(2)
+        >>> average([mean], [torch.tensor([4.0, 8.0])], 0.25)
+        >>> mean
+        tensor([1., 2.])
+    """
+    lists = {"averages": averages} if parameters is None else {"averages": averages, "parameters": parameters}
+    if not _are_lists(_AVERAGE, lists, "averages", averages):
+        return
+    _check_lists(_AVERAGE, lists, read="")
+    if isinstance(share, Tensor):
+        _check_scalar(_AVERAGE, "share", share, averages[0])
     else:
-        torch._foreach_lerp_(list(averages), list(parameters), cast(float, share))
+        check_interval(_AVERAGE, "share", share, 0, 1, "0 to 1")
+    run = backends.resolve(_AVERAGE, backend=backend, device=averages[0].device, dtype=torch.float32)
+    run(averages, parameters, share)
 
 
 def _check_all(
@@ -114,12 +132,7 @@ def _check_all(
     loss: Tensor | None,
 ) -> None:
     lists = {"parameters": parameters, "gradients": gradients, "means": means, "squares": squares}
-    for name, given in {"rules": rules, **lists}.items():
-        if not isinstance(given, Sequence):
-            raise TypeError(f"{_OP}: {name} must be a list, got {type(given).__name__}")
-        if len(given) != len(rules):
-            raise ValueError(f"{_OP}: {name} must be as many as the {len(rules)} rules, got {len(given)}")
-    if not rules:
+    if not _are_lists(_OP, lists, "rules", rules):
         return
     before: Any = None
     for rule in rules:
@@ -128,24 +141,43 @@ def _check_all(
         if before is None or any(part is not known for part, known in zip(rule[1:], before[1:])):
             _check_rule(rule, parameters[0])  # a training has the same rule many times
         before = rule
-    steps = [rule.step for rule in rules]
-    if not _are_plain(parameters, gradients, means, squares) or not _are_scalars(steps, parameters[0].device):
-        for own in zip(*lists.values(), strict=True):
-            _check(dict(zip(lists, own, strict=True)))
-        check_same_device(_OP, **{f"parameters[{index}]": tensor for index, tensor in enumerate(parameters)})
-        for step in steps:
-            _check_scalar("step", step, parameters[0])
+    _check_lists(_OP, lists, read="gradient")
+    device = parameters[0].device
+    for step in [rule.step for rule in rules]:
+        plain = isinstance(step, Tensor) and step.layout is torch.strided and step.dtype is torch.float32
+        if not plain or step.dim() or step.device != device:
+            _check_scalar(_OP, "step", step, parameters[0])
     if guard is not None:
         if not isinstance(guard, Guard):
             raise TypeError(f"{_OP}: guard must be a Guard, got {type(guard).__name__}")
         check_number(_OP, "limit", guard.limit)
         for name, scalar in zip(guard._fields, guard[:4]):
             if scalar is not None or name != "scale":
-                _check_scalar(name, scalar, parameters[0])
+                _check_scalar(_OP, name, scalar, parameters[0])
     if loss is not None:
         if guard is None:
             raise ValueError(f"{_OP}: loss must come with a guard, got none")
-        _check_scalar("loss", loss, parameters[0])
+        _check_scalar(_OP, "loss", loss, parameters[0])
+
+
+def _are_lists(op: str, lists: dict[str, Sequence[Tensor]], name: str, first: Sequence[Any]) -> bool:
+    """Whether there is anything in the lists, which must be as many as the one of a name."""
+    for key, given in {name: first, **lists}.items():
+        if not isinstance(given, Sequence):
+            raise TypeError(f"{op}: {key} must be a list, got {type(given).__name__}")
+        if len(given) != len(first):
+            raise ValueError(f"{op}: {key} must be as many as the {len(first)} {name}, got {len(given)}")
+    return bool(first)
+
+
+def _check_lists(op: str, lists: dict[str, Sequence[Tensor]], read: str) -> None:
+    """Checks the tensors of all parameters, of which those that are ``read`` alone may have any strides."""
+    if _are_plain(*lists.values()):
+        return
+    for own in zip(*lists.values(), strict=True):
+        _check(op, {name[:-1]: tensor for name, tensor in zip(lists, own, strict=True)}, read)
+    name, first = next(iter(lists.items()))
+    check_same_device(op, **{f"{name}[{index}]": tensor for index, tensor in enumerate(first)})
 
 
 def _are_plain(*lists: Sequence[Any]) -> bool:
@@ -166,43 +198,28 @@ def _are_plain(*lists: Sequence[Any]) -> bool:
     return True
 
 
-def _check(tensors: dict[str, Tensor]) -> None:
-    """Checks the tensors of one parameter, named after their lists."""
-    check_tensor(_OP, "parameter", tensors["parameters"])
-    shape = tensors["parameters"].shape
+def _check(op: str, tensors: dict[str, Tensor], read: str) -> None:
+    """Checks the tensors of one parameter."""
+    first, *_ = tensors.values()
     for name, tensor in tensors.items():
-        one = name[:-1]
-        check_tensor(_OP, one, tensor)
-        check_dtype(_OP, one, tensor, (torch.float32,))
-        if tensor.shape != shape:
-            raise ValueError(f"{_OP}: {one} must have shape {list(shape)}, got {list(tensor.shape)}")
-        if one != "gradient":
-            check_writable(_OP, one, tensor)
-    check_same_device(_OP, **{name[:-1]: tensor for name, tensor in tensors.items()})
+        check_tensor(op, name, tensor)
+        check_dtype(op, name, tensor, (torch.float32,))
+        if tensor.shape != first.shape:
+            raise ValueError(f"{op}: {name} must have shape {list(first.shape)}, got {list(tensor.shape)}")
+        if name != read:
+            check_writable(op, name, tensor)
+    check_same_device(op, **tensors)
 
 
-def _are_scalars(steps: Sequence[Any], device: torch.device) -> bool:
-    """Whether the steps keep all rules."""
-    return all(
-        isinstance(step, Tensor)
-        and step.layout is torch.strided
-        and step.dtype is torch.float32
-        and not step.shape
-        and step.device == device
-        for step in steps
-    )
-
-
-def _check_scalar(name: str, tensor: Any, parameter: Tensor) -> None:
-    check_tensor(_OP, name, tensor)
-    check_shape(_OP, name, tensor, ())
-    check_dtype(_OP, name, tensor, (torch.float32,))
-    check_same_device(_OP, **{"parameters[0]": parameter, name: tensor})
+def _check_scalar(op: str, name: str, tensor: Any, parameter: Tensor) -> None:
+    check_shape(op, name, tensor, ())
+    check_dtype(op, name, tensor, (torch.float32,))
+    check_same_device(op, **{"parameters[0]": parameter, name: tensor})
 
 
 def _check_rule(rule: Rule, parameter: Tensor) -> None:
     if isinstance(rule.learning_rate, Tensor):
-        _check_scalar("learning_rate", rule.learning_rate, parameter)
+        _check_scalar(_OP, "learning_rate", rule.learning_rate, parameter)
     else:
         check_number(_OP, "learning_rate", rule.learning_rate)
     check_number(_OP, "epsilon", rule.epsilon)

@@ -1,4 +1,4 @@
-"""The case of ``adam``."""
+"""The cases of ``adam`` and ``average``."""
 
 from __future__ import annotations
 
@@ -21,4 +21,12 @@ def _make(draw: Draw, n: int) -> Arguments:
     return {"rules": rules, **lists, "guard": guard, "loss": loss}
 
 
-CASE = Case(_make, refused={"loss must come with a guard, got none": {"guard": None}}, in_place=True)
+def _make_averages(draw: Draw, n: int) -> Arguments:
+    averages, parameters = ([draw.normal(size, 2).contiguous() for size in (n, 3)] for _ in range(2))
+    return {"averages": averages, "parameters": draw.among("parameters", parameters, None), "share": 0.25}
+
+
+CASES = {
+    "adam": Case(_make, refused={"loss must come with a guard, got none": {"guard": None}}, in_place=True),
+    "average": Case(_make_averages, refused={"share must lie in 0 to 1, got 2.0": {"share": 2.0}}, in_place=True),
+}

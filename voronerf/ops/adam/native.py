@@ -1,4 +1,4 @@
-"""``adam`` of the compiled module: no custom op, because it works in place on what no graph holds."""
+"""``adam`` and ``average`` of the compiled module: no custom ops, whose arguments could not be lists of rules."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
+from voronerf.ops.adam import reference
 from voronerf.ops.adam.reference import Guard, Rule
 
 
@@ -30,14 +31,17 @@ def adam(
     if scale is not None and isinstance(machine, compiled.Cpu):
         gradients, scale = [gradient / scale for gradient in gradients], None
     judged = compiled.AdamGuard(loss, limit, found, skipped, in_a_row, scale)
-    tensors = judged, gradients, parameters, means, squares, [parameter.numel() for parameter in parameters]
+    taken = given, parameters, gradients, means, squares, judged, [parameter.numel() for parameter in parameters]
     if isinstance(machine, compiled.Cuda):
-        compiled.adam(given, *tensors, parameters[0].new_empty(2 * len(rules)), machine)
+        compiled.adam(*taken, parameters[0].new_empty(2 * len(rules)), machine)
     else:
-        compiled.adam(given, *tensors, machine)
+        compiled.adam(*taken, machine)
 
 
 def average(averages: Sequence[Tensor], parameters: Sequence[Tensor] | None, share: float | Tensor) -> None:
-    """See ``voronerf.ops.adam.average``; on the CPU."""
+    """A share of the way; see ``voronerf.ops.average``."""
+    if native.on_cuda(averages[0]):
+        reference.average(averages, parameters, share)  # a launch for many of them
+        return
     share, sizes = torch.as_tensor(share, dtype=torch.float32), [each.numel() for each in averages]
-    native.compiled.average(share, parameters, averages, sizes, native.cpu())
+    native.compiled.average(averages, parameters, share, sizes, native.cpu())

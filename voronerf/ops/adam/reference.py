@@ -1,9 +1,9 @@
-"""A step of Adam, in place."""
+"""A step of Adam, and averages, in place."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -93,6 +93,15 @@ def adam(
         for tensor, new in ((parameter, moved), (mean, new_mean), (square, new_square)):
             tensor.copy_(torch.where(moves, new, tensor))
         rule.step.add_(~left_out)
+
+
+@torch.no_grad()
+def average(averages: Sequence[Tensor], parameters: Sequence[Tensor] | None, share: float | Tensor) -> None:
+    """A share of the way; see ``voronerf.ops.average``."""
+    if parameters is None:
+        torch._foreach_mul_(list(averages), 1 - share)
+    else:
+        torch._foreach_lerp_(list(averages), list(parameters), cast(float, share))
 
 
 def judge(guard: Guard, loss: Tensor | None, gradients: Sequence[Tensor]) -> None:

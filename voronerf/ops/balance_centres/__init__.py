@@ -36,9 +36,9 @@ def balance_centres(
     call. Not differentiable.
 
     Args:
-        samples: float32 [m, 3], finite.
-        masses: float64 [m], >= 0 and finite.
-        centres: float32 [k, 3], finite, k >= 1.
+        samples: finite.
+        masses: >= 0 and finite.
+        centres: finite, k >= 1.
         steps: number of updates, >= 0.
         alpha: step size, no unit.
         neighbours: size of N(i), >= 1.

@@ -21,7 +21,7 @@ def cell_sort(
     ``y[order] = y_sorted``. The result is the same to the bit on every backend. Cells may be empty.
 
     Args:
-        cells: int32 [n], values 0 to k - 1, n < 2**31.
+        cells: values 0 to k - 1, n < 2**31.
         k: number of cells, 1 to 2**27.
         backend: "auto", "reference", "native" or "warp".
 

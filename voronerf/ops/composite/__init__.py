@@ -34,14 +34,13 @@ def composite(
     its delta is 0. A NaN sample affects only its own ray.
 
     Args:
-        sigma: density, per unit of length, at least 0: [r, s], or [m] packed.
-        rgb: [r, s, c] or [m, c].
-        depths: distance along the ray: [r, s] or [m].
-        deltas: length of the part of the ray that a sample stands for, at least 0: [r, s] or [m].
-        ray_offsets: int32 [r + 1] for packed samples: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``,
-            possibly none. None for the dense form.
-        background: [c] or [r, c], added with weight 1 - opacity, or None. A ray without samples shows only the
-            background.
+        sigma: density, per unit of length, at least 0.
+        rgb: colour, or other channels.
+        depths: distance along the ray.
+        deltas: length of the part of the ray that a sample stands for, at least 0.
+        ray_offsets: of packed samples: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none.
+            None for the dense form.
+        background: added with weight 1 - opacity. A ray without samples shows only the background.
         backend: "auto", "reference", "native" or "warp".
 
     All floating-point arguments share one dtype, float16 to float64; sums are taken in float32 at least. Differentiable

@@ -61,7 +61,7 @@ def draw_pixels(
     The same on every backend and on any number of threads. Not differentiable.
 
     Args:
-        seed: int32 [1].
+        seed: of the hashes.
         count: Of pixels, b, 1 to 2**27.
         below: Pixels to draw from, 1 to 2**48; with runs as many as they have.
         runs: The pixels to draw from; None for 0 to ``below`` - 1.

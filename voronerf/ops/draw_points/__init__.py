@@ -25,9 +25,9 @@ def draw_points(
     Not differentiable.
 
     Args:
-        seed: int32 [1].
+        seed: of the hashes.
         count: Of points, n, 1 to 2**27.
-        box: float32 [2, 3], lowest and highest corner.
+        box: lowest and highest corner.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

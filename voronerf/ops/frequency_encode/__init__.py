@@ -29,7 +29,7 @@ def frequency_encode(
     taken in float32 at least.
 
     Args:
-        x: [n, d] floating point, n < 2**31.
+        x: angles of the first octave, n < 2**31.
         octaves: L, at least 0.
         include_input: whether x itself comes first.
         backend: "auto", "reference", "native" or "warp".

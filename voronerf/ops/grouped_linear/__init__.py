@@ -42,11 +42,11 @@ def grouped_linear(
     ``torch.autocast`` the arguments are cast to its dtype, float64 excepted, as for ``torch.nn.functional.linear``.
 
     Args:
-        x: [n, i] floating point, sorted by cell, n < 2**31, i >= 1.
-        offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
-            (before ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
-        weight: [k, o, i], o >= 1, the dtype of x.
-        bias: [k, o] or None.
+        x: samples, sorted by cell, n < 2**31, i >= 1.
+        offsets: rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells (before
+            ``offsets[0]``, from ``offsets[k]`` on) give 0. Cells may be empty.
+        weight: of each cell, o >= 1.
+        bias: of each cell.
         activation: "none", "relu", "softplus", "sigmoid" or "sine".
         backend: "auto", "reference", "native" or "warp".
 

@@ -30,8 +30,8 @@ def integrated_encode(
     equations 13 and 14; their code puts all sines before all cosines.
 
     Args:
-        means: [n, 3] floating point, n < 2**31.
-        variances: [n, 3], at least 0, squared units of the means, the dtype of the means.
+        means: of the Gaussians, n < 2**31.
+        variances: at least 0, squared units of the means.
         octaves: L, at least 0.
         backend: "auto", "reference", "native" or "warp".
 

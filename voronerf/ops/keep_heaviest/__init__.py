@@ -48,13 +48,13 @@ def keep_heaviest(
     number of threads. Not differentiable.
 
     Args:
-        kept_points: float32 [b, q, d], contiguous.
-        kept_importance: float32 [b, q], contiguous; at least one place.
-        added: int64 [1], batches that were added so far.
-        points: float32 [m, d].
-        weights: float32 [m].
-        error: float32 [r], of the rays; None to leave weights as they are.
-        ray_index: int32 [m], the ray of each sample, 0 to r - 1; None where ``error`` is.
+        kept_points: contiguous.
+        kept_importance: contiguous; at least one place.
+        added: batches that were added so far.
+        points: of the batch.
+        weights: of the samples.
+        error: of the rays; None to leave weights as they are.
+        ray_index: the ray of each sample, 0 to r - 1; None where ``error`` is.
         backend: "auto", "reference", "native" or "warp".
 
     Raises:

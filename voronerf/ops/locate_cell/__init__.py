@@ -45,11 +45,11 @@ def locate_cell(
     is read, and a point whose path leaves the tables, or does not end at a leaf, gets a negative number.
 
     Args:
-        points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are compared in float32.
-        centres: [m, 3] floating point, finite, m >= 1; every diagram has at least one.
-        child_offsets: int32 [g + 1], g >= 1.
-        child: int32 [m]. ``child[c] >= 0``: centre c is refined by diagram ``child[c]``; ``child[c] < 0``: centre c is
-            leaf number ``-child[c] - 1``.
+        points: n < 2**31. float16 and bfloat16 are compared in float32.
+        centres: finite, m >= 1; every diagram has at least one.
+        child_offsets: g >= 1.
+        child: ``child[c] >= 0``: centre c is refined by diagram ``child[c]``; ``child[c] < 0``: centre c is leaf number
+            ``-child[c] - 1``.
         depth: levels of the tree, 1 for a flat diagram.
         backend: "auto", "reference", "native" or "warp".
 

@@ -64,22 +64,22 @@ def march_rays(
     cut, which ``stop`` shows. This form can be captured in a CUDA graph and compiled. Not differentiable.
 
     Args:
-        origins: float32 or float64 [r, 3].
-        directions: [r, 3], unit vectors.
-        near: [r], start of the first stratum.
-        far: [r], end of the last stratum; a ray with far <= near has no samples.
-        occupied: bool [x, y, z], which cells of the box are not empty; x, y, z >= 1.
-        box: [2, 3], lowest and highest corner, the second above the first.
+        origins: of the rays.
+        directions: unit vectors.
+        near: start of the first stratum.
+        far: end of the last stratum; a ray with far <= near has no samples.
+        occupied: which cells of the box are not empty; x, y, z >= 1.
+        box: lowest and highest corner, the second above the first.
         samples: strata of a ray, s, 1 to 65,535.
-        uniforms: [r, s] in 0 to 1, the place of each sample in its stratum; None for the middles.
-        seed: int32 [1], in place of ``uniforms``: they are hashes of stratum and seed + number of the ray, the same for
-            every backend.
+        uniforms: in 0 to 1, the place of each sample in its stratum; None for the middles.
+        seed: in place of ``uniforms``: they are hashes of stratum and seed + number of the ray, the same for every
+            backend.
         spacing: of the strata, "linear" or "disparity" (equal steps of 1 / distance).
-        start: int32 [r], the first stratum to consider, >= 0; None for 0.
+        start: the first stratum to consider, >= 0; None for 0.
         most: largest number of samples of a ray, at least 1; None for all.
         capacity: rows of the result, at least 1; None for the number of samples.
-        contraction: [4], centre and radius of a sphere; [5, 3], centre, right, up, ahead and (near, a, b) of normalised
-            device coordinates; or None. See ``voronerf.nerf.Contraction`` and ``Perspective``.
+        contraction: centre and radius of a sphere; or centre, right, up, ahead and (near, a, b) of normalised device
+            coordinates. See ``voronerf.nerf.Contraction`` and ``Perspective``.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

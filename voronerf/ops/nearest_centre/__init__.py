@@ -34,8 +34,8 @@ def nearest_centre(
     cell 0. Not differentiable.
 
     Args:
-        points: [n, 3] floating point, n < 2**31. float16 and bfloat16 are compared in float32.
-        centres: [k, 3] floating point, finite, k >= 1.
+        points: n < 2**31. float16 and bfloat16 are compared in float32.
+        centres: finite, k >= 1.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

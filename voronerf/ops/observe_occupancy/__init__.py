@@ -53,19 +53,18 @@ def observe_occupancy(
     the world. A cell then gets densities per unit of contracted length along rays from the centre.
 
     Args:
-        density: float32 [x, y, z], >= 0, contiguous.
-        occupied: bool [x, y, z], contiguous: density >= threshold.
-        box: float32 [2, 3], lowest and highest corner.
-        positions: float32 [m, 3]; a position outside the box counts for the nearest cell at its border.
-        sigma: float32 [m], densities of the samples; NaN counts as infinite.
-        deltas: float32 [m], lengths of their strata; a sample of length 0 says nothing. None where all light reaches
-            every sample.
-        weights: float32 [m], their contributions to their rays; None where ``deltas`` is.
+        density: >= 0, contiguous.
+        occupied: contiguous: density >= threshold.
+        box: lowest and highest corner.
+        positions: a position outside the box counts for the nearest cell at its border.
+        sigma: densities of the samples; NaN counts as infinite.
+        deltas: lengths of their strata; a sample of length 0 says nothing. None where all light reaches every sample.
+        weights: their contributions to their rays; None where ``deltas`` is.
         decay: 0 to 1.
         threshold: density from which a cell counts as occupied.
         hidden: share of the light, 0 to 1.
-        contraction: float32 [4], a sphere, or [5, 3], normalised device coordinates, as for ``march_rays``; or None.
-        fixed: bool [x, y, z], cells that stay as they are; None for none.
+        contraction: of the space of the grid, as for ``march_rays``.
+        fixed: cells that stay as they are; None for none.
         backend: "auto", "reference", "native" or "warp".
 
     Raises:

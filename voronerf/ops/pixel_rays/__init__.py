@@ -45,20 +45,19 @@ def pixel_rays(
     The box is met by the slab method (Kay and Kajiya 1986). Not differentiable.
 
     Args:
-        poses: float32 [c, 4, 4], camera to world, OpenGL axes.
-        intrinsics: float32 [c, 4], (fx, fy, cx, cy) in pixels.
-        images: uint8 [c, h, w, 3], or [c, h, w, 4] with an alpha channel that the colours are not multiplied by.
-        index: int64 [b], the pixels: image * h * w + row * w + column. Others are an error on the CPU; on CUDA, where
-            they are not read before, they count as the nearest.
+        poses: camera to world, OpenGL axes.
+        intrinsics: (fx, fy, cx, cy) in pixels.
+        images: with or without an alpha channel, which the colours are not multiplied by.
+        index: the pixels: image * h * w + row * w + column. Others are an error on the CPU; on CUDA, where they are not
+            read before, they count as the nearest.
         near: nearest distance of interest, >= 0.
         far: farthest.
-        box: float32 [2, 3], lowest and highest corner, or None for all of space.
-        lens: int32 [c], the table of each camera; a number that no table has, such as -1, is a camera without
-            distortion. It comes with tables.
-        tables: float32 [l, h, w, 2], for each lens the directions (x, y, z) of its pixels in the camera's axes as
-            stereographic projections (x, -y) / (1 - z), see `voronerf.nerf.lenses.LensTables`; None for no distortion.
-        background: float32 [3] or [b, 3], the colour behind images with an alpha channel; None leaves their
-            colours as they are.
+        box: lowest and highest corner; None for all of space.
+        lens: the table of each camera; a number that no table has, such as -1, is a camera without distortion. It comes
+            with tables.
+        tables: for each lens the directions (x, y, z) of its pixels in the camera's axes as stereographic projections
+            (x, -y) / (1 - z), see `voronerf.nerf.lenses.LensTables`; None for no distortion.
+        background: the colour behind images with an alpha channel; None leaves their colours as they are.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

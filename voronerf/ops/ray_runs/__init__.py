@@ -45,12 +45,12 @@ def own_samples(
     neighbours in one cell.
 
     Args:
-        positions: float32 or float64 [n, 3], of all samples that this rank knows, ray after ray, near to far.
-        ray_index: int32 [n], their rays.
-        depths: [n].
-        deltas: [n], the lengths of their strata.
-        cells: int32 [n], the cell of each, 0 to k - 1.
-        own: int32 [k], the number of each cell among those of this rank, or -1.
+        positions: of all samples that this rank knows, ray after ray, near to far.
+        ray_index: their rays.
+        depths: distances along the rays.
+        deltas: the lengths of their strata.
+        cells: the cell of each, 0 to k - 1.
+        own: the number of each cell among those of this rank, or -1.
         bent: Whether rays are bent by a contraction, and may leave a cell and come back.
         backend: "auto", "reference" or "native".
 
@@ -87,7 +87,7 @@ def run_sums(
     """Partial sums of runs, from what the networks put out for their samples.
 
     Args:
-        raw: float32 or float64 [m, 4], colour and density before their activations, as in `render_loss`.
+        raw: colour and density before their activations, as in `render_loss`.
         samples: Of `own_samples`.
         density_scale: Factor on the density, > 0.
         backend: "auto", "reference" or "native".
@@ -120,9 +120,9 @@ def compose_runs(
     """Puts rays together from the runs of all ranks, and says what each run must know of its ray.
 
     Args:
-        sums: float32 or float64 [q, 6], of `run_sums`, in any order.
-        target: [r, 3], the colours of these rays.
-        background: [3] or [r, 3], what is behind them, or None.
+        sums: of `run_sums`, in any order.
+        target: the colours of these rays.
+        background: what is behind them.
         first: The number of the first of these rays.
         rays: How many all ranks have.
         robust: As in `render_loss`.
@@ -165,9 +165,9 @@ def run_gradients(
     """Gradient of the loss to what the networks put out, from what the runs were told of their rays.
 
     Args:
-        raw: [m, 4], as in `run_sums`.
+        raw: as in `run_sums`.
         samples: Of `own_samples`.
-        answers: [q, 6], of `compose_runs`.
+        answers: of `compose_runs`.
         density_scale: As in `run_sums`.
         hidden: Share of the light, in [0, 1): samples that no more than it reaches have no gradient.
         backend: "auto", "reference" or "native".

@@ -42,13 +42,12 @@ def render_loss(
     beyond s. The native backend computes loss and gradient in one pass over each ray.
 
     Args:
-        raw: [m, 4], colour and density before their activations, or ``activated``: float16, bfloat16, float32 or
-            float64.
-        deltas: [m], length of the part of its ray that a sample stands for, at least 0.
-        ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none.
-            Other samples have weight 0.
-        target: [r, 3], the colours to learn.
-        background: [3] or [r, 3], added with weight 1 - opacity, or None.
+        raw: colour and density before their activations, or ``activated``.
+        deltas: length of the part of its ray that a sample stands for, at least 0.
+        ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none. Other samples have
+            weight 0.
+        target: the colours to learn.
+        background: added with weight 1 - opacity.
         density_scale: factor on the density, > 0; None with ``activated``.
         activated: whether ``raw`` is the colour and the density themselves, as for `composite`: no sigmoid, softplus or
             scale comes in between, nothing is clamped, and gradients are to them.
@@ -106,11 +105,11 @@ def render_loss_gradient(
     """`render_loss` and the gradient of its loss to ``raw``, for `forward_with_tape`; nothing is differentiable.
 
     Args:
-        raw: [m, 4], float32 or float64.
-        deltas: [m], as in `render_loss`.
-        ray_offsets: int32 [r + 1], as in `render_loss`.
-        target: [r, 3], the colours to learn.
-        background: [3] or [r, 3], as in `render_loss`, or None.
+        raw: as in `render_loss`.
+        deltas: as in `render_loss`.
+        ray_offsets: as in `render_loss`.
+        target: the colours to learn.
+        background: as in `render_loss`.
         density_scale: factor on the density, > 0; None with ``activated``.
         activated: whether ``raw`` is the colour and the density themselves, as in `render_loss`. So is the gradient.
         hidden: share of the light, as in `render_loss`.

@@ -87,12 +87,12 @@ def render_opaque(
     lies in front of the first surface of each ray.
 
     Args:
-        origins: float32 or float64 [r, 3].
-        directions: [r, 3], unit vectors, which the layers may read, too.
-        near: [r], as in ``march_rays``.
-        far: [r].
-        occupied: bool [x, y, z], as in ``march_rays``.
-        box: [2, 3].
+        origins: of the rays.
+        directions: unit vectors, which the layers may read, too.
+        near: as in ``march_rays``.
+        far: as in ``march_rays``.
+        occupied: as in ``march_rays``.
+        box: as in ``march_rays``.
         samples: strata of a ray, s; samples are their middles.
         network: Arguments of `routed_mlp` by name: weights, biases and layers, and where there are any, features,
             centres, child_offsets, child and depth. Or ``program`` and ``parameters`` as `grouped_program` takes them,
@@ -105,8 +105,8 @@ def render_opaque(
         wave: samples of a ray that are evaluated at a time, 1 to 1,024.
         opaque: a ray ends with a wave behind which no more than this share of the light is left, in [0, 1).
         spacing: of the strata, "linear" or "disparity".
-        contraction: as in ``march_rays``, or None.
-        background: [3] or [r, 3], the colour behind everything; None is black.
+        contraction: as in ``march_rays``.
+        background: the colour behind everything; None is black.
         heaviest: whether to find the heaviest sample of each ray; else ``heaviest`` is the far end.
         backend: "auto", "reference", "native" or "warp".
 

@@ -39,11 +39,10 @@ def resample(
     uniforms.
 
     Args:
-        weights: [r, s] floating point, s >= 1; need not sum to 1.
-        edges: [r, s + 1], rising along a ray, the dtype of the weights.
+        weights: s >= 1; need not sum to 1.
+        edges: rising along a ray.
         count: depths of a ray, at least 1.
-        uniforms: [r, count] in 0 to 1, in any order, the dtype of the weights; None for the midpoints of ``count``
-            equal strata, which is deterministic.
+        uniforms: in 0 to 1, in any order; None for the midpoints of ``count`` equal strata, which is deterministic.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:

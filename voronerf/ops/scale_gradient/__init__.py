@@ -26,8 +26,8 @@ def scale_gradient(
     Scaling for Improved Near-Camera Training". Not differentiable.
 
     Args:
-        gradient: float32 or float64 [m, c], contiguous.
-        depths: [m], of the samples, of the type of ``gradient``.
+        gradient: contiguous.
+        depths: of the samples.
         full: The distance from which gradients are whole.
         backend: "auto", "reference", "native" or "warp".
 

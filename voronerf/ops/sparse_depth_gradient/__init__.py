@@ -51,14 +51,14 @@ def sparse_depth_gradient(
     gradient. Nothing is differentiable further.
 
     Args:
-        loss: float32 or float64 [].
-        gradient: [m, 4], contiguous, of the type of ``loss`` like all that follows; to the outputs of the networks.
-        density: [m], of the samples.
-        depths: [m], their distances along the rays.
-        deltas: [m], their lengths.
-        weights: [m], their contributions to the rays.
-        ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
-        distances: [s], of the point that each of the first s rays ends at, s <= r; NaN for none.
+        loss: to which the loss is added.
+        gradient: contiguous, to the outputs of the networks.
+        density: of the samples.
+        depths: their distances along the rays.
+        deltas: their lengths.
+        weights: their contributions to the rays.
+        ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
+        distances: of the point that each of the first s rays ends at, s <= r; NaN for none.
         factor: on the loss of each ray.
         density_scale: factor on the density behind its softplus, as for `render_loss`; None with ``activated``.
         activated: whether the gradient is to the density itself.

@@ -27,7 +27,7 @@ def spherical_harmonics(
     that. The result is a polynomial in x, y and z, whatever their length. Gradients of every order.
 
     Args:
-        directions: [n, 3] floating point, unit vectors, n < 2**31.
+        directions: unit vectors, n < 2**31.
         degree: number of bands, 1 to 4.
         backend: "auto", "reference", "native" or "warp".
 
