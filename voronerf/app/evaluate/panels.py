@@ -121,14 +121,7 @@ def save_picture(path: Path, picture: Tensor) -> None:
 
 
 def save_panel(path: Path, truth: Tensor, image: RenderedImage, cells: Tensor) -> None:
-    """Writes truth, render, error, depth and cells of one view side by side, as PNG.
-
-    Args:
-        path: PNG file to write.
-        truth: [h, w, 3] in 0..1.
-        image: the rendered view, on the CPU.
-        cells: integer [h, w].
-    """
+    """Writes truth [h, w, 3], render, error, depth and cells int [h, w] of a view on the CPU side by side, as PNG."""
     pictures = {
         "truth": picture_of_colour(truth),
         "render": picture_of_colour(image.colour),

@@ -66,12 +66,7 @@ def judged_at(state: State) -> int:
 
 
 def why_nothing_is_learnt(batch: Batch, output: RenderOutput) -> str | None:
-    """The fault of a start, from one of its steps; None if it is good. Waits for the device.
-
-    Args:
-        batch: Of the step, r rays.
-        output: Of the step.
-    """
+    """The fault of a start, from the r rays of one of its steps; None if it is good. Waits for the device."""
     background = torch.zeros(3) if batch.background is None else batch.background
     background = background.to(batch.target)
     light = output.error.new_zeros(len(batch.rays)).index_add(
