@@ -11,7 +11,7 @@ from ranks import complaints, network_files, new_store, on_ranks, town_tensors
 
 from voronerf.app.cli import main
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.train import State, TrainConfig
+from voronerf.app.train import Callback, TrainConfig
 from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.app.train.resume import snapshot
 from voronerf.nerf import TrainingStep
@@ -58,19 +58,6 @@ def dies_at_the_start(args):
 
 def is_asked_to_stop(args, step):
     with in_step(step, lambda: os.kill(os.getpid(), signal.SIGTERM)):
-        return main(args)
-
-
-def is_stopped(args):
-    """After some steps, by a signal."""
-    real = State.count_steps
-
-    def count_steps(state, *of):
-        real(state, *of)
-        if state.step < 12:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    with mock.patch.object(State, "count_steps", count_steps):
         return main(args)
 
 
@@ -216,26 +203,29 @@ def test_a_training_learns(whole):
         assert torch.isfinite(found.tensors["router.module.features"]).all()
 
 
-def build_some(out, steps, **more):
-    """Three small territories in this process."""
+def build_some(out, steps, count=3, **more):
+    """Small territories in this process."""
     options = ("levels=4", "log2_entries=10")
     given = {"width": 8, "rays": 24, "cells": (2,), "split_at": (0.85,), "field_options": options, **more}
     config = TrainConfig(steps=steps, out=out, lpips=False, **given)
     scene = builtin_scene(16, train_views=9, test_views=1)
-    return train.build_town(config, scene, 3, group.Group(torch.device("cpu")))
+    return train.build_town(config, scene, count, group.Group(torch.device("cpu")))
 
 
 def test_parts_of_steps_are_replayed(tmp_path, monkeypatch):
     """With the same bits as steps that run as they are, beyond a split and looks at empty space."""
     found = []
+    monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 20)
     for expected in ("parts of it are recorded", "a test"):
         if found:
             monkeypatch.setattr(TrainingStep, "_standing_obstacle", lambda *of, **how: "a test")
-        town = build_some(tmp_path / expected, 120)
+        town = build_some(tmp_path / expected, 60)
         train.train(town)
         found.append([v for state in town.states.values() for v in snapshot(state).tensors.values()])
         for state in town.states.values():
             assert expected in state.training_step.explain()
+            replayed = {name for name, part in state.training_step._parts.items() if part.replayed}
+            assert replayed >= ({"own rays: networks", "own rays: gradients beside 0"} if len(found) == 1 else set())
     assert all(one.equal(other) for one, other in zip(*found, strict=True))
 
 
@@ -269,12 +259,26 @@ def test_photographs_have_a_robust_loss(tmp_path):
 
 
 def test_one_territory_is_an_ordinary_training(tmp_path):
-    """Recorded as a whole, with checkpoints that are opened, stopped and continued."""
-    args = ["train-territories", "--resume", "--panels", "0", "--out"]
-    first, second = tmp_path / "first", tmp_path / "second"
-    one = [*command(first), "--territories", "1"]
-    assert on_ranks(main, one, folder=tmp_path, size=1)[0] == [0]
-    one[one.index(str(first))] = str(second)
-    assert on_ranks(is_stopped, one, folder=tmp_path, size=1)[0] == [130]
-    assert on_ranks(main, [*args, str(second)], folder=tmp_path, size=1)[0] == [0]
-    assert same(first, second)
+    """Recorded as a whole; one that was stopped goes on to the same bits."""
+    found = []
+    for stops in (False, True):
+        town = build_some(tmp_path / str(stops), 30, count=1)
+        if stops:
+            train.train(town, [Stops(town)])
+            assert town.first.step == 12
+            town = build_some(tmp_path / str(stops), 30, count=1)
+            train.resume(town)
+        train.train(town)
+        assert "recorded and replayed" in town.first.training_step.explain()
+        found.append(snapshot(town.first))
+    assert found[1].values["step"] == 30
+    assert all(found[0].tensors[name].equal(tensor) for name, tensor in found[1].tensors.items())
+
+
+class Stops(Callback):
+    def __init__(self, town):
+        self.town = town
+
+    def after_step(self, state):
+        if state.step == 12:
+            self.town.stop()
