@@ -33,15 +33,8 @@ def is_watched() -> bool:
     return False
 
 
-def custom_op(
-    name: str,
-    memory: Callable[[Any], Any],
-    *,
-    devices: tuple[str, ...] = ("cpu", "cuda"),
-    mutates: Sequence[str] = (),
-    counted: bool = False,
-) -> Callable[[Callable[..., Any]], Op]:
-    """Makes a function that fills memory with its results the custom op ``voronerf::name``.
+def custom_op(name: str, memory: Callable[[Any], Any], **options: Any) -> Callable[[Callable[..., Any]], Op]:
+    """Makes a function that fills memory with its results the custom op ``voronerf::name``, with the options of `Op`.
 
     ::
 
@@ -57,20 +50,8 @@ def custom_op(
             native.compiled.nearest_centre(*given, found, ...)
 
         cells = nearest_centre(points, centres)
-
-    The compiled functions check dtypes and make their inputs contiguous (csrc/bindings/load.h).
-
-    Args:
-        name: of the op.
-        memory: gives memory for the results, of shapes alone, which is also the op's fake, with which torch traces. By
-            its annotations the arguments are a named tuple, some of whose members may be named tuples, which the custom
-            op takes apart. An optional one begins with what is never None.
-        devices: device types that it runs on.
-        mutates: the arguments that it writes into.
-        counted: whether only the kernels know how many rows there are: the function then gets the arguments alone, and
-            makes its results, and ``memory`` is nothing but the fake.
     """
-    return lambda fill: Op(name, memory, fill, devices, mutates, counted)
+    return lambda fill: Op(name, memory, fill, **options)
 
 
 class _Fields:
@@ -124,7 +105,19 @@ class Op:
 
     The dispatcher and the autograd of ``torch.library`` take some 130 us for a forward and a backward pass, as long as
     a layer of width 64 takes for a thousand samples, and more for lists of tensors. Modes, transforms, tracers and
-    profilers are given the custom op.
+    profilers are given the custom op. The compiled functions check dtypes and make their inputs contiguous
+    (csrc/bindings/load.h).
+
+    Args:
+        name: of the op.
+        memory: gives memory for the results, of shapes alone, which is also the op's fake, with which torch traces. By
+            its annotations the arguments are a named tuple, some of whose members may be named tuples, which the custom
+            op takes apart. An optional one begins with what is never None.
+        fill: fills it.
+        devices: device types that it runs on.
+        mutates: the arguments that it writes into.
+        counted: whether only the kernels know how many rows there are: ``fill`` then gets the arguments alone, and
+            makes its results, and ``memory`` is nothing but the fake.
 
     Attributes:
         tensors: places of the arguments of the custom op that are tensors, or None.
@@ -135,9 +128,10 @@ class Op:
         name: str,
         memory: Callable[[Any], Any],
         fill: Callable[..., Any],
-        devices: tuple[str, ...],
-        mutates: Sequence[str],
-        counted: bool,
+        *,
+        devices: tuple[str, ...] = ("cpu", "cuda"),
+        mutates: Sequence[str] = (),
+        counted: bool = False,
     ) -> None:
         hints = typing.get_type_hints(memory)
         result, (kind,) = hints.pop("return"), hints.values()
@@ -181,22 +175,21 @@ class Op:
             self._refuse_tangents(flat)
         if active.recording is None and is_watched():
             return self._transformed(flat) if torch._C._are_functorch_transforms_active() else self._op(*flat)
-        tensors = [flat[place] for place in self.tensors]
+        tensors = [flat[place] for place in self.tensors if flat[place] is not None]
         for place in self._lists:
             tensors += flat[place]
         learns = False
         for tensor in tensors:
-            if tensor is not None:
-                here = tensor.is_cpu or (tensor.is_cuda and self._on_cuda)
-                if not here or type(tensor) not in _PLAIN:  # fake tensors of other tracers among them
-                    return self._op(*flat)
-                if _is_wrapped(tensor):  # by a transform that has ended, such as the arguments that vjp keeps
-                    return self._transformed(flat)
-                learns = learns or tensor.requires_grad
+            here = tensor.is_cpu or (tensor.is_cuda and self._on_cuda)
+            if not here or type(tensor) not in _PLAIN:  # fake tensors of other tracers among them
+                return self._op(*flat)
+            learns = learns or tensor.requires_grad
         if not (learns and torch.is_grad_enabled()):
             return self._run(arguments)
         if self._backward is None or active.recording is not None:
             return self._op(*flat)
+        if any(map(_is_wrapped, tensors)):  # by a transform that has ended, such as the arguments that vjp keeps
+            return self._transformed(flat)
         entries, lengths = _flattened(flat) if self._lists else (flat, None)
         return self._given(_apply_directly(*entries, lengths, self, arguments))
 

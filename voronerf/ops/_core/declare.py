@@ -23,7 +23,7 @@ dimensions, of ``[m] if ray_offsets else [r, s]`` where that argument is given. 
 letters that functions of the arguments give (``sizes``). An int is written as a range (``1..4``, ``0..``), a float as
 ``positive``, or an interval (``[0, 1)``, ``0 to 1``), a str as its choices (``linear|disparity``). What is written by
 its class alone is an instance of it. The docstring says what arguments mean; what the signature says of tensors is put
-before it.
+before it, and the backends behind it.
 """
 
 from __future__ import annotations
@@ -223,21 +223,17 @@ class Declaration:
 
     def _letters(self) -> dict[str, Callable[[Any], Any]]:
         """What gives each letter that shapes speak of, and of a tensor of either form whether it has one per ray."""
-        ways, found = dict[str, list[_Way]](), dict[str, Callable[[Any], Any]]()
-        for name, _, optional, rule in self._tensors():
-            own, told = self._places[name], self._places.get(rule.condition)
+        ways, found = dict[str, list[tuple[int, int, int, int]]](), dict[str, Callable[[Any], Any]]()
+        for name, _, _, rule in self._tensors():
             if rule.either:
-                found[f"{name}_per_ray"] = _is_per_ray(own)
+                found[f"{name}_per_ray"] = _is_per_ray(self._places[name])
                 continue
-            for shape, condition, there in [
-                (rule.shape, own if optional else told, True),
-                (rule.otherwise, told, False),
-            ]:
+            for shape in (rule.shape, rule.otherwise):
                 for dimension, entry in enumerate(shape):
                     if isinstance(entry, str) and entry not in self._places:
                         letter, _, one = entry.partition("+")
-                        ways.setdefault(letter, []).append(_Way(own, dimension, len(one), condition, there))
-        return {**found, **{letter: _size_of(each) for letter, each in ways.items()}}
+                        ways.setdefault(letter, []).append((len(shape), self._places[name], dimension, len(one)))
+        return {**found, **{letter: _size_of(sorted(each)) for letter, each in ways.items()}}
 
     def _memory(self) -> Callable[[Any], Any]:
         """What gives new memory for the results: a named tuple where they have names."""
@@ -301,12 +297,15 @@ class Declaration:
         return public
 
     def _described(self) -> str:
-        """The docstring, with the dtypes and the shape of each tensor, which the signature has."""
+        """The docstring, with the dtypes and the shape of each tensor, which the signature has, and the backends."""
         text = self.function.__doc__ or ""
         for name, _, optional, rule in self._tensors():
             form = f"{rule.text} or None" if optional else rule.text
             text = re.sub(rf"^( +{name}: )", rf"\g<1>{form}, ", text, count=1, flags=re.MULTILINE)
-        return text
+        known = {"auto": True, "reference": True, "native": self.native, "warp": self.warp}
+        *others, last = [f'"{name}"' for name, there in known.items() if there]
+        backend = f"        backend: {', '.join(others)} or {last}.\n"
+        return re.sub(r"^ {4}Args:\n(?: {8}.+\n)+", rf"\g<0>{backend}", text, count=1, flags=re.MULTILINE)
 
     def custom_op(self, name: str = "", **options: Any) -> Callable[[Callable[..., Any]], Op]:
         """Makes ``fill(given, found)`` a custom op: it is handed the arguments, and memory for the results.
@@ -395,28 +394,19 @@ class Declaration:
         return made if others else lambda given: new(kind, known(given))
 
 
-class _Way(NamedTuple):
-    """A dimension of an argument that a letter stands for, less one or not; ``told`` is the place of an argument that
-    must be ``there``, or must not, for the argument to have this dimension, None for always."""
+def _size_of(ways: Sequence[tuple[int, int, int, int]]) -> Callable[[Any], int]:
+    """What gives a letter, of the first tensor that is there with so many dimensions, by its place: the size of one of
+    its dimensions, less one or not. 0 where there is none."""
 
-    place: int
-    dimension: int
-    less: int
-    told: int | None
-    there: bool
+    def size(given: Any) -> int:
+        for dimensions, place, dimension, less in ways:
+            tensor = given[place]
+            if tensor is not None and tensor.dim() == dimensions:
+                found: int = tensor.shape[dimension]
+                return found - less
+        return 0
 
-
-def _size_of(ways: Sequence[_Way]) -> Callable[[Any], int]:
-    """What gives a letter in the first of these ways that there is, or 0."""
-    sure = [way for way in ways if way.told is None]
-    place, dimension, less, told, there = (sure or ways)[0]
-    if told is None:
-        return lambda given: given[place].shape[dimension] - less
-    rest = [way for way in ways if way[3:] != (told, there)]
-    otherwise: Callable[[Any], int] = _size_of(rest) if rest else lambda given: 0
-    return lambda given: (
-        given[place].shape[dimension] - less if (given[told] is not None) is there else otherwise(given)
-    )
+    return size
 
 
 def _is_per_ray(place: int) -> Callable[[Any], bool]:

@@ -42,7 +42,6 @@ def balance_centres(
         steps: number of updates, >= 0.
         alpha: step size, no unit.
         neighbours: size of N(i), >= 1.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         (centres float32 [k, 3], weights float64 [k], the mass in each cell of the returned centres).

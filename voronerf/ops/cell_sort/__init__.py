@@ -23,7 +23,6 @@ def cell_sort(
     Args:
         cells: values 0 to k - 1, n < 2**31.
         k: number of cells, 1 to 2**27.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         order int32 [n], the original row of each sorted row; offsets int32 [k + 1], cell c being sorted rows

@@ -41,7 +41,6 @@ def composite(
         ray_offsets: of packed samples: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none.
             None for the dense form.
         background: added with weight 1 - opacity. A ray without samples shows only the background.
-        backend: "auto", "reference", "native" or "warp".
 
     All floating-point arguments share one dtype, float16 to float64; sums are taken in float32 at least. Differentiable
     in all of them.

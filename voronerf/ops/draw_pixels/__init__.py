@@ -66,7 +66,6 @@ def draw_pixels(
         below: Pixels to draw from, 1 to 2**48; with runs as many as they have.
         runs: The pixels to draw from; None for 0 to ``below`` - 1.
         known: Others, of known distances, that the first of the batch are drawn from; None for none.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         int64 [b], float32 [b, 3] in [0, 1), and float32 [several], the distances of the first; [0] without ``known``.

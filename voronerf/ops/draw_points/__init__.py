@@ -28,7 +28,6 @@ def draw_points(
         seed: of the hashes.
         count: Of points, n, 1 to 2**27.
         box: lowest and highest corner.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         float32 [n, 3].

@@ -32,7 +32,6 @@ def frequency_encode(
         x: angles of the first octave, n < 2**31.
         octaves: L, at least 0.
         include_input: whether x itself comes first.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         [n, d + 2 d L], or [n, 2 d L] without the input, in the dtype of x.

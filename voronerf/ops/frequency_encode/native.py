@@ -17,55 +17,43 @@ from voronerf.ops._core.memory import on_huge_pages
 from voronerf.ops.frequency_encode import reference
 
 _OP = declared("frequency_encode")
+_inputs = _OP.inputs(native.compiled.Encoding, variances=None, width="w")
 
 
 @_OP.custom_op("frequency_encode_native")
 def _forward(given: Any, out: Tensor) -> None:
-    encode(out, given.x, None, given.octaves, given.include_input)
+    encode(_inputs(given), out)
 
 
 @_OP.backward_op("frequency_encode_native_backward", _forward, reference.frequency_encode)
 def _backward(given: Any, arriving: Any, gradients: Any) -> None:
-    encode_backward(arriving.result, gradients.x, None, given.x, None, given.octaves, given.include_input)
+    encode_backward(_inputs(given), arriving.result, gradients.x, None)
 
 
 frequency_encode = in_float32(_forward)
 
 
-def encode(out: Tensor, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> None:
+def encode(inputs: native.compiled.Encoding, out: Tensor) -> None:
     """Fills ``out`` with the frequency encoding or, with variances, the integrated one."""
     on_huge_pages(out)
-    native.compiled.encode(_taken(out.shape[1], x, variances, octaves, include_input), out, *_where(x, octaves))
+    native.compiled.encode(inputs, out, *_where(inputs))
 
 
 def encode_backward(
-    gradient: Tensor,
-    of_x: Tensor | None,
-    of_variances: Tensor | None,
-    x: Tensor,
-    variances: Tensor | None,
-    octaves: int,
-    include_input: bool,
+    inputs: native.compiled.Encoding, gradient: Tensor, of_x: Tensor | None, of_variances: Tensor | None
 ) -> None:
     """Fills the gradients to x and to the variances."""
     of_x, of_variances = (
         like.new_empty(like.shape) if part is None and like is not None else part
-        for part, like in ((of_x, x), (of_variances, variances))
+        for part, like in ((of_x, inputs.x), (of_variances, inputs.variances))
     )
-    inputs = _taken(gradient.shape[1], x, variances, octaves, include_input)
-    native.compiled.encode_backward(inputs, gradient, of_x, of_variances, *_where(x, octaves))
+    native.compiled.encode_backward(inputs, gradient, of_x, of_variances, *_where(inputs))
 
 
-def _taken(width: int, x: Tensor, variances: Tensor | None, octaves: int, include_input: bool) -> Any:
-    n, d = x.shape
-    return native.compiled.Encoding(
-        x=x, variances=variances, n=n, d=d, octaves=octaves, include_input=include_input, width=width
-    )
-
-
-def _where(x: Tensor, octaves: int) -> tuple[Any, ...]:
+def _where(inputs: native.compiled.Encoding) -> tuple[Any, ...]:
     """On the CPU a workspace comes before the machine."""
+    x: Any = inputs.x
     compiled, machine = native.compiled, native.machine(x)
     if isinstance(machine, compiled.Cuda):
         return (machine,)
-    return x.new_empty(compiled.encode_workspace(x.shape[1], octaves, machine)), machine
+    return x.new_empty(compiled.encode_workspace(inputs.d, inputs.octaves, machine)), machine

@@ -48,7 +48,6 @@ def grouped_linear(
         weight: of each cell, o >= 1.
         bias: of each cell.
         activation: "none", "relu", "softplus", "sigmoid" or "sine".
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         [n, o] in the dtype of x (of autocast, where it is on).

@@ -33,7 +33,6 @@ def integrated_encode(
         means: of the Gaussians, n < 2**31.
         variances: at least 0, squared units of the means.
         octaves: L, at least 0.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         [n, 6L] in the dtype of the means.

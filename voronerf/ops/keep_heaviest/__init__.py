@@ -55,7 +55,6 @@ def keep_heaviest(
         weights: of the samples.
         error: of the rays; None to leave weights as they are.
         ray_index: the ray of each sample, 0 to r - 1; None where ``error`` is.
-        backend: "auto", "reference", "native" or "warp".
 
     Raises:
         ValueError: what is kept is not contiguous; one of ``error`` and ``ray_index`` alone; on the CPU a ray that is

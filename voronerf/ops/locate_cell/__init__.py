@@ -51,7 +51,6 @@ def locate_cell(
         child: ``child[c] >= 0``: centre c is refined by diagram ``child[c]``; ``child[c] < 0``: centre c is leaf number
             ``-child[c] - 1``.
         depth: levels of the tree, 1 for a flat diagram.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         leaf int32 [n].

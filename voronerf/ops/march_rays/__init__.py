@@ -80,7 +80,6 @@ def march_rays(
         capacity: rows of the result, at least 1; None for the number of samples.
         contraction: centre and radius of a sphere; or centre, right, up, ahead and (near, a, b) of normalised device
             coordinates. See ``voronerf.nerf.Contraction`` and ``Perspective``.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         March(ray_offsets, ray_index, depths, deltas, positions, stop). Floating-point arguments share one dtype, which

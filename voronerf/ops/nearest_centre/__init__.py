@@ -36,7 +36,6 @@ def nearest_centre(
     Args:
         points: n < 2**31. float16 and bfloat16 are compared in float32.
         centres: finite, k >= 1.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         cells int32 [n], in 0 to k - 1.

@@ -65,7 +65,6 @@ def observe_occupancy(
         hidden: share of the light, 0 to 1.
         contraction: of the space of the grid, as for ``march_rays``.
         fixed: cells that stay as they are; None for none.
-        backend: "auto", "reference", "native" or "warp".
 
     Raises:
         ValueError: a grid that is not contiguous; one of ``deltas`` and ``weights`` alone.

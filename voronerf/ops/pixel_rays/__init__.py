@@ -58,7 +58,6 @@ def pixel_rays(
         tables: for each lens the directions (x, y, z) of its pixels in the camera's axes as stereographic projections
             (x, -y) / (1 - z), see `voronerf.nerf.lenses.LensTables`; None for no distortion.
         background: the colour behind images with an alpha channel; None leaves their colours as they are.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         PixelRays(origins, directions, near, far, colour). A ray that misses the box has far == near.

@@ -52,7 +52,6 @@ def own_samples(
         cells: the cell of each, 0 to k - 1.
         own: the number of each cell among those of this rank, or -1.
         bent: Whether rays are bent by a contraction, and may leave a cell and come back.
-        backend: "auto", "reference" or "native".
 
     Returns:
         OwnSamples(positions, ray_index, depths, deltas, cells, run_offsets).
@@ -90,7 +89,6 @@ def run_sums(
         raw: colour and density before their activations, as in `render_loss`.
         samples: Of `own_samples`.
         density_scale: Factor on the density, > 0.
-        backend: "auto", "reference" or "native".
 
     Returns:
         Sums [q, 6]: colour as if nothing were in front, optical depth, depth of the first sample, number of the ray;
@@ -126,7 +124,6 @@ def compose_runs(
         first: The number of the first of these rays.
         rays: How many all ranks have.
         robust: As in `render_loss`.
-        backend: "auto", "reference" or "native".
 
     Returns:
         Answers [q, 6]: the gradient of the loss to the ray's colour, what light from behind the run adds to the loss,
@@ -170,7 +167,6 @@ def run_gradients(
         answers: of `compose_runs`.
         density_scale: As in `run_sums`.
         hidden: Share of the light, in [0, 1): samples that no more than it reaches have no gradient.
-        backend: "auto", "reference" or "native".
 
     Returns:
         Gradient [m, 4], and the contributions [m] of the samples to their rays.

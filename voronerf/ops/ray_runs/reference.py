@@ -50,9 +50,9 @@ class OwnSamples(NamedTuple):
     @staticmethod
     def fake(given: Any) -> OwnSamples:
         """Which samples are own ones, and where runs end, depends on values."""
-        m, q = (torch.library.get_ctx().new_dynamic_size() for _ in range(2))
+        m, ends = (torch.library.get_ctx().new_dynamic_size() for _ in range(2))
         kept = [part.new_empty((m, *part.shape[1:])) for part in given[:5]]
-        return OwnSamples._make([*kept, given.cells.new_empty(q + 1)])
+        return OwnSamples._make([*kept, given.cells.new_empty(ends)])
 
 
 class Runs(NamedTuple):

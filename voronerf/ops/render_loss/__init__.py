@@ -54,7 +54,6 @@ def render_loss(
         hidden: share of the light, in [0, 1). Samples that no more than it reaches have no gradient; they count as all
             others in those of the samples in front of them.
         robust: s in [0, 1), the scale of the errors beyond which the loss is not squared; 0 for none.
-        backend: "auto", "reference", "native" or "warp".
 
     ``deltas``, ``target`` and ``background`` are float32, or float64 where ``raw`` is; so are the results. The loss is
     differentiable in ``raw``, any number of times. Nothing else has gradients.
@@ -114,7 +113,6 @@ def render_loss_gradient(
         activated: whether ``raw`` is the colour and the density themselves, as in `render_loss`. So is the gradient.
         hidden: share of the light, as in `render_loss`.
         robust: as in `render_loss`.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         (RenderLoss, gradient [m, 4]).

@@ -108,7 +108,6 @@ def render_opaque(
         contraction: as in ``march_rays``.
         background: the colour behind everything; None is black.
         heaviest: whether to find the heaviest sample of each ray; else ``heaviest`` is the far end.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         RaysSeen(colour [r, 3], opacity [r], depth [r], light [r], heaviest [r]).

@@ -43,7 +43,6 @@ def resample(
         edges: rising along a ray.
         count: depths of a ray, at least 1.
         uniforms: in 0 to 1, in any order; None for the midpoints of ``count`` equal strata, which is deterministic.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         depths [r, count], rising along a ray, in the dtype of the edges.

@@ -29,7 +29,6 @@ def scale_gradient(
         gradient: contiguous.
         depths: of the samples.
         full: The distance from which gradients are whole.
-        backend: "auto", "reference", "native" or "warp".
 
     Raises:
         ValueError: a gradient that is not contiguous.

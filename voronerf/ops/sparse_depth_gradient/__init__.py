@@ -62,7 +62,6 @@ def sparse_depth_gradient(
         factor: on the loss of each ray.
         density_scale: factor on the density behind its softplus, as for `render_loss`; None with ``activated``.
         activated: whether the gradient is to the density itself.
-        backend: "auto", "reference", "native" or "warp".
 
     Raises:
         ValueError: a gradient that is not contiguous; more distances than rays; ``density_scale`` with ``activated``,

@@ -29,7 +29,6 @@ def spherical_harmonics(
     Args:
         directions: unit vectors, n < 2**31.
         degree: number of bands, 1 to 4.
-        backend: "auto", "reference", "native" or "warp".
 
     Returns:
         [n, degree**2] in the dtype of the directions: 1, 4, 9 or 16 values, computed in float32 at least.
