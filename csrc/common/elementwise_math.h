@@ -44,6 +44,29 @@ VN_INLINE void sines(F32* angle, const F32* half) {
   }
 }
 
+// Sines and cosines of angles up to kLargestAngle, from one reduction: angle = k pi/2 + r, |r| <= pi/4. N at a time.
+template <int N>
+VN_INLINE void sines_and_cosines(const F32* angle, F32* sine, F32* cosine) {
+  const F32 round = splat(0.5f * kRound);  // to multiples of 1/2, which count half turns by quarters
+  F32 turns[N], r[N], u[N], s[N], c[N];
+  for (int i = 0; i < N; ++i) turns[i] = fma(angle[i], splat(0.318309886f), round);
+  for (int i = 0; i < N; ++i) r[i] = less_multiple_of_pi(angle[i], turns[i] - round);
+  for (int i = 0; i < N; ++i) u[i] = r[i] * r[i];
+  for (int i = 0; i < N; ++i) s[i] = fma(u[i], splat(-1.95152959e-4f), splat(8.33216087e-3f));
+  for (int i = 0; i < N; ++i) c[i] = fma(u[i], splat(2.44331571e-5f), splat(-1.38873163e-3f));
+  for (int i = 0; i < N; ++i) s[i] = fma(u[i], s[i], splat(-1.66666546e-1f));
+  for (int i = 0; i < N; ++i) c[i] = fma(u[i], c[i], splat(4.16666457e-2f));
+  for (int i = 0; i < N; ++i) s[i] = fma(r[i] * u[i], s[i], r[i]);
+  for (int i = 0; i < N; ++i) c[i] = fma(u[i], fma(u[i], c[i], splat(-0.5f)), splat(1.0f));
+  for (int i = 0; i < N; ++i) {
+    const Bits k = reinterpret_cast<Bits>(turns[i]), top = reinterpret_cast<Bits>(splat(-0.0f));
+    const auto odd = (k & 1) != 0;
+    const F32 first = odd ? c[i] : s[i], second = odd ? s[i] : c[i];
+    sine[i] = reinterpret_cast<F32>(reinterpret_cast<Bits>(first) ^ (k << 30 & top));
+    cosine[i] = reinterpret_cast<F32>(reinterpret_cast<Bits>(second) ^ ((k + 1) << 30 & top));
+  }
+}
+
 VN_INLINE F32 sine(F32 angle, F32 half) {
   sines<1>(&angle, &half);
   return angle;

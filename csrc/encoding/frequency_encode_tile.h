@@ -3,11 +3,13 @@
 // x each value times exp(-4^l variance / 2), as in integrated_encode beside it.
 //
 // A lane is a column of the encoding: a permutation brings it its feature, a table its octave and phase, and one sine
-// with one range reduction does the rest. So rows come out in the layout the products read, with no transposition.
+// with one range reduction does the rest. So rows come out in the layout the products read, with no transposition. What
+// goes into tile registers is made otherwise (encode_turned).
 #pragma once
 
 #include "common/elementwise_math.h"
 #include "network/cpu/gemm_tile.h"
+#include "network/cpu/program_rows_tile.h"
 
 namespace voronerf {
 namespace VN_ISA_NAMESPACE {
@@ -78,39 +80,93 @@ struct Lanes {
   }
 };
 
-// V neighbouring vectors of columns of R rows from `row` on: d <= kLanes, all angles small. Side by side, so that the
-// steps of one fill the time in which another waits. `out` and `pairs` as in `encode`, either may be null. kRaw: some
-// lanes are raw.
-template <int R, int V, bool kRaw>
-VN_INLINE void encode_block(const float* x, int64_t x_stride, int64_t row, const Lanes* lanes, float* out,
-                            int64_t stride, float* pairs, int64_t pairs_stride) {
-  F32 value[R * V], angle[R * V], phase[R * V];
-  for (int i = 0; i < R * V; ++i) {
-    value[i] = permute(load(x + (row + i / V) * x_stride), lanes[i % V].index) * lanes[i % V].scale;
-    if (kRaw) angle[i] = value[i];
-    phase[i] = lanes[i % V].phase;
+// A vector of columns of R rows from `row` on: d <= kLanes, all angles small. Side by side, so that the steps of one
+// fill the time in which another waits. kRaw: some lanes are raw.
+template <int R, bool kRaw>
+VN_INLINE void encode_block(const float* x, int64_t x_stride, int64_t row, const Lanes& lanes, float* out,
+                            int64_t stride) {
+  F32 value[R], angle[R], phase[R];
+  for (int r = 0; r < R; ++r) {
+    value[r] = permute(load(x + (row + r) * x_stride), lanes.index) * lanes.scale;
+    if (kRaw) angle[r] = value[r];
+    phase[r] = lanes.phase;
   }
-  sines<R * V>(value, phase);
-  for (int i = 0; kRaw && i < R * V; ++i) value[i] = lanes[i % V].raw ? angle[i] : value[i];
-  for (int i = 0; (!VN_HALF || out != nullptr) && i < R * V; ++i) {
-    store(out + (row + i / V) * stride + i % V * kLanes, value[i]);
-  }
-#if VN_HALF
-  for (int r = 0; pairs != nullptr && r < R; ++r) {
-    store(pairs + (row + r) * pairs_stride, joined(value[V * r], V == 2 ? value[2 * r + 1] : splat(0.0f)));
-  }
-#else
-  static_cast<void>(pairs), static_cast<void>(pairs_stride);
-#endif
+  sines<R>(value, phase);
+  for (int r = 0; kRaw && r < R; ++r) value[r] = lanes.raw ? angle[r] : value[r];
+  for (int r = 0; r < R; ++r) store(out + (row + r) * stride, value[r]);
 }
 
-template <int R, int V, bool kRaw>
-VN_INLINE void encode_strip(const float* x, int64_t x_stride, int64_t rows, const Lanes* lanes, float* out,
-                            int64_t stride, float* pairs, int64_t pairs_stride) {
+template <bool kRaw>
+VN_INLINE void encode_strip(const float* x, int64_t x_stride, int64_t rows, const Lanes& lanes, float* out,
+                            int64_t stride) {
+  constexpr int R = kRegisters / 8;
   int64_t row = 0;
-  for (; row + R <= rows; row += R) encode_block<R, V, kRaw>(x, x_stride, row, lanes, out, stride, pairs, pairs_stride);
-  for (; row < rows; ++row) encode_block<1, V, kRaw>(x, x_stride, row, lanes, out, stride, pairs, pairs_stride);
+  for (; row + R <= rows; row += R) encode_block<R, kRaw>(x, x_stride, row, lanes, out, stride);
+  for (; row < rows; ++row) encode_block<1, kRaw>(x, x_stride, row, lanes, out, stride);
 }
+
+#if VN_HALF == 2
+
+constexpr int64_t kMostTurned = 128;  // columns of `encode_turned`
+
+// Up to kTurned rows as pairs alone, all angles small. Lanes are rows: sine and cosine of a feature share a range
+// reduction, and octaves follow from the one before by the double-angle formulas, each of which doubles the error. So
+// every fifth is exact again, which leaves 2e-6 where rounding to bfloat16 makes 2e-3; and every second where what
+// rounding has left counts, which leaves 2e-7 beside 8e-6. All columns are transposed at the end.
+void encode_turned(const float* x, int64_t x_stride, int64_t rows, const Columns& columns, float* pairs,
+                   int64_t pairs_stride, int64_t left) {
+  constexpr int kVectors = kTurned / kLanes;
+  constexpr int64_t kRow = kTurned / 2;
+  const int64_t d = columns.d, octaves_of_one = left > 0 ? 2 : 5;
+  alignas(64) float made[kMostTurned][kRow], rest[kMostTurned][kRow];
+  const auto keep = [&](int64_t column, const F32* values) {
+    for (int v = 0; v < kVectors; v += 2) {
+      const F32 rounded = joined(values[v], values[v + 1]);
+      store(made[column] + v * kLanes / 2, rounded);
+      if (left > 0) store(rest[column] + v * kLanes / 2, left_of(values[v], values[v + 1], rounded));
+    }
+  };
+  F32 points[3][kVectors];
+  const bool whole = d == 3 && x_stride == 3 && rows == kTurned;
+  for (int v = 0; whole && v < kVectors; ++v) {
+    load_points(x + 3 * v * kLanes, points[0][v], points[1][v], points[2][v]);
+  }
+  for (int64_t f = 0; f < d; ++f) {
+    F32 given[kVectors], sine[kVectors], cosine[kVectors];
+    float lanes[kTurned];
+    for (int64_t row = 0; !whole && row < kTurned; ++row) lanes[row] = x[smaller(row, rows - 1) * x_stride + f];
+    for (int v = 0; v < kVectors; ++v) given[v] = whole ? points[f][v] : load(lanes + v * kLanes);
+    if (columns.input) keep(f, given);
+    float scale = 1.0f;
+    for (int64_t octave = 0, at = columns.first() + f; octave < columns.octaves; ++octave, at += 2 * d, scale *= 2.0f) {
+      if (octave % octaves_of_one == 0) {
+        F32 angle[kVectors];
+        for (int v = 0; v < kVectors; ++v) angle[v] = given[v] * splat(scale);
+        sines_and_cosines<kVectors>(angle, sine, cosine);
+      } else {
+        for (int v = 0; v < kVectors; ++v) {
+          const F32 twice = sine[v] + sine[v];
+          const F32 next = twice * cosine[v];
+          cosine[v] = splat(1.0f) - twice * sine[v];
+          sine[v] = next;
+        }
+      }
+      keep(at, sine);
+      keep(at + d, cosine);
+    }
+  }
+  const int64_t width = columns.width();
+  const auto turn = [&](float (*from)[kRow], float* to) {
+    for (int64_t c = width; c % kTurned != 0; ++c) __builtin_memset(from[c], 0, sizeof from[c]);
+    for (int64_t c = 0; c < width; c += kTurned) {
+      turn_pairs({from[c], kRow, false}, kTurned, kTurned, to + c / 2, pairs_stride);
+    }
+  };
+  turn(made, pairs);
+  if (left > 0) turn(rest, pairs + left);
+}
+
+#endif
 
 // Any number of features.
 void encode_row_slowly(const float* x, const float* table, int64_t stride, int64_t d, float* out) {
@@ -134,59 +190,65 @@ VN_INLINE bool all_small(const float* x, int64_t count, float largest) {
   return rest;
 }
 
-// Rows x, `x_stride` floats apart and with kLanes readable floats from every row's start -> out [rows][stride]; with
-// bfloat16 operands also `pairs` [rows][pairs_stride], whole vectors, if not null, and then out only where it is
-// `kept`.
-void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns, float* out,
-            int64_t stride, float* pairs = nullptr, int64_t pairs_stride = 0, bool kept = true) {
-  const int64_t d = columns.d;
-  const bool waves = columns.octaves > 0;
-  const float largest = waves ? kLargestAngle / table[stride + columns.width() - 1] : 0.0f;
-  bool lanes = waves && d <= kLanes;
-  if (lanes && x_stride == d) {
-    lanes = all_small(x, rows * d, largest);
-  } else {
-    for (int64_t row = 0; lanes && row < rows; ++row) lanes = all_small(x + row * x_stride, d, largest);
-  }
+// Rows x, `x_stride` floats apart and with kLanes readable floats from every row's start -> out [rows][stride].
+VN_INLINE void encode_floats(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns,
+                             bool lanes, float largest, float* out, int64_t stride) {
   if (lanes) {
-    int64_t column = 0;
-#if VN_HALF
-    for (; pairs != nullptr && column + 2 * kLanes <= stride; column += 2 * kLanes) {
-      const Lanes both[] = {{table, stride, column, columns}, {table, stride, column + kLanes, columns}};
-      encode_strip<2, 2, true>(x, x_stride, rows, both, kept ? out + column : nullptr, stride, pairs + column / 2,
-                               pairs_stride);
-    }
-#endif
-    for (; column < stride; column += kLanes) {
-      const Lanes one(table, stride, column, columns);
-      float* to = kept ? out + column : nullptr;
-      float* paired = pairs == nullptr ? nullptr : pairs + column / 2;
+    for (int64_t column = 0; column < stride; column += kLanes) {
+      const Lanes own(table, stride, column, columns);
       if (column < columns.first()) {
-        encode_strip<kRegisters / 8, 1, true>(x, x_stride, rows, &one, to, stride, paired, pairs_stride);
+        encode_strip<true>(x, x_stride, rows, own, out + column, stride);
       } else {
-        encode_strip<kRegisters / 8, 1, false>(x, x_stride, rows, &one, to, stride, paired, pairs_stride);
+        encode_strip<false>(x, x_stride, rows, own, out + column, stride);
       }
-    }
-    column = (stride + 2 * kLanes - 1) / 2 / kLanes * kLanes;  // of pairs: what fills up their rows
-    for (; pairs != nullptr && column < pairs_stride; column += kLanes) {
-      for (int64_t row = 0; row < rows; ++row) store(pairs + row * pairs_stride + column, splat(0.0f));
     }
     return;
   }
   for (int64_t row = 0; row < rows; ++row) {
     const float* from = x + row * x_stride;
     float* to = out + row * stride;
-    if (waves && all_small(from, d, largest)) {
-      encode_row_slowly(from, table, stride, d, to);
-    } else if (waves) {
+    if (columns.octaves > 0 && all_small(from, columns.d, largest)) {
+      encode_row_slowly(from, table, stride, columns.d, to);
+    } else if (columns.octaves > 0) {
       encode_row_exactly(from, table, stride, columns, to);
     }
     for (int64_t f = 0; f < columns.first(); ++f) to[f] = from[f];
   }
-#if VN_HALF
-  for (int64_t row = 0; pairs != nullptr && row < rows; ++row) {
-    narrow_row(out + row * stride, columns.width(), pairs + row * pairs_stride);
+}
+
+// In tile registers also as `pairs` [rows][pairs_stride], whole vectors, if not null, with what rounding has left so
+// many floats behind them unless `left` is 0; then out only where it is `kept`.
+void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, const Columns& columns, float* out,
+            int64_t stride, [[maybe_unused]] float* pairs = nullptr, [[maybe_unused]] int64_t pairs_stride = 0,
+            [[maybe_unused]] int64_t left = 0, [[maybe_unused]] bool kept = true) {
+  const int64_t d = columns.d;
+  const bool waves = columns.octaves > 0;
+  const float largest = waves ? kLargestAngle / table[stride + columns.width() - 1] : 0.0f;
+  bool small = waves;
+  if (x_stride == d) {
+    small = small && all_small(x, rows * d, largest);
+  } else {
+    for (int64_t row = 0; small && row < rows; ++row) small = all_small(x + row * x_stride, d, largest);
   }
+#if VN_HALF == 2
+  if (pairs != nullptr && !kept && waves && columns.width() <= kMostTurned) {
+    for (int64_t row = 0; row < rows; row += kTurned) {
+      encode_turned(x + row * x_stride, x_stride, smaller(kTurned, rows - row), columns, pairs + row * pairs_stride,
+                    pairs_stride, left);
+    }
+    for (int64_t row = 0; !small && row < rows; ++row) {  // which leaves the rows beside them as they are
+      const float* const from = x + row * x_stride;
+      if (all_small(from, d, largest)) continue;
+      encode_floats(from, x_stride, table, 1, columns, false, largest, out, stride);
+      narrow_row(out, columns.width(), pairs + row * pairs_stride,
+                 left == 0 ? nullptr : pairs + row * pairs_stride + left);
+    }
+    return;
+  }
+#endif
+  encode_floats(x, x_stride, table, rows, columns, small && d <= kLanes, largest, out, stride);
+#if VN_HALF == 2
+  if (pairs != nullptr) narrow_rows({out, stride, false}, columns.width(), rows, pairs, pairs_stride, left);
 #endif
 }
 

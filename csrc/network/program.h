@@ -89,8 +89,7 @@ struct ProgramInputs {
   // what was looked up is not kept.
   float* const* kept;
   bool ready;
-  // RowCount that are 0 in all inputs from this one on, float32 and of no rays, add nothing to any sum; -1: there are
-  // none such.
+  // Rows that are 0 in all inputs from this one on, none of rays, add nothing to any sum; -1: there are none such.
   int64_t gradients;
   const char *caller, *ray_name;  // the operation that errors name, and its name for ray_index
 };

@@ -10,6 +10,7 @@ from torch import Tensor
 from voronerf.ops import grouped_mlp
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import MLP, Layer
+from voronerf.ops._core.tolerances import agree_gradients
 
 pytestmark = pytest.mark.native
 
@@ -180,6 +181,19 @@ def test_a_row_does_not_depend_on_its_place(name: str, dtype: torch.dtype, isa: 
         if "directions" in given:
             one["directions"] = given["directions"][row : row + 1]
         assert torch.equal(grouped_mlp(**one, backend="native")[0], together[row])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_rows_without_a_gradient_add_nothing_to_weights(dtype: torch.dtype, isa: str) -> None:
+    given = cast(arguments(nerf(17, 2), [900, 3, 0, 70], rays=9), dtype)
+    slopes = torch.randn(973, 4).to(dtype)
+    slopes[torch.arange(973) % 7 != 0] = -0.0
+    slopes[14] = torch.tensor([0.0, -0.0, 0.0, 1e-3]).to(dtype)
+    found = []
+    for backend in ("native", "reference"):
+        out = grouped_mlp(**given, backend=backend)
+        found.append(torch.autograd.grad(out, [*given["weights"], *given["biases"]], slopes))
+    assert agree_gradients(*found)
 
 
 def test_relu_on_few_outputs(isa: str) -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from voronerf.ops import grouped_mlp
+from voronerf.ops import frequency_encode, grouped_mlp
 from voronerf.ops._core.layers import MLP, Layer
 
 native = pytest.importorskip("voronerf.ops._core.native")
@@ -92,6 +92,28 @@ def test_each_precision_is_as_exact_as_it_says(
     assert error(found, exact) < PRECISIONS[asked]
     same = all(torch.equal(a, b) for a, b in zip(found, tight))
     assert same == (asked == "highest")
+
+
+@pytest.mark.parametrize(("asked", "most"), [("high", 1e-5), ("medium", 2.0**-9 + 4e-6)])
+@pytest.mark.parametrize("largest", [1.0, 15.0, 1e5])  # angles of 512, 7,680, and beyond those of the vector sine
+@pytest.mark.parametrize("d", [1, 3, 5])
+def test_octaves_are_no_less_exact_than_what_they_are_rounded_to(
+    d: int, largest: float, asked: str, most: float, registers: str, precision: Callable[[str], None]
+) -> None:
+    x = largest * (2 * torch.rand(1057, d, generator=torch.Generator().manual_seed(1)) - 1)
+    width = 2 * 10 * d + d
+    table = MLP((Layer(("positions",), width),), (0,), position_octaves=10)
+    precision(asked)
+    offsets, weights = torch.tensor([0, len(x)], dtype=torch.int32), [torch.eye(width)[None]]
+
+    def encoded(x: Tensor) -> Tensor:
+        return grouped_mlp(x, offsets, weights, [None], layers=table, backend="native")[:, d:]
+
+    found, exact = encoded(x), frequency_encode(x.double(), 10, include_input=False, backend="reference")
+    assert (found - exact).abs().max() < most
+    beside = x.clone()
+    beside[40] = 1e7
+    assert torch.equal(encoded(beside)[:40], found[:40])
 
 
 @pytest.mark.parametrize("asked", ["high", "medium"])

@@ -104,6 +104,23 @@ struct Sifted {
   std::vector<int32_t> rows, order, offsets;  // numbers as sorted, and of the caller; [k+1]. Empty: all rows
 };
 
+// Whether values, float32 or bfloat16, are all 0, of either sign.
+bool all_zero(const char* values, int64_t count, bool half) {
+  const int64_t bytes = count * (half ? 2 : 4);
+  const uint64_t sizes = half ? 0x7fff7fff7fff7fffu : 0x7fffffff7fffffffu;
+  uint64_t any = 0;
+  for (int64_t i = 0; i < bytes; i += 8) {
+    uint64_t some = 0;
+    if (i + 8 <= bytes) {
+      std::memcpy(&some, values + i, 8);
+    } else {
+      std::memcpy(&some, values + i, static_cast<size_t>(bytes - i));
+    }
+    any |= some & sizes;
+  }
+  return any == 0;
+}
+
 // Empty too where the few without a gradient would not pay for copies. Blocks of rows list their own, which are then
 // put together.
 Sifted sift(const ProgramTable& table, const ProgramInputs& in, int threads) {
@@ -114,18 +131,25 @@ Sifted sift(const ProgramTable& table, const ProgramInputs& in, int threads) {
     int32_t* to = lists.data() + block * kBlock;
     int32_t count = 0;
     const int64_t begin = first + block * kBlock, end = std::min(first + all, begin + kBlock);
-    for (int64_t i = begin; i < end; ++i) {
-      const int64_t row = in.order == nullptr ? i : in.order[i];
-      bool zero = true;
-      for (size_t input = static_cast<size_t>(in.gradients); input < table.inputs.size(); ++input) {
-        const int64_t width = table.inputs[input].width;
-        const bool turned = in.turned[input] != 0;
-        const int64_t next = turned ? in.n.value : 1;
-        const float* from = static_cast<const float*>(in.inputs[input]) + row * (turned ? 1 : width);
-        for (int64_t c = 0; c < width; ++c) zero &= from[c * next] == 0.0f;
+    bool zero[kBlock];
+    std::fill_n(zero, kBlock, true);
+    for (size_t input = static_cast<size_t>(in.gradients); input < table.inputs.size(); ++input) {
+      const int64_t width = table.inputs[input].width;
+      const bool half = in.input_types[input] == TableType::bfloat16, turned = in.turned[input] != 0;
+      const auto* from = static_cast<const char*>(in.inputs[input]);
+      const int32_t* order = in.order;
+      for (int64_t i = begin; i < end; ++i) {
+        const int64_t row = order == nullptr ? i : order[i];
+        if (turned) {
+          for (int64_t c = 0; c < width; ++c) zero[i - begin] &= all_zero(from + 4 * (c * in.n + row), 1, false);
+        } else {
+          zero[i - begin] &= all_zero(from + row * width * (half ? 2 : 4), width, half);
+        }
       }
+    }
+    for (int64_t i = begin; i < end; ++i) {
       to[count] = static_cast<int32_t>(i);
-      count += !zero;
+      count += !zero[i - begin];
     }
     begins[block + 1] = count;
   });

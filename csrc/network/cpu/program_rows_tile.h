@@ -168,7 +168,7 @@ VN_INLINE void turn_pairs(const Rows& x, int64_t columns, int64_t rows, float* t
 #else
   for (int64_t column = 0; column < columns; ++column) {
     auto* const turned = reinterpret_cast<uint16_t*>(to + column * stride);
-    for (int64_t row = 0; row < 2 * stride; ++row) {
+    for (int64_t row = 0; row < 2 * pairs_of(rows); ++row) {
       __builtin_memcpy(turned + row, reinterpret_cast<const uint16_t*>(x.data + row * x.stride) + column, 2);
     }
   }
@@ -201,14 +201,14 @@ VN_INLINE void zip_pairs(const Rows& x, int64_t columns, int64_t rows, float* to
 VN_INLINE void add_pairs(const Rows& x, int64_t columns, int64_t rows, bool first, float* to) {
   for (int64_t column = 0; column < columns; column += 2 * kLanes) {
     const bool both = column + kLanes < columns;
-    F32 sums[4];  // two of each half, or every addition waits for the one before
-    for (F32& sum : sums) sum = splat(0.0f);
+    F32 even[] = {splat(0.0f), splat(0.0f)}, odd[] = {splat(0.0f), splat(0.0f)};  // columns, of every second row
     for (int64_t row = 0; row < rows; ++row) {
       const F32 values = load(x.data + row * x.stride + column / 2);
-      sums[row % 2] = sums[row % 2] + widened(values, 0);
-      sums[2 + row % 2] = sums[2 + row % 2] + widened(values, 1);
+      even[row % 2] = even[row % 2] + lower_of(values);
+      odd[row % 2] = odd[row % 2] + upper_of(values);
     }
-    const F32 low = sums[0] + sums[1], high = sums[2] + sums[3];
+    F32 low, high;
+    zip(even[0] + even[1], odd[0] + odd[1], low, high);
     store(to + column, first ? low : low + load(to + column));
     if (both) store(to + column + kLanes, first ? high : high + load(to + column + kLanes));
   }

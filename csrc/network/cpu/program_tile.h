@@ -107,7 +107,7 @@ struct ProgramTile {
   bool narrows(const ProgramStep& step) const {
     if (step.op == ProgramOp::input) return !narrowed_as_read(step);
     const bool waves = step.op == ProgramOp::encode && step.order == 0 && step.encoding == ProgramEncoding::frequency;
-    return step.op != ProgramOp::linear && (!waves || call.parts);
+    return step.op != ProgramOp::linear && !waves;
   }
   bool narrowed_as_read(const ProgramStep& step) const {
     return step.pairs >= 0 && !call.turned[step.number] && !call.parts;
@@ -189,6 +189,9 @@ struct ProgramTile {
     if (call.turned[number]) return turn(static_cast<const float*>(call.inputs[number]), step, to);
     if (call.input_types[number] == TableType::bfloat16) {
       const auto* from = static_cast<const uint16_t*>(call.inputs[number]);
+      if (width == stride && call.order == nullptr && !call.rays[number]) {
+        return widen_row(from + begin * width, rows * width, to);
+      }
       for (int64_t row = 0; row < rows; ++row) widen_row(from + row_of(row) * width, width, to + row * stride);
       return;
     }
@@ -409,7 +412,7 @@ struct ProgramTile {
     const float* const table = packed + pack(step.number).at;
     const bool integrated = step.encoding == ProgramEncoding::integrated;
     float* const pairs = step.pairs < 0 || narrows(step) ? nullptr : slot(step.pairs);
-    encode(x.data, x.stride, table, rows, columns, to, step.stride, pairs, pairs_of(step.width),
+    encode(x.data, x.stride, table, rows, columns, to, step.stride, pairs, stride_of(step.width), left_of(step.width),
            pairs == nullptr || step.floats);
     if (integrated) {
       blur(x.data + columns.d, x.stride, table, rows, to, step.stride);

@@ -1,7 +1,8 @@
 """Layer tables as programs, for the ops that run them. n samples, r rays, k cells, p and q features of a raw position
 and direction.
 
-Tensors are cast to float32 on the way in and back on the way out, a cell having few weights. With bfloat16 storage, or
+Samples are read and results written as they are stored where all are bfloat16; else, and parameters always, a cell
+having few of them, they are cast to float32 on the way in and back on the way out. With bfloat16 storage, or
 under autocast to it, products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16, AMX), and
 float32 ones elsewhere; sums are float32 always.
 """
@@ -36,7 +37,7 @@ class Network(NamedTuple):
     """A network as the program op takes it.
 
     Attributes:
-        inputs: positions, and directions if any layer reads them, in float32.
+        inputs: positions, and directions if any layer reads them, in float32, or all in the bfloat16 of the result.
         parameters: weights, biases and the table of a hash grid, in float32 but for that.
         ray_index: int32 [n] where directions have one row for each ray, or None.
         how: it runs.
@@ -85,12 +86,13 @@ def as_network(given: Given, caller: str) -> Network:
         taken.append(features)
         features = features.float() if features.dtype == torch.float64 else features
         parameters.append(features if features.dim() == 3 else features[None])
-    rows, inputs = [positions], [positions.float()]
+    rows = [positions]
     seen = layers.uses_directions and directions is not None
     if seen:
         assert directions is not None
         rows.append(directions)
-        inputs.append(directions.float())
+    stored = features is None and {dtype, *(x.dtype for x in rows)} == {torch.bfloat16}  # hash grids read float32
+    inputs = rows if stored else [x.float() for x in rows]
     biased = "".join(["0" if bias is None else "1" for bias in biases])
     how = How(layers.text, biased, caller, half_products(dtype))
     return Network(inputs, parameters, index if seen else None, how, dtype, [*rows, *taken])

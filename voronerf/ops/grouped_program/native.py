@@ -151,12 +151,14 @@ def run(given: _Call, found: list[Tensor]) -> None:
     if native.on_cuda(offsets):
         _run_on_cuda(program, rows, how, taken, outputs, sums)
         return
-    results = native.compiled.ProgramResults(
-        outputs=outputs, output_types=[taken.input_types[0]] * len(outputs), sums=sums
-    )
+    made = [to.float() if i in program.by_ray else to for i, to in enumerate(outputs)]  # sums of rays are float32
+    results = native.compiled.ProgramResults(outputs=made, output_types=[_NAMES[to.dtype] for to in made], sums=sums)
     for result in found:
         on_huge_pages(result)
     native.compiled.grouped_program(lowered.program, taken, results, native.cpu())
+    for to, result in zip(outputs, made):
+        if to is not result:
+            to.copy_(result)
 
 
 def _run_on_cuda(
@@ -316,7 +318,7 @@ def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted
     split, given = len(program.outputs), tuple([g is not None for g in arriving])
     own = _gradient(program.text, count, split, tuple(wanted), given)
     more = [[g for g in part if g is not None] for part in (arriving[:split], arriving[split:])]
-    sifts = own.sifts and not more[1] and all(g.dtype == torch.float32 for g in more[0])
+    sifts = own.sifts and not more[1]
     following = How(own.text, "", how.caller, how.products, False, count if sifts else -1)
     inputs, parameters, kept = [*rows.inputs, *more[0]], [*rows.parameters, *more[1]], rows.kept if own.keeps else ()
     call = rows._replace(inputs=inputs, parameters=parameters, kept=kept)
