@@ -18,6 +18,8 @@ from voronerf.ops._core import backends
 from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.ops.render_loss import render_loss_gradient
 from voronerf.ops.scale_gradient import scale_gradient
+from voronerf.ops.smooth_depth_gradient import smooth_depth_gradient
+from voronerf.ops.smooth_depth_gradient.reference import smooth_depth_loss
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.sparse_depth_gradient.reference import near_point, sparse_depth_loss
 
@@ -33,6 +35,7 @@ class Batch:
         target: [r, 3], the colour of each ray's pixel over the background.
         background: [3], or [r, 3] where it was drawn; None for black.
         sparse_depths: [s], the distances of the points of a sparse model that the first s rays end at, or None.
+        unseen: Pairs at the end that are `voronerf.ops.unseen_rays`, whose colours are not known.
 
     Examples:
         >>> import torch
@@ -47,6 +50,7 @@ class Batch:
     target: Tensor
     background: Tensor | None = None
     sparse_depths: Tensor | None = None
+    unseen: int = 0
 
 
 class RenderOutput(NamedTuple):
@@ -95,6 +99,8 @@ class RayLoss:
             (Deng et al. 2022, "Depth-supervised NeRF"); 0 is off.
         robust: Scale of the errors beyond which the loss of a ray is not squared: see `voronerf.ops.render_loss`. What
             differs from picture to picture, such as exposure, is no reason for fog then. 0 is off.
+        smooth_depth: Factor of the loss on depths that differ between two neighbours of the unseen rays of a batch: see
+            `voronerf.ops.smooth_depth_gradient`.
 
     Examples:
         >>> import torch
@@ -113,8 +119,11 @@ class RayLoss:
         field: forward: fused
     """
 
-    def __init__(self, renderer: Renderer, *, sparse_depth: float = 0.0, robust: float = 0.0) -> None:
+    def __init__(
+        self, renderer: Renderer, *, sparse_depth: float = 0.0, robust: float = 0.0, smooth_depth: float = 0.0
+    ) -> None:
         self.renderer, self.sparse_depth, self.robust = renderer, sparse_depth, robust
+        self.smooth_depth = smooth_depth
 
     def __call__(
         self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False
@@ -181,6 +190,24 @@ class RayLoss:
                 **field.rule,
                 backend=renderer.backend,
             )
+        if batch.unseen:
+            smooth_depth_gradient(
+                found.loss,
+                found.error,
+                gradient,
+                found.density,
+                samples.depths,
+                samples.deltas,
+                found.weights,
+                samples.ray_offsets,
+                batch.far,
+                pairs=batch.unseen,
+                factor=self.smooth_depth,
+                robust=self.robust,
+                hidden=HIDDEN,
+                **field.rule,
+                backend=renderer.backend,
+            )
         if (full := renderer.sampler.space.full_gradient) is not None:
             scale_gradient(gradient, samples.depths, full, backend=renderer.backend)
         loss = tape.backward(found.loss, gradient, defer=not backward)
@@ -189,7 +216,9 @@ class RayLoss:
     def _separate(self, batch: Batch, generator: torch.Generator | None, backward: bool) -> RenderOutput:
         given: dict[str, Any] = {"background": batch.background, "jitter": True, "generator": generator}
         *before, last = self.renderer.render(batch.rays, batch.near, batch.far, **given)
-        loss, samples = colour_loss(last.colour, batch.target, self.robust), last.samples
+        rays, samples = len(batch.rays), last.samples
+        seen = rays - 2 * batch.unseen
+        loss = colour_loss(last.colour[:seen], batch.target[:seen], self.robust) * (seen / rays)
         if self.sparse_depth and batch.sparse_depths is not None:
             several = len(batch.sparse_depths)
             known = torch.nn.functional.pad(batch.sparse_depths, (0, len(batch.rays) - several), value=torch.nan)
@@ -197,9 +226,14 @@ class RayLoss:
             there = last.weights * near_point(samples.depths, samples.deltas, known[ray])
             light = torch.zeros_like(known).index_add(0, ray, there)
             loss = loss + self.sparse_depth * sparse_depth_loss(light[:several]).mean()
+        if batch.unseen:
+            nearness = last.weights / samples.depths
+            disparity = torch.zeros_like(batch.far).index_add(0, samples.ray_index.long(), nearness)
+            loss = loss + self.smooth_depth * smooth_depth_loss(disparity, last.opacity, batch.far, batch.unseen)
         for first in before:
             loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
         error = (last.colour.detach() - batch.target).square().sum(-1)
+        error[seen:] = 0
         if backward:
             loss.backward()
             loss = loss.detach()
