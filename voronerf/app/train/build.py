@@ -37,7 +37,7 @@ PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 #: Scale of the robust loss of photographs, whose exposure and highlights differ; pictures that are computed have none.
 ROBUST = 0.05
 #: Factor of the loss on smooth depths of photographs from where no camera was.
-SMOOTH_DEPTH = 0.2
+SMOOTH_DEPTH = 0.1
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
 SAMPLE_BYTES = 64
 
