@@ -231,7 +231,8 @@ class RayLoss:
             disparity = torch.zeros_like(batch.far).index_add(0, samples.ray_index.long(), nearness)
             loss = loss + self.smooth_depth * smooth_depth_loss(disparity, last.opacity, batch.far, batch.unseen)
         for first in before:
-            loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
+            target = torch.cat((batch.target[:seen], first.colour[seen:].detach()))
+            loss = loss + self.renderer.sampler.loss_before(first, last, target)
         error = (last.colour.detach() - batch.target).square().sum(-1)
         error[seen:] = 0
         if backward:

@@ -91,7 +91,8 @@ def build(
         config, scene, routers, grid=make_grid(config, scene, device) if config.occupancy else None
     )
     if batches is None:
-        batches = make_batches(config, scene, unseen=unseen_move(scene, renderer.sampler.space))
+        unseen = unseen_move(scene, renderer.sampler.space) if config.occupancy else 0.0
+        batches = make_batches(config, scene, unseen=unseen)
     optimizer = Adam.of(
         routers,
         lr=float(config.lr or 0),

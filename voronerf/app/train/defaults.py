@@ -97,12 +97,12 @@ def unseen_move(scene: Scene, space: Space) -> float:
     points, cameras = scene.train.sparse_depth, scene.train.cameras
     if scene.background is not None or space.full_gradient is None or points is None:
         return 0.0
-    side = max(cameras.width, cameras.height) / TILES
+    side = max(1, round(max(cameras.width, cameras.height) / TILES))
     row, column = points.pixels // cameras.width, points.pixels % cameras.width
     image, row = row // cameras.height, row % cameras.height
-    tiles = torch.stack((image, (row / side).long(), (column / side).long())).unique(dim=1).shape[1]
+    tiles = ((image * cameras.height + row // side) * cameras.width + column // side).unique()
     every = sum(width * height for width, height in map(cameras.size, range(len(cameras)))) / side**2
-    return BESIDE * space.full_gradient if tiles < COVERED * every else 0.0
+    return BESIDE * space.full_gradient if len(tiles) < COVERED * every else 0.0
 
 
 def machine_speed() -> float:
