@@ -92,13 +92,14 @@ def make(name, k=4, **options):
     return router, DirectionPerSample(router) if isinstance(router.module, Foreign) else router
 
 
-def batch_of(rays=64, sparse=0):
+def batch_of(rays=64, sparse=0, unseen=0):
     generator = seeded(1)
     directions = F.normalize(torch.randn(rays, 3, generator=generator), dim=-1)
     origins = -2.0 * directions + 0.2 * torch.randn(rays, 3, generator=generator)
     ends = torch.full((rays,), 0.5), torch.full((rays,), 3.5)
     depths = 1 + torch.rand(sparse, generator=generator) if sparse else None
-    return Batch(Rays(origins, directions), *ends, torch.rand(rays, 3, generator=generator), torch.ones(3), depths)
+    target = torch.rand(rays, 3, generator=generator)
+    return Batch(Rays(origins, directions), *ends, target, torch.ones(3), depths, unseen)
 
 
 def losses(field, monkeypatch, backend="auto", **terms):
@@ -156,6 +157,19 @@ def test_with_a_term_in_torch(name, monkeypatch):
     compare(router, fast, separate, batch_of(sparse=20))
     without = losses(field, monkeypatch, sparse_depth=0.3)[0](batch_of(sparse=20), seeded(3))
     assert fast(batch_of(sparse=20), seeded(3)).loss > without.loss + 0.1
+
+
+@pytest.mark.parametrize("name", ["relu", "hash"])
+def test_with_rays_from_where_no_camera_was(name, monkeypatch):
+    """Their depths are learnt from, their colours are not."""
+    router, field = make(name)
+    fast, separate = losses(field, monkeypatch, smooth_depth=0.3, sparse_depth=0.3, robust=0.05)
+    batch = batch_of(sparse=20, unseen=20)
+    compare(router, fast, separate, batch)
+    found = fast(batch, seeded(3))
+    batch.target[24:] = 7.0
+    torch.testing.assert_close(fast(batch, seeded(3)).loss, found.loss, rtol=1e-4, atol=0)
+    assert bool(found.error[:24].all()) and not bool(found.error[24:].any())
 
 
 @pytest.mark.parametrize("name", ["relu", "one shared", "hash"])

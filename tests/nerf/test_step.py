@@ -29,11 +29,12 @@ BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
 class Training:
     """A small training, whose grid empties a part of the box, so that its numbers of samples vary."""
 
-    def __init__(self, cells=1, field=None, sampler=Occupancy, **options):
+    def __init__(self, cells=1, field=None, sampler=Occupancy, unseen=False, **options):
         torch.manual_seed(0)
         cameras = orbit_cameras(3, radius=3.0, elevation=0.3, width=16, height=16, focal=16.0)
         images = torch.randint(256, (3, 16, 16, 3), dtype=torch.uint8)
-        self.batches = RayBatches(cameras, images, near=1.0, far=5.0, box=BOX, background=torch.ones(3))
+        where = {"unseen": 0.5} if unseen else {"box": BOX}
+        self.batches = RayBatches(cameras, images, near=1.0, far=5.0, background=torch.ones(3), **where)
         own, field = field, field() if field else HashGridField(levels=4, log2_entries=10, width=16)
         share = ["features"] if isinstance(field, HashGridField) else []
         options = {"share": share, **options}
@@ -42,7 +43,7 @@ class Training:
         grid.density[:6] = grid.occupied[:6] = 0
         self.sampler = sampler(grid, 32)
         shown = self.router if own is None else DirectionPerSample(self.router)
-        self.loss = RayLoss(Renderer({"field": shown}, self.sampler))
+        self.loss = RayLoss(Renderer({"field": shown}, self.sampler), smooth_depth=0.1)
         self.optimizer = Adam.of({"field": self.router}, lr=0.01, sparse=["features"])
         self.guard, self.generator = Guard.on("cpu"), torch.Generator().manual_seed(1)
         given = {"guard": self.guard, "generator": self.generator}
@@ -84,14 +85,14 @@ def threads(request):
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("cells", [1, 6])
-def test_same_bits_as_steps_that_run_as_they_are(cells, threads):
+@pytest.mark.parametrize(("cells", "unseen"), [(1, False), (6, False), (6, True)])
+def test_same_bits_as_steps_that_run_as_they_are(cells, unseen, threads):
     """Parameters, moments, grid, and all that a step gives; rays grow beyond what there is memory for, and shrink."""
 
     def rays(step):
         return 64 + 5 * step if step < 30 else 150 - 3 * (step - 30)
 
-    one, other = Training(cells), Training(cells)
+    one, other = Training(cells, unseen=unseen), Training(cells, unseen=unseen)
     found, expected = one.train(60, rays), other.train(60, rays, as_it_is=True)
     assert same(found, expected) and same(one.everything(), other.everything())
     assert "replayed" in one.step.explain() and one.recorded < 12, one.recorded

@@ -44,11 +44,13 @@ class Calls(TorchDispatchMode):
 @pytest.mark.native
 @pytest.mark.parametrize("contracted", [False, True])
 def test_a_step_computes_in_ops_alone(contracted):
-    """Of a scene with near cameras, sparse points and voxels that stay empty, at a step that looks at voxels again."""
+    """Of near cameras, sparse points, rays from elsewhere and voxels that stay empty, at a step that looks at these."""
     cameras = orbit_cameras(4, radius=2.0, elevation=10.0, width=20, height=20, focal=22.0)
     images = torch.randint(255, (4, 20, 20, 3), dtype=torch.uint8)
     sparse = torch.randint(1600, (50,)), torch.rand(50) + 1
-    batches = RayBatches(cameras, images, near=0.2, far=9.0, background=torch.ones(3), sparse=sparse)
+    batches = RayBatches(
+        cameras, images, near=0.2, far=9.0, background=torch.ones(3), sparse=sparse, unseen=0.5 * contracted
+    )
     field = HashGridField(width=8, log2_entries=10)
     router = VoronoiRouter(field, torch.rand(4, 3), **field.router_options)
     contraction, box = Contraction(torch.zeros(3), 1.0), torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -56,7 +58,7 @@ def test_a_step_computes_in_ops_alone(contracted):
     grid = OccupancyGrid.for_training(None if contracted else box, 32, contraction=contraction, resolution=16)
     space, empty = Space(contraction=contraction, full_gradient=1.0), torch.rand(16**3) < 0.2
     sampler, random = Occupancy(grid, 32, space=space, empty=empty), seeded(0)
-    loss = RayLoss(Renderer({"field": router}, sampler), sparse_depth=0.003)
+    loss = RayLoss(Renderer({"field": router}, sampler), sparse_depth=0.003, smooth_depth=0.1)
     strategy = SplitStrategy({"field": router}, [PlannedSplit(at=0.5, children=4)], reservoir=100, batches=10)
 
     def step(number):

@@ -13,9 +13,12 @@ from voronerf.nerf.loss import Batch
 from voronerf.nerf.occupancy import draw_seed
 from voronerf.ops._core.recording import following_count
 from voronerf.ops.draw_pixels import Known, Runs, draw_pixels
+from voronerf.ops.unseen_rays import unseen_rays
 
 #: Share of the rays that are drawn through points of a sparse model, where these are learnt from.
 SPARSE = 0.25
+#: Pairs of unseen rays for each ray of a batch, and how many pixels the two are apart along each axis at most.
+UNSEEN, APART = 0.125, 5.0
 
 
 class RayBatches:
@@ -36,6 +39,8 @@ class RayBatches:
         masks: bool [c, h, w], False for pixels that are not drawn; None for none.
         sparse: int64 [s] pixels, numbered through all images, that show points of a sparse model, and float32 [s], the
             distances of the points. A share of the rays, `SPARSE`, is drawn from them. None for none.
+        unseen: How far from a camera along each axis, at most, the last rays of a batch begin, which are pairs of
+            neighbours, `UNSEEN` of the batch; 0 for none. There must be no box.
         views: int64, the pictures to draw from; None for all.
         cones: Whether the rays have radii.
         fetch: Called with the pixels of a batch, int64 [r], before they are read, as for images on disk.
@@ -64,6 +69,7 @@ class RayBatches:
         random_background: bool = True,
         masks: Tensor | None = None,
         sparse: tuple[Tensor, Tensor] | None = None,
+        unseen: float = 0.0,
         views: Tensor | None = None,
         cones: bool = False,
         fetch: Callable[[Tensor], None] | None = None,
@@ -76,6 +82,10 @@ class RayBatches:
         self.box, self.background = (None if each is None else each.to(self.place) for each in (box, background))
         self.random_background = random_background and (images.shape[-1] == 4 or background is None)
         self.cones, self.fetch, self.backend = cones, fetch, backend
+        if unseen and box is not None:
+            message = "RayBatches: unseen must be 0 with a box, which rays from elsewhere may miss"
+            raise ValueError(f"{message}, got {unseen}")
+        self.unseen, self.tilt = unseen, APART / float(cameras.intrinsics[:, :2].mean())
         self.useful = self._useful_pixels(masks, views)
         self.sparse = None
         if sparse is not None:
@@ -138,9 +148,13 @@ class RayBatches:
             background=background,
             backend=self.backend,
         )
+        pairs = following_count(count, lambda rays: int(UNSEEN * rays)) if self.unseen else 0
+        if pairs:
+            origins, directions = rays_seen.origins, rays_seen.directions
+            unseen_rays(origins, directions, seed, pairs=pairs, move=self.unseen, tilt=self.tilt, backend=self.backend)
         radii = None
         if self.cones:
             radii = cameras.radii(rays_seen.directions, index // (cameras.width * cameras.height)).to(self.device)
         origins, directions, near, far, colour = (tensor.to(self.device) for tensor in rays_seen)
         background = None if background is None else background.to(self.device)
-        return Batch(Rays(origins, directions, radii), near, far, colour, background, depths)
+        return Batch(Rays(origins, directions, radii), near, far, colour, background, depths, pairs)

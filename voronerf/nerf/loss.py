@@ -19,6 +19,8 @@ from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.ops.render_loss import render_loss_gradient
 from voronerf.ops.render_loss.reference import activate, robust_error
 from voronerf.ops.scale_gradient import scale_gradient
+from voronerf.ops.smooth_depth_gradient import smooth_depth_gradient
+from voronerf.ops.smooth_depth_gradient.reference import smooth_depth_loss
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.sparse_depth_gradient.reference import sparse_depth_loss
 
@@ -34,6 +36,7 @@ class Batch:
         target: [r, 3], the colour of each ray's pixel over the background.
         background: [3], or [r, 3] where it was drawn; None for black.
         sparse_depths: [s], the distances of the points of a sparse model that the first s rays end at, or None.
+        unseen: Pairs at the end that are `voronerf.ops.unseen_rays`, whose colours are not known.
 
     Examples:
         >>> import torch
@@ -48,6 +51,7 @@ class Batch:
     target: Tensor
     background: Tensor | None = None
     sparse_depths: Tensor | None = None
+    unseen: int = 0
 
 
 class RenderOutput(NamedTuple):
@@ -96,6 +100,8 @@ class RayLoss:
             (Deng et al. 2022, "Depth-supervised NeRF"); 0 is off.
         robust: Scale of the errors beyond which the loss of a ray is not squared: see `voronerf.ops.render_loss`. What
             differs from picture to picture, such as exposure, is no reason for fog then. 0 is off.
+        smooth_depth: Factor of the loss on depths that differ between two neighbours of the unseen rays of a batch: see
+            `voronerf.ops.smooth_depth_gradient`.
         term: A further term of the loss, a scalar that torch computes from the rendered rays and their batch. The
             networks alone learn from it, and a :class:`TrainingStep` with it is not recorded.
 
@@ -123,9 +129,11 @@ class RayLoss:
         *,
         sparse_depth: float = 0.0,
         robust: float = 0.0,
+        smooth_depth: float = 0.0,
         term: Callable[[Rendered, Batch], Tensor] | None = None,
     ) -> None:
-        self.renderer, self.sparse_depth, self.robust, self.term = renderer, sparse_depth, robust, term
+        self.renderer, self.sparse_depth, self.robust = renderer, sparse_depth, robust
+        self.smooth_depth, self.term = smooth_depth, term
 
     def __call__(
         self, batch: Batch, generator: torch.Generator | None = None, *, backward: bool = False
@@ -192,6 +200,24 @@ class RayLoss:
                 **field.rule,
                 backend=renderer.backend,
             )
+        if batch.unseen:
+            smooth_depth_gradient(
+                result.loss,
+                result.error,
+                gradient,
+                result.density,
+                samples.depths,
+                samples.deltas,
+                result.weights,
+                samples.ray_offsets,
+                batch.far,
+                pairs=batch.unseen,
+                factor=self.smooth_depth,
+                robust=self.robust,
+                hidden=HIDDEN,
+                **field.rule,
+                backend=renderer.backend,
+            )
         if self.term is not None:
             with torch.enable_grad():
                 raw = tape.raw.detach().requires_grad_()
@@ -209,15 +235,23 @@ class RayLoss:
         *before, last = self.renderer.render(
             batch.rays, batch.near, batch.far, background=batch.background, jitter=True, generator=generator
         )
-        samples, error = last.samples, (last.colour - batch.target).square().sum(-1)
-        loss = robust_error(error, self.robust).mean() / 3
+        samples, rays = last.samples, len(batch.rays)
+        seen = rays - 2 * batch.unseen
+        error = (last.colour[:seen] - batch.target[:seen]).square().sum(-1)
+        loss = robust_error(error, self.robust).sum() / (3 * max(rays, 1))
         if self.sparse_depth and batch.sparse_depths is not None:
             along = last.weights, samples.depths, samples.deltas, samples.ray_offsets
             loss = loss + self.sparse_depth * sparse_depth_loss(*along, batch.sparse_depths).mean()
+        if batch.unseen:
+            nearness = last.weights / samples.depths
+            disparity = torch.zeros_like(batch.far).index_add(0, samples.ray_index.long(), nearness)
+            loss = loss + self.smooth_depth * smooth_depth_loss(disparity, last.opacity, batch.far, batch.unseen)
         if self.term is not None:
             loss = loss + self.term(last, batch)
         for first in before:
-            loss = loss + self.renderer.sampler.loss_before(first, last, batch.target)
+            target = torch.cat((batch.target[:seen], first.colour[seen:].detach()))
+            loss = loss + self.renderer.sampler.loss_before(first, last, target)
+        error = torch.nn.functional.pad(error.detach(), (0, rays - seen))
         if backward:
             loss.backward()
             loss = loss.detach()

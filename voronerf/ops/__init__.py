@@ -37,8 +37,10 @@ from voronerf.ops.render_opaque import RaysSeen, render_opaque
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.scale_gradient import scale_gradient
+from voronerf.ops.smooth_depth_gradient import smooth_depth_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.spherical_harmonics import spherical_harmonics
+from voronerf.ops.unseen_rays import unseen_rays
 
 __all__ = [
     "MLP",
@@ -85,6 +87,8 @@ __all__ = [
     "run_gradients",
     "run_sums",
     "scale_gradient",
+    "smooth_depth_gradient",
     "sparse_depth_gradient",
     "spherical_harmonics",
+    "unseen_rays",
 ]

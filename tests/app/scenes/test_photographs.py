@@ -15,9 +15,10 @@ from voronerf.app import open_run
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.scenes import SceneError, load_scene, photographs
 from voronerf.app.scenes.colmap import read_model
-from voronerf.app.train import ConfigError, TrainConfig
+from voronerf.app.scenes.scene import SparseDepth
+from voronerf.app.train import Callback, ConfigError, TrainConfig, train
 from voronerf.app.train.build import ROBUST, build, make_batches, make_renderer, make_routers
-from voronerf.app.train.defaults import resolve
+from voronerf.app.train.defaults import BESIDE, resolve
 from voronerf.nerf.cameras import Cameras, orbit_cameras
 
 COUNT, SIZE = 9, (12, 10)
@@ -82,8 +83,8 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     assert (config.sparse_depth, space.full_gradient) == (0.0015, 1.0)
     assert config.occupancy and config.samples == (256,)
     assert resolve(TrainConfig(budget=60), scene).samples == (128,)
-    losses = [build(config, each).ray_loss for each in (scene, replace(scene, background="white"))]
-    assert [loss.robust for loss in losses] == [ROBUST, 0.0]  # of photographs alone
+    states = [build(config, each) for each in (scene, replace(scene, background="white"))]
+    assert [each.ray_loss.robust for each in states] == [ROBUST, 0.0]  # of photographs alone
     batch = make_batches(config, scene).draw(400, torch.Generator().manual_seed(0))
     assert len(batch.rays) == 400 and len(batch.sparse_depths) == 100
     assert batch.background.shape == (400, 3) and batch.background.unique().numel() > 1000  # drawn for each
@@ -102,6 +103,32 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     assert resolve(TrainConfig(), without).sparse_depth == 0
     with pytest.raises(ConfigError, match="--sparse-depth needs a COLMAP model with points"):
         resolve(TrainConfig(sparse_depth=0.1), without)
+
+
+def test_rays_from_elsewhere_end_half_way(tmp_path):
+    """They are of photographs of something that cameras stand around, most of whose tiles have no point."""
+    write_both(tmp_path)
+    scene = load_scene(tmp_path)  # whose pixels are its tiles
+    pixels = torch.arange(len(scene.train) * 120)
+
+    def known(share):
+        points = pixels[: int(share * len(pixels))].repeat(2)
+        return replace(
+            scene, train=replace(scene.train, sparse_depth=SparseDepth(points, torch.full((len(points),), 1.0)))
+        )
+
+    few, many = known(0.48), known(0.52)
+    config, found = TrainConfig(steps=64, rays=32, samples=(16,), cells=(), field_options=("log2_entries=10",)), []
+
+    class Note(Callback):
+        def after_step(self, state):
+            found.append((state.step <= 32, state.batches.unseen))
+
+    train(build(config, few), [Note()])
+    assert set(found) == {(True, BESIDE), (False, 0.0)}
+    without = replace(few, train=replace(few.train, sparse_depth=None))
+    for other in (many, without, replace(few, background="white"), replace(few, kind="inside-out")):
+        assert build(config, other).batches.unseen == 0
 
 
 @pytest.mark.parametrize(("kind", "turn"), [("forward", 0.0), ("inside-out", 180.0), ("unbounded", 0.0)])

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.store import Pages
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.defaults import resolve, why_no_occupancy
+from voronerf.app.train.defaults import resolve, unseen_move, why_no_occupancy
 from voronerf.app.train.state import State
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.adam import Adam
@@ -37,6 +37,8 @@ TEMPERATURE = 0.05
 PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 #: Scale of the robust loss of photographs, whose exposure and highlights differ; pictures that are computed have none.
 ROBUST = 0.05
+#: Factor of the loss on smooth depths of photographs from where no camera was.
+SMOOTH_DEPTH = 0.1
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
 SAMPLE_BYTES = 64
 
@@ -83,13 +85,15 @@ def build(
     generator = torch.Generator().manual_seed(config.seed)
     # Random numbers are drawn on the device that uses them, so that the host need not wait.
     draws = generator if device.type == "cpu" else torch.Generator(device).manual_seed(config.seed)
-    batches = make_batches(config, scene) if batches is None else batches
     routers = make_routers(config)
     for router in routers.values():
         router.generator = draws
     renderer = make_renderer(
         config, scene, routers, grid=make_grid(config, scene, device) if config.occupancy else None
     )
+    if batches is None:
+        unseen = unseen_move(scene, renderer.sampler.space) if config.occupancy else 0.0
+        batches = make_batches(config, scene, unseen=unseen)
     optimizer = Adam.of(
         routers,
         lr=float(config.lr or 0),
@@ -112,7 +116,10 @@ def build(
         routers=routers,
         renderer=renderer,
         ray_loss=RayLoss(
-            renderer, sparse_depth=config.sparse_depth or 0.0, robust=0.0 if scene.background is not None else ROBUST
+            renderer,
+            sparse_depth=config.sparse_depth or 0.0,
+            robust=0.0 if scene.background is not None else ROBUST,
+            smooth_depth=SMOOTH_DEPTH,
         ),
         optimizer=optimizer,
         strategy=strategy,
@@ -126,8 +133,8 @@ def build(
     )
 
 
-def make_batches(config: TrainConfig, scene: Scene, views: Tensor | None = None) -> RayBatches:
-    """Batches of rays of the training views of a scene; ``views`` int64 for some of them alone."""
+def make_batches(config: TrainConfig, scene: Scene, views: Tensor | None = None, *, unseen: float = 0.0) -> RayBatches:
+    """Batches of rays of the training views of a scene; ``views`` int64 for some, ``unseen`` as of `RayBatches`."""
     train, device = scene.train, torch.device(config.device)
     images = train.images if train.on_disk else train.images.to(device)
     return RayBatches(
@@ -139,6 +146,7 @@ def make_batches(config: TrainConfig, scene: Scene, views: Tensor | None = None)
         background=scene.background_colour(),
         masks=train.masks,
         sparse=train.sparse_depth if config.sparse_depth else None,
+        unseen=unseen,
         views=views,
         cones=config.field_type.cones,
         fetch=Pages(images).fetch if train.on_disk else None,

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 
 from voronerf.app.train.start import judge_start, steps_to_judgement
 from voronerf.app.train.state import State
-from voronerf.nerf.schedule import GROUP
+from voronerf.nerf.schedule import GROUP, UNSEEN_UNTIL
 from voronerf.nerf.split import SplitDone
 from voronerf.nerf.step import StepOutput
 from voronerf.ops._core import backends
@@ -115,6 +115,8 @@ def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool =
             for callback in callbacks:
                 callback.after_split(state, done)
     optimizer.set_learning_rate(state.learning_rate())
+    if state.fraction >= UNSEEN_UNTIL:
+        state.batches.unseen = 0.0
     if not state.router.training:
         state.renderer.train()
 

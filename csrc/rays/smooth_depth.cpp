@@ -1,0 +1,81 @@
+// Each ray depends on its pair alone, and one thread sums the losses, so results do not depend on the threads.
+#include "rays/smooth_depth.h"
+
+#include <cmath>
+#include <stdexcept>
+#include <string>
+
+#include "common/parallel.h"
+#include "rays/render_loss_math.h"
+
+namespace voronerf {
+
+namespace {
+
+// The derivative of the density to the last of the outputs: of a softplus, 1 - exp(-density / scale) times the scale.
+float density_slope(const SmoothDepth& in, int64_t i) {
+  return in.activated ? 1.0f : -in.density_scale * std::expm1(-in.density[i] / in.density_scale);
+}
+
+double light_left(const SmoothDepth& in, int64_t ray) {
+  double left = 1.0;
+  for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) left -= static_cast<double>(in.weights[i]);
+  return left;
+}
+
+float disparity_of(const SmoothDepth& in, int64_t ray) {
+  double sum = light_left(in, ray) / static_cast<double>(in.far[ray]);
+  for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) {
+    sum += static_cast<double>(in.weights[i]) / static_cast<double>(in.depths[i]);
+  }
+  return static_cast<float>(sum);
+}
+
+// The gradient of a ray's samples from that to its disparity; what is behind a sample adds up from the end.
+void learn_ray(const SmoothDepth& in, int64_t ray, float to_disparity, float* gradient) {
+  double through = light_left(in, ray), behind = through / static_cast<double>(in.far[ray]);
+  for (int64_t i = in.offsets[ray + 1]; i-- > in.offsets[ray];) {
+    const double own = 1.0 / static_cast<double>(in.depths[i]), weight = static_cast<double>(in.weights[i]);
+    const float to_density = to_disparity * in.deltas[i] * static_cast<float>(through * own - behind);
+    for (int k = 0; k < 3; ++k) gradient[4 * i + k] = 0.0f;
+    gradient[4 * i + 3] = through + weight <= static_cast<double>(in.hidden) ? 0.0f : to_density * density_slope(in, i);
+    through += weight;
+    behind += weight * own;
+  }
+}
+
+}  // namespace
+
+void smooth_depth_gradient_cpu(const SmoothDepth& in, float* loss, float* error, float* gradient, float* of_rays,
+                               int threads) {
+  constexpr int64_t kPairs = 32;  // of a task
+  int64_t before = 0;
+  for (int64_t i = 0; i <= in.r; ++i) {
+    if (in.offsets[i] < before || in.offsets[i] > in.m) {
+      throw std::invalid_argument(
+          "smooth_depth_gradient: ray_offsets must rise from 0 or more to at most the number of samples, " +
+          std::to_string(in.m) + ", got " + std::to_string(in.offsets[i]) + " for ray " + std::to_string(i));
+    }
+    before = in.offsets[i];
+  }
+  if (in.pairs == 0) return;
+  const int64_t first = in.r - 2 * in.pairs;
+  const float share = in.factor / static_cast<float>(in.pairs);
+  parallel_for(in.pairs, kPairs, threads, [&](int64_t pair) {
+    const int64_t one = first + pair, other = one + in.pairs;
+    const float here = disparity_of(in, one), there = disparity_of(in, other), apart = std::log(here / there);
+    const float slope = 2.0f * share * apart * ray_loss_slope(apart * apart, in.edge);
+    learn_ray(in, one, slope / here, gradient);
+    learn_ray(in, other, -slope / there, gradient);
+    of_rays[pair] = ray_loss(apart * apart, in.edge);
+  });
+  double sum = 0.0, colours = 0.0;
+  for (int64_t pair = 0; pair < in.pairs; ++pair) sum += static_cast<double>(of_rays[pair]);
+  for (int64_t ray = first; ray < in.r; ++ray) {
+    colours += static_cast<double>(ray_loss(error[ray], in.robust));
+    error[ray] = 0.0f;
+  }
+  *loss += static_cast<float>(share * sum - colours / (3.0 * static_cast<double>(in.r)));
+}
+
+}  // namespace voronerf

@@ -1,0 +1,27 @@
+// How much the depths of neighbouring rays differ where no picture says, and the gradient: pairs of r rays, m samples.
+// Ray i owns samples offsets[i] : offsets[i + 1]. The formulas are in voronerf/ops/smooth_depth_gradient.
+#pragma once
+
+#include <cstdint>
+
+#include "common/row_count.h"
+
+namespace voronerf {
+
+struct SmoothDepth {
+  const float *density, *depths, *deltas, *weights;  // [m]
+  const int32_t* offsets;                            // [r+1]
+  const float* far;                                  // [r]
+  float factor, robust, hidden;                      // the last: samples that no more light reaches have no gradient
+  float edge;  // scale of the differences of logarithms, as robust is that of colours
+  float density_scale;
+  bool activated;  // the gradient is to the density itself, else to what comes before its softplus
+  RowCount pairs, r, m;
+};
+
+// Changes loss: [1], error: [r] and gradient: [m,4]. of_rays: [r], working memory. Throws std::invalid_argument for
+// offsets that fall or exceed m, and changes nothing then.
+void smooth_depth_gradient_cpu(const SmoothDepth& in, float* loss, float* error, float* gradient, float* of_rays,
+                               int threads);
+
+}  // namespace voronerf

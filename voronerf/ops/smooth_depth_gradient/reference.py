@@ -1,0 +1,50 @@
+"""How much the depths of neighbouring rays differ where no picture says, with its gradient. r rays, m samples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from voronerf.ops.composite.reference import check_ray_offsets, composite, optical_depth, packed_light
+from voronerf.ops.render_loss.reference import kept, robust_error
+
+#: Scale of the differences of the logarithms beyond which the loss is not squared: at the edge of a surface.
+EDGE = 0.05
+
+
+def smooth_depth_loss(disparity: Tensor, opacity: Tensor, far: Tensor, pairs: int) -> Tensor:
+    """The loss [] of the last of r rays, from their sums [r] of weights over depths and of weights.
+
+    Formula and arguments are those of ``voronerf.ops.smooth_depth_gradient``.
+    """
+    seen = (disparity + (1 - opacity) / far)[len(far) - 2 * pairs :].log()
+    return robust_error((seen[:pairs] - seen[pairs:]).square(), EDGE).mean() if pairs else seen.sum()
+
+
+@torch.inference_mode(False)
+@torch.enable_grad()
+def smooth_depth_gradient(loss: Tensor, error: Tensor, gradient: Tensor, *given: Any) -> None:
+    """Smooth depths in the place of colours; see ``voronerf.ops.smooth_depth_gradient``."""
+    *tensors, pairs, factor, robust, hidden, density_scale, activated = given
+    density, depths, deltas, _, ray_offsets, far = (kept(tensor.detach()) for tensor in tensors)
+    check_ray_offsets("smooth_depth_gradient", ray_offsets, len(density))
+    first = len(far) - 2 * pairs
+    density.requires_grad_()
+    disparities = 1 / depths[:, None]
+    light, _ = packed_light(optical_depth(density.detach(), deltas), ray_offsets)
+    lit = torch.where(light <= hidden, density.detach(), density)
+    seen = composite(lit, disparities, depths, deltas, ray_offsets)
+    own = factor * smooth_depth_loss(seen.colour[:, 0], seen.opacity, far, pairs)
+    slope = torch.autograd.grad(own, density)[0]
+    if not activated:
+        slope = slope * -density_scale * torch.expm1(-density / density_scale)  # of a softplus
+    with torch.no_grad():
+        loss += own - robust_error(error[first:], robust).sum() / (3 * max(len(far), 1))
+        error[first:] = 0
+        # Samples behind those of the rays belong to none; no host reads where the rays begin.
+        sample = torch.arange(len(density), device=density.device)
+        unseen = (sample >= ray_offsets[first]) & (sample < ray_offsets[-1])
+        gradient[:] = torch.where(unseen[:, None], 0, gradient)
+        gradient[:, 3] += slope
