@@ -115,7 +115,7 @@ def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool =
             for callback in callbacks:
                 callback.after_split(state, done)
     optimizer.set_learning_rate(state.learning_rate())
-    if state.fraction >= UNSEEN_UNTIL:
+    if state.batches.unseen and state.fraction >= UNSEEN_UNTIL:
         state.batches.unseen = 0.0
     if not state.router.training:
         state.renderer.train()
