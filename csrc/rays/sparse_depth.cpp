@@ -22,7 +22,7 @@ float slope(const SparseDepth& in, int64_t i) {
   return in.activated ? 1.0f : -in.density_scale * std::expm1(-in.density[i] / in.density_scale);
 }
 
-float learn_ray(const SparseDepth& in, int64_t begin, int64_t end, float distance, float* gradient) {
+float learn_ray(const SparseDepth& in, float share, int64_t begin, int64_t end, float distance, float* gradient) {
   double sum = 0.0;
   for (int64_t i = begin; i < end; ++i) sum += near_point(in, i, distance) ? static_cast<double>(in.weights[i]) : 0.0;
   const float total = static_cast<float>(sum);
@@ -34,7 +34,7 @@ float learn_ray(const SparseDepth& in, int64_t begin, int64_t end, float distanc
     light += there ? static_cast<double>(in.weights[i]) : 0.0;
     const float through = there ? std::exp(-static_cast<float>(optical)) : 0.0f;
     const float to_density = -in.deltas[i] / total * (through - (total - static_cast<float>(light)));
-    gradient[4 * i + 3] += in.factor * to_density * slope(in, i);
+    gradient[4 * i + 3] += share * to_density * slope(in, i);
   }
   return -std::log(total);
 }
@@ -52,12 +52,14 @@ void sparse_depth_gradient_cpu(const SparseDepth& in, float* loss, float* gradie
     }
     before = in.offsets[i];
   }
+  if (in.s == 0) return;
+  const float share = in.factor / static_cast<float>(in.s);
   parallel_for(in.s, kRays, threads, [&](int64_t i) {
-    of_rays[i] = learn_ray(in, in.offsets[i], in.offsets[i + 1], in.distances[i], gradient);
+    of_rays[i] = learn_ray(in, share, in.offsets[i], in.offsets[i + 1], in.distances[i], gradient);
   });
   double sum = 0.0;
   for (int64_t i = 0; i < in.s; ++i) sum += static_cast<double>(of_rays[i]);
-  *loss += in.factor * static_cast<float>(sum);
+  *loss += share * static_cast<float>(sum);
 }
 
 }  // namespace voronerf

@@ -12,7 +12,7 @@ struct SparseDepth {
   const float *density, *depths, *deltas, *weights;  // [m]
   const int32_t* offsets;                            // [r+1]
   const float* distances;                            // [s], of the points of the first rays, NaN for none
-  float nearby, factor;
+  float nearby, factor;                              // the latter on the mean over the s rays
   float density_scale;
   bool activated;  // the gradient is to the density itself, else to what comes before its softplus
   RowCount s, r, m;

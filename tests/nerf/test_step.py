@@ -27,13 +27,17 @@ BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
 
 
 class Training:
-    """A small training, whose grid empties a part of the box, so that its numbers of samples vary."""
+    """A small training, whose grid empties a part of the box, so that its numbers of samples vary.
 
-    def __init__(self, cells=1, field=None, sampler=Occupancy, unseen=False, **options):
+    As of a photograph it has points of a sparse model, and rays from where no camera was.
+    """
+
+    def __init__(self, cells=1, field=None, sampler=Occupancy, photograph=False, **options):
         torch.manual_seed(0)
         cameras = orbit_cameras(3, radius=3.0, elevation=0.3, width=16, height=16, focal=16.0)
         images = torch.randint(256, (3, 16, 16, 3), dtype=torch.uint8)
-        where = {"unseen": 0.5} if unseen else {"box": BOX}
+        points = torch.arange(0, 768, 7), torch.full((110,), 3.0)
+        where = {"unseen": 0.5, "sparse": points} if photograph else {"box": BOX}
         self.batches = RayBatches(cameras, images, near=1.0, far=5.0, background=torch.ones(3), **where)
         own, field = field, field() if field else HashGridField(levels=4, log2_entries=10, width=16)
         share = ["features"] if isinstance(field, HashGridField) else []
@@ -43,7 +47,7 @@ class Training:
         grid.density[:6] = grid.occupied[:6] = 0
         self.sampler = sampler(grid, 32)
         shown = self.router if own is None else DirectionPerSample(self.router)
-        self.loss = RayLoss(Renderer({"field": shown}, self.sampler), smooth_depth=0.1)
+        self.loss = RayLoss(Renderer({"field": shown}, self.sampler), smooth_depth=0.1, sparse_depth=0.3)
         self.optimizer = Adam.of({"field": self.router}, lr=0.01, sparse=["features"])
         self.guard, self.generator = Guard.on("cpu"), torch.Generator().manual_seed(1)
         given = {"guard": self.guard, "generator": self.generator}
@@ -85,14 +89,14 @@ def threads(request):
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize(("cells", "unseen"), [(1, False), (6, False), (6, True)])
-def test_same_bits_as_steps_that_run_as_they_are(cells, unseen, threads):
+@pytest.mark.parametrize(("cells", "photograph"), [(1, False), (6, False), (6, True)])
+def test_same_bits_as_steps_that_run_as_they_are(cells, photograph, threads):
     """Parameters, moments, grid, and all that a step gives; rays grow beyond what there is memory for, and shrink."""
 
     def rays(step):
         return 64 + 5 * step if step < 30 else 150 - 3 * (step - 30)
 
-    one, other = Training(cells, unseen=unseen), Training(cells, unseen=unseen)
+    one, other = Training(cells, photograph=photograph), Training(cells, photograph=photograph)
     found, expected = one.train(60, rays), other.train(60, rays, as_it_is=True)
     assert same(found, expected) and same(one.everything(), other.everything())
     assert "replayed" in one.step.explain() and one.recorded < 12, one.recorded

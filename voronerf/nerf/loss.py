@@ -196,7 +196,7 @@ class RayLoss:
                 result.weights,
                 samples.ray_offsets,
                 depths,
-                factor=self.sparse_depth / len(depths),
+                factor=self.sparse_depth,
                 **field.rule,
                 backend=renderer.backend,
             )

@@ -46,8 +46,8 @@ def sparse_depth_gradient(
     a ray is ``-log`` of the sum of the weights of these samples, at least 0.001: the likelihood of Deng et al. 2022,
     "Depth-supervised NeRF", with a box in the place of their Gaussian. Fog before the point takes from them. With the
     transmittance T behind a sample and the light S from points that lie behind it, the derivative of the sum by its
-    density is ``delta (T near - S)``. What is added is ``factor`` times the sum of the losses, and to the last column
-    of the gradient that of it. A weight that is NaN makes the loss NaN if it is near the point, and its ray has no
+    density is ``delta (T near - S)``. What is added is ``factor`` times the mean of the s losses, and to the last
+    column of the gradient that of it. A weight that is NaN makes the loss NaN if it is near the point, and its ray has no
     gradient. Nothing is differentiable further.
 
     Args:
@@ -59,7 +59,7 @@ def sparse_depth_gradient(
         weights: their contributions to the rays.
         ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
         distances: of the point that each of the first s rays ends at, s <= r; NaN for none.
-        factor: on the loss of each ray.
+        factor: on the mean of the losses.
         density_scale: factor on the density behind its softplus, as for `render_loss`; None with ``activated``.
         activated: whether the gradient is to the density itself.
 

@@ -33,7 +33,7 @@ def sparse_depth_loss(
 @torch.inference_mode(False)
 @torch.enable_grad()
 def sparse_depth_gradient(loss: Tensor, gradient: Tensor, *given: Any) -> None:
-    """Adds the sum of the `sparse_depth_loss`, and its gradient; see ``voronerf.ops.sparse_depth_gradient``."""
+    """Adds the mean of the `sparse_depth_loss`, and its gradient; see ``voronerf.ops.sparse_depth_gradient``."""
     *tensors, factor, density_scale, activated = given
     density, depths, deltas, weights, ray_offsets, distances = (kept(tensor.detach()) for tensor in tensors)
     check_ray_offsets("sparse_depth_gradient", ray_offsets, len(density))
@@ -41,7 +41,8 @@ def sparse_depth_gradient(loss: Tensor, gradient: Tensor, *given: Any) -> None:
     weights.requires_grad_()
     rgb = density.detach()[:, None]
     composed = composite(density, rgb, depths, deltas, ray_offsets).weights
-    own = factor * sparse_depth_loss(weights, depths, deltas, ray_offsets, distances).sum()
+    of_rays = sparse_depth_loss(weights, depths, deltas, ray_offsets, distances)
+    own = factor * of_rays.sum() / max(len(distances), 1)
     slope = torch.autograd.grad(composed, density, torch.autograd.grad(own, weights))[0]
     if not activated:
         slope = slope * -density_scale * torch.expm1(-density / density_scale)  # of a softplus
