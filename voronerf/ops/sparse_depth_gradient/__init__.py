@@ -47,8 +47,8 @@ def sparse_depth_gradient(
     "Depth-supervised NeRF", with a box in the place of their Gaussian. Fog before the point takes from them. With the
     transmittance T behind a sample and the light S from points that lie behind it, the derivative of the sum by its
     density is ``delta (T near - S)``. What is added is ``factor`` times the mean of the s losses, and to the last
-    column of the gradient that of it. A weight that is NaN makes the loss NaN if it is near the point, and its ray has no
-    gradient. Nothing is differentiable further.
+    column of the gradient that of it. A weight that is NaN makes the loss NaN if it is near the point, and its ray has
+    no gradient. Nothing is differentiable further.
 
     Args:
         loss: to which the loss is added.
