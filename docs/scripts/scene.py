@@ -13,7 +13,7 @@ def scene_page() -> Path:
     """The page of a built-in scene after twenty seconds of training."""
     page, run = FOLDER / "scene.html", FOLDER / "run"
     if not page.is_file():
-        training = f"train --data builtin --budget 20 --panels 1 --eval-views 4 --out {run}".split()
+        training = f"train --data builtin --budget 12 --panels 1 --eval-views 4 --out {run}".split()
         for command in (
             [] if (run / "summary.json").is_file() else [training],
             [["export", str(run), "--web", str(page)]],

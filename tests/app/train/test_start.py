@@ -15,11 +15,10 @@ from voronerf.nerf.volume import Samples
 
 
 @pytest.mark.native
-@pytest.mark.parametrize("seed", [0, 3])
-def test_steps_of_many_rays_do_not_empty_the_grid_before_the_field_is_dense(seed):
-    """Seeds whose trainings stayed without a sample, at 9 dB."""
+def test_steps_of_many_rays_do_not_empty_the_grid_before_the_field_is_dense():
+    """A seed whose training stayed without a sample, at 9 dB."""
     scene = builtin_scene(32, train_views=30, test_views=2)
-    config = TrainConfig(steps=6000, split_at=(0.9,), rays=4096, samples=(128,), seed=seed)
+    config = TrainConfig(steps=6000, split_at=(0.9,), rays=4096, samples=(128,), seed=3)
     state = steps_of(build(config, scene), 115)
     with state.averaged():
         assert state.sampler.grid.share < 0.9
