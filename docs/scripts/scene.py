@@ -10,7 +10,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "build" / "docs"
 
 
 def scene_page() -> Path:
-    """The page of a built-in scene after twenty seconds of training."""
+    """The page of a built-in scene after twelve seconds of training."""
     page, run = FOLDER / "scene.html", FOLDER / "run"
     if not page.is_file():
         training = f"train --data builtin --budget 12 --panels 1 --eval-views 4 --out {run}".split()
