@@ -103,7 +103,8 @@ class RayLoss:
         smooth_depth: Factor of the loss on depths that differ between two neighbours of the unseen rays of a batch: see
             `voronerf.ops.smooth_depth_gradient`.
         term: A further term of the loss, a scalar that torch computes from the rendered rays and their batch. The
-            networks alone learn from it, and a :class:`TrainingStep` with it is not recorded.
+            networks alone learn from it, and a :class:`TrainingStep` with it is not recorded. It is given all rays: of
+            the last ``2 * batch.unseen``, no picture shows the colour.
 
     Examples:
         >>> import torch
