@@ -41,8 +41,9 @@ from voronerf.ops._core.recording import Recording
 TEAMS = (2, 8, 16, 32)
 REST = "Python and torch"
 BANDWIDTHS = {"40": 40e9, "80": 80e9}
-TRACED, TIMED = GROUP, 2 * GROUP
-"""Steps of a turn: with a trace, where there is one, and by the clock."""
+TURN = GROUP, 2 * GROUP, 4 * GROUP
+"""Steps of a turn after which the trace begins, where there is one, the clock, and the next turn: in the first of them
+`train` starts, which takes milliseconds."""
 LINE, SAMPLE_BYTES, ENTRY_BYTES, TAUGHT_BYTES = 16, 450, 8, 24
 """Entries of a cache line; bytes that a step reads and writes of a sample (positions to gradients), of an entry (its
 gradient, twice), and of one in a line with a gradient (itself and two moments, each read and written)."""
@@ -65,7 +66,7 @@ CASES = {
     "bonsai": Case("bonsai", 2, {"steps": 500}),
     "nerf": Case("lego", 4, {"steps": 300, "field": "nerf"}),
 }
-QUICK = {"quick": Case("builtin:32", 1, {"steps": TRACED + TIMED + 2}, 1)}
+QUICK = {"quick": Case("builtin:32", 1, {"steps": TURN[-1] + 2}, 1)}
 
 
 class Way(NamedTuple):
@@ -137,37 +138,37 @@ class Training(Callback):
         self.ms: list[float] = []
         self.processor_ms: list[float] = []
         self.traced: list[dict[str, list[float]]] = []
-        self._steps, self._end, self._traces, self._began, self._processor = 0, 0, False, 0.0, 0.0
+        self._began, self._passed = 0, 0  # the step at which the turn began, and what it has passed of TURN
+        self._since = 0, 0.0, 0.0  # of the last of these: step, and seconds by the clock and of the processor
 
     def turn(self, other: Other) -> None:
         """Makes the steps of a turn."""
         with threads(self.way.threads):
             other.work(self.way.beside)
-            self._run(TRACED, self.way == Way(1, self.way.replayed))
-            before = self.state.seconds
-            self._run(TIMED, False)
-            self.processor_ms.append(1e3 * self._processor / TIMED)
-            self.ms.append(1e3 * (self.state.seconds - before) / TIMED)
+            self._began, self._passed = self.state.step, 0
+            self.state.clear_stop()
+            train(self.state, [self])
             other.work(0)
 
-    def _run(self, count: int, traces: bool) -> None:
-        self._steps, self._end = self.state.step, self.state.step + count
-        self._traces, self._began, self._processor = traces, time.process_time(), 0.0
-        self.state.clear_stop()
-        native.compiled.trace(traces)
-        train(self.state, [self])
-        native.compiled.trace(False)
-
     def after_step(self, state: State) -> None:
-        """Keeps what was traced, a step, and the processor time."""
-        seconds, calls = time.process_time() - self._began, native.compiled.trace(self._traces)
-        self._processor += seconds
-        if self._traces:
-            steps, found = state.step - self._steps, parts(seconds, calls)
-            self.traced.append({name: [value / steps for value in own] for name, own in found.items()})
-        if state.step >= self._end:
+        """Keeps what a step took by the clock, and what was traced."""
+        if state.step - self._began < TURN[self._passed]:
+            return
+        now = state.step, time.perf_counter(), time.process_time()
+        steps, clock, processor = (to - at for to, at in zip(now, self._since, strict=True))
+        if self._passed == 0:
+            native.compiled.trace(self.way == Way(1, self.way.replayed))
+        elif self._passed == 1:
+            calls = native.compiled.trace(False)
+            if calls:
+                found = parts(processor, calls)
+                self.traced.append({name: [value / steps for value in own] for name, own in found.items()})
+        else:
+            self.ms.append(1e3 * clock / steps)
+            self.processor_ms.append(1e3 * processor / steps)
             state.stop()
-        self._steps, self._began = state.step, time.process_time()
+        self._passed += 1
+        self._since = state.step, time.perf_counter(), time.process_time()
 
 
 def config(case: Case) -> TrainConfig:
@@ -253,7 +254,7 @@ def measure(name: str, case: Case, cores: int, region_us: float) -> list[dict[st
     """The row of a training and, if there is one, of a picture of its field."""
     scene, other = load(case), Other(case)
     trainings = {way: Training(case, scene, how) for way, how in ways(cores).items()}
-    turns = (case.settings["steps"] - 1) // (TRACED + TIMED)
+    turns = (case.settings["steps"] - 1) // TURN[-1]
     for number in range(turns):
         if number == turns // 4:  # from here on
             for training in trainings.values():
