@@ -34,11 +34,13 @@ bool in_tiles(const ProgramTable& table) {
   return table.layout == ProgramLayout::tiles || table.layout == ProgramLayout::parts;
 }
 
-// Whether values leave 0 to end - 1.
+// Whether values leave 0 to end - 1: they, or what is left to the end, are negative then. A sum of signs is made in
+// vectors on any processor, unlike one of comparisons without signs.
 bool leaves(const int32_t* values, int64_t n, int64_t end) {
-  bool beyond = false;  // what is below 0, too, as an unsigned number
-  for (int64_t i = 0; i < n; ++i) beyond |= static_cast<uint32_t>(values[i]) >= static_cast<uint32_t>(end);
-  return beyond;
+  const auto last = static_cast<uint32_t>(end - 1);
+  uint32_t signs = 0;
+  for (int64_t i = 0; i < n; ++i) signs |= static_cast<uint32_t>(values[i]) | (last - static_cast<uint32_t>(values[i]));
+  return signs >> 31 != 0;
 }
 
 void check(const ProgramInputs& in) {
