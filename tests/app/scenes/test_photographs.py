@@ -126,6 +126,10 @@ def test_rays_from_elsewhere_end_half_way(tmp_path):
 
     train(build(config, few), [Note()])
     assert set(found) == {(True, BESIDE), (False, 0.0)}
+    states = [build(replace(config, steps=40), few) for _ in range(2)]  # half of which is within a group of steps
+    for state, callbacks in zip(states, ([Note()], [])):
+        train(state, callbacks)
+    assert torch.equal(*(state.router.module.features for state in states))
     without = replace(few, train=replace(few.train, sparse_depth=None))
     for other in (many, without, replace(few, background="white"), replace(few, kind="inside-out")):
         assert build(config, other).batches.unseen == 0

@@ -115,7 +115,8 @@ def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool =
             for callback in callbacks:
                 callback.after_split(state, done)
     optimizer.set_learning_rate(state.learning_rate())
-    if state.batches.unseen and state.fraction >= UNSEEN_UNTIL:
+    group = state.step - (state.step - state.began) % GROUP  # its first step: the clock may cut a group anywhere
+    if state.batches.unseen and state.fraction_at(group) >= UNSEEN_UNTIL:
         state.batches.unseen = 0.0
     if not state.router.training:
         state.renderer.train()
