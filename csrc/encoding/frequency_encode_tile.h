@@ -111,8 +111,8 @@ constexpr int64_t kMostTurned = 128;  // columns of `encode_turned`
 
 // Up to kTurned rows as pairs alone, all angles small. Lanes are rows: sine and cosine of a feature share a range
 // reduction, and octaves follow from the one before by the double-angle formulas, each of which doubles the error. So
-// every fifth is exact again, which leaves 2e-6 where rounding to bfloat16 makes 2e-3. All columns are transposed at the
-// end.
+// every fifth is exact again, which leaves 2e-6 where rounding to bfloat16 makes 2e-3. All columns are transposed at
+// the end.
 void encode_turned(const float* x, int64_t x_stride, int64_t rows, const Columns& columns, float* pairs,
                    int64_t pairs_stride) {
   constexpr int kVectors = kTurned / kLanes;
