@@ -50,7 +50,7 @@ def dies(args, step):
 
 def dies_at_the_start(args):
     """Rank 1, before it has met the others, who wait for it for some seconds."""
-    if group.own_rank() == 1:
+    if os.environ["RANK"] == "1":
         os.kill(os.getpid(), signal.SIGKILL)
     with mock.patch.object(group, "PATIENCE", 3):
         return main(args)
