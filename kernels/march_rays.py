@@ -15,7 +15,7 @@ import warp as wp
 from voronerf.kernels._launch import array, filled, launch
 from voronerf.ops._core.checks import MAX_COUNT
 from voronerf.ops._core.declare import declared
-from voronerf.ops.march_rays.reference import March
+from voronerf.ops.march_rays.reference import March, fake, memory
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 _OP = declared("march_rays")
@@ -211,7 +211,7 @@ def _march_kernel(given: Given, counting: wp.bool, offsets: wp.array(dtype=wp.in
         out.stop[ray] = given.samples
 
 
-@_OP.custom_op("march_rays_warp", fake=March.fake)
+@_OP.custom_op("march_rays_warp", fake=fake)
 def march_rays(given: Any) -> March:
     """Samples in occupied cells; see ``voronerf.ops.march_rays``."""
     near, r, capacity, inputs = given.near, given.r, given.capacity, _inputs(given)
@@ -221,7 +221,7 @@ def march_rays(given: Any) -> March:
     launch(_march_kernel, r, [inputs, True, array(counts[:0], near), out], near)
     # In int64: the number of samples of all rays may not fit int32; the capacity does.
     offsets = counts.cumsum(dim=0).clamp(max=MAX_COUNT if capacity is None else capacity).int()
-    found = March.memory(near, offsets, int(offsets[-1]) if capacity is None else capacity)
+    found = memory(near, offsets, int(offsets[-1]) if capacity is None else capacity)
     for part in found[1:5]:  # 0 in rows that belong to no ray
         part.zero_()
     launch(_march_kernel, r, [inputs, False, array(offsets, near), _samples(found)], near)

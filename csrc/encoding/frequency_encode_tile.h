@@ -111,20 +111,16 @@ constexpr int64_t kMostTurned = 128;  // columns of `encode_turned`
 
 // Up to kTurned rows as pairs alone, all angles small. Lanes are rows: sine and cosine of a feature share a range
 // reduction, and octaves follow from the one before by the double-angle formulas, each of which doubles the error. So
-// every fifth is exact again, which leaves 2e-6 where rounding to bfloat16 makes 2e-3; and every second where what
-// rounding has left counts, which leaves 2e-7 beside 8e-6. All columns are transposed at the end.
+// every fifth is exact again, which leaves 2e-6 where rounding to bfloat16 makes 2e-3. All columns are transposed at
+// the end.
 void encode_turned(const float* x, int64_t x_stride, int64_t rows, const Columns& columns, float* pairs,
-                   int64_t pairs_stride, int64_t left) {
+                   int64_t pairs_stride) {
   constexpr int kVectors = kTurned / kLanes;
-  constexpr int64_t kRow = kTurned / 2;
-  const int64_t d = columns.d, octaves_of_one = left > 0 ? 2 : 5;
-  alignas(64) float made[kMostTurned][kRow], rest[kMostTurned][kRow];
+  constexpr int64_t kRow = kTurned / 2, kOctavesOfOne = 5;
+  const int64_t d = columns.d;
+  alignas(64) float made[kMostTurned][kRow];
   const auto keep = [&](int64_t column, const F32* values) {
-    for (int v = 0; v < kVectors; v += 2) {
-      const F32 rounded = joined(values[v], values[v + 1]);
-      store(made[column] + v * kLanes / 2, rounded);
-      if (left > 0) store(rest[column] + v * kLanes / 2, left_of(values[v], values[v + 1], rounded));
-    }
+    for (int v = 0; v < kVectors; v += 2) store(made[column] + v * kLanes / 2, joined(values[v], values[v + 1]));
   };
   F32 points[3][kVectors];
   const bool whole = d == 3 && x_stride == 3 && rows == kTurned;
@@ -139,7 +135,7 @@ void encode_turned(const float* x, int64_t x_stride, int64_t rows, const Columns
     if (columns.input) keep(f, given);
     float scale = 1.0f;
     for (int64_t octave = 0, at = columns.first() + f; octave < columns.octaves; ++octave, at += 2 * d, scale *= 2.0f) {
-      if (octave % octaves_of_one == 0) {
+      if (octave % kOctavesOfOne == 0) {
         F32 angle[kVectors];
         for (int v = 0; v < kVectors; ++v) angle[v] = given[v] * splat(scale);
         sines_and_cosines<kVectors>(angle, sine, cosine);
@@ -156,14 +152,10 @@ void encode_turned(const float* x, int64_t x_stride, int64_t rows, const Columns
     }
   }
   const int64_t width = columns.width();
-  const auto turn = [&](float (*from)[kRow], float* to) {
-    for (int64_t c = width; c % kTurned != 0; ++c) __builtin_memset(from[c], 0, sizeof from[c]);
-    for (int64_t c = 0; c < width; c += kTurned) {
-      turn_pairs({from[c], kRow, false}, kTurned, kTurned, to + c / 2, pairs_stride);
-    }
-  };
-  turn(made, pairs);
-  if (left > 0) turn(rest, pairs + left);
+  for (int64_t c = width; c % kTurned != 0; ++c) __builtin_memset(made[c], 0, sizeof made[c]);
+  for (int64_t c = 0; c < width; c += kTurned) {
+    turn_pairs({made[c], kRow, false}, kTurned, kTurned, pairs + c / 2, pairs_stride);
+  }
 }
 
 #endif
@@ -231,17 +223,16 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
     for (int64_t row = 0; small && row < rows; ++row) small = all_small(x + row * x_stride, d, largest);
   }
 #if VN_HALF == 2
-  if (pairs != nullptr && !kept && waves && columns.width() <= kMostTurned) {
+  if (pairs != nullptr && !kept && left == 0 && waves && columns.width() <= kMostTurned) {
     for (int64_t row = 0; row < rows; row += kTurned) {
       encode_turned(x + row * x_stride, x_stride, smaller(kTurned, rows - row), columns, pairs + row * pairs_stride,
-                    pairs_stride, left);
+                    pairs_stride);
     }
     for (int64_t row = 0; !small && row < rows; ++row) {  // which leaves the rows beside them as they are
       const float* const from = x + row * x_stride;
       if (all_small(from, d, largest)) continue;
       encode_floats(from, x_stride, table, 1, columns, false, largest, out, stride);
-      narrow_row(out, columns.width(), pairs + row * pairs_stride,
-                 left == 0 ? nullptr : pairs + row * pairs_stride + left);
+      narrow_row(out, columns.width(), pairs + row * pairs_stride);
     }
     return;
   }

@@ -3,11 +3,10 @@
 #include "rays/composite.h"
 
 #include <algorithm>
-#include <stdexcept>
-#include <string>
 
 #include "common/parallel.h"
 #include "rays/composite_isa.h"
+#include "rays/ray_offsets.h"
 
 namespace voronerf {
 
@@ -26,16 +25,7 @@ void ray_backward(Isa isa, const CompositeInputs& in, const CompositeGradients& 
 }
 
 void check(const CompositeInputs& in) {
-  if (in.offsets == nullptr) return;
-  int64_t before = 0;
-  for (int64_t i = 0; i <= in.r; ++i) {
-    if (in.offsets[i] < before || in.offsets[i] > in.m) {
-      throw std::invalid_argument("composite: ray_offsets must rise from 0 or more to at most the number of samples, " +
-                                  std::to_string(in.m) + ", got " + std::to_string(in.offsets[i]) + " for ray " +
-                                  std::to_string(i));
-    }
-    before = in.offsets[i];
-  }
+  if (in.offsets != nullptr) check_ray_offsets("composite", in.offsets, in.r, in.m);
 }
 
 int64_t first_sample(const CompositeInputs& in, int64_t ray) {

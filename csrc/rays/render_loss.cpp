@@ -3,10 +3,9 @@
 #include "rays/render_loss.h"
 
 #include <algorithm>
-#include <stdexcept>
-#include <string>
 
 #include "common/parallel.h"
+#include "rays/ray_offsets.h"
 #include "rays/render_loss_isa.h"
 #include "rays/render_loss_math.h"
 
@@ -42,15 +41,7 @@ void strays_of(Isa isa, const RenderLossInputs& in, const RenderLossOutputs& out
 }  // namespace
 
 void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, Isa isa, int threads) {
-  int64_t before = 0;
-  for (int64_t i = 0; i <= in.r; ++i) {
-    if (in.offsets[i] < before || in.offsets[i] > in.m) {
-      throw std::invalid_argument(
-          "render_loss: ray_offsets must rise from 0 or more to at most the number of samples, " +
-          std::to_string(in.m) + ", got " + std::to_string(in.offsets[i]) + " for ray " + std::to_string(i));
-    }
-    before = in.offsets[i];
-  }
+  check_ray_offsets("render_loss", in.offsets, in.r, in.m);
   strays_of(isa, in, out, 0, in.offsets[0]);
   strays_of(isa, in, out, in.offsets[in.r], in.m);
   each_block(in.r, threads, [&](int64_t begin, int64_t end) { rays_of(isa, in, out, begin, end); });

@@ -2,20 +2,15 @@
 #include "rays/smooth_depth.h"
 
 #include <cmath>
-#include <stdexcept>
-#include <string>
 
 #include "common/parallel.h"
+#include "rays/density_slope.h"
+#include "rays/ray_offsets.h"
 #include "rays/render_loss_math.h"
 
 namespace voronerf {
 
 namespace {
-
-// The derivative of the density to the last of the outputs: of a softplus, 1 - exp(-density / scale) times the scale.
-float density_slope(const SmoothDepth& in, int64_t i) {
-  return in.activated ? 1.0f : -in.density_scale * std::expm1(-in.density[i] / in.density_scale);
-}
 
 double light_left(const SmoothDepth& in, int64_t ray) {
   double left = 1.0;
@@ -38,7 +33,9 @@ void learn_ray(const SmoothDepth& in, int64_t ray, float to_disparity, float* gr
     const double own = 1.0 / static_cast<double>(in.depths[i]), weight = static_cast<double>(in.weights[i]);
     const float to_density = to_disparity * in.deltas[i] * static_cast<float>(through * own - behind);
     for (int k = 0; k < 3; ++k) gradient[4 * i + k] = 0.0f;
-    gradient[4 * i + 3] = through + weight <= static_cast<double>(in.hidden) ? 0.0f : to_density * density_slope(in, i);
+    gradient[4 * i + 3] = through + weight <= static_cast<double>(in.hidden)
+                              ? 0.0f
+                              : to_density * density_slope(in.density[i], in.density_scale, in.activated);
     through += weight;
     behind += weight * own;
   }
@@ -49,15 +46,7 @@ void learn_ray(const SmoothDepth& in, int64_t ray, float to_disparity, float* gr
 void smooth_depth_gradient_cpu(const SmoothDepth& in, float* loss, float* error, float* gradient, float* of_rays,
                                int threads) {
   constexpr int64_t kPairs = 32;  // of a task
-  int64_t before = 0;
-  for (int64_t i = 0; i <= in.r; ++i) {
-    if (in.offsets[i] < before || in.offsets[i] > in.m) {
-      throw std::invalid_argument(
-          "smooth_depth_gradient: ray_offsets must rise from 0 or more to at most the number of samples, " +
-          std::to_string(in.m) + ", got " + std::to_string(in.offsets[i]) + " for ray " + std::to_string(i));
-    }
-    before = in.offsets[i];
-  }
+  check_ray_offsets("smooth_depth_gradient", in.offsets, in.r, in.m);
   if (in.pairs == 0) return;
   const int64_t first = in.r - 2 * in.pairs;
   const float share = in.factor / static_cast<float>(in.pairs);

@@ -2,10 +2,10 @@
 #include "rays/sparse_depth.h"
 
 #include <cmath>
-#include <stdexcept>
-#include <string>
 
 #include "common/parallel.h"
+#include "rays/density_slope.h"
+#include "rays/ray_offsets.h"
 
 namespace voronerf {
 
@@ -15,11 +15,6 @@ constexpr float kLeast = 1e-3f;  // light of a ray whose loss has a gradient
 
 bool near_point(const SparseDepth& in, int64_t i, float distance) {
   return std::fabs(in.depths[i] - distance) <= in.nearby * distance + in.deltas[i];
-}
-
-// The derivative of the density to the last of the outputs: of a softplus, 1 - exp(-density / scale) times the scale.
-float slope(const SparseDepth& in, int64_t i) {
-  return in.activated ? 1.0f : -in.density_scale * std::expm1(-in.density[i] / in.density_scale);
 }
 
 float learn_ray(const SparseDepth& in, float share, int64_t begin, int64_t end, float distance, float* gradient) {
@@ -34,7 +29,7 @@ float learn_ray(const SparseDepth& in, float share, int64_t begin, int64_t end, 
     light += there ? static_cast<double>(in.weights[i]) : 0.0;
     const float through = there ? std::exp(-static_cast<float>(optical)) : 0.0f;
     const float to_density = -in.deltas[i] / total * (through - (total - static_cast<float>(light)));
-    gradient[4 * i + 3] += share * to_density * slope(in, i);
+    gradient[4 * i + 3] += share * to_density * density_slope(in.density[i], in.density_scale, in.activated);
   }
   return -std::log(total);
 }
@@ -43,15 +38,7 @@ float learn_ray(const SparseDepth& in, float share, int64_t begin, int64_t end, 
 
 void sparse_depth_gradient_cpu(const SparseDepth& in, float* loss, float* gradient, float* of_rays, int threads) {
   constexpr int64_t kRays = 64;  // of a task
-  int64_t before = 0;
-  for (int64_t i = 0; i <= in.r; ++i) {
-    if (in.offsets[i] < before || in.offsets[i] > in.m) {
-      throw std::invalid_argument(
-          "sparse_depth_gradient: ray_offsets must rise from 0 or more to at most the number of samples, " +
-          std::to_string(in.m) + ", got " + std::to_string(in.offsets[i]) + " for ray " + std::to_string(i));
-    }
-    before = in.offsets[i];
-  }
+  check_ray_offsets("sparse_depth_gradient", in.offsets, in.r, in.m);
   if (in.s == 0) return;
   const float share = in.factor / static_cast<float>(in.s);
   parallel_for(in.s, kRays, threads, [&](int64_t i) {

@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+from dataclasses import replace
 from unittest import mock
 
 import pytest
@@ -11,7 +12,9 @@ from ranks import complaints, network_files, new_store, on_ranks, town_tensors
 
 from voronerf.app.cli import main
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.train import Callback, TrainConfig
+from voronerf.app.scenes.scene import SparseDepth
+from voronerf.app.train import Callback, TrainConfig, build
+from voronerf.app.train import train as train_alone
 from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.app.train.resume import snapshot
 from voronerf.nerf import TrainingStep
@@ -50,7 +53,7 @@ def dies(args, step):
 
 def dies_at_the_start(args):
     """Rank 1, before it has met the others, who wait for it for some seconds."""
-    if group.own_rank() == 1:
+    if os.environ["RANK"] == "1":
         os.kill(os.getpid(), signal.SIGKILL)
     with mock.patch.object(group, "PATIENCE", 3):
         return main(args)
@@ -273,6 +276,21 @@ def test_one_territory_is_an_ordinary_training(tmp_path):
         found.append(snapshot(town.first))
     assert found[1].values["step"] == 30
     assert all(found[0].tensors[name].equal(tensor) for name, tensor in found[1].tensors.items())
+
+
+def test_one_territory_of_photographs_is_an_ordinary_training(tmp_path):
+    """With points of a sparse model and rays that no picture shows, to the bit."""
+    computed, points = builtin_scene(16, train_views=9, test_views=1), SparseDepth(torch.arange(60), torch.ones(60))
+    views = replace(computed.train, images=computed.train.images[..., :3].contiguous(), sparse_depth=points)
+    scene = replace(computed, train=views, box=None, background=None, kind="unbounded")
+    more = {"rays": 32, "samples": (16,), "cells": (2,), "field_options": ("levels=4", "log2_entries=10")}
+    config = TrainConfig(steps=30, out=tmp_path / "run", **more)
+    town, alone = train.build_town(config, scene, 1, group.Group(torch.device("cpu"))), build(config, scene)
+    assert alone.batches.unseen > 0 and alone.ray_loss.sparse_depth > 0
+    train.train(town)
+    train_alone(alone)
+    found, expected = snapshot(town.first).tensors, snapshot(alone).tensors
+    assert found.keys() == expected.keys() and all(found[name].equal(expected[name]) for name in expected)
 
 
 class Stops(Callback):

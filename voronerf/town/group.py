@@ -41,13 +41,8 @@ def world_size() -> int:
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
-def own_rank() -> int:
-    """The number of this process among them, from 0."""
-    return int(os.environ.get("RANK", "0"))
-
-
 def local_rank() -> int:
-    """The number of this process among those of its machine, which is that of its GPU."""
+    """The number of this process among those of its machine, from 0, which is that of its GPU."""
     return int(os.environ.get("LOCAL_RANK", "0"))
 
 

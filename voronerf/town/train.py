@@ -31,7 +31,7 @@ from voronerf.app.train.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from voronerf.app.train.defaults import resolve
+from voronerf.app.train.defaults import resolve, unseen_move
 from voronerf.app.train.loop import count, prepare
 from voronerf.app.train.loop import train as train_alone
 from voronerf.app.train.resume import snapshot
@@ -123,7 +123,7 @@ def check_territories(config: TrainConfig, count: int, ranks: int) -> None:
         "contraction": (config.contraction != "ndc", "be none or sphere: parts have no normalised device coordinates"),
         "occupancy": (config.occupancy, "be on"),
         "precision": (config.precision == "fp32", "be fp32"),
-        "sparse_depth": (not config.sparse_depth, "be 0: no territory sees whole rays"),
+        "sparse_depth": (count == 1 or not config.sparse_depth, "be 0: no territory sees whole rays"),
     }
     for name, (fits, rule) in rules.items():
         if not fits:
@@ -144,11 +144,12 @@ def build_town(
         group: The ranks.
         on_event: Called with a line of text for what happens.
     """
-    config = replace(config, sparse_depth=0.0)
+    config = config if count == 1 else replace(config, sparse_depth=0.0)
     check_territories(config, count, group.size)
     whole = resolve(config, scene)
     check_territories(whole, count, group.size)
-    contraction = scene.space(whole.contraction).contraction
+    space = scene.space(whole.contraction)
+    contraction, unseen = space.contraction, unseen_move(scene, space) if count == 1 else 0.0
     try:
         territories = cut_space(scene, count, contraction)
     except ValueError as error:
@@ -157,8 +158,9 @@ def build_town(
     states: dict[int, State] = {}
     members: dict[int, Territory] = {}
     for number in (n for n in range(count) if owner[n] == group.rank):
-        own = replace(config, seed=(config.seed + 1_000_003 * number) % 2**63)
-        batches = make_batches(own, scene, territories.views(number))
+        seed = (config.seed + 1_000_003 * number) % 2**63
+        own = replace(config, seed=seed, sparse_depth=whole.sparse_depth)
+        batches = make_batches(own, scene, territories.views(number), unseen=unseen)
         place = territories.place(number)
         state = states[number] = build(own, territories.scene(scene, number), batches=batches, on_event=on_event)
         obstacle, known = state.ray_loss.why_not_fused(), radiance_of(state.renderer.field)

@@ -65,23 +65,23 @@ VN_INLINE void shape_tiles(const TileShapes& shapes) {
 }
 VN_INLINE void release_tiles() { shape_tiles({}); }
 template <int T>
-VN_INLINE void tile_zero() {
+void tile_zero() {
   tiles()[T] = {tiles()[T].rows, tiles()[T].bytes, {}};
 }
 template <int T>
-VN_INLINE void tile_load(const void* from, int64_t stride) {
+void tile_load(const void* from, int64_t stride) {
   Tile& tile = tiles()[T];
   const auto* row = static_cast<const unsigned char*>(from);
   for (int64_t i = 0; i < tile.rows; ++i, row += stride) __builtin_memcpy(tile.data[i], row, tile.bytes);
 }
 template <int T>
-VN_INLINE void tile_store(void* to, int64_t stride) {
+void tile_store(void* to, int64_t stride) {
   const Tile& tile = tiles()[T];
   auto* row = static_cast<unsigned char*>(to);
   for (int64_t i = 0; i < tile.rows; ++i, row += stride) __builtin_memcpy(row, tile.data[i], tile.bytes);
 }
 template <int C, int A, int B>
-VN_INLINE void tile_products() {
+void tile_products() {
   Tile& c = tiles()[C];
   const Tile &a = tiles()[A], &b = tiles()[B];
   constexpr int64_t kValues = kTileBytes / 2;

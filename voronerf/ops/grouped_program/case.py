@@ -26,7 +26,7 @@ def every_step() -> Program:
     share = b.binary("div", back, b.apply("affine", squared, 1.0, 3.0))
     moved = b.move(12, [(share.part(1, 4), 0), (y, 5), (total, 8), (one, 11)])
     added = b.move(4, [(moved.part(0, 3), 1), (share.part(2, 3), 0)])
-    gated = b.binary("gate", added, b.apply("step", share.part(0, 4)))
+    gated = b.binary("gate", added, b.apply("step", x.part(0, 4)))  # jumps where no rounding decides
     return b.program([b.binary("sub", gated, moved.part(7, 4)), shifted, one])
 
 

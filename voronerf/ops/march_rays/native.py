@@ -14,7 +14,7 @@ from voronerf.ops._core import native
 from voronerf.ops._core.checks import MAX_COUNT
 from voronerf.ops._core.declare import declared
 from voronerf.ops._core.recording import read_count
-from voronerf.ops.march_rays.reference import March
+from voronerf.ops.march_rays.reference import March, fake, memory
 
 
 def space_of(given: Any) -> native.compiled.MarchSpace:
@@ -38,7 +38,7 @@ INPUTS: dict[str, Any] = {
 inputs_of = _OP.inputs(native.compiled.MarchInputs, **INPUTS)
 
 
-@_OP.custom_op("march_rays_native", fake=March.fake)
+@_OP.custom_op("march_rays_native", fake=fake)
 def march_rays(given: Any) -> March:
     """Samples in occupied cells; see ``voronerf.ops.march_rays``."""
     near, capacity, inputs, machine = given.near, given.capacity, inputs_of(given), native.machine(given.near)
@@ -51,6 +51,6 @@ def march_rays(given: Any) -> March:
     else:
         native.compiled.march_rays_count(inputs, mask, offsets, total, most, machine)
     rows = read_count(total) if capacity is None else capacity
-    found = March.memory(near, offsets, rows)
+    found = memory(near, offsets, rows)
     native.compiled.march_rays_fill(inputs, mask, offsets, rows, *found[1:], machine)
     return found

@@ -41,18 +41,18 @@ class March(NamedTuple):
     positions: Annotated[Tensor, "same [m, 3]"]
     stop: Annotated[Tensor, "int32 [r]"]
 
-    @staticmethod
-    def memory(near: Tensor, offsets: Tensor, rows: Any) -> March:
-        """Memory for so many samples, after the offsets of the rays."""
-        index, stop = (near.new_empty(count, dtype=torch.int32) for count in (rows, near.shape[0]))
-        return March(offsets, index, near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3), stop)
 
-    @staticmethod
-    def fake(given: Any) -> March:
-        """Without a capacity the number of samples depends on where the rays go."""
-        rows = torch.library.get_ctx().new_dynamic_size() if given.capacity is None else given.capacity
-        offsets = given.near.new_empty(given.near.shape[0] + 1, dtype=torch.int32)
-        return March.memory(given.near, offsets, rows)
+def memory(near: Tensor, offsets: Tensor, rows: Any) -> March:
+    """Memory for so many samples, after the offsets of the rays."""
+    index, stop = (near.new_empty(count, dtype=torch.int32) for count in (rows, near.shape[0]))
+    return March(offsets, index, near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3), stop)
+
+
+def fake(given: Any) -> March:
+    """Without a capacity the number of samples depends on where the rays go."""
+    rows = torch.library.get_ctx().new_dynamic_size() if given.capacity is None else given.capacity
+    offsets = given.near.new_empty(given.near.shape[0] + 1, dtype=torch.int32)
+    return memory(given.near, offsets, rows)
 
 
 @torch.no_grad()

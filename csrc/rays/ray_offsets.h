@@ -1,0 +1,23 @@
+// The check of where the samples of rays begin.
+#pragma once
+
+#include <cstdint>
+#include <stdexcept>
+#include <string>
+
+namespace voronerf {
+
+// Throws std::invalid_argument unless offsets [r+1] rise from 0 or more to at most m.
+inline void check_ray_offsets(const std::string& op, const int32_t* offsets, int64_t r, int64_t m) {
+  int64_t before = 0;
+  for (int64_t i = 0; i <= r; ++i) {
+    if (offsets[i] < before || offsets[i] > m) {
+      throw std::invalid_argument(op + ": ray_offsets must rise from 0 or more to at most the number of samples, " +
+                                  std::to_string(m) + ", got " + std::to_string(offsets[i]) + " for ray " +
+                                  std::to_string(i));
+    }
+    before = offsets[i];
+  }
+}
+
+}  // namespace voronerf
