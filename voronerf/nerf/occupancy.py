@@ -30,10 +30,9 @@ from voronerf.ops.render_opaque import RaysSeen, render_opaque
 
 #: Voxels of a grid along each axis, of a box and of contracted space, which is all the world.
 RESOLUTION, CONTRACTED_RESOLUTION = 64, 128
-#: A voxel is empty if a sample in it would take less of the light than this, were the voxel that dense throughout: in a
-#: training, and for pictures of a field that was trained without a grid. Most of what a young field has spread through
-#: empty space lies between the two, and would keep a third of the samples.
-TRAINING_OPACITY, PICTURE_OPACITY = 0.05, 0.02
+#: A voxel is empty if a sample in it would take less of the light than this, were the voxel that dense throughout. More
+#: cuts away what is thin: masts, ropes and water.
+OPACITY = 0.02
 #: The same of a voxel of contracted space, for the light on its way through the whole voxel.
 CONTRACTED_OPACITY = 0.1
 #: How many samples in a row empty a new voxel: about thirty steps, until which the field has said nothing about most.
@@ -118,7 +117,7 @@ class OccupancyGrid:
         *,
         contraction: Contraction | Perspective | None = None,
         resolution: int | None = None,
-        opacity: float = TRAINING_OPACITY,
+        opacity: float = OPACITY,
         device: torch.device | str | None = None,
     ) -> OccupancyGrid:
         """A grid with the threshold and the memory of a training, over a box or over the cube of a contraction.
@@ -142,7 +141,7 @@ class OccupancyGrid:
             >>> from voronerf import OccupancyGrid
             >>> grid = OccupancyGrid.for_training(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 64)
             >>> round(grid.threshold, 3), grid.occupied.shape
-            (0.948, torch.Size([64, 64, 64]))
+            (0.373, torch.Size([64, 64, 64]))
         """
         if contraction is not None:
             box, size, patience = contraction.cube, resolution or CONTRACTED_RESOLUTION, CONTRACTED_PATIENCE

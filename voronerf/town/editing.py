@@ -25,7 +25,7 @@ from voronerf.app.train.checkpoint import checkpoint_paths, is_shown, last_check
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
-from voronerf.nerf.occupancy import PICTURE_OPACITY, OccupancyGrid
+from voronerf.nerf.occupancy import OPACITY, OccupancyGrid
 from voronerf.town.geometry import Similarity, Solid
 from voronerf.town.network import StoredRouter, config_of
 from voronerf.town.parts import Part, Parts
@@ -452,7 +452,7 @@ def _trimmed(grid: OccupancyGrid, parts: Parts, full: Tensor) -> OccupancyGrid |
 
 def _found_grid(source: Source, parts: Parts, box: Tensor) -> OccupancyGrid:
     """What is empty in a box of a run that has no grid, by asking the field in every voxel."""
-    threshold = -math.log1p(-PICTURE_OPACITY) * (source.config.samples or (64,))[0] / float((box[1] - box[0]).norm())
+    threshold = -math.log1p(-OPACITY) * (source.config.samples or (64,))[0] / float((box[1] - box[0]).norm())
     return ask_everywhere(OccupancyGrid(box, PICTURE_RESOLUTION, threshold=threshold), parts.eval())
 
 

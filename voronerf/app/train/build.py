@@ -22,7 +22,7 @@ from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
 from voronerf.nerf.field import DirectionPerSample, Field
 from voronerf.nerf.loss import RayLoss
-from voronerf.nerf.occupancy import PICTURE_OPACITY, TRAINING_OPACITY, OccupancyGrid
+from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import SAMPLERS, Occupancy, Sampler
 from voronerf.nerf.split import SplitStrategy
@@ -215,18 +215,14 @@ def as_field(router: VoronoiRouter) -> Field:
 
 
 def make_grid(
-    config: TrainConfig,
-    scene: Scene,
-    device: torch.device | str = "cpu",
-    resolution: int | None = None,
-    opacity: float = TRAINING_OPACITY,
+    config: TrainConfig, scene: Scene, device: torch.device | str = "cpu", resolution: int | None = None
 ) -> OccupancyGrid:
     """A grid over the scene's box, or over the cube of its contraction, that is occupied everywhere."""
     contraction = scene.space(config.contraction, device=device).contraction
     if contraction is None and scene.box is None:
         raise ConfigError(f"--occupancy needs a scene with a box or --contraction, {scene.name} has no box")
-    samples, options = (config.samples or (0,))[0], {"resolution": resolution, "opacity": opacity, "device": device}
-    return OccupancyGrid.for_training(scene.box, samples, contraction=contraction, **options)  # type: ignore[arg-type]
+    samples = (config.samples or (0,))[0]
+    return OccupancyGrid.for_training(scene.box, samples, contraction=contraction, resolution=resolution, device=device)
 
 
 def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> OccupancyGrid:
@@ -234,7 +230,7 @@ def make_picture_grid(config: TrainConfig, scene: Scene, renderer: Renderer) -> 
     obstacle = why_no_occupancy(config)
     if obstacle is not None:
         raise ConfigError(f"--occupancy does not work with {obstacle}")
-    grid = make_grid(config, scene, renderer.device, PICTURE_RESOLUTION, PICTURE_OPACITY)
+    grid = make_grid(config, scene, renderer.device, PICTURE_RESOLUTION)
     return ask_everywhere(grid, renderer.field, renderer.backend)
 
 
