@@ -5,7 +5,7 @@
 namespace voronerf {
 
 VN_STRUCT(SmoothDepth, density, depths, deltas, weights, offsets, far, factor, robust, hidden, edge, density_scale,
-          activated, pairs, r, m);
+          activated, triples, r, m);
 
 VN_BINDINGS(module) { module.cpu("smooth_depth_gradient", VN_CPU(smooth_depth_gradient_cpu)); }
 

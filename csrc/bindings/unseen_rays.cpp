@@ -4,7 +4,7 @@
 
 namespace voronerf {
 
-VN_STRUCT(UnseenRays, seed, move, tilt, pairs, r);
+VN_STRUCT(UnseenRays, seed, move, tilt, triples, r);
 
 VN_BINDINGS(module) { module.cpu("unseen_rays", VN_CPU(unseen_rays_cpu)); }
 

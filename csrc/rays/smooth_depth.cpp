@@ -1,4 +1,4 @@
-// Each ray depends on its pair alone, and one thread sums the losses, so results do not depend on the threads.
+// Each ray depends on its triple alone, and one thread sums the losses, so results do not depend on the threads.
 #include "rays/smooth_depth.h"
 
 #include <cmath>
@@ -45,21 +45,23 @@ void learn_ray(const SmoothDepth& in, int64_t ray, float to_disparity, float* gr
 
 void smooth_depth_gradient_cpu(const SmoothDepth& in, float* loss, float* error, float* gradient, float* of_rays,
                                int threads) {
-  constexpr int64_t kPairs = 32;  // of a task
+  constexpr int64_t kTriples = 24;  // of a task
   check_ray_offsets("smooth_depth_gradient", in.offsets, in.r, in.m);
-  if (in.pairs == 0) return;
-  const int64_t first = in.r - 2 * in.pairs;
-  const float share = in.factor / static_cast<float>(in.pairs);
-  parallel_for(in.pairs, kPairs, threads, [&](int64_t pair) {
-    const int64_t one = first + pair, other = one + in.pairs;
-    const float here = disparity_of(in, one), there = disparity_of(in, other), apart = std::log(here / there);
-    const float slope = 2.0f * share * apart * ray_loss_slope(apart * apart, in.edge);
-    learn_ray(in, one, slope / here, gradient);
-    learn_ray(in, other, -slope / there, gradient);
-    of_rays[pair] = ray_loss(apart * apart, in.edge);
+  const int64_t triples = in.triples, first = in.r - 3 * triples;
+  if (triples == 0) return;
+  const float share = in.factor / static_cast<float>(triples);
+  parallel_for(triples, kTriples, threads, [&](int64_t triple) {
+    const int64_t middle = first + triple, one = middle + triples, other = one + triples;
+    const float here = disparity_of(in, middle), beside = disparity_of(in, one) + disparity_of(in, other);
+    const float bent = std::log(beside / (2.0f * here));
+    const float slope = 2.0f * share * bent * ray_loss_slope(bent * bent, in.edge);
+    learn_ray(in, middle, -slope / here, gradient);
+    learn_ray(in, one, slope / beside, gradient);
+    learn_ray(in, other, slope / beside, gradient);
+    of_rays[triple] = ray_loss(bent * bent, in.edge);
   });
   double sum = 0.0, colours = 0.0;
-  for (int64_t pair = 0; pair < in.pairs; ++pair) sum += static_cast<double>(of_rays[pair]);
+  for (int64_t triple = 0; triple < triples; ++triple) sum += static_cast<double>(of_rays[triple]);
   for (int64_t ray = first; ray < in.r; ++ray) {
     colours += static_cast<double>(ray_loss(error[ray], in.robust));
     error[ray] = 0.0f;

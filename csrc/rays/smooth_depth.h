@@ -1,4 +1,5 @@
-// How much the depths of neighbouring rays differ where no picture says, and the gradient: pairs of r rays, m samples.
+// How far the depths of neighbouring rays are from a plane where no picture says, and the gradient: triples of r rays,
+// m samples.
 // Ray i owns samples offsets[i] : offsets[i + 1]. The formulas are in voronerf/ops/smooth_depth_gradient.
 #pragma once
 
@@ -13,10 +14,10 @@ struct SmoothDepth {
   const int32_t* offsets;                            // [r+1]
   const float* far;                                  // [r]
   float factor, robust, hidden;                      // the last: samples that no more light reaches have no gradient
-  float edge;  // scale of the differences of logarithms, as robust is that of colours
+  float edge;                                        // scale of the logarithms, as robust is that of colours
   float density_scale;
   bool activated;  // the gradient is to the density itself, else to what comes before its softplus
-  RowCount pairs, r, m;
+  RowCount triples, r, m;
 };
 
 // Changes loss: [1], error: [r] and gradient: [m,4]. of_rays: [r], working memory. Throws std::invalid_argument for

@@ -1,4 +1,4 @@
-// Each pair is a hash of the number of its first ray, so that results do not depend on the threads.
+// Each triple is a hash of the number of its middle ray, so that results do not depend on the threads.
 #include "rays/unseen_rays.h"
 
 #include <cmath>
@@ -8,23 +8,36 @@
 
 namespace voronerf {
 
-constexpr uint32_t kBefore = 5;  // numbers of a ray that draw_pixels makes of the same seed
+constexpr uint32_t kBefore = 5;   // numbers of a ray that draw_pixels makes of the same seed
+constexpr float kOctaves = 4.0f;  // of the distances between neighbours
 
 void unseen_rays_cpu(const UnseenRays& in, float* origins, float* directions, int threads) {
-  constexpr int64_t kPairs = 256;  // of a task
-  parallel_for(in.pairs, kPairs, threads, [&](int64_t pair) {
-    const int64_t first = in.r - 2 * in.pairs + pair, second = first + in.pairs;
-    const uint32_t key = hash_key(*in.seed, first);
-    float* const origin = origins + 3 * first;
-    float turned[3], length = 0.0f;
+  constexpr int64_t kTriples = 128;  // of a task
+  const int64_t triples = in.triples;
+  parallel_for(triples, kTriples, threads, [&](int64_t triple) {
+    const int64_t middle = in.r - 3 * triples + triple;
+    const uint32_t key = hash_key(*in.seed, middle);
+    const float tilt = in.tilt * std::exp2(-kOctaves * hashed(key, kBefore + 6));
+    const float* const ahead = directions + 3 * middle;
+    float* const origin = origins + 3 * middle;
+    float aside[3], along = 0.0f;
     for (int axis = 0; axis < 3; ++axis) {
       origin[axis] += in.move * (2.0f * hashed(key, kBefore + axis) - 1.0f);
-      origins[3 * second + axis] = origin[axis];
-      turned[axis] = directions[3 * first + axis] + in.tilt * (2.0f * hashed(key, kBefore + 3 + axis) - 1.0f);
-      length += turned[axis] * turned[axis];
+      aside[axis] = tilt * (2.0f * hashed(key, kBefore + 3 + axis) - 1.0f);
+      along += aside[axis] * ahead[axis];
     }
-    const float scale = 1.0f / std::sqrt(length);
-    for (int axis = 0; axis < 3; ++axis) directions[3 * second + axis] = turned[axis] * scale;
+    float square = 0.0f;
+    for (int axis = 0; axis < 3; ++axis) {
+      aside[axis] -= along * ahead[axis];
+      square += aside[axis] * aside[axis];
+    }
+    const float scale = 1.0f / std::sqrt(1.0f + square);
+    for (int axis = 0; axis < 3; ++axis) {
+      const int64_t one = 3 * (middle + triples) + axis, other = one + 3 * triples;
+      origins[one] = origins[other] = origin[axis];
+      directions[one] = (ahead[axis] + aside[axis]) * scale;
+      directions[other] = (ahead[axis] - aside[axis]) * scale;
+    }
   });
 }
 

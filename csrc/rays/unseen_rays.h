@@ -1,4 +1,4 @@
-// Pairs of neighbouring rays from where no camera was: the last of r rays. What it computes is said in
+// Triples of neighbouring rays from where no camera was: the last of r rays. What it computes is said in
 // voronerf/ops/unseen_rays.
 #pragma once
 
@@ -11,7 +11,7 @@ namespace voronerf {
 struct UnseenRays {
   const int32_t* seed;  // [1]
   float move, tilt;
-  RowCount pairs, r;
+  RowCount triples, r;
 };
 
 // Changes origins and directions: [r,3].

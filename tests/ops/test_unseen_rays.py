@@ -1,4 +1,4 @@
-"""Pairs of neighbouring rays from where no camera was."""
+"""Triples of neighbouring rays from where no camera was."""
 
 from __future__ import annotations
 
@@ -12,19 +12,23 @@ pytestmark = pytest.mark.op("unseen_rays")
 SEED = torch.tensor([-7], dtype=torch.int32)
 
 
-def test_pairs_begin_around_the_cameras_and_lie_close_together(device, backend):
+def test_triples_begin_around_the_cameras_and_lie_on_a_line(device, backend):
     need("unseen_rays", backend, device, torch.float32)
-    cameras = torch.randn(4000, 3)
-    ahead = torch.nn.functional.normalize(torch.randn(4000, 3), dim=1)
+    cameras = torch.randn(5500, 3)
+    ahead = torch.nn.functional.normalize(torch.randn(5500, 3), dim=1)
     origins, directions = cameras.to(device, copy=True), ahead.to(device, copy=True)
-    rule = {"pairs": 1500, "move": 0.25, "tilt": 0.01, "backend": backend}
+    rule = {"triples": 1500, "move": 0.25, "tilt": 0.1, "backend": backend}
     unseen_rays(origins, directions, SEED.to(device), **rule)
     origins, directions = origins.cpu(), directions.cpu()
     assert torch.equal(origins[:1000], cameras[:1000]) and torch.equal(directions[:2500], ahead[:2500])
-    assert torch.equal(origins[1000:2500], origins[2500:])
-    moved = origins[1000:2500] - cameras[1000:2500]
-    turned = directions[2500:] - directions[1000:2500]
-    for numbers, most in ((moved, 0.25), (turned, 0.01)):
-        assert float(numbers.abs().max()) < 1.3 * most and float(numbers.mean(0).abs().max()) < 0.1 * most
-        assert bool((numbers.std(0) > 0.4 * most).all())  # 0.58 of uniform numbers
-    torch.testing.assert_close(directions.norm(dim=1), torch.ones(4000))
+    torch.testing.assert_close(directions.norm(dim=1), torch.ones(5500))
+    middle, one, other = (origins[1000:].view(3, 1500, 3)).unbind()
+    assert torch.equal(middle, one) and torch.equal(middle, other)
+    moved = middle - cameras[1000:2500]
+    assert float(moved.abs().max()) < 0.25001 and float(moved.mean(0).abs().max()) < 0.025
+    assert bool((moved.std(0) > 0.1).all())  # 0.144 of uniform numbers
+    middle, one, other = (directions[1000:].view(3, 1500, 3)).unbind()
+    torch.testing.assert_close(one + other, middle * (one + other).norm(dim=1, keepdim=True))  # as far to both sides
+    apart = ((one - other) / (one + other).norm(dim=1, keepdim=True)).norm(dim=1)  # tangent of the angle to the middle
+    assert float(apart.min()) > 0 and float(apart.max()) < 0.1 * 3**0.5
+    assert 0.01 < float(apart.median()) < 0.03  # a quarter of 0.1, times a median length across of 0.8

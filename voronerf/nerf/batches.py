@@ -17,8 +17,8 @@ from voronerf.ops.unseen_rays import unseen_rays
 
 #: Share of the rays that are drawn through points of a sparse model, where these are learnt from.
 SPARSE = 0.25
-#: Pairs of unseen rays for each ray of a batch, and how many pixels the two are apart along each axis at most.
-UNSEEN, APART = 0.125, 5.0
+#: Triples of unseen rays for each ray of a batch, and how far their directions are apart along each axis at most.
+UNSEEN, TILT = 1 / 12, 0.15
 
 
 class RayBatches:
@@ -39,7 +39,7 @@ class RayBatches:
         masks: bool [c, h, w], False for pixels that are not drawn; None for none.
         sparse: int64 [s] pixels, numbered through all images, that show points of a sparse model, and float32 [s], the
             distances of the points. A share of the rays, `SPARSE`, is drawn from them. None for none.
-        unseen: How far from a camera along each axis, at most, the last rays of a batch begin, which are pairs of
+        unseen: How far from a camera along each axis, at most, the last rays of a batch begin, which are triples of
             neighbours, `UNSEEN` of the batch; 0 for none. There must be no box.
         views: int64, the pictures to draw from; None for all.
         cones: Whether the rays have radii.
@@ -85,7 +85,7 @@ class RayBatches:
         if unseen and box is not None:
             message = "RayBatches: unseen must be 0 with a box, which rays from elsewhere may miss"
             raise ValueError(f"{message}, got {unseen}")
-        self.unseen, self.tilt = unseen, APART / float(cameras.intrinsics[:, :2].mean())
+        self.unseen = unseen
         self.useful = self._useful_pixels(masks, views)
         self.sparse = None
         if sparse is not None:
@@ -148,13 +148,13 @@ class RayBatches:
             background=background,
             backend=self.backend,
         )
-        pairs = following_count(count, lambda rays: int(UNSEEN * rays)) if self.unseen else 0
-        if pairs:
+        triples = following_count(count, lambda rays: int(UNSEEN * rays)) if self.unseen else 0
+        if triples:
             origins, directions = rays_seen.origins, rays_seen.directions
-            unseen_rays(origins, directions, seed, pairs=pairs, move=self.unseen, tilt=self.tilt, backend=self.backend)
+            unseen_rays(origins, directions, seed, triples=triples, move=self.unseen, tilt=TILT, backend=self.backend)
         radii = None
         if self.cones:
             radii = cameras.radii(rays_seen.directions, index // (cameras.width * cameras.height)).to(self.device)
         origins, directions, near, far, colour = (tensor.to(self.device) for tensor in rays_seen)
         background = None if background is None else background.to(self.device)
-        return Batch(Rays(origins, directions, radii), near, far, colour, background, depths, pairs)
+        return Batch(Rays(origins, directions, radii), near, far, colour, background, depths, triples)

@@ -36,7 +36,7 @@ class Batch:
         target: [r, 3], the colour of each ray's pixel over the background.
         background: [3], or [r, 3] where it was drawn; None for black.
         sparse_depths: [s], the distances of the points of a sparse model that the first s rays end at, or None.
-        unseen: Pairs at the end that are `voronerf.ops.unseen_rays`, whose colours are not known.
+        unseen: Triples at the end that are `voronerf.ops.unseen_rays`, whose colours are not known.
 
     Examples:
         >>> import torch
@@ -100,11 +100,11 @@ class RayLoss:
             (Deng et al. 2022, "Depth-supervised NeRF"); 0 is off.
         robust: Scale of the errors beyond which the loss of a ray is not squared: see `voronerf.ops.render_loss`. What
             differs from picture to picture, such as exposure, is no reason for fog then. 0 is off.
-        smooth_depth: Factor of the loss on depths that differ between two neighbours of the unseen rays of a batch: see
-            `voronerf.ops.smooth_depth_gradient`.
+        smooth_depth: Factor of the loss on depths of unseen rays of a batch that lie on no plane with those of their
+            neighbours: see `voronerf.ops.smooth_depth_gradient`.
         term: A further term of the loss, a scalar that torch computes from the rendered rays and their batch. The
             networks alone learn from it, and a :class:`TrainingStep` with it is not recorded. It is given all rays: of
-            the last ``2 * batch.unseen``, no picture shows the colour.
+            the last ``3 * batch.unseen``, no picture shows the colour.
 
     Examples:
         >>> import torch
@@ -212,7 +212,7 @@ class RayLoss:
                 result.weights,
                 samples.ray_offsets,
                 batch.far,
-                pairs=batch.unseen,
+                triples=batch.unseen,
                 factor=self.smooth_depth,
                 robust=self.robust,
                 hidden=HIDDEN,
@@ -237,7 +237,7 @@ class RayLoss:
             batch.rays, batch.near, batch.far, background=batch.background, jitter=True, generator=generator
         )
         samples, rays = last.samples, len(batch.rays)
-        seen = rays - 2 * batch.unseen
+        seen = rays - 3 * batch.unseen
         error = (last.colour[:seen] - batch.target[:seen]).square().sum(-1)
         loss = robust_error(error, self.robust).sum() / (3 * max(rays, 1))
         if self.sparse_depth and batch.sparse_depths is not None:

@@ -1,4 +1,4 @@
-"""Pairs of rays from where no camera was. r rays."""
+"""Triples of rays from where no camera was. r rays."""
 
 from __future__ import annotations
 
@@ -7,15 +7,20 @@ from torch import Tensor
 
 from voronerf.ops.march_rays.reference import hashed_uniforms
 
-#: Numbers of a ray that `draw_pixels` makes of the same seed.
-BEFORE = 5
+#: Numbers of a ray that `draw_pixels` makes of the same seed, and octaves of the distances between neighbours.
+BEFORE, OCTAVES = 5, 4.0
 
 
 @torch.no_grad()
-def unseen_rays(origins: Tensor, directions: Tensor, seed: Tensor, pairs: int, move: float, tilt: float) -> None:
+def unseen_rays(origins: Tensor, directions: Tensor, seed: Tensor, triples: int, move: float, tilt: float) -> None:
     """Moves the last rays; see ``voronerf.ops.unseen_rays``."""
-    first, second = (slice(len(origins) - count, len(origins) - count + pairs) for count in (2 * pairs, pairs))
-    numbers = 2 * hashed_uniforms(seed, len(origins), BEFORE + 6)[first, BEFORE:].to(origins) - 1
-    origins[first] += move * numbers[:, :3]
-    origins[second] = origins[first]
-    directions[second] = torch.nn.functional.normalize(directions[first] + tilt * numbers[:, 3:], dim=1)
+    begin = len(origins) - 3 * triples
+    middle, one, other = (slice(begin + i * triples, begin + (i + 1) * triples) for i in range(3))
+    numbers = hashed_uniforms(seed, len(origins), BEFORE + 7)[middle, BEFORE:].to(origins)
+    signed, tilts = 2 * numbers[:, :6] - 1, tilt * torch.exp2(-OCTAVES * numbers[:, 6:])
+    origins[middle] += move * signed[:, :3]
+    origins[one] = origins[other] = origins[middle]
+    ahead, aside = directions[middle], tilts * signed[:, 3:]
+    aside = aside - (aside * ahead).sum(1, keepdim=True) * ahead
+    directions[one] = torch.nn.functional.normalize(ahead + aside, dim=1)
+    directions[other] = torch.nn.functional.normalize(ahead - aside, dim=1)
