@@ -1,0 +1,117 @@
+"""Signs of a folded model: pictures of a thing that looks alike from two sides, placed on one of them.
+
+Matches between two sides lie on that thing alone, and it fills little of the pictures. Matches of neighbours reach over
+much of them. So the latter are believed, and a model that contradicts them is folded.
+
+f features of an image, m matches of two images. Places are in pixels, as of :func:`voronerf.nerf.lenses.unproject`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from voronerf.app.scenes.colmap import ColmapImage
+from voronerf.nerf.lenses import unproject
+
+Array = NDArray[Any]
+Pair = tuple[str, str]
+
+#: Wide pairs have so many matches, in boxes of at least this share of those of all features, in both images. Of a can
+#: with the same print on two sides, half of the right pairs are above .24, and 90 % of the wrong ones below .1.
+WIDE_MATCHES, WIDE = 40, 0.12
+#: An image without wide pairs is held by so many pairs, those with the most matches.
+HOLDING = 2
+#: A pair is contradicted if half of its matches lie farther than this from where the cameras have them, in widths of
+#: the image. Sound models have one such pair of 470 at most, and none other above .012.
+CONTRADICTED = 0.02
+#: A model is folded if it contradicts so many wide pairs, and this share of them.
+FOLDED_PAIRS, FOLDED = 3, 0.01
+#: In the place of zero, where a length divides.
+TINY = 1e-12
+
+
+class Matches(NamedTuple):
+    """What COLMAP has matched and found to fit two cameras, by the names of the images."""
+
+    features: dict[str, Array]  # float [f, 2], the places of the features of each image
+    pairs: dict[Pair, Array]  # int64 [m, 2], of each pair the features that match
+
+
+def wide_pairs(matches: Matches) -> list[Pair]:
+    """The pairs whose matches reach over much of both images."""
+    boxes = {name: _box(places) for name, places in matches.features.items()}
+
+    def spread(pair: Pair) -> float:
+        found = matches.pairs[pair].T
+        return min(_box(matches.features[name][rows]) / max(boxes[name], TINY) for name, rows in zip(pair, found))
+
+    return [pair for pair, found in matches.pairs.items() if len(found) >= WIDE_MATCHES and spread(pair) >= WIDE]
+
+
+def _box(places: Array) -> float:
+    """The area of a box of places [n, 2], without the 5 % at each border."""
+    low, high = np.quantile(places, (0.05, 0.95), axis=0) if len(places) else np.zeros((2, 2))
+    return float((high - low).prod())
+
+
+def trusted_pairs(matches: Matches, wide: Iterable[Pair]) -> set[Pair]:
+    """The wide pairs, and of an image without any those with the most matches."""
+    trusted = set(wide)
+    held = {name for pair in trusted for name in pair}
+    ordered = sorted(matches.pairs, key=lambda pair: -len(matches.pairs[pair]))
+    for name in matches.features.keys() - held:
+        trusted.update([pair for pair in ordered if name in pair][:HOLDING])
+    return trusted
+
+
+def contradicted_pairs(matches: Matches, wide: Iterable[Pair], images: Sequence[ColmapImage]) -> tuple[int, int]:
+    """How many wide pairs the cameras of a model contradict, and how many wide pairs the model has."""
+    by_name = {image.name: image for image in images}
+    known = [pair for pair in wide if by_name.keys() >= set(pair)]
+    rays = {name: _rays(by_name[name], matches.features[name]) for name in {name for pair in known for name in pair}}
+    count = 0
+    for pair in known:
+        a, b = (by_name[name] for name in pair)
+        rows = torch.from_numpy(matches.pairs[pair])
+        base = torch.from_numpy(b.pose[:3, 3] - a.pose[:3, 3])
+        angle = epipolar_angles(rays[a.name][rows[:, 0]], rays[b.name][rows[:, 1]], base).nanmedian()
+        count += float(angle) * a.camera.lens.intrinsics[0] > CONTRADICTED * a.camera.width
+    return count, len(known)
+
+
+def _rays(image: ColmapImage, places: Array) -> Tensor:
+    """Directions of places [f, 2] in the scene, float64 [f, 3]; NaN where the lens has none."""
+    x, y = torch.from_numpy(places.astype(np.float64)).unbind(-1)
+    lens = image.camera.lens
+    directions, there = unproject(
+        x, y, torch.tensor(lens.intrinsics), torch.tensor(lens.coefficients, dtype=torch.float64), lens.model
+    )
+    directions[~there] = torch.nan
+    return directions @ torch.from_numpy(image.pose[:3, :3]).T
+
+
+def epipolar_angles(a: Tensor, b: Tensor, base: Tensor) -> Tensor:
+    """How far the rays of matches miss each other: angles to the epipolar planes in radians, float64 [m].
+
+    Sampson's distance, as in Hartley and Zisserman 2004, "Multiple View Geometry", 11.4.3, for directions: it is right
+    where it is small.
+
+    Args:
+        a: [m, 3], directions of unit length from one camera.
+        b: [m, 3], from the other one.
+        base: [3], from the first camera to the other one.
+    """
+    across = [torch.linalg.cross(base.expand_as(rays), rays).norm(dim=-1) for rays in (a, b)]
+    missed = (torch.linalg.cross(a, b) @ base).abs()
+    return missed / torch.hypot(*across).clamp_min(TINY)
+
+
+def is_folded(contradicted: int, pairs: int) -> bool:
+    """Whether a model that contradicts some of its wide pairs is folded."""
+    return contradicted >= FOLDED_PAIRS and contradicted > FOLDED * pairs
