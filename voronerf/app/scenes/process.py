@@ -99,13 +99,13 @@ class Model:
     lost: dict[str, str]  # names of the other images, and what is wrong with their cameras
     error: float  # mean distance of the points from where they were seen, in pixels
     faults: list[str]  # what is wrong with it, as parts of a line
-    contradicted: int = 0  # pairs of images that match over much of the picture, and that its cameras contradict
-    pairs: int = 0  # that match over much of the picture
+    contradicted: int = 0  # pairs of images that match well over much of both, and that its cameras contradict
+    witnesses: int = 0  # pairs that match well over much of both
 
     @property
     def folded(self) -> bool:
         """Whether something that looks alike from several sides has misled the mapper."""
-        return is_folded(self.contradicted, self.pairs)
+        return is_folded(self.contradicted, self.witnesses)
 
 
 def process(
@@ -497,7 +497,7 @@ def _best(models: Sequence[Model], count: int) -> Model:
     """The best of models of so many images: sound, not folded, with the most cameras, and the least error."""
 
     def worth(model: Model) -> tuple[float, ...]:
-        folded = model.contradicted / model.pairs if model.folded else 0.0
+        folded = model.contradicted / model.witnesses if model.folded else 0.0
         return _sound(model, LEAST_SHARE * count), -folded, len(model.images), -model.error
 
     return max(models, key=worth)
@@ -578,7 +578,7 @@ def _described(model: Model | None, images: int) -> str:
 
 def _contradiction(model: Model) -> str:
     """What a folded model is wrong about, as a part of a line."""
-    what = f"contradicts {model.contradicted} of {model.pairs} pairs of images that match over much of the picture"
+    what = f"contradicts {model.contradicted} of {model.witnesses} pairs of images that match well over much of both"
     return f"{what}: something looks alike from several sides"
 
 
