@@ -438,9 +438,9 @@ def _find_models(stages: Stages, mapper: str, count: int, say: Callable[[str], N
     matches = _read_matches(stages)
     wide, models = wide_pairs(matches), list[Model]()
     for name, again in itertools.product(MAPPERS[1:], (False, True)):
-        folded = any(model.folded for model in models)
+        folded = bool(models) and models[-1].folded
         good = any(_sound(model, GOOD_SHARE * count) and not (model.folded or model.lost) for model in models)
-        if good or mapper not in ("auto", name) or again != folded:
+        if good or mapper not in ("auto", name) or (again and not folded):
             continue
         database, about = stages.work / "database.db", f"{name} mapping"
         if again:
@@ -494,11 +494,13 @@ def _sound(model: Model, least: float) -> bool:
 
 
 def _best(models: Sequence[Model], count: int) -> Model:
-    """The best of models of so many images: sound, not folded, with the most cameras, and the least error."""
+    """The best of models of so many images: sound, with the most cameras, and the least error.
+
+    A pair that a model contradicts weighs as much as a camera.
+    """
 
     def worth(model: Model) -> tuple[float, ...]:
-        folded = model.contradicted / model.witnesses if model.folded else 0.0
-        return _sound(model, LEAST_SHARE * count), -folded, len(model.images), -model.error
+        return _sound(model, LEAST_SHARE * count), len(model.images) - model.contradicted, -model.error
 
     return max(models, key=worth)
 
@@ -579,7 +581,7 @@ def _described(model: Model | None, images: int) -> str:
 def _contradiction(model: Model) -> str:
     """What a folded model is wrong about, as a part of a line."""
     what = f"contradicts {model.contradicted} of {model.witnesses} pairs of images that match well over much of both"
-    return f"{what}: something looks alike from several sides"
+    return f"{what}: something may look alike from several sides"
 
 
 def _write_sound(colmap: Any, model: Model, folder: Path) -> None:

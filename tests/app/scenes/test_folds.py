@@ -1,0 +1,102 @@
+"""Signs of a folded model, on matches of points that cameras on a circle see."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from voronerf.app.scenes.colmap import ColmapCamera, ColmapImage
+from voronerf.app.scenes.folds import (
+    Matches,
+    contradicted_pairs,
+    epipolar_angles,
+    is_folded,
+    trusted_pairs,
+    wide_pairs,
+)
+from voronerf.app.scenes.lenses import colmap_lens
+from voronerf.nerf.cameras import orbit_cameras
+from voronerf.nerf.lenses import distort
+
+COUNT, WIDTH, HEIGHT, FOCAL = 12, 400, 300, 300.0
+NAMES = [f"{index:02}.png" for index in range(COUNT)]
+LENS = colmap_lens("SIMPLE_RADIAL", (FOCAL, WIDTH / 2, HEIGHT / 2, 0.05))
+
+
+def images(turned=()):
+    """Images on a circle; the turned ones lie on its other side."""
+    poses = orbit_cameras(COUNT, radius=4.0, elevation=20.0, width=WIDTH, height=HEIGHT, focal=FOCAL).poses.double()
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
+    made = []
+    for index, name in enumerate(NAMES):
+        pose = torch.eye(4).double()
+        pose[:3] = half_turn @ poses[index, :3] if index in turned else poses[index, :3]
+        camera = ColmapCamera("SIMPLE_RADIAL", LENS, WIDTH, HEIGHT)
+        made.append(ColmapImage(name, camera, pose.numpy(), np.zeros(0, dtype=np.int64)))
+    return made
+
+
+def matches():
+    """All images see 200 points; neighbours match all of them, others 40 that lie together."""
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
+    points[:40] *= 0.2
+    features = {}
+    for image in images():
+        x, y, z = ((points - torch.from_numpy(image.pose[:3, 3])) @ torch.from_numpy(image.pose[:3, :3])).unbind(-1)
+        u, v = distort(x / -z, y / z, torch.tensor(LENS.coefficients), LENS.model)
+        features[image.name] = (torch.stack((u, v), -1) * FOCAL + torch.tensor((WIDTH / 2, HEIGHT / 2))).numpy()
+    pairs = {}
+    for a, b in itertools.combinations(range(COUNT), 2):
+        rows = np.arange(200 if (b - a) % COUNT in (1, COUNT - 1) else 40)
+        pairs[NAMES[a], NAMES[b]] = np.stack((rows, rows), 1)
+    return Matches(features, pairs)
+
+
+def neighbours():
+    return {tuple(sorted((NAMES[index - 1], NAMES[index]))) for index in range(COUNT)}
+
+
+def test_pairs_that_match_over_much_of_both_images_are_wide():
+    found = matches()
+    assert set(wide_pairs(found)) == neighbours()
+    few = {pair: rows[:29] if pair == (NAMES[0], NAMES[1]) else rows for pair, rows in found.pairs.items()}
+    assert set(wide_pairs(Matches(found.features, few))) == neighbours() - {(NAMES[0], NAMES[1])}
+    bare = {"a": np.zeros((0, 2)), "b": np.ones((40, 2))}
+    assert wide_pairs(Matches(bare, {("a", "b"): np.zeros((0, 2), dtype=np.int64)})) == []
+
+
+def test_an_image_without_wide_pairs_keeps_those_with_the_most_matches():
+    pairs = {("a", "b"): 90, ("a", "c"): 80, ("b", "d"): 20, ("c", "d"): 30, ("a", "d"): 25, ("b", "e"): 5}
+    found = Matches(
+        {name: np.zeros((0, 2)) for name in "abcdef"}, {pair: np.zeros((n, 2)) for pair, n in pairs.items()}
+    )
+    wide = [("a", "b"), ("b", "c"), ("a", "c")]
+    assert trusted_pairs(found, wide) == {*wide, ("c", "d"), ("a", "d"), ("b", "e")}
+
+
+def test_a_model_contradicts_the_pairs_that_a_fold_tears_apart():
+    found = matches()
+    wide = wide_pairs(found)
+    assert contradicted_pairs(found, wide, images()) == (0, COUNT)
+    folded = images(turned=range(3, 9))
+    assert contradicted_pairs(found, wide, folded) == (2, COUNT)  # at both ends of the turned part
+    assert contradicted_pairs(found, wide, folded[:6]) == (1, 5)
+    assert contradicted_pairs(found, wide, []) == (0, 0)
+    weak = {pair: rows[:45] if pair == (NAMES[2], NAMES[3]) else rows for pair, rows in found.pairs.items()}
+    assert contradicted_pairs(Matches(found.features, weak), wide, folded) == (1, COUNT - 1)
+    assert [is_folded(*counts) for counts in ((2, 12), (3, 12), (3, 300), (4, 300), (0, 0))] == [0, 1, 0, 1, 0]
+
+
+@pytest.mark.parametrize("missed", [0.0, 0.003, 0.05])
+def test_rays_miss_each_other_by_the_angle_to_the_epipolar_plane(missed):
+    points = torch.rand(9, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.5
+    left, right = torch.tensor([0.0, -1.0, 8.0]).double(), torch.tensor([0.0, 1.0, 8.0]).double()
+    a, b = (torch.nn.functional.normalize(points - origin, dim=-1) for origin in (left, right))
+    across = torch.nn.functional.normalize(torch.linalg.cross((right - left).expand_as(b), b), dim=-1)
+    turned = math.cos(missed) * b + math.sin(missed) * across
+    angles = epipolar_angles(a, turned, right - left)
+    # Sampson's distance spreads the angle over both rays.
+    torch.testing.assert_close(angles, torch.full_like(angles, missed / math.sqrt(2)), rtol=0.1, atol=1e-9)
+    assert (epipolar_angles(a, turned, torch.zeros(3).double()) == 0).all()
