@@ -183,12 +183,15 @@ def test_a_folded_model_is_made_again_by_pairs_that_can_be_trusted(tmp_path, mon
         "global mapping by 0 pairs of 0: 10 of 10 images, points off by 0.50 pixels",
     ]
     others = {"incremental": None, "incremental_again": None}
-    asked, _, best = found(**{"global": folded, "global_again": circle(5)}, **others)  # too few cameras are left
+    asked, _, best = found(**{"global": folded, "global_again": circle(4)}, **others)  # too few cameras are left
     assert asked == ["global", "global_again", "incremental"] and best.folder.name == "global"
     asked, _, best = found(**{"global": folded, "global_again": (circle(10), 3)}, **others)
     assert asked == ["global", "global_again", "incremental", "incremental_again"] and best.contradicted == 3
     asked, *_ = found(**{"global": (circle(10), 2)})  # may be wrong pairs
     assert asked == ["global"]
+    lost = circle(10) * torch.tensor([1.0] * 9 + [90.0])[:, None]  # so others may be wrong, too
+    asked, _, best = found(**{"global": lost, "incremental": circle(9)})
+    assert asked == ["global", "incremental"] and best.folder.name == "incremental"
     broken = SceneError("cameras.bin: camera 1 must have a focal length")
     asked, said, best = found(**{"global": broken, "incremental": circle(9)})
     assert asked == ["global", "incremental"] and best.folder.name == "incremental"

@@ -101,10 +101,8 @@ def contradicted_pairs(matches: Matches, wide: Iterable[Pair], images: Sequence[
 def _rays(image: ColmapImage, places: Array) -> Tensor:
     """Directions of places [f, 2] in the scene, float64 [f, 3]; NaN where the lens has none."""
     x, y = torch.from_numpy(places.astype(np.float64)).unbind(-1)
-    lens = image.camera.lens
-    directions, there = unproject(
-        x, y, torch.tensor(lens.intrinsics), torch.tensor(lens.coefficients, dtype=torch.float64), lens.model
-    )
+    intrinsics, coefficients, model = image.camera.lens
+    directions, there = unproject(x, y, torch.tensor(intrinsics), torch.tensor(coefficients), model)
     directions[~there] = torch.nan
     return directions @ torch.from_numpy(image.pose[:3, :3]).T
 

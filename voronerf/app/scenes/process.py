@@ -135,7 +135,7 @@ def process(
             "auto", those whose largest features match, and the next two by name.
         camera_model: COLMAP's name of the model of the lens.
         mapper: "global", "incremental", or "auto": global, and incremental too if its model has faults or loses
-            cameras. A model that contradicts pairs of images is made again, by pairs that can be trusted.
+            cameras. A model that contradicts pairs of images is made again, without pairs that may mislead.
         max_features: of an image.
         size: of an image's longer side in pixels, to which it is reduced where features are searched; None for COLMAP's
             3,200.
@@ -494,13 +494,14 @@ def _sound(model: Model, least: float) -> bool:
 
 
 def _best(models: Sequence[Model], count: int) -> Model:
-    """The best of models of so many images: sound, with the most cameras, and the least error.
+    """The best of models of so many images: sound, not folded, with the most cameras, and the least error.
 
-    A pair that a model contradicts weighs as much as a camera.
+    What a model loses or contradicts weighs as much as a camera: it tells that others are wrong, too.
     """
 
     def worth(model: Model) -> tuple[float, ...]:
-        return _sound(model, LEAST_SHARE * count), len(model.images) - model.contradicted, -model.error
+        cameras = len(model.images) - len(model.lost) - model.contradicted
+        return _sound(model, LEAST_SHARE * count), -model.contradicted * model.folded, cameras, -model.error
 
     return max(models, key=worth)
 
