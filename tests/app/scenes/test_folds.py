@@ -13,8 +13,10 @@ from voronerf.app.scenes.folds import (
     contradicted_pairs,
     epipolar_angles,
     is_folded,
+    spreads,
     trusted_pairs,
     wide_pairs,
+    witness_pairs,
 )
 from voronerf.app.scenes.lenses import colmap_lens
 from voronerf.nerf.cameras import orbit_cameras
@@ -60,32 +62,38 @@ def neighbours():
 
 def test_pairs_that_match_over_much_of_both_images_are_wide():
     found = matches()
-    assert set(wide_pairs(found)) == neighbours()
+    assert set(wide_pairs(found, spreads(found))) == neighbours()
     few = {pair: rows[:29] if pair == (NAMES[0], NAMES[1]) else rows for pair, rows in found.pairs.items()}
-    assert set(wide_pairs(Matches(found.features, few))) == neighbours() - {(NAMES[0], NAMES[1])}
+    assert set(wide_pairs(Matches(found.features, few), spreads(found))) == neighbours() - {(NAMES[0], NAMES[1])}
     bare = {"a": np.zeros((0, 2)), "b": np.ones((40, 2))}
-    assert wide_pairs(Matches(bare, {("a", "b"): np.zeros((0, 2), dtype=np.int64)})) == []
+    assert spreads(Matches(bare, {("a", "b"): np.zeros((0, 2), dtype=np.int64)})) == {("a", "b"): 0}
 
 
-def test_an_image_without_wide_pairs_keeps_those_with_the_most_matches():
-    pairs = {("a", "b"): 90, ("a", "c"): 80, ("b", "d"): 20, ("c", "d"): 30, ("a", "d"): 25, ("b", "e"): 5}
-    found = Matches(
-        {name: np.zeros((0, 2)) for name in "abcdef"}, {pair: np.zeros((n, 2)) for pair, n in pairs.items()}
-    )
-    wide = [("a", "b"), ("b", "c"), ("a", "c")]
-    assert trusted_pairs(found, wide) == {*wide, ("c", "d"), ("a", "d"), ("b", "e")}
+def test_an_image_without_witnesses_keeps_its_best_pairs():
+    pairs = {  # matches, and the share of the images over which they reach
+        ("a", "b"): (200, 0.5),
+        ("a", "c"): (100, 0.5),
+        ("b", "d"): (49, 0.5),  # wide, but of few matches
+        ("a", "d"): (190, 0.02),
+        ("c", "d"): (90, 0.1),
+        ("b", "c"): (90, 0.03),
+        ("d", "e"): (29, 0.1),
+    }
+    found = Matches(dict.fromkeys("abcdef"), {pair: np.zeros((n, 2)) for pair, (n, _) in pairs.items()})
+    spread = {pair: share for pair, (_, share) in pairs.items()}
+    wide = wide_pairs(found, spread)
+    assert wide == [("a", "b"), ("a", "c"), ("b", "d")] and witness_pairs(found, wide) == wide[:2]
+    assert trusted_pairs(found, spread) == {*wide, ("c", "d"), ("a", "d")}
 
 
 def test_a_model_contradicts_the_pairs_that_a_fold_tears_apart():
     found = matches()
-    wide = wide_pairs(found)
-    assert contradicted_pairs(found, wide, images()) == (0, COUNT)
+    witnesses = witness_pairs(found, wide_pairs(found, spreads(found)))
+    assert contradicted_pairs(found, witnesses, images()) == (0, COUNT)
     folded = images(turned=range(3, 9))
-    assert contradicted_pairs(found, wide, folded) == (2, COUNT)  # at both ends of the turned part
-    assert contradicted_pairs(found, wide, folded[:6]) == (1, 5)
-    assert contradicted_pairs(found, wide, []) == (0, 0)
-    weak = {pair: rows[:45] if pair == (NAMES[2], NAMES[3]) else rows for pair, rows in found.pairs.items()}
-    assert contradicted_pairs(Matches(found.features, weak), wide, folded) == (1, COUNT - 1)
+    assert contradicted_pairs(found, witnesses, folded) == (2, COUNT)  # at both ends of the turned part
+    assert contradicted_pairs(found, witnesses, folded[:6]) == (1, 5)
+    assert contradicted_pairs(found, witnesses, []) == (0, 0)
     assert [is_folded(*counts) for counts in ((2, 12), (3, 12), (3, 300), (4, 300), (0, 0))] == [0, 1, 0, 1, 0]
 
 

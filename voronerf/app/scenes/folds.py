@@ -8,8 +8,7 @@ f features of an image, m matches of two images. Places are in pixels, as of :fu
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,11 +25,11 @@ Pair = tuple[str, str]
 #: Wide pairs have so many matches, in boxes of at least this share of those of all features, in both images. Of a can
 #: with the same print on two sides, 326 right pairs and a wrong one are wide, of 835 in all.
 WIDE_MATCHES, WIDE = 30, 0.12
-#: An image with fewer wide pairs is held by so many that have the most of its matches, too.
-HOLDING = 2
 #: Wide pairs are witnesses with this share of the most matches that one of the two images has. Weaker ones may be wrong
 #: where patterns repeat: the sound cameras of bonsai contradict 22 of 593 wide pairs, none above .2.
 WITNESS = 0.25
+#: An image without witnesses is held by so many other pairs.
+HOLDING = 2
 #: A pair is contradicted if half of its matches lie farther than this from where the cameras have them, in widths of
 #: the image.
 CONTRADICTED = 0.02
@@ -47,15 +46,13 @@ class Matches(NamedTuple):
     pairs: dict[Pair, Array]  # int64 [m, 2], of each pair the features that match
 
 
-def wide_pairs(matches: Matches) -> list[Pair]:
-    """The pairs whose matches reach over much of both images."""
-    boxes = {name: _box(places) for name, places in matches.features.items()}
-
-    def spread(pair: Pair) -> float:
-        found = matches.pairs[pair].T
-        return min(_box(matches.features[name][rows]) / max(boxes[name], TINY) for name, rows in zip(pair, found))
-
-    return [pair for pair, found in matches.pairs.items() if len(found) >= WIDE_MATCHES and spread(pair) >= WIDE]
+def spreads(matches: Matches) -> dict[Pair, float]:
+    """Of each pair the share of the images over which its matches reach, the smaller one of both images."""
+    boxes = {name: max(_box(places), TINY) for name, places in matches.features.items()}
+    return {
+        pair: min(_box(matches.features[name][rows]) / boxes[name] for name, rows in zip(pair, found.T))
+        for pair, found in matches.pairs.items()
+    }
 
 
 def _box(places: Array) -> float:
@@ -64,38 +61,41 @@ def _box(places: Array) -> float:
     return float((high - low).prod())
 
 
-def trusted_pairs(matches: Matches, wide: Collection[Pair]) -> set[Pair]:
-    """The wide pairs, and the pairs with the most matches of an image that has few wide ones."""
-    trusted = set(wide)
-    held = Counter(name for pair in wide for name in pair)
-    ordered = sorted(matches.pairs, key=lambda pair: -len(matches.pairs[pair]))
-    for name in matches.features:
-        if held[name] < HOLDING:
-            trusted.update([pair for pair in ordered if name in pair][:HOLDING])
-    return trusted
+def wide_pairs(matches: Matches, spread: dict[Pair, float]) -> list[Pair]:
+    """The pairs whose matches reach over much of both images."""
+    return [pair for pair, found in matches.pairs.items() if len(found) >= WIDE_MATCHES and spread[pair] >= WIDE]
 
 
-def contradicted_pairs(matches: Matches, wide: Iterable[Pair], images: Sequence[ColmapImage]) -> tuple[int, int]:
-    """How many witnesses the cameras of a model contradict, and how many witnesses it has."""
-    by_name = {image.name: image for image in images}
+def witness_pairs(matches: Matches, wide: Iterable[Pair]) -> list[Pair]:
+    """The wide pairs whose matches are not few beside those of the best pairs of their images."""
     most = dict.fromkeys(matches.features, 0)
     for pair, found in matches.pairs.items():
         most.update({name: max(most[name], len(found)) for name in pair})
-    witnesses = [
-        (a, b)
-        for a, b in wide
-        if a in by_name and b in by_name and len(matches.pairs[a, b]) >= WITNESS * max(most[a], most[b])
-    ]
-    rays = {
-        name: _rays(by_name[name], matches.features[name]) for name in {name for pair in witnesses for name in pair}
-    }
+    return [(a, b) for a, b in wide if len(matches.pairs[a, b]) >= WITNESS * max(most[a], most[b])]
+
+
+def trusted_pairs(matches: Matches, spread: dict[Pair, float]) -> set[Pair]:
+    """The wide pairs and, of an image without witnesses, the best others by matches times share."""
+    wide = set(wide_pairs(matches, spread))
+    held = {name for pair in witness_pairs(matches, wide) for name in pair}
+    others = [pair for pair, found in matches.pairs.items() if pair not in wide and len(found) >= WIDE_MATCHES]
+    others.sort(key=lambda pair: -len(matches.pairs[pair]) * spread[pair])
+    bare = matches.features.keys() - held
+    return wide.union(*([pair for pair in others if name in pair][:HOLDING] for name in bare))
+
+
+def contradicted_pairs(matches: Matches, witnesses: Iterable[Pair], images: Sequence[ColmapImage]) -> tuple[int, int]:
+    """How many witnesses the cameras of a model contradict, and how many witnesses it has."""
+    by_name = {image.name: image for image in images}
+    known = [pair for pair in witnesses if by_name.keys() >= set(pair)]
+    rays = {name: _rays(by_name[name], matches.features[name]) for name in {name for pair in known for name in pair}}
     count = 0
-    for a, b in witnesses:
+    for a, b in known:
         rows, camera = torch.from_numpy(matches.pairs[a, b]), by_name[a].camera
         base = torch.from_numpy(by_name[b].pose[:3, 3] - by_name[a].pose[:3, 3])
         angle = float(epipolar_angles(rays[a][rows[:, 0]], rays[b][rows[:, 1]], base).nanmedian())
         count += angle * camera.lens.intrinsics[0] > CONTRADICTED * camera.width
-    return count, len(witnesses)
+    return count, len(known)
 
 
 def _rays(image: ColmapImage, places: Array) -> Tensor:

@@ -37,7 +37,16 @@ from voronerf.app.files import write_text
 from voronerf.app.scenes.colmap import FILES, ColmapImage, ColmapModel, depth_bounds, points_seen, read_model
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import HEIF, listed_images
-from voronerf.app.scenes.folds import Matches, Pair, contradicted_pairs, is_folded, trusted_pairs, wide_pairs
+from voronerf.app.scenes.folds import (
+    Matches,
+    Pair,
+    contradicted_pairs,
+    is_folded,
+    spreads,
+    trusted_pairs,
+    wide_pairs,
+    witness_pairs,
+)
 from voronerf.app.scenes.images import UNREADABLE, read_header, read_image
 from voronerf.app.scenes.lenses import MODELS
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
@@ -338,6 +347,8 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
     if settings.size is not None:
         extraction.max_image_size = settings.size
     reader = colmap.ImageReaderOptions(camera_model=settings.camera_model)
+    verification = colmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
 
     def extract(some: Sequence[str], where: Path = database) -> None:
         with colmap.Database.open(where) as opened:
@@ -358,7 +369,8 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
 
         def match_part(some: Sequence[Pair]) -> None:
             listed.write_text("".join(f"{a} {b}\n" for a, b in some))
-            colmap.match_image_pairs(where, pairing_options=colmap.ImportedPairingOptions(match_list_path=listed))
+            pairing = colmap.ImportedPairingOptions(match_list_path=listed)
+            colmap.match_image_pairs(where, pairing_options=pairing, verification_options=verification)
 
         stages.in_parts(name, sorted(pairs, key=lambda pair: [block[image] for image in pair]), PART, match_part)
         listed.unlink(missing_ok=True)
@@ -436,7 +448,8 @@ def _choose_pairs(colmap: Any, few: Path) -> list[Pair]:
 def _find_models(stages: Stages, mapper: str, count: int, say: Callable[[str], None]) -> list[Model]:
     """The models of a mapper or, with "auto", of as many as it takes for a good one of so many images."""
     matches = _read_matches(stages)
-    wide, models = wide_pairs(matches), list[Model]()
+    spread = spreads(matches)
+    witnesses, models = witness_pairs(matches, wide_pairs(matches, spread)), list[Model]()
     for name, again in itertools.product(MAPPERS[1:], (False, True)):
         folded = bool(models) and models[-1].folded
         good = any(_sound(model, GOOD_SHARE * count) and not (model.folded or model.lost) for model in models)
@@ -444,11 +457,11 @@ def _find_models(stages: Stages, mapper: str, count: int, say: Callable[[str], N
             continue
         database, about = stages.work / "database.db", f"{name} mapping"
         if again:
-            trusted = trusted_pairs(matches, wide)
+            trusted = trusted_pairs(matches, spread)
             database = _keep_pairs(stages.colmap, database, trusted)
             about += f" by {len(trusted)} pairs of {len(matches.pairs)}"
         try:
-            model = _map(stages, f"{name}_again" if again else name, database, matches, wide)
+            model = _map(stages, f"{name}_again" if again else name, database, matches, witnesses)
         except SceneError as error:  # such as a model whose focal lengths are not finite
             say(f"{about}: no model: {error}")
             continue
@@ -506,7 +519,7 @@ def _best(models: Sequence[Model], count: int) -> Model:
     return max(models, key=worth)
 
 
-def _map(stages: Stages, name: str, database: Path, matches: Matches, wide: Sequence[Pair]) -> Model | None:
+def _map(stages: Stages, name: str, database: Path, matches: Matches, witnesses: Sequence[Pair]) -> Model | None:
     """The largest model of a mapper, which its name begins with, or None if it finds none."""
     colmap, folder = stages.colmap, stages.work / name
     mapper, _, again = name.partition("_")
@@ -554,7 +567,7 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, wide: Sequ
     error = float(colmap.Reconstruction(largest).compute_mean_reprojection_error())
     if error > LARGEST_ERROR:
         faults.append(f"its points are off by {error:.2f} pixels")
-    return Model(largest, images, lost, error, faults, *contradicted_pairs(matches, wide, images))
+    return Model(largest, images, lost, error, faults, *contradicted_pairs(matches, witnesses, images))
 
 
 def _lost(model: ColmapModel) -> dict[str, str]:
