@@ -114,19 +114,33 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
     process.process(pictures, out, max_features=300, mapper="incremental", progress=lambda *now: seen.append(now))
     assert max(done for stage, done, _ in seen if stage == "incremental mapping") >= COUNT - 2
 
+    shutil.rmtree(out / "sparse")
+    pairs = sorted((images[index].name, images[index + 1].name) for index in range(COUNT - 1))
+    monkeypatch.setattr(process, "trusted_pairs", lambda *_: {*pairs, (images[0].name, images[2].name)})
+    monkeypatch.setattr(process, "is_folded", lambda *_: True)
+    process.process(pictures, out, max_features=300, mapper="global", say=said.append)
+    assert said[-2].startswith("check the cameras: the model contradicts 0 of ")
+    assert any(line.startswith(f"global mapping by {COUNT} pairs of ") for line in said)
+    with pycolmap.Database.open(out / "colmap/trusted.db") as opened:
+        assert opened.num_verified_image_pairs() == COUNT
+    assert (out / "colmap/global_again/0/images.bin").is_file()
+
 
 def models(tmp_path, monkeypatch, pictures, **found):
-    """Has the mappers find cameras at places [c, 3], or nothing."""
+    """Has the mappers find cameras at places [c, 3], these and how many pairs they contradict, nothing, or an error."""
     asked = []
 
-    def map_images(stages, name):
+    def map_images(stages, name, *_):
         asked.append(name)
         if found[name] is None:
             return None
-        origins, lost = found[name], lost_cameras(found[name])
-        names = [f"{number:02}.png" for number in lost.nonzero()[:, 0].tolist()]
+        if isinstance(found[name], Exception):
+            raise found[name]
+        origins, contradicted = found[name] if isinstance(found[name], tuple) else (found[name], 0)
+        names = [f"{number:02}.png" for number in lost_cameras(origins).nonzero()[:, 0].tolist()]
         kept = [None] * (len(origins) - len(names))
-        return process.Model(tmp_path, name, kept, dict.fromkeys(names, "far"), 0.5, camera_faults(origins))
+        faults = camera_faults(origins)
+        return process.Model(tmp_path / name, kept, dict.fromkeys(names, "far"), 0.5, faults, contradicted, 50)
 
     monkeypatch.setattr(process, "_match", lambda *_: None)
     monkeypatch.setattr(process, "_map", map_images)
@@ -150,6 +164,38 @@ def test_a_model_with_faults_is_not_a_scene(tmp_path, monkeypatch, pictures):
     refuses("less than half of the images", process.process, pictures, tmp_path / "out", error=SceneError)
     models(tmp_path, monkeypatch, pictures, **{"global": None, "incremental": None})
     refuses("COLMAP finds no model", process.process, pictures, tmp_path / "out", error=SceneError)
+
+
+def test_a_folded_model_is_made_again_by_pairs_that_can_be_trusted(tmp_path, monkeypatch, pictures):
+    def found(**of_mappers):
+        """The mappers that were asked, what was said, and which model is the best of 10 images."""
+        asked, said = models(tmp_path, monkeypatch, pictures, **of_mappers), []
+        stages = process.Stages(pycolmap, tmp_path, pictures, print)
+        made = process._find_models(stages, "auto", 10, said.append)
+        return asked, said, process._best(made, 10)
+
+    folded = (circle(10), 4)
+    asked, said, best = found(**{"global": folded, "global_again": circle(10)})
+    assert asked == ["global", "global_again"] and best.folder.name == "global_again" and not best.folded
+    assert said == [
+        "global mapping: 10 of 10 images, points off by 0.50 pixels; contradicts 4 of 50 pairs of images that match "
+        "well over much of both: something may look alike from several sides",
+        "global mapping by 0 pairs of 0: 10 of 10 images, points off by 0.50 pixels",
+    ]
+    others = {"incremental": None, "incremental_again": None}
+    asked, _, best = found(**{"global": folded, "global_again": circle(4)}, **others)  # too few cameras are left
+    assert asked == ["global", "global_again", "incremental"] and best.folder.name == "global"
+    asked, _, best = found(**{"global": folded, "global_again": (circle(10), 3)}, **others)
+    assert asked == ["global", "global_again", "incremental", "incremental_again"] and best.contradicted == 3
+    asked, *_ = found(**{"global": (circle(10), 2)})  # may be wrong pairs
+    assert asked == ["global"]
+    lost = circle(10) * torch.tensor([1.0] * 9 + [90.0])[:, None]  # so others may be wrong, too
+    asked, _, best = found(**{"global": lost, "incremental": circle(9)})
+    assert asked == ["global", "incremental"] and best.folder.name == "incremental"
+    broken = SceneError("cameras.bin: camera 1 must have a focal length")
+    asked, said, best = found(**{"global": broken, "incremental": circle(9)})
+    assert asked == ["global", "incremental"] and best.folder.name == "incremental"
+    assert said[0] == f"global mapping: no model: {broken}"
 
 
 def test_cameras_far_from_all_others_count_as_missing():
@@ -305,6 +351,22 @@ def test_images_of_phones_are_named_where_they_cannot_be_read(tmp_path, monkeypa
     refuses("no model", process.process, tmp_path / "images", tmp_path / "out", say=said.append, error=SceneError)
     assert said[0].endswith("images: 2 HEIC images are left out; pip install pillow-heif reads them")
     assert len(list((tmp_path / "out/images").iterdir())) == 3
+
+
+def test_images_of_one_size_share_a_camera(tmp_path, pictures, monkeypatch):
+    (tmp_path / "mixed").mkdir()
+    for number, path in enumerate(sorted(pictures.iterdir())[:6]):
+        with Image.open(path) as image:  # every other one held upright
+            image.rotate(90 * (number % 2), expand=True).save(tmp_path / f"mixed/{number}.png")
+    monkeypatch.setattr(process, "_map", lambda *_: None)
+    said = []
+    with pytest.raises(SceneError, match="finds no model"):
+        process.process(tmp_path / "mixed", tmp_path / "out", max_features=100, say=said.append)
+    assert said[0].startswith("6 images with 2 cameras, one for each size; ")
+    with pycolmap.Database.open(tmp_path / "out/colmap/database.db") as opened:
+        cameras = {each.camera_id: (each.width, each.height) for each in opened.read_all_cameras()}
+        taken = [cameras[opened.read_image_with_name(f"{number}.png").camera_id] for number in range(6)]
+    assert len(cameras) == 2 and taken == 3 * [(WIDTH, HEIGHT), (HEIGHT, WIDTH)]
 
 
 def test_features_are_searched_in_smaller_images(tmp_path, pictures, monkeypatch):

@@ -37,7 +37,7 @@ def process(
             their largest features (auto).
         camera_model: COLMAP's name of the lens, such as SIMPLE_RADIAL, OPENCV or OPENCV_FISHEYE.
         mapper: How cameras are found; auto is global, and incremental too if that model has faults or loses
-            cameras.
+            cameras. A model that contradicts pairs of images is made again, without pairs that may mislead.
         max_features: Of an image.
         size: Pixels of an image's longer side, to which it is reduced where features are searched; default 3200.
         verbose: Show what COLMAP says.

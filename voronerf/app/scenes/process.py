@@ -5,7 +5,8 @@ Its stages leave what they found in `OUT/colmap`, where a stopped process goes o
     features   `database.db`: the features of each image
     pairs      `few.db`: the largest features of each image, matched between all; `pairs.json`: those that share some
     matches    `database.db`: matches of those pairs
-    cameras    `global` and, if that model has faults or loses cameras, `incremental`: the better of both becomes
+    cameras    `global` and, if that model has faults or loses cameras, `incremental`. Each is made again, by
+               `trusted.db`, if it contradicts pairs of images (:mod:`voronerf.app.scenes.folds`). The best becomes
                `OUT/sparse/0`, without cameras that few points hold or that lie far from the others
 
 Matching the largest features first is the preemptive matching of Wu 2013, "Towards Linear-time Incremental Structure
@@ -23,7 +24,7 @@ import re
 import shutil
 import subprocess
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -36,6 +37,16 @@ from voronerf.app.files import write_text
 from voronerf.app.scenes.colmap import FILES, ColmapImage, ColmapModel, depth_bounds, points_seen, read_model
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import HEIF, listed_images
+from voronerf.app.scenes.folds import (
+    Matches,
+    Pair,
+    contradicted_pairs,
+    is_folded,
+    spreads,
+    trusted_pairs,
+    wide_pairs,
+    witness_pairs,
+)
 from voronerf.app.scenes.images import UNREADABLE, read_header, read_image
 from voronerf.app.scenes.lenses import MODELS
 from voronerf.app.scenes.soundness import camera_faults, lost_cameras, some_of
@@ -73,7 +84,7 @@ LEAST_SIDE = 256
 LOG, BEGINS = "log.", re.compile(r"=== Running (?:iterative )?(.+) ===")
 
 Progress = Callable[[str, int, int], None]
-Pair = tuple[str, str]
+Size = tuple[int, int]
 Item = TypeVar("Item")
 
 
@@ -93,11 +104,17 @@ class Model:
     """The model that a mapper made."""
 
     folder: Path  # of its files
-    mapper: str  # "global" or "incremental"
     images: list[ColmapImage]  # that have a sound camera, in the order of their names
     lost: dict[str, str]  # names of the other images, and what is wrong with their cameras
     error: float  # mean distance of the points from where they were seen, in pixels
     faults: list[str]  # what is wrong with it, as parts of a line
+    contradicted: int = 0  # pairs of images that match well over much of both, and that its cameras contradict
+    witnesses: int = 0  # pairs that match well over much of both
+
+    @property
+    def folded(self) -> bool:
+        """Whether something that looks alike from several sides has misled the mapper."""
+        return is_folded(self.contradicted, self.witnesses)
 
 
 def process(
@@ -116,8 +133,8 @@ def process(
 ) -> None:
     """Makes a scene: `out/images`, reduced copies, a COLMAP model in `out/sparse/0` and `out/transforms.json`.
 
-    The images of a video, and images of one size, share a camera; else each has its own. `out/colmap` keeps what each
-    stage found, and a process with the same settings goes on there. `out/sparse/0` appears when all is done.
+    Images of one size share a camera. `out/colmap` keeps what each stage found, and a process with the same settings
+    goes on there. `out/sparse/0` appears when all is done.
 
     Args:
         source: a video, or a folder of PNG, JPEG or, with pillow-heif, HEIC images.
@@ -127,7 +144,7 @@ def process(
             "auto", those whose largest features match, and the next two by name.
         camera_model: COLMAP's name of the model of the lens.
         mapper: "global", "incremental", or "auto": global, and incremental too if its model has faults or loses
-            cameras.
+            cameras. A model that contradicts pairs of images is made again, without pairs that may mislead.
         max_features: of an image.
         size: of an image's longer side in pixels, to which it is reduced where features are searched; None for COLMAP's
             3,200.
@@ -165,21 +182,16 @@ def process(
     if not (images := out / "images").is_dir():
         _gather(source, out, frames, say)
     files = listed_images(images)
-    shared = len({read_header(path).size for path in files}) == 1
-    say(f"{len(files)} images with {'one camera' if shared else 'a camera each'}; {work} keeps what COLMAP finds")
+    sizes = {path.name: read_header(path).size for path in files}
+    count = len(set(sizes.values()))
+    shared = "one camera" if count == 1 else f"{count} cameras, one for each size"
+    say(f"{len(files)} images with {shared}; {work} keeps what COLMAP finds")
     stages = Stages(pycolmap, work, images, progress)
-    _match(stages, [path.name for path in files], settings, shared)
-    models: list[Model] = []
-    for name in ("global", "incremental"):
-        good = bool(models) and not (models[0].faults or models[0].lost)
-        good = good and len(models[0].images) >= GOOD_SHARE * len(files)
-        if mapper == name or (mapper == "auto" and not good):
-            model = _map(stages, name)
-            say(f"{name} mapping: {_described(model, len(files))}")
-            models += [model] if model is not None else []
+    _match(stages, sizes, settings)
+    models = _find_models(stages, mapper, len(files), say)
     if not models:
         raise SceneError(f"{source}: COLMAP finds no model: the images must overlap, be sharp and differ in place")
-    best = max(models, key=lambda model: (not model.faults, len(model.images), -model.error))
+    best = _best(models, len(files))
     few = len(best.images) < LEAST_SHARE * len(files)
     faults = best.faults or ["less than half of the images have a camera"] * few
     if faults:
@@ -198,6 +210,8 @@ def process(
     with contextlib.suppress(SceneError):  # for a lens that only COLMAP has
         write_transforms(out / "transforms.json", shown)
     _write_sound(pycolmap, best, out / "sparse" / "0")
+    if best.folded:
+        say(f"check the cameras: the model {_contradiction(best)}")
     say(f"wrote {out}: cameras of {len(best.images)} of {len(files)} images; voronerf train --data {out}")
 
 
@@ -325,33 +339,38 @@ def _told(stage: str) -> Iterator[None]:
         raise SceneError(f"pycolmap: {stage}: {' '.join(str(error).split())[:300]}") from None
 
 
-def _match(stages: Stages, names: Sequence[str], settings: Settings, shared: bool) -> None:
-    """Finds the features of the images, and matches them."""
-    colmap, database = stages.colmap, stages.work / "database.db"
+def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
+    """Finds the features of images, given by their names and sizes, and matches them."""
+    colmap, database, names = stages.colmap, stages.work / "database.db", list(sizes)
     extraction = colmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = settings.max_features
     if settings.size is not None:
         extraction.max_image_size = settings.size
     reader = colmap.ImageReaderOptions(camera_model=settings.camera_model)
+    verification = colmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
 
     def extract(some: Sequence[str], where: Path = database) -> None:
-        colmap.extract_features(
-            where,
-            stages.images,
-            image_names=list(some),
-            camera_mode=colmap.CameraMode.SINGLE if shared else colmap.CameraMode.PER_IMAGE,
-            reader_options=reader,
-            extraction_options=extraction,
-        )
-        if shared and where == database:
-            reader.existing_camera_id = 1  # for the next images
+        with colmap.Database.open(where) as opened:
+            cameras = {(each.width, each.height): each.camera_id for each in opened.read_all_cameras()}
+        for size, alike in itertools.groupby(sorted(some, key=sizes.__getitem__), sizes.__getitem__):
+            reader.existing_camera_id = cameras.get(size, -1)
+            colmap.extract_features(
+                where,
+                stages.images,
+                image_names=list(alike),
+                camera_mode=colmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=extraction,
+            )
 
     def match(where: Path, name: str, pairs: Sequence[Pair]) -> None:
         listed, block = stages.work / "part.txt", {image: number // BLOCK for number, image in enumerate(names)}
 
         def match_part(some: Sequence[Pair]) -> None:
             listed.write_text("".join(f"{a} {b}\n" for a, b in some))
-            colmap.match_image_pairs(where, pairing_options=colmap.ImportedPairingOptions(match_list_path=listed))
+            pairing = colmap.ImportedPairingOptions(match_list_path=listed)
+            colmap.match_image_pairs(where, pairing_options=pairing, verification_options=verification)
 
         stages.in_parts(name, sorted(pairs, key=lambda pair: [block[image] for image in pair]), PART, match_part)
         listed.unlink(missing_ok=True)
@@ -426,9 +445,84 @@ def _choose_pairs(colmap: Any, few: Path) -> list[Pair]:
     return sorted((a, b) for a, b in pairs)
 
 
-def _map(stages: Stages, name: str) -> Model | None:
-    """The largest model of a mapper, or None if it finds none."""
+def _find_models(stages: Stages, mapper: str, count: int, say: Callable[[str], None]) -> list[Model]:
+    """The models of a mapper or, with "auto", of as many as it takes for a good one of so many images."""
+    matches = _read_matches(stages)
+    spread = spreads(matches)
+    witnesses, models = witness_pairs(matches, wide_pairs(matches, spread)), list[Model]()
+    for name, again in itertools.product(MAPPERS[1:], (False, True)):
+        folded = bool(models) and models[-1].folded
+        good = any(_sound(model, GOOD_SHARE * count) and not (model.folded or model.lost) for model in models)
+        if good or mapper not in ("auto", name) or (again and not folded):
+            continue
+        database, about = stages.work / "database.db", f"{name} mapping"
+        if again:
+            trusted = trusted_pairs(matches, spread)
+            database = _keep_pairs(stages.colmap, database, trusted)
+            about += f" by {len(trusted)} pairs of {len(matches.pairs)}"
+        try:
+            model = _map(stages, f"{name}_again" if again else name, database, matches, witnesses)
+        except SceneError as error:  # such as a model whose focal lengths are not finite
+            say(f"{about}: no model: {error}")
+            continue
+        say(f"{about}: {_described(model, count)}")
+        models += [model] if model is not None else []
+    return models
+
+
+def _read_matches(stages: Stages) -> Matches:
+    """The matches that fit two cameras."""
+    colmap, pairs = stages.colmap, {}
+    with colmap.Database.open(stages.work / "database.db") as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        features = {name: opened.read_keypoints(number)[:, :2] for number, name in names.items()}
+        for pair, count in zip(*opened.read_two_view_geometry_num_inliers()):
+            if count:
+                a, b = colmap.pair_id_to_image_pair(pair)
+                found = np.asarray(opened.read_two_view_geometry(a, b).inlier_matches)
+                pairs[names[a], names[b]] = found.astype(np.int64)
+    return Matches(features, pairs)
+
+
+def _keep_pairs(colmap: Any, database: Path, pairs: Collection[Pair]) -> Path:
+    """A copy of a database, beside it, with the matches of some pairs alone; one that is there is kept."""
+    kept = database.with_name("trusted.db")
+    if kept.is_file():
+        return kept
+    part = kept.with_suffix(".part")
+    shutil.copyfile(database, part)
+    with colmap.Database.open(part) as opened:
+        numbers = {image.name: image.image_id for image in opened.read_all_images()}
+        fitted = {(numbers[a], numbers[b]): opened.read_two_view_geometry(numbers[a], numbers[b]) for a, b in pairs}
+        opened.clear_two_view_geometries()
+        for (a, b), geometry in sorted(fitted.items()):
+            opened.write_two_view_geometry(a, b, geometry)
+    os.replace(part, kept)
+    return kept
+
+
+def _sound(model: Model, least: float) -> bool:
+    """Whether a model has no faults, and so many cameras."""
+    return not model.faults and len(model.images) >= least
+
+
+def _best(models: Sequence[Model], count: int) -> Model:
+    """The best of models of so many images: sound, not folded, with the most cameras, and the least error.
+
+    What a model loses or contradicts weighs as much as a camera: it tells that others are wrong, too.
+    """
+
+    def worth(model: Model) -> tuple[float, ...]:
+        cameras = len(model.images) - len(model.lost) - model.contradicted
+        return _sound(model, LEAST_SHARE * count), -model.contradicted * model.folded, cameras, -model.error
+
+    return max(models, key=worth)
+
+
+def _map(stages: Stages, name: str, database: Path, matches: Matches, witnesses: Sequence[Pair]) -> Model | None:
+    """The largest model of a mapper, which its name begins with, or None if it finds none."""
     colmap, folder = stages.colmap, stages.work / name
+    mapper, _, again = name.partition("_")
     if not folder.is_dir():
         part = _emptied(stages.work / f".{name}")
         errors: list[Exception] = []
@@ -436,18 +530,14 @@ def _map(stages: Stages, name: str) -> Model | None:
 
         def find() -> None:
             try:
-                if name == "global":
+                if mapper == "global":
                     options = colmap.GlobalPipelineOptions(random_seed=0)
                     options.mapper.track_required_tracks_per_view = TRACKS
-                    colmap.global_mapping(stages.work / "database.db", stages.images, part, options)
+                    colmap.global_mapping(database, stages.images, part, options)
                 else:
                     options = colmap.IncrementalPipelineOptions(random_seed=0)
                     colmap.incremental_mapping(
-                        stages.work / "database.db",
-                        stages.images,
-                        part,
-                        options,
-                        next_image_callback=lambda: placed.append(None),
+                        database, stages.images, part, options, next_image_callback=lambda: placed.append(None)
                     )
             except Exception as error:
                 errors.append(error)
@@ -457,9 +547,9 @@ def _map(stages: Stages, name: str) -> Model | None:
         thread.start()
         while thread.is_alive():
             thread.join(0.5)
-            logs = sorted(stages.work.glob(f"{LOG}*")) if name == "global" else []
+            logs = sorted(stages.work.glob(f"{LOG}*")) if mapper == "global" else []
             begun = BEGINS.findall(logs[-1].read_text(errors="replace")) if logs else []
-            stages.progress(": ".join((f"{name} mapping", *begun[-1:])), len(placed), 0)
+            stages.progress(": ".join((f"{mapper} mapping {again}".rstrip(), *begun[-1:])), len(placed), 0)
         with _told("mapping"):
             for failure in errors:
                 raise failure
@@ -477,7 +567,7 @@ def _map(stages: Stages, name: str) -> Model | None:
     error = float(colmap.Reconstruction(largest).compute_mean_reprojection_error())
     if error > LARGEST_ERROR:
         faults.append(f"its points are off by {error:.2f} pixels")
-    return Model(largest, name, images, lost, error, faults)
+    return Model(largest, images, lost, error, faults, *contradicted_pairs(matches, witnesses, images))
 
 
 def _lost(model: ColmapModel) -> dict[str, str]:
@@ -496,10 +586,16 @@ def _lost(model: ColmapModel) -> dict[str, str]:
 def _described(model: Model | None, images: int) -> str:
     if model is None:
         return "no model"
-    rest = "".join(f"; {fault}" for fault in model.faults)
+    rest = "".join(f"; {fault}" for fault in [*model.faults, *[_contradiction(model)] * model.folded])
     if model.lost:
         rest += f"; without the cameras of {some_of([f'{name} ({why})' for name, why in model.lost.items()])}"
     return f"{len(model.images)} of {images} images, points off by {model.error:.2f} pixels{rest}"
+
+
+def _contradiction(model: Model) -> str:
+    """What a folded model is wrong about, as a part of a line."""
+    what = f"contradicts {model.contradicted} of {model.witnesses} pairs of images that match well over much of both"
+    return f"{what}: something may look alike from several sides"
 
 
 def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
