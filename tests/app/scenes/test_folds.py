@@ -14,9 +14,9 @@ from voronerf.app.scenes.folds import (
     epipolar_angles,
     is_folded,
     spreads,
+    strong_pairs,
     trusted_pairs,
     wide_pairs,
-    witness_pairs,
 )
 from voronerf.app.scenes.lenses import colmap_lens
 from voronerf.nerf.cameras import orbit_cameras
@@ -69,7 +69,7 @@ def test_pairs_that_match_over_much_of_both_images_are_wide():
     assert spreads(Matches(bare, {("a", "b"): np.zeros((0, 2), dtype=np.int64)})) == {("a", "b"): 0}
 
 
-def test_an_image_without_witnesses_keeps_its_best_pairs():
+def test_an_image_without_strong_pairs_keeps_its_best_pairs():
     pairs = {  # matches, and the share of the images over which they reach
         ("a", "b"): (200, 0.5),
         ("a", "c"): (100, 0.5),
@@ -82,18 +82,18 @@ def test_an_image_without_witnesses_keeps_its_best_pairs():
     found = Matches(dict.fromkeys("abcdef"), {pair: np.zeros((n, 2)) for pair, (n, _) in pairs.items()})
     spread = {pair: share for pair, (_, share) in pairs.items()}
     wide = wide_pairs(found, spread)
-    assert wide == [("a", "b"), ("a", "c"), ("b", "d")] and witness_pairs(found, wide) == wide[:2]
+    assert wide == [("a", "b"), ("a", "c"), ("b", "d")] and strong_pairs(found, wide) == wide[:2]
     assert trusted_pairs(found, spread) == {*wide, ("c", "d"), ("a", "d")}
 
 
 def test_a_model_contradicts_the_pairs_that_a_fold_tears_apart():
     found = matches()
-    witnesses = witness_pairs(found, wide_pairs(found, spreads(found)))
-    assert contradicted_pairs(found, witnesses, images()) == (0, COUNT)
+    strong = strong_pairs(found, wide_pairs(found, spreads(found)))
+    assert contradicted_pairs(found, strong, images()) == (0, COUNT)
     folded = images(turned=range(3, 9))
-    assert contradicted_pairs(found, witnesses, folded) == (2, COUNT)  # at both ends of the turned part
-    assert contradicted_pairs(found, witnesses, folded[:6]) == (1, 5)
-    assert contradicted_pairs(found, witnesses, []) == (0, 0)
+    assert contradicted_pairs(found, strong, folded) == (2, COUNT)  # at both ends of the turned part
+    assert contradicted_pairs(found, strong, folded[:6]) == (1, 5)
+    assert contradicted_pairs(found, strong, []) == (0, 0)
     assert [is_folded(*counts) for counts in ((2, 12), (3, 12), (3, 300), (4, 300), (0, 0))] == [0, 1, 0, 1, 0]
 
 

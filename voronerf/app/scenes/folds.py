@@ -25,15 +25,15 @@ Pair = tuple[str, str]
 #: Wide pairs have so many matches, in boxes of at least this share of those of all features, in both images. Of a can
 #: with the same print on two sides, 326 right pairs and a wrong one are wide, of 835 in all.
 WIDE_MATCHES, WIDE = 30, 0.12
-#: Wide pairs are witnesses with this share of the most matches that one of the two images has. Weaker ones may be wrong
+#: Wide pairs are strong with this share of the most matches that one of the two images has. Weaker ones may be wrong
 #: where patterns repeat: the sound cameras of bonsai contradict 22 of 593 wide pairs, none above .2.
-WITNESS = 0.25
-#: An image without witnesses is held by so many other pairs.
+STRONG = 0.25
+#: An image without strong pairs is held by so many other pairs.
 HOLDING = 2
 #: A pair is contradicted if half of its matches lie farther than this from where the cameras have them, in widths of
 #: the image.
 CONTRADICTED = 0.02
-#: A model is folded if it contradicts so many witnesses, and this share of them.
+#: A model is folded if it contradicts so many strong pairs, and this share of them.
 FOLDED_PAIRS, FOLDED = 3, 0.01
 #: In the place of zero, where a length divides.
 TINY = 1e-12
@@ -66,28 +66,28 @@ def wide_pairs(matches: Matches, spread: dict[Pair, float]) -> list[Pair]:
     return [pair for pair, found in matches.pairs.items() if len(found) >= WIDE_MATCHES and spread[pair] >= WIDE]
 
 
-def witness_pairs(matches: Matches, wide: Iterable[Pair]) -> list[Pair]:
+def strong_pairs(matches: Matches, wide: Iterable[Pair]) -> list[Pair]:
     """The wide pairs whose matches are not few beside those of the best pairs of their images."""
     most = dict.fromkeys(matches.features, 0)
     for pair, found in matches.pairs.items():
         most.update({name: max(most[name], len(found)) for name in pair})
-    return [(a, b) for a, b in wide if len(matches.pairs[a, b]) >= WITNESS * max(most[a], most[b])]
+    return [(a, b) for a, b in wide if len(matches.pairs[a, b]) >= STRONG * max(most[a], most[b])]
 
 
 def trusted_pairs(matches: Matches, spread: dict[Pair, float]) -> set[Pair]:
-    """The wide pairs and, of an image without witnesses, the best others by matches times share."""
+    """The wide pairs and, of an image without strong pairs, the best others by matches times share."""
     wide = set(wide_pairs(matches, spread))
-    held = {name for pair in witness_pairs(matches, wide) for name in pair}
+    held = {name for pair in strong_pairs(matches, wide) for name in pair}
     others = [pair for pair, found in matches.pairs.items() if pair not in wide and len(found) >= WIDE_MATCHES]
     others.sort(key=lambda pair: -len(matches.pairs[pair]) * spread[pair])
     bare = matches.features.keys() - held
     return wide.union(*([pair for pair in others if name in pair][:HOLDING] for name in bare))
 
 
-def contradicted_pairs(matches: Matches, witnesses: Iterable[Pair], images: Sequence[ColmapImage]) -> tuple[int, int]:
-    """How many witnesses the cameras of a model contradict, and how many witnesses it has."""
+def contradicted_pairs(matches: Matches, strong: Iterable[Pair], images: Sequence[ColmapImage]) -> tuple[int, int]:
+    """How many strong pairs the cameras of a model contradict, and how many its images have."""
     by_name = {image.name: image for image in images}
-    known = [pair for pair in witnesses if by_name.keys() >= set(pair)]
+    known = [pair for pair in strong if by_name.keys() >= set(pair)]
     rays = {name: _rays(by_name[name], matches.features[name]) for name in {name for pair in known for name in pair}}
     count = 0
     for a, b in known:
@@ -123,6 +123,6 @@ def epipolar_angles(a: Tensor, b: Tensor, base: Tensor) -> Tensor:
     return missed / torch.hypot(*across).clamp_min(TINY)
 
 
-def is_folded(contradicted: int, witnesses: int) -> bool:
-    """Whether a model that contradicts some of its witnesses is folded."""
-    return contradicted >= FOLDED_PAIRS and contradicted > FOLDED * witnesses
+def is_folded(contradicted: int, strong: int) -> bool:
+    """Whether a model that contradicts some of its strong pairs is folded."""
+    return contradicted >= FOLDED_PAIRS and contradicted > FOLDED * strong

@@ -43,9 +43,9 @@ from voronerf.app.scenes.folds import (
     contradicted_pairs,
     is_folded,
     spreads,
+    strong_pairs,
     trusted_pairs,
     wide_pairs,
-    witness_pairs,
 )
 from voronerf.app.scenes.images import UNREADABLE, read_header, read_image
 from voronerf.app.scenes.lenses import MODELS
@@ -109,12 +109,12 @@ class Model:
     error: float  # mean distance of the points from where they were seen, in pixels
     faults: list[str]  # what is wrong with it, as parts of a line
     contradicted: int = 0  # pairs of images that match well over much of both, and that its cameras contradict
-    witnesses: int = 0  # pairs that match well over much of both
+    strong: int = 0  # pairs that match well over much of both
 
     @property
     def folded(self) -> bool:
         """Whether something that looks alike from several sides has misled the mapper."""
-        return is_folded(self.contradicted, self.witnesses)
+        return is_folded(self.contradicted, self.strong)
 
 
 def process(
@@ -449,7 +449,7 @@ def _find_models(stages: Stages, mapper: str, count: int, say: Callable[[str], N
     """The models of a mapper or, with "auto", of as many as it takes for a good one of so many images."""
     matches = _read_matches(stages)
     spread = spreads(matches)
-    witnesses, models = witness_pairs(matches, wide_pairs(matches, spread)), list[Model]()
+    strong, models = strong_pairs(matches, wide_pairs(matches, spread)), list[Model]()
     for name, again in itertools.product(MAPPERS[1:], (False, True)):
         folded = bool(models) and models[-1].folded
         good = any(_sound(model, GOOD_SHARE * count) and not (model.folded or model.lost) for model in models)
@@ -461,7 +461,7 @@ def _find_models(stages: Stages, mapper: str, count: int, say: Callable[[str], N
             database = _keep_pairs(stages.colmap, database, trusted)
             about += f" by {len(trusted)} pairs of {len(matches.pairs)}"
         try:
-            model = _map(stages, f"{name}_again" if again else name, database, matches, witnesses)
+            model = _map(stages, f"{name}_again" if again else name, database, matches, strong)
         except SceneError as error:  # such as a model whose focal lengths are not finite
             say(f"{about}: no model: {error}")
             continue
@@ -519,7 +519,7 @@ def _best(models: Sequence[Model], count: int) -> Model:
     return max(models, key=worth)
 
 
-def _map(stages: Stages, name: str, database: Path, matches: Matches, witnesses: Sequence[Pair]) -> Model | None:
+def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Sequence[Pair]) -> Model | None:
     """The largest model of a mapper, which its name begins with, or None if it finds none."""
     colmap, folder = stages.colmap, stages.work / name
     mapper, _, again = name.partition("_")
@@ -567,7 +567,7 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, witnesses:
     error = float(colmap.Reconstruction(largest).compute_mean_reprojection_error())
     if error > LARGEST_ERROR:
         faults.append(f"its points are off by {error:.2f} pixels")
-    return Model(largest, images, lost, error, faults, *contradicted_pairs(matches, witnesses, images))
+    return Model(largest, images, lost, error, faults, *contradicted_pairs(matches, strong, images))
 
 
 def _lost(model: ColmapModel) -> dict[str, str]:
@@ -594,7 +594,7 @@ def _described(model: Model | None, images: int) -> str:
 
 def _contradiction(model: Model) -> str:
     """What a folded model is wrong about, as a part of a line."""
-    what = f"contradicts {model.contradicted} of {model.witnesses} pairs of images that match well over much of both"
+    what = f"contradicts {model.contradicted} of {model.strong} pairs of images that match well over much of both"
     return f"{what}: something may look alike from several sides"
 
 
