@@ -15,8 +15,6 @@ WARMUP_STEPS = 100
 WARMUP = 0.02
 #: Learning rate at the end, as a fraction of that at the start.
 FINAL = 0.05
-#: The part of a training in which depths from where no camera was are to be smooth: later, what is fine is learnt.
-UNSEEN_UNTIL = 0.5
 #: The share of a step's samples that are to be left once empty space is known, if more rays can bring them, and the
 #: samples of a ray, in a box and in contracted space, beyond which it grows with them: these go with larger tables,
 #: which larger steps keep cheap.

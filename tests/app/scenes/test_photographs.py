@@ -18,7 +18,7 @@ from voronerf.app.scenes.colmap import read_model
 from voronerf.app.scenes.scene import SparseDepth
 from voronerf.app.train import Callback, ConfigError, TrainConfig, train
 from voronerf.app.train.build import ROBUST, build, make_batches, make_renderer, make_routers
-from voronerf.app.train.defaults import BESIDE, resolve
+from voronerf.app.train.defaults import BESIDE, COVERED, resolve
 from voronerf.nerf.cameras import Cameras, orbit_cameras
 
 COUNT, SIZE = 9, (12, 10)
@@ -105,7 +105,24 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
         resolve(TrainConfig(sparse_depth=0.1), without)
 
 
-def test_rays_from_elsewhere_end_half_way(tmp_path):
+def test_space_before_the_rays_of_cameras_stays_empty(tmp_path):
+    """Where cameras look to; not behind them, and not beyond."""
+    write_both(tmp_path)
+    scene = load_scene(tmp_path)
+    state = build(TrainConfig(steps=20, rays=32, samples=(16,), cells=(), field_options=("log2_entries=10",)), scene)
+    grid, cameras = state.sampler.grid, scene.train.cameras
+
+    def occupied(part):
+        points = cameras.origins + part * scene.near * cameras.forward
+        return grid.occupied.view(-1)[grid.voxels(grid.contraction.points(points)).long()]
+
+    for _ in range(2):
+        assert not any(occupied(part).any() for part in (0.1, 0.5, 0.9)) and occupied(1.1).all()
+        assert occupied(-0.5).all() and 0.002 < float((~grid.occupied).float().mean()) < 0.2
+        train(state)
+
+
+def test_rays_from_elsewhere_end_the_sooner_the_more_points_there_are(tmp_path):
     """They are of photographs of something that cameras stand around, most of whose tiles have no point."""
     write_both(tmp_path)
     scene = load_scene(tmp_path)  # whose pixels are its tiles
@@ -117,7 +134,7 @@ def test_rays_from_elsewhere_end_half_way(tmp_path):
             scene, train=replace(scene.train, sparse_depth=SparseDepth(points, torch.full((len(points),), 1.0)))
         )
 
-    few, many = known(0.48), known(0.52)
+    few, many = known(0.51 * COVERED), known(1.01 * COVERED)
     config, found = TrainConfig(steps=64, rays=32, samples=(16,), cells=(), field_options=("log2_entries=10",)), []
 
     class Note(Callback):

@@ -15,11 +15,12 @@ from torch import Tensor, nn
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.store import Pages
 from voronerf.app.train.config import ConfigError, TrainConfig
-from voronerf.app.train.defaults import resolve, unseen_move, why_no_occupancy
+from voronerf.app.train.defaults import resolve, unseen_move, unseen_share, why_no_occupancy
 from voronerf.app.train.state import State
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
+from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.field import DirectionPerSample, Field
 from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.occupancy import OccupancyGrid
@@ -39,6 +40,8 @@ PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 ROBUST = 0.05
 #: Factor of the loss on smooth depths of photographs from where no camera was.
 SMOOTH_DEPTH = 0.1
+#: Rays along the longer side of a picture that find what its camera looks through before its rays begin.
+LOOKS = 64
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
 SAMPLE_BYTES = 64
 
@@ -88,9 +91,10 @@ def build(
     routers = make_routers(config)
     for router in routers.values():
         router.generator = draws
-    renderer = make_renderer(
-        config, scene, routers, grid=make_grid(config, scene, device) if config.occupancy else None
-    )
+    grid = make_grid(config, scene, device) if config.occupancy else None
+    contraction = None if grid is None else grid.contraction
+    empty = space_before(scene, grid, contraction) if grid and isinstance(contraction, Contraction) else None
+    renderer = make_renderer(config, scene, routers, grid=grid, empty=empty)
     if batches is None:
         unseen = unseen_move(scene, renderer.sampler.space) if config.occupancy else 0.0
         batches = make_batches(config, scene, unseen=unseen)
@@ -129,6 +133,7 @@ def build(
         scaler=torch.amp.GradScaler(device.type, enabled=config.precision == "fp16"),
         guard=Guard.on(device),
         rays=int(config.rays or 0),
+        unseen_share=unseen_share(scene, renderer.sampler.space),
         on_event=on_event,
     )
 
@@ -183,6 +188,7 @@ def make_renderer(
     routers: Mapping[str, VoronoiRouter],
     *,
     grid: OccupancyGrid | None = None,
+    empty: Tensor | None = None,
     samples: tuple[int, ...] | None = None,
     backend: str | None = None,
 ) -> Renderer:
@@ -193,6 +199,7 @@ def make_renderer(
         scene: Whose space is sampled.
         routers: The networks by name.
         grid: Which space is empty; None to take every sample.
+        empty: Its voxels that stay empty in a training; None for none.
         samples: Samples per ray of each pass, in pictures too; None for those of the configuration.
         backend: Of the operations; None for that of the configuration.
     """
@@ -204,8 +211,28 @@ def make_renderer(
         sampler = SAMPLERS[config.sampling](*counts, space=space, backend=backend)
     else:
         picture = None if samples is None else samples[0]
-        sampler = Occupancy(grid, counts[0], picture_samples=picture, space=space, backend=backend)
+        sampler = Occupancy(grid, counts[0], picture_samples=picture, space=space, empty=empty, backend=backend)
     return Renderer({name: as_field(router) for name, router in routers.items()}, sampler, backend=backend)
+
+
+def space_before(scene: Scene, grid: OccupancyGrid, contraction: Contraction) -> Tensor:
+    """The voxels of contracted space that training views look through before their rays begin, bool [x, y, z].
+
+    A camera stands in free space. Fog there could explain the pictures of other cameras, and would hide all else from a
+    place beside this one.
+    """
+    device, cameras = grid.box.device, scene.train.cameras.to(grid.box.device)
+    voxel = float((grid.box[1] - grid.box[0]).min()) / max(grid.occupied.shape)
+    depths = torch.arange(voxel / 4, scene.near - voxel / 2, voxel / 2, device=device)
+    empty = torch.zeros(grid.occupied.numel(), dtype=torch.bool, device=device)
+    for image in range(len(cameras)):
+        width, height = cameras.size(image)
+        across, down = (torch.arange(0, side, max(width, height) / LOOKS, device=device) for side in (width, height))
+        y, x = torch.meshgrid(down, across, indexing="ij")
+        rays = cameras.rays(image, x.reshape(-1), y.reshape(-1))
+        points = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]
+        empty[grid.voxels(contraction.points(points.reshape(-1, 3))).long()] = True
+    return empty.view(grid.occupied.shape)
 
 
 def as_field(router: VoronoiRouter) -> Field:

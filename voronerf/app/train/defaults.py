@@ -18,11 +18,12 @@ from voronerf.ops._core import native
 #: Factor of the loss on sparse depths, beside the robust loss, whose gradients are as large as those of the squared one
 #: at most. Beside that, twice as much gave 0.3 dB more on bonsai and 0.7 to 1.4 on beer, at equal steps and time.
 SPARSE_DEPTH = 0.0015
-#: Depths from where no camera was are to be smooth if points of the sparse model lie in less than `COVERED` of the
-#: tiles of photographs, `TILES` of which go along the longer side. They do in 0.13 of the mouse's and 0.36 of the
-#: bust's, which gain by it, and in 0.68 of bonsai's, which lose. `BESIDE` is how far from a camera that is, as a share
-#: of the distance of the farthest one from what they look at.
-COVERED, TILES, BESIDE = 0.5, 12, 0.2
+#: Depths from where no camera was are to lie on planes in the more steps, the fewer tiles of photographs have points of
+#: the sparse model: in all if none has, in none from this share on. `TILES` go along the longer side. Of the mouse's
+#: 0.13 have points, of beer's 0.31, of the bust's 0.35, and of bonsai's, which loses by such depths, 0.68.
+COVERED, TILES = 2 / 3, 12
+#: How far from a camera that is, as a share of the distance of the farthest one from what they look at.
+BESIDE = 0.2
 #: Samples of a ray in one pass and in each of two, where empty space is not skipped.
 SAMPLES, EACH_SAMPLES = 64, 32
 #: Rays of a step. On a hash grid in a box, a training of four times `SHORT` seconds has twice as many, one of sixteen
@@ -91,11 +92,11 @@ def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfi
     return config
 
 
-def unseen_move(scene: Scene, space: Space) -> float:
-    """How far from cameras the rays of a batch begin that no picture shows; 0 for none.
+def unseen_share(scene: Scene, space: Space) -> float:
+    """The part of a training in which batches have rays that no picture shows; 0 for none.
 
-    They are of photographs of something that cameras stand around, most of whose tiles have no point of the sparse
-    model: there, surfaces are plain.
+    They are of photographs of something that cameras stand around. The fewer of the tiles have a point of the sparse
+    model, the more surfaces are plain.
     """
     points, cameras = scene.train.sparse_depth, scene.train.cameras
     if scene.background is not None or space.full_gradient is None or points is None:
@@ -105,7 +106,12 @@ def unseen_move(scene: Scene, space: Space) -> float:
     image, row = row // cameras.height, row % cameras.height
     tiles = ((image * cameras.height + row // side) * cameras.width + column // side).unique()
     every = sum(width * height for width, height in map(cameras.size, range(len(cameras)))) / side**2
-    return BESIDE * space.full_gradient if len(tiles) < COVERED * every else 0.0
+    return max(0.0, 1 - len(tiles) / every / COVERED)
+
+
+def unseen_move(scene: Scene, space: Space) -> float:
+    """How far from cameras these rays begin; 0 for none."""
+    return BESIDE * (space.full_gradient or 0.0) if unseen_share(scene, space) else 0.0
 
 
 def machine_speed() -> float:

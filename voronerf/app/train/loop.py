@@ -9,7 +9,7 @@ from contextlib import nullcontext
 
 from voronerf.app.train.start import judge_start, steps_to_judgement
 from voronerf.app.train.state import State
-from voronerf.nerf.schedule import GROUP, UNSEEN_UNTIL
+from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.split import SplitDone
 from voronerf.nerf.step import StepOutput
 from voronerf.ops._core import backends
@@ -116,7 +116,7 @@ def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool =
                 callback.after_split(state, done)
     optimizer.set_learning_rate(state.learning_rate())
     group = state.step - (state.step - state.began) % GROUP  # its first step: the clock may cut a group anywhere
-    if state.batches.unseen and state.fraction_at(group) >= UNSEEN_UNTIL:
+    if state.batches.unseen and state.fraction_at(group) >= state.unseen_share:
         state.batches.unseen = 0.0
     if not state.router.training:
         state.renderer.train()

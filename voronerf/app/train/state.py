@@ -72,6 +72,7 @@ class State:
         evaluation_seconds: Of evaluations so far that count towards the budget.
         reserved_seconds: Of the budget, for the last evaluation.
         rays: Of the next step.
+        unseen_share: The part of the training in which batches have rays that no picture shows.
         rays_done: Of all steps.
         loss: Of the last step that the host has read.
         skipped_in_a_row: Steps that the guard has left out since the last good one.
@@ -93,6 +94,7 @@ class State:
     scaler: torch.amp.GradScaler
     guard: Guard
     rays: int
+    unseen_share: float = 0.0
     on_event: Callable[[str], None] | None = None
     step: int = 0
     seconds: float = 0.0
