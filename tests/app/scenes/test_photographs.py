@@ -120,6 +120,7 @@ def test_space_before_the_rays_of_cameras_stays_empty(tmp_path):
         assert not any(occupied(part).any() for part in (0.1, 0.5, 0.9)) and occupied(1.1).all()
         assert occupied(-0.5).all() and 0.002 < float((~grid.occupied).float().mean()) < 0.2
         train(state)
+    assert not build(state.config, replace(scene, near=0.01)).sampler.empty.any()  # nearer than a voxel is wide
 
 
 def test_rays_from_elsewhere_end_the_sooner_the_more_points_there_are(tmp_path):

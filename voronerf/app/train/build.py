@@ -223,7 +223,7 @@ def space_before(scene: Scene, grid: OccupancyGrid, contraction: Contraction) ->
     """
     device, cameras = grid.box.device, scene.train.cameras.to(grid.box.device)
     voxel = float((grid.box[1] - grid.box[0]).min()) / max(grid.occupied.shape)
-    depths = torch.arange(voxel / 4, scene.near - voxel / 2, voxel / 2, device=device)
+    depths = torch.arange(voxel / 4, max(scene.near - voxel / 2, voxel / 4), voxel / 2, device=device)
     empty = torch.zeros(grid.occupied.numel(), dtype=torch.bool, device=device)
     for image in range(len(cameras)):
         width, height = cameras.size(image)
