@@ -173,6 +173,13 @@ def test_long_trainings_of_objects_take_more_rays_a_step():
     def rays(**settings):
         return resolve(TrainConfig(**settings), scene).rays
 
+    large = builtin_scene(400, train_views=1, test_views=1)  # some 350 pixels along the box
+    assert [resolve(TrainConfig(budget=seconds), large).rays for seconds in (60, 75, 180, 300)] == [
+        512,
+        1024,
+        1024,
+        2048,
+    ]
     assert [rays(budget=seconds) for seconds in (1, 39, 40, 159, 160, 640, 1e6)] == [
         512,
         512,

@@ -125,7 +125,7 @@ class SamplingSettings:
     """Rays and where they are sampled."""
 
     rays: int | None = None
-    """Rays per training step; default 512, on a hash grid in a box more for a --budget from 40 on. Where empty space is
+    """Rays per training step; default 512, on a hash grid in a box more for a long --budget. Where empty space is
     skipped, of the first steps: hashgrid takes up to eight times as many when few samples of a ray are left."""
     sampling: str = "stratified"
     """Samples along a ray: stratified in one pass, or hierarchical, with a second pass where the first found something

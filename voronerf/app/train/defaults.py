@@ -27,8 +27,9 @@ BESIDE = 0.2
 #: Samples of a ray in one pass and in each of two, where empty space is not skipped.
 SAMPLES, EACH_SAMPLES = 64, 32
 #: Rays of a step. On a hash grid in a box, a training of four times `SHORT` seconds has twice as many, one of sixteen
-#: times as long four times as many, up to `MOST_RAYS`: beyond some 4,000 steps, more rays a step teach more.
-RAYS, MOST_RAYS, SHORT = 512, 4096, 10.0
+#: times as long four times as many, up to `MOST_RAYS`: beyond some 4,000 steps, more rays a step teach more. Steps of
+#: pictures with more than `SHORT_PIXELS` along the box take longer, so that `SHORT` grows with the root of these.
+RAYS, MOST_RAYS, SHORT, SHORT_PIXELS = 512, 4096, 10.0, 128
 #: About what a step takes on two cores, for a training that is given in steps.
 STEP_SECONDS = 0.01
 #: Operations a second of the two cores on which the rules were measured: multiply-adds of two threads of Zen 5.
@@ -57,14 +58,15 @@ def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfi
     if sparse_depth is None:
         sparse_depth = SPARSE_DEPTH if points else 0.0
     seconds = STEP_SECONDS * (config.steps or 0) if config.budget is None else config.budget * speed
+    side = 0.0 if scene.box is None else float((scene.box[1] - scene.box[0]).amax())
     if rays is None:
-        grows = config.budget is not None and kind.scene_options is not None and not contracted and seconds > SHORT
-        rays = min(RAYS * 2 ** math.floor(math.log(seconds / SHORT, 4) + 1e-9), MOST_RAYS) if grows else RAYS
+        short = SHORT * math.sqrt(max(1.0, side / pixel / SHORT_PIXELS))
+        grows = config.budget is not None and kind.scene_options is not None and not contracted and seconds > short
+        rays = min(RAYS * 2 ** math.floor(math.log(seconds / short, 4) + 1e-9), MOST_RAYS) if grows else RAYS
     if samples is None:
         passes = SAMPLERS[config.sampling].passes
         each = EACH_SAMPLES if passes > 1 else SAMPLES
         if occupancy:
-            side = 0.0 if scene.box is None else float((scene.box[1] - scene.box[0]).amax())
             # The rule was measured with hash grids: a step of a larger network takes several times as long.
             long = seconds if contracted or kind.scene_options is not None else 0.0
             each = usual_samples(side / pixel, contracted=contracted, seconds=long)
