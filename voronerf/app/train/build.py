@@ -93,7 +93,9 @@ def build(
         router.generator = draws
     grid = make_grid(config, scene, device) if config.occupancy else None
     contraction = None if grid is None else grid.contraction
-    empty = space_before(scene, grid, contraction) if grid and isinstance(contraction, Contraction) else None
+    empty = (
+        space_before(scene, grid, contraction) if grid is not None and isinstance(contraction, Contraction) else None
+    )
     renderer = make_renderer(config, scene, routers, grid=grid, empty=empty)
     if batches is None:
         unseen = unseen_move(scene, renderer.sampler.space) if config.occupancy else 0.0
