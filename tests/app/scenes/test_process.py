@@ -115,6 +115,13 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
     assert max(done for stage, done, _ in seen if stage == "incremental mapping") >= COUNT - 2
 
     shutil.rmtree(out / "sparse")
+    again = {"max_features": 300, "mapper": "incremental"}
+    monkeypatch.setattr(process, "LARGEST_ERROR", 0.0)
+    refuses("its points are off by 0.", process.process, pictures, out, **again, error=SceneError)
+    monkeypatch.setattr(process, "ERROR_SHARE", 2 / WIDTH)
+    process.process(pictures, out, **again)
+
+    shutil.rmtree(out / "sparse")
     pairs = sorted((images[index].name, images[index + 1].name) for index in range(COUNT - 1))
     monkeypatch.setattr(process, "trusted_pairs", lambda *_: {*pairs, (images[0].name, images[2].name)})
     monkeypatch.setattr(process, "is_folded", lambda *_: True)
