@@ -24,7 +24,7 @@ def process(
     camera_model: str = "SIMPLE_RADIAL",
     mapper: Literal["auto", "global", "incremental"] = "auto",
     max_features: int = 4096,
-    size: int | None = None,
+    size: int = 1600,
     verbose: bool = False,
 ) -> int:
     """Make a scene of a video or of images: COLMAP finds the cameras. A stopped one goes on with the same command.
@@ -39,7 +39,7 @@ def process(
         mapper: How cameras are found; auto is global, and incremental too if that model has faults or loses
             cameras. A model that contradicts pairs of images is made again, without pairs that may mislead.
         max_features: Of an image.
-        size: Pixels of an image's longer side, to which it is reduced where features are searched; default 3200.
+        size: Pixels of an image's longer side, to which it is reduced where features are searched.
         verbose: Show what COLMAP says.
     """
     check_counts(frames=frames, max_features=max_features, size=size)
