@@ -199,6 +199,8 @@ def test_a_folded_model_is_made_again_by_pairs_that_can_be_trusted(tmp_path, mon
     lost = circle(10) * torch.tensor([1.0] * 9 + [90.0])[:, None]  # so others may be wrong, too
     asked, _, best = found(**{"global": lost, "incremental": circle(9)})
     assert asked == ["global", "incremental"] and best.folder.name == "incremental"
+    _, _, best = found(**{"global": lost, "incremental": circle(8)})
+    assert best.folder.name == "global"
     broken = SceneError("cameras.bin: camera 1 must have a focal length")
     asked, said, best = found(**{"global": broken, "incremental": circle(9)})
     assert asked == ["global", "incremental"] and best.folder.name == "incremental"

@@ -507,14 +507,14 @@ def _sound(model: Model, least: float) -> bool:
 
 
 def _best(models: Sequence[Model], count: int) -> Model:
-    """The best of models of so many images: sound, not folded, with the most cameras, and the least error.
+    """The best of models of so many images: sound, not folded, with the most cameras, fewer lost, and the least error.
 
-    What a model loses or contradicts weighs as much as a camera: it tells that others are wrong, too.
+    A pair that a model contradicts weighs as much as a camera: it tells that others are wrong, too.
     """
 
     def worth(model: Model) -> tuple[float, ...]:
-        cameras = len(model.images) - len(model.lost) - model.contradicted
-        return _sound(model, LEAST_SHARE * count), -model.contradicted * model.folded, cameras, -model.error
+        cameras = len(model.images) - model.contradicted
+        return _sound(model, LEAST_SHARE * count), -model.contradicted * model.folded, cameras, -len(model.lost), -model.error
 
     return max(models, key=worth)
 
