@@ -80,7 +80,7 @@ def test_the_grid_grows_with_the_images():
     found = [HashGridField.scene_options(1 / pixels, box, False, 480) for pixels in (10, 40, 80, 100, 353)]
     assert [own["finest"] for own in found] == [32, 80, 160, 200, 706]
     assert [own["log2_entries"] for own in found] == [14, 14, 15, 15, 18]
-    for seconds, entries in ((60, 17), (180, 19)):
+    for seconds, entries in ((15, 17), (60, 19)):
         contracted = HashGridField.scene_options(1 / 353, box, True, seconds)
         assert contracted == {"box": box, "finest": 353, "log2_entries": entries, "density_scale": 40.0}
 
@@ -109,7 +109,7 @@ def test_a_table_that_does_not_fit_into_memory(monkeypatch):
     ("side", "contraction", "budget", "samples", "entries"),
     [
         *((100, "none", 37, 64, 15), (100, "none", 38, 128, 15), (20, "none", 480, 96, 14)),
-        *((20, "sphere", 149, 128, 17), (20, "sphere", 150, 256, 19)),
+        *((20, "sphere", 24, 128, 17), (20, "sphere", 25, 256, 19), (20, "sphere", 90, 384, 19)),
     ],
 )
 def test_large_images_and_long_trainings_get_more_of_both(side, contraction, budget, samples, entries):

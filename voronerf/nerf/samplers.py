@@ -50,10 +50,11 @@ REVISITED, MOST_REVISITED = 1 / 8, 32_768
 #: Samples of a ray of a picture for each of training, whose samples are jittered and so cover each stratum over time.
 #: At most so many: of the 256 of a long training, twice as many would make no picture more than 0.05 dB better.
 PICTURE_SAMPLES, MOST_PICTURE_SAMPLES = 2, 384
-#: Samples of a ray through contracted space whose empty part is skipped, and those of a training of at least `LONG`
-#: seconds: shorter strata make steps dearer at first, and sharper pictures in the end. In a box a training is long from
-#: so many seconds for each pixel along it.
-CONTRACTED_SAMPLES, LONG_SAMPLES, LONG_IN_BOX = 128, 256, 0.45
+#: Samples of a ray through contracted space whose empty part is skipped, by the seconds of a training from which on it
+#: has them: shorter strata make steps dearer at first, and sharper pictures in the end.
+CONTRACTED_SAMPLES = {0.0: 128, LONG: 256, 90.0: 384}
+#: In a box a training is long from so many seconds for each pixel along it, and has at most so many samples of a ray.
+LONG_IN_BOX, LONG_SAMPLES = 0.45, 256
 #: Renders samples through one of the networks of a cell, given by its name.
 Look = Callable[[str, Samples], Rendered]
 
@@ -534,6 +535,6 @@ def usual_samples(pixels: float, *, contracted: bool = False, seconds: float = 0
         seconds: Of the training, on two cores of an AMD EPYC (Zen 5).
     """
     if contracted:
-        return LONG_SAMPLES if seconds >= LONG else CONTRACTED_SAMPLES
+        return max(samples for least, samples in CONTRACTED_SAMPLES.items() if seconds >= least)
     usual = min(max(8 * round(0.85 * math.sqrt(pixels)), 48), 192)
     return min(2 * usual, LONG_SAMPLES) if seconds >= LONG_IN_BOX * pixels else usual

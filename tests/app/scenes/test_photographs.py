@@ -81,8 +81,8 @@ def test_points_of_a_model_are_learnt_from_where_images_show_them(tmp_path):
     config = resolve(TrainConfig(), scene)
     space = make_renderer(config, scene, make_routers(config, "cpu")).sampler.space
     assert (config.sparse_depth, space.full_gradient) == (0.0015, 1.0)
-    assert config.occupancy and config.samples == (256,)
-    assert resolve(TrainConfig(budget=60), scene).samples == (128,)
+    assert config.occupancy and config.samples == (384,)
+    assert resolve(TrainConfig(budget=15), scene).samples == (128,)
     states = [build(config, each) for each in (scene, replace(scene, background="white"))]
     assert [each.ray_loss.robust for each in states] == [ROBUST, 0.0]  # of photographs alone
     batch = make_batches(config, scene).draw(400, torch.Generator().manual_seed(0))

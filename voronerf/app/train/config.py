@@ -132,10 +132,10 @@ class SamplingSettings:
     (nerf: a coarse and a fine network)."""
     samples: tuple[int, ...] | None = None
     """Samples per ray of each pass; default 32 and 32 for two passes, for one 64. Where empty space is skipped 128, or
-    256 in a training of at least 150 seconds; for an object more for larger images: 64 at 100 pixels across it, 128 at
-    400, and on a hash grid twice as many, at most 256, in a training of at least 40 or 160 seconds. A CPU that is
-    measured to be faster than two cores of an AMD EPYC (Zen 5) needs less of --budget for it; --steps count the same
-    everywhere."""
+    256 in a training of at least 25 seconds, or 384 in one of 90; for an object more for larger images: 64 at 100
+    pixels across it, 128 at 400, and on a hash grid twice as many, at most 256, in a training of at least 40 or 160
+    seconds. A CPU that is measured to be faster than two cores of an AMD EPYC (Zen 5) needs less of --budget for it;
+    --steps count the same everywhere."""
     sparse_depth: float | None = None
     """Factor of a loss on light that does not come from where the points of a sparse model are (Deng et al. 2022,
     "Depth-supervised NeRF"); default 0.0015 for COLMAP's models, and 0, which is off, without points."""

@@ -18,8 +18,8 @@ from voronerf.ops._core.layers import MLP, Layer
 HIDDEN_BIAS = 0.3
 
 #: The logarithm of the entries of a level in contracted space, and that of a training of at least so many seconds: a
-#: larger table takes longer to read and to learn, and shows more in the end.
-CONTRACTED_ENTRIES, LONG_ENTRIES, LONG = 17, 19, 150.0
+#: larger table takes longer to read and to learn, and shows more from half a minute on.
+CONTRACTED_ENTRIES, LONG_ENTRIES, LONG = 17, 19, 25.0
 
 #: The density scale in contracted space.
 CONTRACTED_DENSITY = 40.0
@@ -127,7 +127,7 @@ class HashGridField(RadianceField):
         the entries grow more slowly, since larger tables take longer to read and to learn: 2^15 for an object of 88
         pixels, 2^18 for 353. In contracted space, most of what is seen is farther away than the middle, by which a
         pixel is measured: the finest cells are as wide as that pixel, and there are 2^17 entries, or 2^19 in a training
-        of more than two minutes. Surfaces there are thinner beside all of space, so the density has a larger scale.
+        of at least 25 seconds. Surfaces there are thinner beside all of space, so the density has a larger scale.
         """
         pixels = max(high - low for low, high in zip(*box)) / pixel
         finest, entries = round((1 if contracted else 2) * pixels), round(1.5 * math.log2(pixels) + 5.3)
