@@ -73,8 +73,8 @@ SEQUENTIAL = 10
 LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
 #: A camera is held by so many points that at least three images see. COLMAP asks for as many matches of two images.
 LEAST_HELD = 15
-#: Mean error of the points of a sound model: pixels, and, of larger images, the share of the longer side. Phones' images
-#: of 4,032 pixels, whose lens is a little off, have 2.04, and the fields are as good as with 1.39.
+#: Mean error of the points of a sound model: pixels, and, of larger images, the share of the longer side. A phone's
+#: images of 4,032 pixels have 2.04, and fields are as good as with 1.39.
 LARGEST_ERROR, ERROR_SHARE = 2.0, 1 / 800
 #: The global mapper places cameras by the longest tracks, until each image has so many; triangulation adds the others.
 TRACKS = 200
@@ -507,14 +507,14 @@ def _sound(model: Model, least: float) -> bool:
 
 
 def _best(models: Sequence[Model], count: int) -> Model:
-    """The best of models of so many images: sound, not folded, with the most cameras, fewer lost, and the least error.
+    """The best of models of so many images: sound, not folded, with the most cameras, few lost, and the least error.
 
     A pair that a model contradicts weighs as much as a camera: it tells that others are wrong, too.
     """
 
     def worth(model: Model) -> tuple[float, ...]:
-        cameras = len(model.images) - model.contradicted
-        return _sound(model, LEAST_SHARE * count), -model.contradicted * model.folded, cameras, -len(model.lost), -model.error
+        cameras, folded = len(model.images) - model.contradicted, model.contradicted * model.folded
+        return _sound(model, LEAST_SHARE * count), -folded, cameras, -len(model.lost), -model.error
 
     return max(models, key=worth)
 
