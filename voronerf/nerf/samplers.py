@@ -527,7 +527,8 @@ def usual_samples(pixels: float, *, contracted: bool = False, seconds: float = 0
 
     In a box they grow with the square root of its pixels: 64 for the 100 x 100 images of Lego, 128 for those of 400 x
     400. Every sample costs time, every pixel that a stratum is longer than costs sharpness. A long training, of 40
-    seconds for the former and 160 for the latter, has twice as many, at most 256.
+    seconds for the former and 160 for the latter, has twice as many, at most 256. Contracted space has 128, or 256 in a
+    training of at least 25 seconds, or 384 in one of 90.
 
     Args:
         pixels: Of the training views along the largest side of the box.

@@ -199,8 +199,9 @@ def test_a_folded_model_is_made_again_by_pairs_that_can_be_trusted(tmp_path, mon
     lost = circle(10) * torch.tensor([1.0] * 9 + [90.0])[:, None]  # so others may be wrong, too
     asked, _, best = found(**{"global": lost, "incremental": circle(9)})
     assert asked == ["global", "incremental"] and best.folder.name == "incremental"
-    _, _, best = found(**{"global": lost, "incremental": circle(8)})
-    assert best.folder.name == "global"
+    lost = circle(10) * torch.tensor([1.0] * 8 + [90.0, -200.0])[:, None]
+    _, _, best = found(**{"global": lost, "incremental": circle(7)})  # 8 cameras are more than 7
+    assert best.folder.name == "global" and len(best.images) == 8
     broken = SceneError("cameras.bin: camera 1 must have a focal length")
     asked, said, best = found(**{"global": broken, "incremental": circle(9)})
     assert asked == ["global", "incremental"] and best.folder.name == "incremental"
