@@ -313,6 +313,18 @@ def test_reduced_images_keep_the_orientation_tag(tmp_path, monkeypatch):
         assert reduced.size == (6, 5) and reduced.getexif()[0x0112] == 6
 
 
+def test_reduced_images_of_a_palette_keep_their_transparent_colour(tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "LEAST_SIDE", 4)
+    indexed = Image.new("P", (12, 10))
+    indexed.putpalette([200, 0, 0, 0, 100, 0])
+    indexed.paste(1, (6, 0, 12, 10))
+    indexed.save(path := tmp_path / "a.png", transparency=1)
+    process._write_reduced([path], tmp_path / "images_2", 2)
+    with Image.open(tmp_path / "images_2/a.png") as reduced:
+        assert reduced.size == (6, 5) and reduced.getpixel((0, 0)) == (200, 0, 0, 255)
+        assert reduced.getpixel((5, 0))[3] == 0
+
+
 def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, monkeypatch):
     write_images(tmp_path, [(12, 10)] * 2)
     (tmp_path / "text.mp4").write_text("no video")
@@ -392,6 +404,23 @@ def test_features_are_searched_in_smaller_images(tmp_path, pictures, monkeypatch
         "was begun with --size 100, not 90", process.process, pictures, out, max_features=300, size=90, error=SceneError
     )
     refuses("size must be at least 64, got 9", process.process, pictures, tmp_path / "new", size=9)
+
+
+def test_transparent_parts_have_no_features(tmp_path, pictures, monkeypatch):
+    (cut := tmp_path / "cut").mkdir()
+    for number, path in enumerate(sorted(pictures.iterdir())):
+        with Image.open(path) as image:  # the first one stays opaque
+            if number:
+                alpha = Image.fromarray(np.arange(WIDTH)[None].repeat(HEIGHT, 0) < WIDTH // 2)
+                image.putalpha(alpha.convert("L"))
+            image.save(cut / f"{number}.png")
+    monkeypatch.setattr(process, "_map", lambda *_: None)
+    refuses("no model", process.process, cut, tmp_path / "out", max_features=300, error=SceneError)
+    with pycolmap.Database.open(tmp_path / "out/colmap/database.db") as opened:
+        images = sorted(opened.read_all_images(), key=lambda image: image.name)
+        right = [opened.read_keypoints(image.image_id)[:, 0].max() > WIDTH // 2 + 1 for image in images]
+        counts = [opened.num_keypoints_for_image(image.image_id) for image in images]
+    assert right == [True] + (COUNT - 1) * [False] and min(counts) > 50
 
 
 def test_a_training_of_photographs_without_cameras_points_to_process(tmp_path):

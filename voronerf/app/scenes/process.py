@@ -2,7 +2,7 @@
 
 Its stages leave what they found in `OUT/colmap`, where a stopped process goes on and COLMAP's own program can look:
 
-    features   `database.db`: the features of each image
+    features   `database.db`: the features of each image; `masks`: where images are not transparent
     pairs      `few.db`: the largest features of each image, matched between all; `pairs.json`: those that share some
     matches    `database.db`: matches of those pairs
     cameras    `global` and, if that model has faults or loses cameras, `incremental`. Each is made again, by
@@ -57,6 +57,8 @@ CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
 LEAST_IMAGES = 3
 MATCHINGS = ("auto", "exhaustive", "sequential")
 MAPPERS = ("auto", "global", "incremental")
+#: Of transparent images, the alpha from which features count.
+OPAQUE = 128
 #: "auto" matches at most so many images all with all.
 FEW_IMAGES = 40
 #: Of the largest features of an image that choose its pairs; with how many images it is matched, and how many matches
@@ -138,7 +140,8 @@ def process(
     goes on there. `out/sparse/0` appears when all is done.
 
     Args:
-        source: a video, or a folder of PNG, JPEG or, with pillow-heif, HEIC images.
+        source: a video, or a folder of PNG, JPEG or, with pillow-heif, HEIC images. Transparent parts have no features:
+            the surroundings of an object on a turntable, which stand still, must be so.
         out: the folder to make. It must not exist, be empty, or be that of a process that was stopped.
         frames: of a video, evenly spread.
         matching: which images are matched: "exhaustive", all with all; "sequential", with those next to them by name;
@@ -188,6 +191,8 @@ def process(
     shared = "one camera" if count == 1 else f"{count} cameras, one for each size"
     say(f"{len(files)} images with {shared}; {work} keeps what COLMAP finds")
     stages = Stages(pycolmap, work, images, progress)
+    if any(read_header(path).alpha for path in files):
+        _write_masks(files, work / "masks")
     _match(stages, sizes, settings)
     models = _find_models(stages, mapper, len(files), say)
     if not models:
@@ -347,6 +352,8 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
     extraction.sift.max_num_features = settings.max_features
     extraction.max_image_size = settings.size
     reader = colmap.ImageReaderOptions(camera_model=settings.camera_model)
+    if (masks := stages.work / "masks").is_dir():
+        reader.mask_path = masks
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
 
@@ -613,6 +620,18 @@ def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
     os.replace(part, folder)
 
 
+def _write_masks(files: Sequence[Path], folder: Path) -> None:
+    """Writes masks as COLMAP reads them: black where an image is transparent."""
+    if folder.is_dir():
+        return
+    part = _emptied(folder.with_name(f".{folder.name}"))
+    for path in files:
+        pixels = read_image(path, 1)
+        opaque = pixels[..., 3] >= OPAQUE if pixels.shape[-1] == 4 else np.ones(pixels.shape[:2], dtype=bool)
+        Image.fromarray(opaque).save(part / f"{path.name}.png")
+    os.replace(part, folder)
+
+
 def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
     """Writes the images reduced by area, unless they are there or would be too small."""
     if folder.is_dir() or max(max(read_header(path).size) for path in files) // factor < LEAST_SIDE:
@@ -621,7 +640,9 @@ def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
     for path in files:
         with Image.open(path) as image:
             kept = {} if path.suffix.lower() == ".png" else {"quality": 95, "exif": image.getexif()}
-            image.reduce(factor).save(part / path.name, **kept)
+            indexed = image.mode in ("P", "1")
+            shown = image.convert("RGBA" if read_header(path).alpha else "RGB") if indexed else image
+            shown.reduce(factor).save(part / path.name, **kept)
     os.replace(part, folder)
 
 
