@@ -1,4 +1,4 @@
-"""Signs of a folded model, on matches of points that cameras on a circle see."""
+"""Signs of what misleads a mapper, on matches of points that cameras on a circle see."""
 
 import itertools
 import math
@@ -9,11 +9,13 @@ import torch
 
 from voronerf.app.scenes.colmap import ColmapCamera, ColmapImage
 from voronerf.app.scenes.folds import (
+    WIDE_MATCHES,
     Matches,
     contradicted_pairs,
     epipolar_angles,
     is_folded,
     spreads,
+    still_pairs,
     strong_pairs,
     trusted_pairs,
     wide_pairs,
@@ -54,6 +56,20 @@ def matches():
         rows = np.arange(200 if (b - a) % COUNT in (1, COUNT - 1) else 40)
         pairs[NAMES[a], NAMES[b]] = np.stack((rows, rows), 1)
     return Matches(features, pairs)
+
+
+def test_a_background_that_stands_still_is_seen_in_pairs_that_differ_by_a_shift():
+    found = matches()
+    assert still_pairs(found) == (0, len(found.pairs))
+    generator = np.random.default_rng(0)
+    background = generator.uniform((0, 0), (WIDTH, HEIGHT), (250, 2))
+    for name, places in found.features.items():  # each image is cut out at another place
+        found.features[name] = np.concatenate((places, background + generator.uniform(-30, 30, 2)))
+    behind = np.arange(200, 450)[:, None].repeat(2, 1)
+    moved = {pair: np.concatenate((rows, behind)) for pair, rows in found.pairs.items()}
+    assert still_pairs(Matches(found.features, moved)) == (len(moved), len(moved))
+    few = {pair: rows[: WIDE_MATCHES - 1] for pair, rows in moved.items()}
+    assert still_pairs(Matches(found.features, few)) == (0, 0)
 
 
 def neighbours():

@@ -178,7 +178,7 @@ def test_a_folded_model_is_made_again_by_pairs_that_can_be_trusted(tmp_path, mon
         """The mappers that were asked, what was said, and which model is the best of 10 images."""
         asked, said = models(tmp_path, monkeypatch, pictures, **of_mappers), []
         stages = process.Stages(pycolmap, tmp_path, pictures, print)
-        made = process._find_models(stages, "auto", 10, said.append)
+        made = process._find_models(stages, process._read_matches(stages), "auto", 10, said.append)
         return asked, said, process._best(made, 10)
 
     folded = (circle(10), 4)
@@ -421,6 +421,15 @@ def test_transparent_parts_have_no_features(tmp_path, pictures, monkeypatch):
         right = [opened.read_keypoints(image.image_id)[:, 0].max() > WIDTH // 2 + 1 for image in images]
         counts = [opened.num_keypoints_for_image(image.image_id) for image in images]
     assert right == [True] + (COUNT - 1) * [False] and min(counts) > 50
+
+
+def test_a_background_that_stands_still_is_said(tmp_path, pictures, monkeypatch):
+    monkeypatch.setattr(process, "_map", lambda *_: None)
+    for still, lines in ((3, 0), (8, 1)):
+        monkeypatch.setattr(process, "still_pairs", lambda _, still=still: (still, 28))
+        out, said = tmp_path / f"{still}", []
+        refuses("no model", process.process, pictures, out, max_features=300, say=said.append, error=SceneError)
+        assert sum("8 of 28 pairs differ by a shift alone" in line for line in said) == lines
 
 
 def test_a_training_of_photographs_without_cameras_points_to_process(tmp_path):

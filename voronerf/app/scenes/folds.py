@@ -1,4 +1,7 @@
-"""Signs of a folded model: pictures of a thing that looks alike from two sides, placed on one of them.
+"""Signs of what misleads a mapper: a background that stands still, and a thing that looks alike from two sides.
+
+Behind an object on a turntable the background has most features, and shows a camera that does not move. A model is
+folded if pictures of two sides of a thing are placed on one of them.
 
 Matches between two sides lie on that thing alone, and it fills little of the pictures. Matches of neighbours reach over
 much of them. So the latter are believed, and a model that contradicts them is folded.
@@ -35,6 +38,10 @@ HOLDING = 2
 CONTRADICTED = 0.02
 #: A model is folded if it contradicts so many strong pairs, and this share of them.
 FOLDED_PAIRS, FOLDED = 3, 0.01
+#: A pair of images is still if more than this share of its matches lie within this distance of their median shift, in
+#: parts of the longest side of the features. Of bust, beer, fern, fox and mouse at most 2 % of the pairs are, of a head
+#: on a turntable 57 %. From this share of them on a background stands still.
+SHIFTED, SHIFT, STILL = 0.5, 0.0025, 0.25
 #: In the place of zero, where a length divides.
 TINY = 1e-12
 
@@ -59,6 +66,18 @@ def _box(places: Array) -> float:
     """The area of a box of places [n, 2], without the 5 % at each border."""
     low, high = np.quantile(places, (0.05, 0.95), axis=0) if len(places) else np.zeros((2, 2))
     return float((high - low).prod())
+
+
+def still_pairs(matches: Matches) -> tuple[int, int]:
+    """How many pairs of images differ by a shift alone in most of their matches, and how many have enough matches."""
+    lengths = {name: float(np.ptp(places, axis=0).max()) for name, places in matches.features.items() if len(places)}
+    known = {pair: found for pair, found in matches.pairs.items() if len(found) >= WIDE_MATCHES}
+    count = 0
+    for (a, b), found in known.items():
+        moved = matches.features[b][found[:, 1]] - matches.features[a][found[:, 0]]
+        off = np.linalg.norm(moved - np.median(moved, axis=0), axis=1)
+        count += bool((off < SHIFT * lengths[a]).mean() > SHIFTED)
+    return count, len(known)
 
 
 def wide_pairs(matches: Matches, spread: dict[Pair, float]) -> list[Pair]:

@@ -38,11 +38,13 @@ from voronerf.app.scenes.colmap import FILES, ColmapImage, ColmapModel, depth_bo
 from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import HEIF, listed_images
 from voronerf.app.scenes.folds import (
+    STILL,
     Matches,
     Pair,
     contradicted_pairs,
     is_folded,
     spreads,
+    still_pairs,
     strong_pairs,
     trusted_pairs,
     wide_pairs,
@@ -194,7 +196,14 @@ def process(
     if any(read_header(path).alpha for path in files):
         _write_masks(files, work / "masks")
     _match(stages, sizes, settings)
-    models = _find_models(stages, mapper, len(files), say)
+    matches = _read_matches(stages)
+    still, pairs = still_pairs(matches)
+    if still > STILL * pairs:
+        say(
+            f"check the images: {still} of {pairs} pairs differ by a shift alone, so that a background stands still; "
+            "the surroundings of an object on a turntable must be transparent (PNG)"
+        )
+    models = _find_models(stages, matches, mapper, len(files), say)
     if not models:
         raise SceneError(f"{source}: COLMAP finds no model: the images must overlap, be sharp and differ in place")
     best = _best(models, len(files))
@@ -452,9 +461,8 @@ def _choose_pairs(colmap: Any, few: Path) -> list[Pair]:
     return sorted((a, b) for a, b in pairs)
 
 
-def _find_models(stages: Stages, mapper: str, count: int, say: Callable[[str], None]) -> list[Model]:
+def _find_models(stages: Stages, matches: Matches, mapper: str, count: int, say: Callable[[str], None]) -> list[Model]:
     """The models of a mapper or, with "auto", of as many as it takes for a good one of so many images."""
-    matches = _read_matches(stages)
     spread = spreads(matches)
     strong, models = strong_pairs(matches, wide_pairs(matches, spread)), list[Model]()
     for name, again in itertools.product(MAPPERS[1:], (False, True)):
