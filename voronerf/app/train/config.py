@@ -39,7 +39,8 @@ class SceneSettings:
     """Scene folder (--format says which there are), or a built-in scene: "builtin", "builtin:400" of so many
     pixels, or "builtin-city:4x4", a city of so many blocks."""
     format: Literal["auto", "blender", "colmap", "transforms", "llff"] = "auto"
-    """What is read of a scene folder; auto is the first of them that it holds, in this order."""
+    """What is read of a scene folder; auto is the first of them that it holds, in this order, but
+    transforms before the model in colmap/sparse/0 that nerfstudio made it of."""
     kind: Literal["auto", "object", "forward", "inside-out", "unbounded"] = "auto"
     """Kind of scene: an object on white; cameras that look the same way; that look outwards; or that look at one place
     with surroundings. auto tells it by transparent pixels and by the cameras."""
