@@ -1,5 +1,7 @@
 """The built-in scene against its own formulas, and the box that is carved from its masks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -159,6 +161,26 @@ def test_carved_box_holds_the_scene_and_is_tight(scene):
     assert (box[1] - scene.box[1]).max() < 0.12 * sides
     # below the plinth no view from above can carve everything
     assert (scene.box[0] - box[0])[:2].max() < 0.12 * sides and (scene.box[0] - box[0])[2] < 0.5 * sides
+
+
+@pytest.mark.parametrize("k1", [-1.0, 0.8])
+def test_box_is_carved_by_masks_of_a_lens(scene, k1):
+    straight = scene.train.cameras
+    lenses = torch.zeros(len(straight), 8)
+    lenses[:, 0] = k1
+    cameras = replace(straight, distortion=lenses)
+    masks = scene.train.images[..., 3]
+    bent = torch.zeros_like(masks)
+    for index in range(len(cameras)):  # what each pixel of the lens sees
+        rays = cameras.image_rays(index)
+        column, row = straight.project(rays.origins + rays.directions, index)[0].floor().long().unbind(-1)
+        seen = (column >= 0) & (column < 40) & (row >= 0) & (row < 40)
+        bent[index].view(-1)[seen] = masks[index, row[seen], column[seen]]
+    found, expected = carve_box(cameras, bent, 2.0, 6.0), carve_box(straight, masks, 2.0, 6.0)
+    assert found is not None and expected is not None
+    assert (found - expected).abs().max() < 0.02
+    without = carve_box(straight, bent, 2.0, 6.0)
+    assert without is not None and (without - expected).abs().max() > 0.05
 
 
 def test_no_box_without_silhouettes(scene):

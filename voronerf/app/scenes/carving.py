@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from voronerf.nerf.cameras import Cameras, focus_point
+from voronerf.nerf.lenses import distort
 
 Array = NDArray[np.float32]
 
@@ -36,19 +37,20 @@ def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tenso
     a fortieth of the object's size, and by concave parts that no silhouette shows.
 
     Args:
-        cameras: c cameras without lens distortion that look at the object from around it.
+        cameras: c perspective cameras that look at the object from around it.
         alpha: uint8 [c, h, w]; a pixel with alpha > 0 shows the object. Zero beside smaller images.
         near: distance before which there is nothing.
         far: distance behind which there is nothing; the search covers a cube of half side (far - near) / 2.
 
     Returns:
-        float32 [2, 3], or None if there is no such box: nothing or everything is opaque, the lens distorts, the cameras
-        have no common focus, or the rays of more than a thousandth of the masks' pixels would miss the box.
+        float32 [2, 3], or None if there is no such box: nothing or everything is opaque, a lens is a fisheye's or the
+        like, the cameras have no common focus, or the rays of more than a thousandth of the masks' pixels would miss
+        the box.
     """
     every = -(-len(cameras) // VIEWS)
     cameras, visible = cameras[::every], (alpha[::every] > 0).numpy()
     focus = focus_point(cameras)
-    if focus is None or cameras.distortion is not None or not visible.any() or visible.all():
+    if focus is None or cameras.models is not None or not visible.any() or visible.all():
         return None
     shrink = max(1, min(visible.shape[1:]) // MASK_PIXELS, max(visible.shape[1:]) // MOST_MASK_PIXELS)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -74,7 +76,10 @@ class _Silhouette:
         mask = _block_any(visible, shrink)
         self.height, self.width = mask.shape
         # A view that shows the whole object also rules out what lies outside its picture.
-        self.whole = not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
+        self.whole = not _touches_border(mask)
+        if cameras.distortion is not None:
+            mask = self._straightened(mask, cameras.distortion[index])
+            self.whole &= not _touches_border(mask)
         mask = np.pad(mask, MARGIN)
         levels = []
         done = 0
@@ -85,6 +90,16 @@ class _Silhouette:
             done = grow
         levels.append(np.ones_like(mask))  # for voxels that are wider still
         self.masks = np.stack(levels)
+
+    def _straightened(self, mask: NDArray[np.bool_], coefficients: Tensor) -> NDArray[np.bool_]:
+        """The mask as a camera without the lens would have it; what the picture does not show may be the object."""
+        row, column = torch.from_numpy(np.indices(mask.shape) + 0.5)
+        u, v = distort((column - self.cx) / self.fx, (row - self.cy) / self.fy, coefficients)
+        x, y = (u * self.fx + self.cx).floor().numpy(), (v * self.fy + self.cy).floor().numpy()
+        shown = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        straight = np.full(mask.shape, not self.whole)
+        straight[shown] = mask[y[shown].astype(np.int64), x[shown].astype(np.int64)]
+        return straight
 
     def judge(self, points: Array, radius: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """(seen [n], missed [n]): the balls that this view sees, and those of them that lie outside its mask."""
@@ -129,6 +144,11 @@ def _block_any(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
     padded = np.pad(mask, ((0, -height % size), (0, -width % size)))
     blocks = padded.reshape(padded.shape[0] // size, size, padded.shape[1] // size, size)
     return np.asarray(blocks.any(axis=(1, 3)))
+
+
+def _touches_border(mask: NDArray[np.bool_]) -> bool:
+    """Whether any pixel at the border is set."""
+    return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
 def _widen(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
