@@ -2,7 +2,7 @@
 
 c images, n sparse points. A scene is moved, turned and scaled so that the networks meet the same numbers whatever the
 units of its files: what the cameras look at becomes the origin, their mean up direction the z axis, and the farthest
-camera is at distance 1.
+camera is at distance 1, or the longest side of an object's box is 5.
 """
 
 from __future__ import annotations
