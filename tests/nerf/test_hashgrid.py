@@ -11,6 +11,7 @@ from voronerf.app.scenes import SceneError, builtin_scene, load_scene
 from voronerf.app.train.build import check_memory, make_routers
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.defaults import resolve
+from voronerf.nerf.fields.hashgrid import BOX_DENSITY, BOX_INITIAL
 
 
 def rays(n):
@@ -85,7 +86,19 @@ def test_the_grid_grows_with_the_images():
         assert contracted == {"box": box, "finest": 353, "log2_entries": entries, "density_scale": 40.0}
 
 
+@pytest.mark.parametrize("side", [0.1, 2.5, 100.0])
+def test_a_field_begins_alike_in_a_box_of_any_size(side):
+    low, high = (0.0, 0.0, 0.0), (side, side / 2, side / 3)
+    torch.manual_seed(0)
+    field = HashGridField(**HashGridField.scene_options(side / 100, (low, high), False, 60))
+    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    _, density = field(torch.rand(500, 3) * torch.tensor(high), directions)
+    assert 0.5 < float(density.mean()) * side / BOX_INITIAL < 2
+    assert field.density_scale * side == pytest.approx(BOX_DENSITY)
+
+
 def test_bad_settings():
+    refuses("HashGridField: initial_density must be positive, got 0", HashGridField, initial_density=0)
     refuses("HashGridField: width must be at least 2 and depth 1, got 1 and 1", HashGridField, width=1)
     refuses("HashGrid: log2_entries must be an integer from 10 to 24, got 30", HashGridField, log2_entries=30)
     with pytest.raises(ConfigError, match=r"--field nerf of --width 4096 with 10000 cells needs .* GiB of"):

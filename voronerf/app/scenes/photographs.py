@@ -2,7 +2,7 @@
 
 c images, n sparse points. A scene is moved, turned and scaled so that the networks meet the same numbers whatever the
 units of its files: what the cameras look at becomes the origin, their mean up direction the z axis, and the farthest
-camera is at distance 1, or the longest side of an object's box is 5.
+camera is at distance 1.
 """
 
 from __future__ import annotations
@@ -38,9 +38,6 @@ NEAREST = 0.05
 FAR = 4.0
 # Smallest near bound that points give; half of the samples lie before twice the near bound.
 LEAST_NEAR = 0.02
-# The longest side of the box of an object. In a smaller one a field begins thinner, since its density is one of scene
-# units: of a dark head with a side of 1.7 all colours became one, with 2.5 it was 1.4 dB behind.
-OBJECT_SIDE = 5.0
 # Of the bounds of the views: things may be a little nearer than the nearest point, and farther than the farthest.
 NEARER, FARTHER = 0.75, 1.5
 # Mean of the viewing directions, a unit vector each, from which on they count as one direction.
@@ -150,11 +147,6 @@ def photograph_scene(
         box = carve_box(cameras[:count], pictures.images[:count, ..., 3], frame.near, frame.far)
         if box is None and cameras.models is None:
             notes = [*notes, "check the cameras: the silhouettes of the object do not fit together, it has no box"]
-        if box is not None and reading.normalise:
-            scale = OBJECT_SIDE / float((box[1] - box[0]).max())
-            poses = cameras.poses.clone()
-            poses[:, :3, 3] *= scale
-            frame, cameras, box = frame.enlarged(scale), replace(cameras, poses=poses), scale * box
     names = tuple(distinct_names([view.path for view in views], folder))
     train, test = (
         Split(
@@ -265,11 +257,6 @@ class Frame:
     def scale(self) -> float:
         """Lengths in the scene over those in the files."""
         return float(torch.linalg.det(self.matrix[:3, :3])) ** (1 / 3)
-
-    def enlarged(self, factor: float) -> Frame:
-        """The frame of the scene enlarged about its origin."""
-        larger = torch.diag(torch.tensor([factor, factor, factor, 1.0], dtype=torch.float64))
-        return replace(self, matrix=larger @ self.matrix, near=factor * self.near, far=factor * self.far)
 
     def poses(self, poses: Tensor) -> Tensor:
         """Poses float64 [c, 4, 4] in the scene, rigid as before."""

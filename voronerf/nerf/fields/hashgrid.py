@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import nn
 
-from voronerf.nerf.fields.radiance import RadianceField, reset_layers
+from voronerf.nerf.fields.radiance import INITIAL_DENSITY, RadianceField, reset_layers
 from voronerf.ops._core.checks import physical_memory
 from voronerf.ops._core.grids import UNIT_CUBE, HashGrid
 from voronerf.ops._core.layers import MLP, Layer
@@ -23,6 +23,10 @@ CONTRACTED_ENTRIES, LONG_ENTRIES, LONG = 17, 19, 25.0
 
 #: The density scale in contracted space.
 CONTRACTED_DENSITY = 40.0
+
+#: The density scale and the density of the untrained field in a box, times its longest side. A field that begins
+#: thinner learns more slowly: of a dark object, all colours may become one while it lets most of the light through.
+BOX_DENSITY, BOX_INITIAL = 200.0, 2.0
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
@@ -48,6 +52,7 @@ class HashGridField(RadianceField):
         direction_octaves: Octaves of the encoding of the view direction.
         view_directions: Whether colour depends on the view direction.
         density_scale: Factor on the density, per scene unit, > 0.
+        initial_density: Of the untrained field, per scene unit, > 0.
 
     Raises:
         ValueError: For a size out of range, or a table that does not fit into memory.
@@ -82,6 +87,7 @@ class HashGridField(RadianceField):
         direction_octaves: int = 2,
         view_directions: bool = True,
         density_scale: float = 10.0,
+        initial_density: float = INITIAL_DENSITY,
     ) -> None:
         super().__init__()
         if width < 2 or depth < 1:
@@ -90,11 +96,14 @@ class HashGridField(RadianceField):
             raise ValueError(f"HashGridField: direction_octaves must not be negative, got {direction_octaves}")
         if not density_scale > 0:
             raise ValueError(f"HashGridField: density_scale must be positive, got {density_scale}")
+        if not initial_density > 0:
+            raise ValueError(f"HashGridField: initial_density must be positive, got {initial_density}")
         grid = HashGrid(levels, level_features, log2_entries, base, finest, box or UNIT_CUBE)
         trunk = [Layer(("positions",) if i == 0 else (i - 1,), width, "relu") for i in range(depth)]
         view: tuple[int | str, ...] = (depth - 1, "directions") if view_directions else (depth - 1,)
         heads = [Layer((depth - 1,), 1), Layer(view, width, "relu"), Layer((depth + 1,), 3)]
         self.view_directions, self.density_scale = view_directions, density_scale
+        self.initial_density = initial_density
         self.layers = MLP(
             (*trunk, *heads),
             outputs=(depth + 2, depth),
@@ -127,9 +136,11 @@ class HashGridField(RadianceField):
         the entries grow more slowly, since larger tables take longer to read and to learn: 2^15 for an object of 88
         pixels, 2^18 for 353. In contracted space, most of what is seen is farther away than the middle, by which a
         pixel is measured: the finest cells are as wide as that pixel, and there are 2^17 entries, or 2^19 in a training
-        of at least 25 seconds. Surfaces there are thinner beside all of space, so the density has a larger scale.
+        of at least 25 seconds. Surfaces there are thinner beside all of space, so the density has a larger scale. In a
+        box the density goes with its size, whatever the units of the scene are.
         """
-        pixels = max(high - low for low, high in zip(*box)) / pixel
+        side = max(high - low for low, high in zip(*box))
+        pixels = side / pixel
         finest, entries = round((1 if contracted else 2) * pixels), round(1.5 * math.log2(pixels) + 5.3)
         large = LONG_ENTRIES if seconds >= LONG else CONTRACTED_ENTRIES
         options = {
@@ -137,12 +148,14 @@ class HashGridField(RadianceField):
             "finest": max(finest, 32),
             "log2_entries": large if contracted else min(max(entries, 14), 19),
         }
-        return {**options, "density_scale": CONTRACTED_DENSITY} if contracted else options
+        if contracted:
+            return {**options, "density_scale": CONTRACTED_DENSITY}
+        return {**options, "density_scale": BOX_DENSITY / side, "initial_density": BOX_INITIAL / side}
 
     def reset_parameters(self) -> None:
         """Features near zero, as published; the layers as in :func:`voronerf.nerf.fields.radiance.reset_layers`."""
         nn.init.uniform_(self.features, -1e-4, 1e-4)
-        reset_layers(self.linears(), [self.density, self.colour], self.density_scale)
+        reset_layers(self.linears(), [self.density, self.colour], self.density_scale, self.initial_density)
         for layer in (*self.linears()[:-3], self.view):
             nn.init.constant_(layer.bias, HIDDEN_BIAS)
 

@@ -38,21 +38,27 @@ def activate_radiance(self: Any, raw: Tensor) -> tuple[Tensor, Tensor]:
     return torch.sigmoid(colour), F.softplus(density.squeeze(-1)) * self.density_scale
 
 
-def reset_layers(layers: Sequence[nn.Linear], heads: Sequence[nn.Linear], density_scale: float) -> None:
+def reset_layers(
+    layers: Sequence[nn.Linear],
+    heads: Sequence[nn.Linear],
+    density_scale: float,
+    initial_density: float = INITIAL_DENSITY,
+) -> None:
     """He initialisation of ReLU layers (He et al. 2015), small heads, and a density that can grow.
 
     Args:
         layers: all layers, the heads too.
         heads: those without an activation; the first gives the density.
         density_scale: factor on the softplus of the density.
+        initial_density: of the untrained field, per scene unit.
     """
     for layer in layers:
         nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
         nn.init.zeros_(layer.bias)
     for head in heads:
         nn.init.xavier_uniform_(head.weight, gain=0.1)
-    # The inverse of softplus, so that the untrained density is INITIAL_DENSITY wherever the head's weights say 0.
-    nn.init.constant_(heads[0].bias, math.log(math.expm1(INITIAL_DENSITY / density_scale)))
+    # The inverse of softplus, so that the untrained density is that wherever the head's weights say 0.
+    nn.init.constant_(heads[0].bias, math.log(math.expm1(initial_density / density_scale)))
 
 
 def run_network(
