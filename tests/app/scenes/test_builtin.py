@@ -12,7 +12,7 @@ from voronerf.app.scenes.builtin.caster import Caster
 from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, shaded
 from voronerf.app.scenes.builtin.plain import SOLIDS
 from voronerf.app.scenes.builtin.solids import Box, Cylinder, Sphere, Torus, rotation
-from voronerf.app.scenes.carving import carve_box
+from voronerf.app.scenes.carving import MARGIN, _Silhouette, carve_box
 from voronerf.nerf.cameras import Cameras
 
 
@@ -181,6 +181,18 @@ def test_box_is_carved_by_masks_of_a_lens(scene, k1):
     assert (found - expected).abs().max() < 0.02
     without = carve_box(straight, bent, 2.0, 6.0)
     assert without is not None and (without - expected).abs().max() > 0.05
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_what_a_picture_does_not_show_may_be_an_object_that_it_cuts(scene, cut):
+    lenses = torch.zeros(len(scene.train.cameras), 8)
+    lenses[:, 0] = 0.8  # a camera without the lens sees more at its borders
+    visible = np.zeros((40, 40), dtype=bool)
+    visible[18:22, 18:] = cut
+    visible[18:22, 18:22] = True
+    silhouette = _Silhouette(replace(scene.train.cameras, distortion=lenses), 0, visible, 1)
+    straight = silhouette.masks[0][MARGIN:-MARGIN, MARGIN:-MARGIN]
+    assert silhouette.whole != cut and straight[20, 20] and straight[0, 0] == cut
 
 
 def test_no_box_without_silhouettes(scene):

@@ -185,7 +185,7 @@ def test_silhouettes_that_do_not_fit_together_are_said(tmp_path):
             Image.fromarray(image.numpy()).save(folder / f"{number:02d}.png")
         scene = load_scene(folder)
         assert scene.kind == "object" and (scene.box is None) == wrong
-        assert any("the silhouettes of the object do not fit" in note for note in scene.notes) == wrong
+        assert any("the silhouettes of the object give no box" in note for note in scene.notes) == wrong
 
 
 def test_images_of_different_sizes_train_and_are_scored_as_they_are(tmp_path):

@@ -146,7 +146,7 @@ def photograph_scene(
     if kind == "object":
         box = carve_box(cameras[:count], pictures.images[:count, ..., 3], frame.near, frame.far)
         if box is None and cameras.models is None:
-            notes = [*notes, "check the cameras: the silhouettes of the object do not fit together, it has no box"]
+            notes = [*notes, "check the cameras: the silhouettes of the object give no box around it"]
     names = tuple(distinct_names([view.path for view in views], folder))
     train, test = (
         Split(
