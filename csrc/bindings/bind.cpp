@@ -9,6 +9,7 @@
 #include <deque>
 #include <map>
 #include <optional>
+#include <set>
 #include <stdexcept>
 
 #include "common/cuda_device.h"
@@ -60,6 +61,7 @@ Recording*& recorded() {  // the one that the calling thread's calls are added t
   return recording;
 }
 const Count* count_of(Recording& recording, int64_t rows);
+void add_tensor(Recording& recording, PyObject* tensor);
 
 // What a call has taken from Python, given back when it ends.
 class Frame {
@@ -122,7 +124,8 @@ class Frame {
         return false;
       case Type::Kind::text:
         if (!PyUnicode_Check(given)) return false;
-        *static_cast<const char**>(place) = PyUnicode_AsUTF8(given);  // which the string keeps
+        *static_cast<const char**>(place) = PyUnicode_AsUTF8(given);
+        keep(given);  // which has the letters
         return *static_cast<const char**>(place) != nullptr;
       case Type::Kind::tensor:
         return load_tensor(type, given, *static_cast<void**>(place));
@@ -142,6 +145,7 @@ class Frame {
       case Type::Kind::opaque:
         if (!PyCapsule_IsValid(given, type.exact.c_str())) return false;
         place = PyCapsule_GetPointer(given, type.exact.c_str());
+        keep(given);
         return true;
       default:
         return false;
@@ -150,6 +154,11 @@ class Frame {
 
  private:
   static void store(void* place, long long value, size_t size) { std::memcpy(place, &value, size); }
+
+  void keep(PyObject* given) {
+    Py_INCREF(given);
+    kept_.push_back(given);
+  }
 
   // Tensors: anything with a dtype, contiguous(), is_contiguous(), is_neg(), resolve_neg() and data_ptr().
   bool load_tensor(const Type& type, PyObject* given, void*& address) {
@@ -174,8 +183,7 @@ class Frame {
     } else {
       Py_DECREF(answer);  // True or False
       if (answer != Py_True) return false;
-      Py_INCREF(given);
-      kept_.push_back(given);
+      keep(given);
     }
     PyObject* const negative = PyObject_CallMethodNoArgs(kept_.back(), negative_word);
     if (negative == nullptr) return PyErr_Clear(), false;
@@ -192,6 +200,7 @@ class Frame {
     if (found == nullptr && holds_entries(kept_.back())) return false;  // memory that was freed, as by storage.resize_
     alignas(64) static char nothing[64];
     address = found == nullptr ? nothing : found;
+    if (recorded() != nullptr) add_tensor(*recorded(), kept_.back());
     return true;
   }
 
@@ -339,7 +348,18 @@ void call(const Loaded& loaded, Result& result) {
   }
 }
 
-// Members of dictionaries that must stay the same objects, but for that of the key `skip`.
+// The address of a tensor's memory; null and no error where it has none.
+const void* address_of(PyObject* tensor) {
+  static PyObject* const word = PyUnicode_InternFromString("data_ptr");
+  PyObject* const number = PyObject_CallMethodNoArgs(tensor, word);
+  const void* const address = number == nullptr ? nullptr : PyLong_AsVoidPtr(number);
+  PyErr_Clear();
+  Py_XDECREF(number);
+  return address;
+}
+
+// Members of dictionaries that must stay the same objects, but for that of the key `skip`, and tensors that must stay
+// where they are. Their storages are held too: memory that a tensor has left (`x.data = y`) is not freed.
 class Guards {
  public:
   void add(const py::dict& members, const std::string& skip) {
@@ -349,6 +369,10 @@ class Guards {
       guard.values.push_back(any ? py::object() : py::reinterpret_borrow<py::object>(value));
     }
     guards_.push_back(std::move(guard));
+  }
+  void add_tensor(const py::object& tensor) {
+    if (!known_.insert(tensor.ptr()).second) return;
+    tensors_.push_back({tensor, tensor.attr("untyped_storage")(), address_of(tensor.ptr())});
   }
   // Compares addresses alone: between the kernels of a loop, whatever is looked at must come from memory.
   bool hold() const {
@@ -361,7 +385,8 @@ class Guards {
       }
       if (i != guard.values.size()) return false;
     }
-    return true;
+    return std::all_of(tensors_.begin(), tensors_.end(),
+                       [](const Held& held) { return address_of(held.tensor.ptr()) == held.address; });
   }
 
  private:
@@ -369,11 +394,17 @@ class Guards {
     py::dict members;
     std::vector<py::object> values;  // null for any
   };
+  struct Held {
+    py::object tensor, storage;
+    const void* address;
+  };
   std::vector<Guard> guards_;
+  std::vector<Held> tensors_;
+  std::set<PyObject*> known_;  // of these
 };
 
-// Calls of a step in their order, with what they have taken, to be made again on the same memory. A number of rows is
-// read again from where it lies, so the memory must do for the most rows.
+// Calls of a step in their order, with what they have taken, to be made again on the same memory, which is held. A
+// number of rows is read again from where it lies, so the memory must do for the most rows.
 class Recording {
  public:
   // Calls of this thread are added from here to `end`, in the place of those from before.
@@ -381,13 +412,17 @@ class Recording {
     calls_.clear();
     counts_.clear();
     obstacle_.clear();
+    tensors_ = {};
     recorded() = this;
   }
   void end() { recorded() = nullptr; }
 
-  void count(std::uintptr_t memory, int64_t most) {
-    counts_.push_back({reinterpret_cast<const int64_t*>(memory), most});
+  void count(const py::object& memory, int64_t most) {
+    tensors_.add_tensor(memory);
+    counts_.push_back({static_cast<const int64_t*>(address_of(memory.ptr())), most});
   }
+  // A tensor that is read or written, or of which one that is, is a view.
+  void add_tensor(const py::object& tensor) { tensors_.add_tensor(tensor); }
   const Count* count_of(int64_t rows) {
     const Count* found = nullptr;
     for (const Count& count : counts_) {
@@ -403,9 +438,10 @@ class Recording {
   }
 
   // Makes the calls again, so many times in a row. Before each time the next random numbers, `bytes` for each of
-  // `places`, are copied there. Gives how often they were made: it ends before a call that would exceed its memory.
-  // With a trace they have no team.
+  // `places`, are copied there. Gives how often they were made: it ends before a call that would exceed its memory, and
+  // does not begin where a tensor has moved. With a trace they have no team.
   int replay(int threads, int times, std::uintptr_t drawn, const std::vector<std::uintptr_t>& places, size_t bytes) {
+    if (!tensors_.hold()) return 0;
     const py::gil_scoped_release released;
     int made = 0;
     std::exception_ptr failure;
@@ -451,9 +487,13 @@ class Recording {
   std::vector<std::unique_ptr<Loaded>> calls_;
   std::deque<Count> counts_;
   std::string obstacle_;
+  Guards tensors_;
 };
 
 const Count* count_of(Recording& recording, int64_t rows) { return recording.count_of(rows); }
+void add_tensor(Recording& recording, PyObject* tensor) {
+  recording.add_tensor(py::reinterpret_borrow<py::object>(tensor));
+}
 
 py::object run(Loaded& loaded) {
   const Bound& bound = *loaded.bound;
@@ -542,6 +582,7 @@ constexpr const char* kStub =
     "\n"
     "class Guards:\n"
     "    def add(self, members: Any, skip: str) -> None: ...\n"
+    "    def add_tensor(self, tensor: Tensor) -> None: ...\n"
     "    def hold(self) -> bool: ...\n"
     "\n"
     "class Recording:\n"
@@ -549,7 +590,8 @@ constexpr const char* kStub =
     "    def __len__(self) -> int: ...\n"
     "    def begin(self) -> None: ...\n"
     "    def end(self) -> None: ...\n"
-    "    def count(self, memory: int, most: int) -> None: ...\n"
+    "    def count(self, memory: Tensor, most: int) -> None: ...\n"
+    "    def add_tensor(self, tensor: Tensor) -> None: ...\n"
     "    def replay(self, threads: int, times: int, drawn: int, places: list[int], bytes: int) -> int: ...\n"
     "\n"
     "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n"
@@ -659,12 +701,17 @@ void bind_all(PyObject* python) {
     if (!there) continue;
     bound.def(name.c_str(), [one = &function](const py::args& given) { return call_any(*one, given); });
   }
-  py::class_<Guards>(bound, "Guards").def(py::init()).def("add", &Guards::add).def("hold", &Guards::hold);
+  py::class_<Guards>(bound, "Guards")
+      .def(py::init())
+      .def("add", &Guards::add)
+      .def("add_tensor", &Guards::add_tensor)
+      .def("hold", &Guards::hold);
   py::class_<Recording>(bound, "Recording")
       .def(py::init())
       .def("begin", &Recording::begin)
       .def("end", &Recording::end)
       .def("count", &Recording::count)
+      .def("add_tensor", &Recording::add_tensor)
       .def("replay", &Recording::replay)
       .def("__len__", &Recording::size)
       .def_property_readonly("obstacle", &Recording::obstacle);

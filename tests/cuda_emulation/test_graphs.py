@@ -76,6 +76,29 @@ def captured(replays):
     return ["register", "capture", *["replay"] * replays]
 
 
+@pytest.mark.parametrize("which", ["parameter", "gradient", "moment", "grid", "pictures", "centres"])
+def test_moved_memory_is_captured_anew(which):
+    """The graph goes on with the addresses that it has, so what lies there is held, and no longer used."""
+    with emulated(), graphs() as seen:
+        state = built()
+        steps(state, 7)
+        parameter = state.router.module.colour.weight
+        moved = {
+            "parameter": parameter,
+            "gradient": parameter.grad,
+            "moment": state.optimizer.state[parameter]["exp_avg"],
+            "grid": state.sampler.grid.density,
+            "pictures": state.training_step.batches.images,
+            "centres": state.router.diagram.centres,
+        }[which]
+        before = seen.calls.count("capture")
+        steps(state, 2)
+        assert seen.calls.count("capture") == before
+        moved.data = moved.data.clone()
+        steps(state, 2)
+        assert seen.calls.count("capture") == before + 1
+
+
 class Reading(SplitStrategy):
     __module__ = "voronerf.tests"
 

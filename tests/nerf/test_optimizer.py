@@ -25,6 +25,24 @@ def test_dense_groups_are_torchs():
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("option", ["weight_decay", "amsgrad", "maximize", "differentiable"])
+def test_options_that_are_not_there_are_refused(option):
+    """In a group, and where one is set later; nothing has moved then."""
+    weight = torch.nn.Parameter(torch.ones(3))
+    value = 0.1 if option == "weight_decay" else True
+    with pytest.raises(ValueError, match=f"Adam: {option} of a group must be 0 or False, got {value}"):
+        Adam([{"params": [weight], option: value}], lr=0.1)
+    optimizer = Adam([weight], lr=0.1)
+    optimizer.param_groups[0][option] = value
+    weight.grad = torch.ones(3)
+    with pytest.raises(ValueError, match=f"Adam: {option} of a group must be"):
+        optimizer.step()
+    assert bool((weight == 1).all()) and not optimizer.state[weight]
+    optimizer.param_groups[0][option] = False
+    optimizer.step()
+    assert bool((weight < 1).all())
+
+
 def test_tables_move_where_they_have_a_gradient_and_keep_it():
     table, other = torch.nn.Parameter(torch.ones(6, 2)), torch.nn.Parameter(torch.ones(2))
     optimizer = Adam([{"params": [other]}, {"params": [table], "sparse": True}], lr=0.5)

@@ -5,80 +5,14 @@ from itertools import pairwise
 
 import pytest
 import torch
+from step_training import BOX, Training, same
 
-from voronerf import HashGridField, OccupancyGrid, VoronoiRouter
-from voronerf.nerf import (
-    Adam,
-    DirectionPerSample,
-    Occupancy,
-    PlannedSplit,
-    RayBatches,
-    RayLoss,
-    Renderer,
-    SplitStrategy,
-    TrainingStep,
-    orbit_cameras,
-)
-from voronerf.ops import Guard
+from voronerf import OccupancyGrid
+from voronerf.nerf import Occupancy, PlannedSplit, SplitStrategy
+from voronerf.ops import cell_sort
 from voronerf.ops._core.recording import Recording
 
 pytestmark = pytest.mark.native
-BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
-
-
-class Training:
-    """A small training, whose grid empties a part of the box, so that its numbers of samples vary.
-
-    As of a photograph it has points of a sparse model, and rays from where no camera was.
-    """
-
-    def __init__(self, cells=1, field=None, sampler=Occupancy, photograph=False, **options):
-        torch.manual_seed(0)
-        cameras = orbit_cameras(3, radius=3.0, elevation=0.3, width=16, height=16, focal=16.0)
-        images = torch.randint(256, (3, 16, 16, 3), dtype=torch.uint8)
-        points = torch.arange(0, 768, 7), torch.full((110,), 3.0)
-        where = {"unseen": 0.5, "sparse": points} if photograph else {"box": BOX}
-        self.batches = RayBatches(cameras, images, near=1.0, far=5.0, background=torch.ones(3), **where)
-        own, field = field, field() if field else HashGridField(levels=4, log2_entries=10, width=16)
-        share = ["features"] if isinstance(field, HashGridField) else []
-        options = {"share": share, **options}
-        self.router = VoronoiRouter(field, torch.rand(cells, 3) - 0.5, coords="first3", **options)
-        grid = OccupancyGrid.for_training(BOX, 32, resolution=16)
-        grid.density[:6] = grid.occupied[:6] = 0
-        self.sampler = sampler(grid, 32)
-        shown = self.router if own is None else DirectionPerSample(self.router)
-        self.loss = RayLoss(Renderer({"field": shown}, self.sampler), smooth_depth=0.1, sparse_depth=0.3)
-        self.optimizer = Adam.of({"field": self.router}, lr=0.01, sparse=["features"])
-        self.guard, self.generator = Guard.on("cpu"), torch.Generator().manual_seed(1)
-        given = {"guard": self.guard, "generator": self.generator}
-        self.step = TrainingStep(self.batches, self.loss, self.optimizer, **given)
-        self.recorded = 0
-        record = self.step._record
-        self.step._record = lambda *of: (setattr(self, "recorded", self.recorded + 1), record(*of))[1]
-
-    def train(self, steps, rays=lambda step: 64, as_it_is=False):
-        """Steps, of which some are as they are; gives what they have found."""
-        found = []
-        for step in range(steps):
-            if as_it_is:
-                self.step.forget()
-                self.step._standing_obstacle = lambda: "a test"
-            self.optimizer.set_learning_rate(0.01 / (1 + step))
-            made = self.step(rays(step))
-            output = made.output
-            kept = made.loss, output.weights, output.samples.ray_index, output.colour, made.batch.target
-            found += [*(each.clone() for each in kept), torch.tensor([made.rays, made.samples])]
-        return found
-
-    def everything(self):
-        moments = [value for each in self.optimizer.state.values() for value in each.values()]
-        grid = self.sampler.grid
-        gradients = [p.grad for p in self.router.parameters()]
-        return [*self.router.parameters(), *gradients, *moments, grid.density, grid.occupied, *self.guard[:3]]
-
-
-def same(one, other):
-    return len(one) == len(other) and all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 @pytest.fixture(params=[1, 2, 5])
@@ -140,9 +74,8 @@ def test_more_and_more_samples_and_none():
 
 
 @pytest.mark.parametrize("cells", [1, 6])
-def test_steps_in_one_call_are_the_same_bits(cells, threads, monkeypatch):
+def test_steps_in_one_call_are_the_same_bits(cells, threads):
     """With what sampler and optimiser do before and after them; parts of a call may exceed the memory."""
-    monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 96)  # a multiple of the steps of a call
     found = []
     for calls in ([16] * 14, [1] * 224, [5, 11, 3, 13] * 7):
         training, done = Training(cells), 0
@@ -187,6 +120,20 @@ def test_numbers_of_rows_that_are_much_the_same():
     assert recording.obstacle == "two numbers of rows are much the same, 9"
 
 
+def test_a_replay_refuses_what_a_call_finds_wrong():
+    """As the call did: cells that came to lie out of range while it was replayed."""
+    cells = torch.tensor([0, 2, 1, 2, 0, 1], dtype=torch.int32)
+    with Recording() as recording:
+        recording.count(lambda: 6)
+        order, _ = cell_sort(cells, 3)
+    assert recording.obstacle is None and recording.replay(threads=1) == 1
+    cells[3] = 5
+    with pytest.raises(ValueError, match="cell_sort: indices out of range"):
+        recording.replay(threads=1)
+    cells[3] = 0
+    assert recording.replay(threads=1) == 1 and order.tolist() == [0, 3, 4, 2, 5, 1]
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -197,6 +144,7 @@ def test_numbers_of_rows_that_are_much_the_same():
         lambda t: t.router.freeze([0, 2]),
         lambda t: t.router.subdivide(2, points=torch.rand(500, 3), weights=torch.ones(500), optimizer=t.optimizer),
         lambda t: t.optimizer.param_groups[0].update(betas=(0.5, 0.6)),
+        lambda t: t.optimizer.param_groups[0]["betas"].__setitem__(0, 0.5),
         lambda t: t.optimizer.load_state_dict(t.optimizer.state_dict()),
         lambda t: t.optimizer.state.clear(),
         lambda t: t.optimizer.drop_averages(),
@@ -226,6 +174,148 @@ def test_what_changes_is_followed(change):
     finally:
         torch.set_num_threads(before)
         torch.set_float32_matmul_precision("highest")
+    assert same(*found)
+
+
+def new_data(*tensors):
+    """As many codes do it: other memory with the same or, for images, other values."""
+    for tensor in tensors:
+        tensor.data = 255 - tensor.data if tensor.dtype == torch.uint8 else tensor.data.clone()
+
+
+def new_vector(training):
+    """All parameters in one piece of memory."""
+    parameters = list(training.router.parameters())
+    torch.nn.utils.vector_to_parameters(torch.nn.utils.parameters_to_vector(parameters), parameters)
+
+
+#: What moves tensors to other memory, while the objects stay.
+MOVES = {
+    "gradients": lambda t: new_data(*(p.grad for p in t.router.parameters() if p.grad is not None)),
+    "moments": lambda t: new_data(*(state["exp_avg"] for state in t.optimizer.state.values())),
+    "steps": lambda t: new_data(*(state["step"] for state in t.optimizer.state.values())),
+    "averages": lambda t: new_data(*(state["average"] for state in t.optimizer.state.values())),
+    "densities": lambda t: new_data(t.sampler.grid.density),
+    "occupied voxels": lambda t: new_data(t.sampler.grid.occupied),
+    "images": lambda t: new_data(t.batches.images),
+    "background": lambda t: setattr(t.batches.background, "data", torch.tensor([0.5, 0.0, 1.0])),
+    "centres": lambda t: setattr(t.router.diagram.centres, "data", t.router.diagram.centres.data.flip(0)),
+    "poses": lambda t: setattr(t.batches.cameras.poses, "data", t.batches.cameras.poses.data.flip(0)),
+    "parameters": lambda t: new_data(*t.router.parameters()),
+    "a vector": new_vector,
+    "a parameter that does not learn": lambda t: new_data(t.router.module.density.bias),
+    "guard": lambda t: new_data(*t.guard[:3]),
+    "shared memory": lambda t: t.router.module.density.weight.share_memory_(),
+    "set": lambda t: t.sampler.grid.density.set_(t.sampler.grid.density.clone()),
+}
+
+
+def test_what_moves_is_followed():
+    """No memory that a tensor has left is written to, and what it now holds is read."""
+    found = []
+    for as_it_is in (False, True):
+        training, steps = Training(cells=3), {}
+        training.router.module.density.bias.requires_grad_(False)
+        training.optimizer.average = 0.9
+        for name, move in {"nothing": lambda t: None, **MOVES}.items():
+            for _ in range(2):  # recorded, and replayed
+                training.train(1, as_it_is=as_it_is)
+                training.step(64, 2, at=1023)
+            recorded = training.recorded
+            move(training)
+            steps[name] = [*training.train(1, as_it_is=as_it_is), training.step(64, 2, at=1023).loss.clone()]
+            where = name in ("averages", "nothing")  # those are of the part after a step
+            assert as_it_is or training.recorded == recorded + (not where), name
+            steps[name] += [each.detach().clone() for each in training.everything() if each is not None]
+        found.append(steps)
+    for name, steps in found[0].items():
+        assert same(steps, found[1][name]), name
+
+
+def test_gradients_that_were_dropped_are_given_back():
+    """Any of them, also where a loop has put another tensor in its place."""
+    one, other = Training(), Training()
+    for training, as_it_is in ((one, False), (other, True)):
+        training.train(5, as_it_is=as_it_is)
+        recorded, parameters = training.recorded, list(training.router.parameters())
+        parameters[3].grad, parameters[-1].grad = None, torch.zeros_like(parameters[-1])
+        training.train(1, as_it_is=as_it_is)
+        assert as_it_is or training.recorded == recorded
+    assert same(one.everything(), other.everything())
+
+
+def test_hooks_in_the_place_of_earlier_ones_are_called():
+    def post(parameter, hook):
+        return parameter.register_post_accumulate_grad_hook(lambda parameter: hook(parameter.grad))
+
+    calls = []
+    for register in (torch.Tensor.register_hook, post):
+        training = Training()
+        parameter = training.router.module.colour.weight
+        register(parameter, lambda gradient: None).remove()
+        training.train(3)
+        assert "replayed" in training.step.explain()
+        calls.clear()
+        handle = register(parameter, lambda gradient: calls.append(gradient.shape))
+        training.train(5)
+        assert calls == 5 * [parameter.shape], register
+        handle.remove()
+        training.train(8)
+        assert "replayed" in training.step.explain() and len(calls) == 5
+
+
+def test_steps_without_gradients_are_refused_as_ever():
+    training = Training()
+    training.train(3)
+    with torch.no_grad(), pytest.raises(RuntimeError, match="does not require grad"):
+        training.train(1)
+    training.train(2)
+    assert "replayed" in training.step.explain()
+
+
+@pytest.mark.parametrize("field", [None, "another"])
+def test_a_second_optimizer_learns(field):
+    """Its parameter, of the router or of a module around it, is named, and moves in each of its steps."""
+    moved = []
+    for as_it_is in (False, True):
+        training = Training(field=Scaled, fuse=True, way="fused") if field else Training()
+        module = training.router.module
+        name, parameter = ("layer.bias", module.layer.bias) if field else ("density.bias", module.density.bias)
+        group = training.optimizer.param_groups[0]
+        group["params"] = [p for p in group["params"] if p is not parameter]
+        other, values = torch.optim.SGD([parameter], lr=1.0), []
+        for step in range(6):
+            training.train(1, as_it_is=as_it_is)
+            if step % 2:  # it accumulates in between
+                other.step()
+                other.zero_grad()
+            values.append(parameter.detach().clone())
+        moved.append(values)
+        prefix = "network.module." if field else "module."
+        if not as_it_is:
+            says = f"step: runs as it is, since {prefix}{name} needs a gradient and is not the optimizer's"
+            assert training.step.explain() == says
+            parameter.requires_grad_(False)
+            training.train(2)
+            assert "replayed" in training.step.explain()
+    assert same(*moved) and all(not torch.equal(*moved[0][i : i + 3 : 2]) for i in (1, 3))
+
+
+@pytest.mark.parametrize("steps", [1, 6, 7, 10, 32])
+def test_any_number_of_steps_of_a_call_keeps_averages_and_decay(steps):
+    """And the grid begins to learn where it does, not at the end of a call."""
+    found = []
+    for calls in (96 // steps * [steps] + [96 % steps], 96 * [1]):
+        training, done = Training(cells=2), 0
+        training.optimizer.average = 0.9
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 40)
+            for count in filter(None, calls):
+                training.step(64, count, at=done)
+                done += count
+        with training.optimizer.averaged():
+            shown = [p.detach().clone() for p in training.router.parameters()]
+        found.append([*shown, *training.everything()])
     assert same(*found)
 
 

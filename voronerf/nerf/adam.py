@@ -66,7 +66,6 @@ class Adam(torch.optim.Adam):
     leaves_frozen = True
 
     # The first call of torch's own imports its compiler, to keep it off them, which takes over a second.
-    add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
     zero_grad = inspect.unwrap(torch.optim.Adam.zero_grad)
     state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
     load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
@@ -110,6 +109,15 @@ class Adam(torch.optim.Adam):
         if tables:
             groups.append({"params": tables, "sparse": True, "shrink": TABLE_DECAY / max(1.0, views / DECAY_VIEWS)})
         return cls(groups, lr=lr, average=average, backend=backend)
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Adds a group of parameters, as ``torch.optim.Adam``.
+
+        Raises:
+            ValueError: An option of ``torch.optim.Adam`` that this one does not have.
+        """
+        _check_group(param_group)
+        inspect.unwrap(torch.optim.Adam.add_param_group)(self, param_group)
 
     def set_learning_rate(self, rate: float) -> None:
         """Sets the learning rate of all groups."""
@@ -199,7 +207,12 @@ class Adam(torch.optim.Adam):
         Args:
             guard: Leaves out the step, see :func:`voronerf.ops.adam`; None for never.
             loss: [], of the step; with it the guard judges first.
+
+        Raises:
+            ValueError: A group has an option of ``torch.optim.Adam`` that this one does not have.
         """
+        for group in self.param_groups:
+            _check_group(group)
         rules, tensors = [], []
         rates = {id(group): varying(functools.partial(group.__getitem__, "lr")) for group in self.param_groups}
         held = [(p, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
@@ -223,6 +236,13 @@ class Adam(torch.optim.Adam):
         if state["step"].device != parameter.device:
             state["step"] = state["step"].to(parameter.device)
         return state
+
+
+def _check_group(group: Mapping[str, Any]) -> None:
+    for option in ("weight_decay", "amsgrad", "maximize", "differentiable"):
+        if group.get(option):
+            remedy = "; shrink=RATE is weight decay apart from the gradients" if option == "weight_decay" else ""
+            raise ValueError(f"Adam: {option} of a group must be 0 or False, got {group[option]}{remedy}")
 
 
 def _shrinks(group: Mapping[str, Any]) -> float:

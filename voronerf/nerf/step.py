@@ -79,7 +79,9 @@ class TrainingStep:
     call for all of them that are asked for at once: no Python runs in between, and threads are woken once. Results are
     the same bits. On CUDA, a step is captured in a CUDA graph, after one of its kind; another number of rays is
     captured anew. What keeps a step from that (:meth:`explain`) lets it run as it is. What the objects are set to is
-    followed, by their attributes; an object that is changed inside needs :meth:`forget`.
+    followed, by their attributes, and so is a tensor that moves to other memory (``x.data = y``); an object that is
+    changed inside needs :meth:`forget`. A parameter that needs a gradient and is not the optimiser's, such as that of
+    a second optimiser, keeps a step from being replayed.
 
     Args:
         batches: Where rays come from.
@@ -135,6 +137,7 @@ class TrainingStep:
         self._guards: Any = None
         self._cpu: Callable[[], Any]
         self._known: Radiance | None = None
+        self._parameters = list[nn.Parameter]()  # of the field and the optimiser
         self._parts = dict[str, Part]()
         self._objects, self._values = list[Any](), list[Any]()
         self._obstacle, self._same = "", False
@@ -156,8 +159,9 @@ class TrainingStep:
         Args:
             rays: Of each step.
             steps: How many, at least 1.
-            at: Steps done before. With it, the sampler's ``step_pre_backward`` is called before these steps, and the
-                optimiser's ``after_step`` after them; they are recorded, too. None where the loop calls them.
+            at: Steps done before. With it, the sampler's ``step_pre_backward`` is called before every step that asks
+                for it (``steps_alike``), and the optimiser's ``after_step`` after every step whose number is a
+                multiple of `GROUP`; they are recorded, too. None where the loop calls them.
 
         Returns:
             What the last step has found.
@@ -167,16 +171,15 @@ class TrainingStep:
         """
         if steps < 1:
             raise ValueError(f"TrainingStep: steps must be >= 1, got {steps}")
-        self._rays, same, made = rays, None, 0
-        if at is not None:
-            same = self._before(at)
-        while True:
-            times, output, same = self._make(steps - made, same)
-            made += times
-            if made == steps:
-                break
-        if at is not None:
-            self._after(at + steps, same)
+        self._rays = rays
+        if at is None:
+            return self._make_all(steps, None)[0]
+        sampler, end = self.loss.renderer.sampler, at + steps
+        while at < end:
+            part = min(end - at, schedule.GROUP - at % schedule.GROUP, sampler.steps_alike(at))
+            output, same = self._make_all(part, self._before(at))
+            at += part
+            self._after(at, same)
         return output
 
     def begin(self, at: int) -> None:
@@ -257,6 +260,14 @@ class TrainingStep:
         if self.strategy is not None:
             self.strategy.step_post_backward(output)
 
+    def _make_all(self, steps: int, same: bool | None) -> tuple[StepOutput, bool | None]:
+        """Makes so many steps; arguments and results as of :meth:`_make`."""
+        while True:
+            made, output, same = self._make(steps, same)
+            steps -= made
+            if not steps:
+                return output, same
+
     def _make(self, steps: int, same: bool | None) -> tuple[int, StepOutput, bool | None]:
         """Makes the next of so many steps, or more of them.
 
@@ -272,8 +283,7 @@ class TrainingStep:
         if recording is not None and same:
             if times := recording.replay(backends.threads(), steps):
                 self._wait = self._left = 0
-                if any(p.grad is not gradient for p, gradient in self._gradients[:1]):  # a step in between had others
-                    self._give_gradients()
+                self._give_gradients()  # a step in between, or the loop, may have left others
                 batch, output = self._made
                 return times, StepOutput(batch, output, recording if isinstance(recording, Recording) else None), True
         elif obstacle := self._standing_obstacle():
@@ -282,8 +292,6 @@ class TrainingStep:
             return 1, StepOutput(*self._run(self._rays)), None
         if self._left:
             self._left -= 1
-            if not same:
-                self.forget()
             return 1, StepOutput(*self._run(self._rays)), None
         return 1, self._record(same), None
 
@@ -361,7 +369,8 @@ class TrainingStep:
 
     def _give_gradients(self) -> None:
         for parameter, gradient in self._gradients:
-            parameter.grad = gradient
+            if parameter.grad is not gradient:
+                parameter.grad = gradient
 
     def _with_gradients(self) -> list[tuple[nn.Parameter, Tensor]]:
         parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
@@ -417,7 +426,13 @@ class TrainingStep:
         for part in (self.batches, self.loss, self.loss.term, renderer.sampler, self.optimizer, self.strategy):
             if part is not None and not type(part).__module__.startswith("voronerf."):
                 return f"{type(part).__name__} may do in Python what is not seen"
-        return self.loss.why_not_fused()
+        if (reason := self.loss.why_not_fused()) is not None:
+            return reason
+        learning = {id(p) for group in self.optimizer.param_groups for p in group["params"]}
+        for name, parameter in cast(nn.Module, renderer.field).named_parameters():
+            if parameter.requires_grad and id(parameter) not in learning:  # others read and drop its gradient
+                return f"{name} needs a gradient and is not the optimizer's"
+        return None
 
     def _guard(self) -> None:
         """Notes what the step that was made depends on."""
@@ -427,21 +442,27 @@ class TrainingStep:
         from voronerf.ops._core import native  # which is not everywhere
 
         self._known, self._guards, self._cpu = known, native.compiled.Guards(), native.cpu
-        grid = getattr(renderer.sampler, "grid", None)
-        for part in (self.batches, self.loss, renderer, renderer.sampler, grid, self.strategy, optimizer):
-            if part is not None:
-                self._guards.add(vars(part), "steps_done")
-        self._guards.add(renderer.fields, "")
-        for module in cast(nn.Module, renderer.field).modules():  # the router, perhaps in a wrapper
+        field, grid = cast(nn.Module, renderer.field), getattr(renderer.sampler, "grid", None)
+        parts = (self.batches, self.loss, renderer, renderer.sampler, grid, self.strategy)
+        dictionaries: list[dict[Any, Any]] = [vars(part) for part in parts if part is not None]
+        dictionaries.append(renderer.fields)
+        for module in field.modules():  # the router, perhaps in a wrapper
             for name, members in vars(module).items():
                 if name in ("_parameters", "_buffers", "_modules") or name.endswith("_hooks"):
-                    self._guards.add(members, "")
-        for module in known.router.module.modules():
-            self._guards.add(vars(module), "")
+                    dictionaries.append(members)
+        dictionaries += [*map(vars, known.router.module.modules()), optimizer.state, *optimizer.state.values()]
+        for members in dictionaries:
+            self._guards.add(members, "")
+        self._guards.add(vars(optimizer), "steps_done")
         for group in optimizer.param_groups:
             self._guards.add(group, "lr")
-        for members in (optimizer.state, *optimizer.state.values()):
-            self._guards.add(members, "")
+        if self._on_gpu():  # a capture does not see which tensors it takes, as a recording does
+            held = [gradient for _, gradient in self._gradients]
+            for tensor in held + [each for members in dictionaries for each in members.values()]:
+                if isinstance(tensor, Tensor):
+                    self._guards.add_tensor(tensor)
+        learning = (p for group in optimizer.param_groups for p in group["params"])
+        self._parameters = [*dict.fromkeys((*field.parameters(), *learning))]
         self._objects, self._values = self._current()
 
     def _holds(self) -> bool:
@@ -467,7 +488,9 @@ class TrainingStep:
         values += [torch.are_deterministic_algorithms_enabled(), torch.backends.cuda.matmul.fp32_precision]
         values.append(backends.cpu_precision())
         for group in optimizer.param_groups:
-            for own in group["params"]:
-                objects += [own._backward_hooks, own._post_accumulate_grad_hooks]
-                values += [own.data_ptr(), own.requires_grad]
+            objects += group["params"]
+            values += [len(group["params"]), tuple(group["betas"])]
+        for parameter in self._parameters:
+            hooks = parameter._backward_hooks, parameter._post_accumulate_grad_hooks
+            values += [parameter.requires_grad, *([*each.values()] if each else [] for each in hooks)]
         return objects, values

@@ -5,6 +5,9 @@ While a function is recorded, it runs as ever. Each of its calls of the compiled
 runs, random integers are drawn again for each of them, and views change nothing. Whatever else torch computes
 would be missing later, so it keeps the function from being replayed: :attr:`Recording.obstacle` says what it is.
 
+A recording holds the storages of all tensors that its calls take. Where one of these tensors, or one that they are
+views of, has moved to other memory (``x.data = y``), the calls are not made: :meth:`Recording.replay` says so.
+
 What changes lies in memory: numbers of rows (:meth:`Recording.count`, :func:`read_count`), other numbers
 (:func:`varying`), random integers, and what earlier calls have computed. Several runs can be made in one call; between
 them only random integers change, and what calls compute. There is memory for a quarter more rows than the
@@ -129,7 +132,7 @@ class Recording(TorchDispatchMode):
         if any(abs(rows - other.rows) <= 1 for other in self._counts):  # a tensor has one more of them, or not
             self._refuse(f"two numbers of rows are much the same, {rows}")
         most = rows + rows // SPARE + SOME
-        self._calls.count(memory.data_ptr(), most)
+        self._calls.count(memory, most)
         self._counts.append(Count(memory, rows, most, given))
         self._refuse("there are no rows" if rows == 0 else "")
 
@@ -145,7 +148,7 @@ class Recording(TorchDispatchMode):
             taken: What :meth:`take` was given, for this run.
 
         Returns:
-            How often they were made: less where there is no memory for the rows.
+            How often they were made: less where there is no memory for the rows, 0 where a tensor has moved.
 
         Raises:
             ValueError: As of the calls, for what they find in their arguments.
@@ -221,6 +224,7 @@ class Recording(TorchDispatchMode):
             return self._new(func, [*args], kwargs, args[0] if name == "aten::empty" else args[1])
         result = func(*args, **kwargs)
         if func.is_view:
+            self._calls.add_tensor(args[0])  # a view of it would stay where it was
             moved = isinstance(result, Tensor) and result.storage_offset() != args[0].storage_offset()
             if moved and self._is_counted(result):
                 self._refuse(f"a part of the rows of a step is read{_line()}")

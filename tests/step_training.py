@@ -1,0 +1,75 @@
+"""A small training whose steps are recorded and replayed, or run as they are, to compare the two."""
+
+import torch
+
+from voronerf import HashGridField, OccupancyGrid, VoronoiRouter
+from voronerf.nerf import (
+    Adam,
+    DirectionPerSample,
+    Occupancy,
+    RayBatches,
+    RayLoss,
+    Renderer,
+    TrainingStep,
+    orbit_cameras,
+)
+from voronerf.ops import Guard
+
+BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+
+
+class Training:
+    """A small training, whose grid empties a part of the box, so that its numbers of samples vary.
+
+    As of a photograph it has points of a sparse model, and rays from where no camera was.
+    """
+
+    def __init__(self, cells=1, field=None, sampler=Occupancy, photograph=False, **options):
+        torch.manual_seed(0)
+        cameras = orbit_cameras(3, radius=3.0, elevation=0.3, width=16, height=16, focal=16.0)
+        images = torch.randint(256, (3, 16, 16, 3), dtype=torch.uint8)
+        points = torch.arange(0, 768, 7), torch.full((110,), 3.0)
+        where = {"unseen": 0.5, "sparse": points} if photograph else {"box": BOX}
+        self.batches = RayBatches(cameras, images, near=1.0, far=5.0, background=torch.ones(3), **where)
+        own, field = field, field() if field else HashGridField(levels=4, log2_entries=10, width=16)
+        share = ["features"] if isinstance(field, HashGridField) else []
+        options = {"share": share, **options}
+        self.router = VoronoiRouter(field, torch.rand(cells, 3) - 0.5, coords="first3", **options)
+        grid = OccupancyGrid.for_training(BOX, 32, resolution=16)
+        grid.density[:6] = grid.occupied[:6] = 0
+        self.sampler = sampler(grid, 32)
+        shown = self.router if own is None else DirectionPerSample(self.router)
+        self.loss = RayLoss(Renderer({"field": shown}, self.sampler), smooth_depth=0.1, sparse_depth=0.3)
+        self.optimizer = Adam.of({"field": self.router}, lr=0.01, sparse=["features"])
+        for group in self.optimizer.param_groups:
+            group["betas"] = list(group["betas"])  # which can be changed in place
+        self.guard, self.generator = Guard.on("cpu"), torch.Generator().manual_seed(1)
+        given = {"guard": self.guard, "generator": self.generator}
+        self.step = TrainingStep(self.batches, self.loss, self.optimizer, **given)
+        self.recorded = 0
+        record = self.step._record
+        self.step._record = lambda *of: (setattr(self, "recorded", self.recorded + 1), record(*of))[1]
+
+    def train(self, steps, rays=lambda step: 64, as_it_is=False):
+        """Steps, of which some are as they are; gives what they have found."""
+        found = []
+        for step in range(steps):
+            if as_it_is:
+                self.step.forget()
+                self.step._standing_obstacle = lambda: "a test"
+            self.optimizer.set_learning_rate(0.01 / (1 + step))
+            made = self.step(rays(step))
+            output = made.output
+            kept = made.loss, output.weights, output.samples.ray_index, output.colour, made.batch.target
+            found += [*(each.clone() for each in kept), torch.tensor([made.rays, made.samples])]
+        return found
+
+    def everything(self):
+        moments = [value for each in self.optimizer.state.values() for value in each.values()]
+        grid = self.sampler.grid
+        gradients = [p.grad for p in self.router.parameters()]
+        return [*self.router.parameters(), *gradients, *moments, grid.density, grid.occupied, *self.guard[:3]]
+
+
+def same(one, other):
+    return len(one) == len(other) and all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
