@@ -18,6 +18,18 @@ from voronerf.ops import Guard
 BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
 
 
+class Scaled(torch.nn.Module):
+    """A field of one's own, with an attribute that changes."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer, self.scale = torch.nn.Linear(3, 4), 1.0
+
+    def forward(self, positions, directions):
+        raw = self.layer(positions)
+        return raw[:, :3].sigmoid(), self.scale * torch.nn.functional.softplus(raw[:, 3])
+
+
 class Training:
     """A small training, whose grid empties a part of the box, so that its numbers of samples vary.
 
@@ -46,17 +58,22 @@ class Training:
         self.guard, self.generator = Guard.on("cpu"), torch.Generator().manual_seed(1)
         given = {"guard": self.guard, "generator": self.generator}
         self.step = TrainingStep(self.batches, self.loss, self.optimizer, **given)
-        self.recorded = 0
+        self.recorded = self.done = 0
+        self.handles, self.other = [], None  # of hooks, and a second optimiser
         record = self.step._record
         self.step._record = lambda *of: (setattr(self, "recorded", self.recorded + 1), record(*of))[1]
+
+    def run_as_it_is(self):
+        """Records no step from here on."""
+        self.step.forget()
+        self.step._standing_obstacle = lambda: "a test"
 
     def train(self, steps, rays=lambda step: 64, as_it_is=False):
         """Steps, of which some are as they are; gives what they have found."""
         found = []
         for step in range(steps):
             if as_it_is:
-                self.step.forget()
-                self.step._standing_obstacle = lambda: "a test"
+                self.run_as_it_is()
             self.optimizer.set_learning_rate(0.01 / (1 + step))
             made = self.step(rays(step))
             output = made.output

@@ -39,6 +39,10 @@ def _python(what: str, file: str, line: str, wrong: str, *tests: str) -> Fault:
     return Fault(what, f"voronerf/{file}", line, wrong, tests)
 
 
+def _step(what: str, file: str, line: str, wrong: str) -> Fault:
+    return _python(f"A recorded step: {what}", file, line, wrong, "tests/nerf/test_step.py")
+
+
 FAULTS = (
     _kernel(
         "cell_sort",
@@ -251,6 +255,75 @@ FAULTS = (
         "tests/router/test_router_rules.py",
         "tests/router/test_router_use.py",
         "tests/router/test_router.py",
+    ),
+    _step(
+        "after a hook on a parameter whose gradient is there it is replayed without that",
+        "nerf/step.py",
+        "hooks = parameter._backward_hooks, parameter._post_accumulate_grad_hooks",
+        "hooks = (parameter._backward_hooks,)",
+    ),
+    _step(
+        "where gradients are off it is replayed and learns",
+        "nerf/step.py",
+        "self._cpu().isa, torch.is_grad_enabled(), len(optimizer.state)]",
+        "self._cpu().isa, len(optimizer.state)]",
+    ),
+    _step(
+        "betas that are changed in place are not seen",
+        "nerf/step.py",
+        'values += [len(group["params"]), tuple(group["betas"])]',
+        'values += [len(group["params"])]',
+    ),
+    _step(
+        "a parameter of a second optimiser keeps no step from being replayed",
+        "nerf/step.py",
+        "if parameter.requires_grad and id(parameter) not in learning:",
+        "if parameter.requires_grad and not learning:",
+    ),
+    _step(
+        "only the first gradient is given back",
+        "nerf/step.py",
+        "        for parameter, gradient in self._gradients:\n            if",
+        "        for parameter, gradient in self._gradients[:1]:\n            if",
+    ),
+    _step(
+        "a call of many steps forgets averages and decay in between",
+        "nerf/step.py",
+        "schedule.GROUP - at % schedule.GROUP, sampler",
+        "sampler",
+    ),
+    _step(
+        "a call of many steps goes on after the grid has begun to learn",
+        "nerf/step.py",
+        "at % schedule.GROUP, sampler.steps_alike(at))",
+        "at % schedule.GROUP)",
+    ),
+    _step(
+        "a tensor may move after a view of it was taken",
+        "ops/_core/recording.py",
+        "self._calls.add_tensor(args[0])",
+        "pass",
+    ),
+    Fault(
+        "A recorded step: tensors may move to other memory",
+        "csrc/bindings/bind.cpp",
+        "if (!tensors_.hold()) return 0;",
+        "",
+        ("tests/nerf/test_step.py",),
+    ),
+    Fault(
+        "A recorded step: a replay does not refuse what a call finds wrong",
+        "csrc/bindings/bind.cpp",
+        "type->kind == Type::Kind::boolean && !result.boolean) {",
+        "type->kind == Type::Kind::boolean && !result.boolean && false) {",
+        ("tests/nerf/test_step.py",),
+    ),
+    _python(
+        "Adam goes down where it is to go up",
+        "nerf/adam.py",
+        '("weight_decay", "amsgrad", "maximize", "differentiable")',
+        '("weight_decay", "amsgrad", "differentiable")',
+        "tests/nerf/test_optimizer.py",
     ),
     _python(
         "A contraction's inverse is that of a ball of radius 1",

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from step_training import BOX, Training, same
+from step_training import BOX, Scaled, Training, same
 
 from voronerf import OccupancyGrid
 from voronerf.nerf import Occupancy, PlannedSplit, SplitStrategy
@@ -385,16 +385,6 @@ def test_a_fused_field_is_replayed():
         training.router.module.scale = 3.0
         found.append([*steps, *training.train(6, as_it_is=as_it_is)])
     assert same(*found)
-
-
-class Scaled(torch.nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.layer, self.scale = torch.nn.Linear(3, 4), 1.0
-
-    def forward(self, positions, directions):
-        raw = self.layer(positions)
-        return raw[:, :3].sigmoid(), self.scale * torch.nn.functional.softplus(raw[:, 3])
 
 
 def test_torch_in_a_step_is_named_and_tried_no_longer():
