@@ -105,6 +105,7 @@ def _share(training: Training, rng: random.Random) -> None:
 
 
 def _write(training: Training, rng: random.Random) -> None:
+    training.router.unfreeze()  # whose cells are not to be written to
     with torch.no_grad():
         rng.choice(_parameters(training)).mul_(0.9)
     pictures = rng.choice((training.batches.images, training.batches.cameras.poses))
@@ -212,7 +213,7 @@ def _convert(training: Training, rng: random.Random) -> None:
 
 
 def _average(training: Training, rng: random.Random) -> None:
-    with training.optimizer.averaged():
+    with training.optimizer.averaged(), torch.no_grad():
         training.router(torch.rand(9, 3), torch.rand(9, 3))
 
 

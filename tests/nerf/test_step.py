@@ -233,15 +233,19 @@ def test_what_moves_is_followed():
 
 
 def test_gradients_that_were_dropped_are_given_back():
-    """Any of them, also where a loop has put another tensor in its place."""
+    """Any of them, also where a loop has put another tensor in its place, or one where there was none."""
     one, other = Training(), Training()
     for training, as_it_is in ((one, False), (other, True)):
+        list(training.router.parameters())[-2].requires_grad_(False)
         training.train(5, as_it_is=as_it_is)
         recorded, parameters = training.recorded, list(training.router.parameters())
         parameters[3].grad, parameters[-1].grad = None, torch.zeros_like(parameters[-1])
+        parameters[-2].grad = torch.zeros_like(parameters[-2])
         training.train(1, as_it_is=as_it_is)
         assert as_it_is or training.recorded == recorded
-    assert same(one.everything(), other.everything())
+        assert parameters[-2].grad is None
+    given = ([each for each in training.everything() if each is not None] for training in (one, other))
+    assert same(*given)
 
 
 def test_hooks_in_the_place_of_earlier_ones_are_called():

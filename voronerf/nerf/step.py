@@ -133,7 +133,7 @@ class TrainingStep:
         """Records the next step anew."""
         self._recording: Recording | Capture | None = None
         self._made: Any = None  # batch and output, when it was recorded
-        self._gradients = list[tuple[nn.Parameter, Tensor]]()  # the memory that replays write
+        self._gradients = list[tuple[nn.Parameter, Tensor | None]]()  # the memory that replays write
         self._guards: Any = None
         self._cpu: Callable[[], Any]
         self._known: Radiance | None = None
@@ -372,9 +372,8 @@ class TrainingStep:
             if parameter.grad is not gradient:
                 parameter.grad = gradient
 
-    def _with_gradients(self) -> list[tuple[nn.Parameter, Tensor]]:
-        parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
-        return [(p, p.grad) for p in parameters if p.grad is not None]
+    def _with_gradients(self) -> list[tuple[nn.Parameter, Tensor | None]]:
+        return [(p, p.grad) for group in self.optimizer.param_groups for p in group["params"]]
 
     def _run(self, rays: int) -> tuple[Batch, RenderOutput]:
         with self.as_it_is():
@@ -457,8 +456,8 @@ class TrainingStep:
         for group in optimizer.param_groups:
             self._guards.add(group, "lr")
         if self._on_gpu():  # a capture does not see which tensors it takes, as a recording does
-            held = [gradient for _, gradient in self._gradients]
-            for tensor in held + [each for members in dictionaries for each in members.values()]:
+            members = [each for dictionary in dictionaries for each in dictionary.values()]
+            for tensor in members + [gradient for _, gradient in self._gradients]:
                 if isinstance(tensor, Tensor):
                     self._guards.add_tensor(tensor)
         learning = (p for group in optimizer.param_groups for p in group["params"])
