@@ -390,4 +390,11 @@ FAULTS = (
         "tests/town/test_parts.py",
         "tests/town/test_editing.py",
     ),
+    _python(
+        "Steps of a parameter in parts are counted for each of them",
+        "nerf/adam.py",
+        "counted = step.clone() if number else step",
+        "counted = step",
+        "tests/nerf/test_optimizer.py",
+    ),
 )

@@ -81,6 +81,23 @@ def test_frozen_cells_do_not_shrink():
     assert torch.equal(weight[[1, 3]], before[[1, 3]] * (1 - 16 * 0.5 * 0.01))
 
 
+def test_steps_count_once_for_a_parameter_whose_cells_are_partly_frozen():
+    torch.manual_seed(0)
+    results, centres, gradients = [], torch.rand(5, 3), torch.randn(3, 5, 2, 3)
+    for frozen in ([], [1, 3]):  # which leave three parts
+        torch.manual_seed(1)
+        router = VoronoiRouter(torch.nn.Linear(3, 2), centres)
+        weight = router.module.weight
+        optimizer = Adam([weight], lr=0.1)
+        router.freeze(frozen)
+        for gradient in gradients:
+            weight.grad = gradient.clone()
+            optimizer.step()
+        assert float(optimizer.state[weight]["step"]) == 3
+        results.append(weight.detach()[[0, 2, 4]])
+    assert torch.equal(*results)
+
+
 def test_a_scaled_gradient_is_unscaled_and_an_overflow_skipped():
     results = []
     for enabled in (False, True):
