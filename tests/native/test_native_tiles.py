@@ -42,11 +42,16 @@ def precision() -> Iterator[Callable[[str], None]]:
 
 
 def network(
-    widths: tuple[int, ...], p: int, octaves: int | None, counts: list[int], seed: int = 0
+    widths: tuple[int, ...],
+    p: int,
+    octaves: int | None,
+    counts: list[int],
+    seed: int = 0,
+    activation: str = "softplus",
 ) -> dict[str, object]:
     """Layers one after the other, the last of which reads the positions again."""
-    layers = [Layer(("positions",), widths[0], "softplus")]
-    layers += [Layer((i,), width, "softplus") for i, width in enumerate(widths[1:])]
+    layers = [Layer(("positions",), widths[0], activation)]
+    layers += [Layer((i,), width, activation) for i, width in enumerate(widths[1:])]
     layers.append(Layer((len(layers) - 1, "positions"), 4))
     table = MLP(tuple(layers), (len(layers) - 1,), position_octaves=octaves)
     draw = torch.Generator().manual_seed(seed)
@@ -123,6 +128,14 @@ def test_any_number_of_rows(rows: int, asked: str, registers: str, precision: Ca
     exact = outcome(given, torch.float64, "reference")
     precision(asked)
     assert error(outcome(given, torch.float32, "native"), exact) < PRECISIONS[asked]
+
+
+def test_layers_with_a_relu_read_nothing_behind_their_columns(registers: str, precision: Callable[[str], None]) -> None:
+    # The 16 columns of a layer take the place of 32 others, which are not 0.
+    given = network((32, 16, 16), 3, 4, [97, 0, 1, 400], activation="relu")
+    exact = outcome(given, torch.float64, "reference")
+    precision("high")
+    assert error(outcome(given, torch.float32, "native"), exact) < PRECISIONS["high"]
 
 
 def test_other_threads_and_forked_children_compute_the_same(precision: Callable[[str], None], registers: str) -> None:
