@@ -579,6 +579,7 @@ constexpr const char* kStub =
     "cuda_outcome: str\n"
     "cuda_architectures: str\n"
     "cuda_major: int\n"
+    "most_sources: int\n"
     "\n"
     "class Guards:\n"
     "    def add(self, members: Any, skip: str) -> None: ...\n"

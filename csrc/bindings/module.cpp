@@ -5,6 +5,7 @@
 
 #include "bindings/bind.h"
 #include "build_info.h"
+#include "network/program_code.h"
 
 PYBIND11_MODULE(_C, module) {
   module.attr("compiler") = VN_COMPILER;
@@ -13,5 +14,6 @@ PYBIND11_MODULE(_C, module) {
   module.attr("cuda_outcome") = VN_CUDA_OUTCOME;
   module.attr("cuda_architectures") = VN_CUDA_ARCHITECTURES;
   module.attr("cuda_major") = VN_CUDA_MAJOR;
+  module.attr("most_sources") = voronerf::kMostSources;
   voronerf::bind_all(module.ptr());
 }

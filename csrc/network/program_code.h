@@ -14,7 +14,8 @@
 
 namespace voronerf {
 
-constexpr int kGranule = 16;  // columns of every slot are padded to a multiple of this
+constexpr int kGranule = 16;     // columns of every slot are padded to a multiple of this
+constexpr int kMostSources = 8;  // of a linear step; Python reads it
 
 enum class ProgramOp : int { input, output, linear, function, binary, total, move, encode, outer, columns };
 enum class ProgramBinary : int { add, sub, mul, div, gate };

@@ -5,12 +5,14 @@ from __future__ import annotations
 import importlib
 import zlib
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from helpers import refuses
 
 import voronerf
+from voronerf.ops._core.layers import MLP, Layer
 from voronerf.ops._core.program import BINARY, ENCODINGS, FUNCTIONS, Builder, Function
 
 pytestmark = pytest.mark.native
@@ -64,3 +66,12 @@ def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch
     program = b.program([b.apply("cube", b.input(3))])
     with pytest.raises(TypeError, match="ProgramStep: function is no ProgramFunction"):
         lowering.lower(program.text)
+
+
+def test_a_product_takes_as_many_sources_as_the_compiled_module_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    lowering = importlib.import_module("voronerf.ops.grouped_program.lowering")
+    made, most = list[Any](), native.compiled.most_sources
+    monkeypatch.setattr(native.compiled, "make_program", made.append)
+    table = MLP((Layer(("positions",) * (2 * most + 3), 5),), (0,))
+    lowering.lower.__wrapped__(table.program(3, 0, (5,), (True,), False).text)
+    assert [step.sources for step in made[0].steps if step.op == "linear"] == [most, most, 3]

@@ -260,7 +260,6 @@ struct ProgramTile {
                                                                : Finish::relu_slope;
     const float* const weights = packed + pack(step.number).at;
     const int64_t depth = steps_of(step.depth), panels = call.parts ? 2 : 1;
-    constexpr int32_t kMostSources = 8;
     Source sources[kMostSources];
     for (int32_t i = 0; i < count; ++i) {
       const Rows x = operand(operands[i]);

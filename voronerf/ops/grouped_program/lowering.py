@@ -31,7 +31,6 @@ _WHOLE = 48  # rows of a tile where harmonics write whole vectors of rows
 _TILE = 32  # rows of a block of products in tile registers
 _GRANULE = 16
 _FEW = 4  # outputs of a layer that has a product of its own (few_outputs_tile.h)
-_MOST_SOURCES = 8  # of a product (program_tile.h)
 _NONE = -1
 
 
@@ -554,7 +553,7 @@ def _joined(steps: list[Step]) -> list[Step]:
         (matrix, start, transposed), count = step.numbers[:3], _sources(before)
         width = sum(c.width for c in before.operands[:count])
         follows = before.numbers[:3] == (matrix, start - width, transposed) and not transposed
-        if not follows or not _all_of(add, before.width) or count >= _MOST_SOURCES:
+        if not follows or not _all_of(add, before.width) or count >= native.compiled.most_sources:
             continue
         operands = (*before.operands[:count], step.operands[0], *before.operands[count:])
         steps[place] = makers[step.out] = step._replace(
