@@ -411,4 +411,25 @@ FAULTS = (
         "count > native.compiled.most_sources",
         "tests/native/test_bindings.py",
     ),
+    _python(
+        "A shader reads a run of columns in the place of one that is broadcast",
+        "app/web/shader.py",
+        "at = columns.start + (0 if columns.spread else number)",
+        "at = columns.start + number",
+        "tests/app/web/test_shader.py",
+    ),
+    _python(
+        "A shader has no layer before its ReLU where something else reads it",
+        "app/web/shader.py",
+        " and readers.count(step.out) == 1:",
+        ":",
+        "tests/app/web/test_shader.py",
+    ),
+    _python(
+        "A shader takes points behind the near plane of a forward scene as they are",
+        "app/web/march.wgsl",
+        "max(dot(local, AHEAD), PLANE.x / 2.0)",
+        "dot(local, AHEAD)",
+        "tests/app/web/test_shader.py",
+    ),
 )

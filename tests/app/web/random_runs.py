@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,8 +12,8 @@ from helpers import renderer_of, seeded
 
 from voronerf import MLP, HashGridField, Layer, NeRF, OccupancyGrid, VoronoiDiagram, VoronoiRouter
 from voronerf.app.run import Run
-from voronerf.app.scenes import builtin_scene
-from voronerf.nerf import Contraction, Perspective
+from voronerf.app.scenes import Scene, builtin_scene
+from voronerf.nerf import Adam, Contraction, Perspective
 from voronerf.nerf.fields import KiloNeRF
 from voronerf.nerf.fields.radiance import RadianceField
 
@@ -65,6 +66,19 @@ class Rotated(torch.nn.Module):
         return torch.tanh(found[:, :3]) * 0.5 + 0.5, torch.nn.functional.leaky_relu(found[:, 3:], 0.0) * 4
 
 
+class Branches(torch.nn.Module):
+    """A traced field: a layer is read before and after its ReLU, and one column is read in the place of three."""
+
+    def __init__(self):
+        super().__init__()
+        self.first, self.last = torch.nn.Linear(6, 7), torch.nn.Linear(7, 5)
+
+    def forward(self, positions, directions):
+        layer = self.first(torch.cat([positions, directions], -1))
+        found = self.last(torch.relu(layer) * 3 - layer)
+        return (found[:, :3] * found[:, 3:4]).sigmoid(), 4 * torch.nn.functional.softplus(found[:, 4], beta=2)
+
+
 class Spherical(RadianceField):
     """A layer table with spherical harmonics of the directions."""
 
@@ -82,6 +96,13 @@ class Spherical(RadianceField):
 
 KINDS["spherical harmonics"] = (Spherical, {}, None, "linear")
 KINDS["traced"] = (Rotated, {"fuse": True, "coords": "first3"}, None, "linear")
+KINDS["branches"] = (Branches, {"fuse": True, "coords": "first3"}, None, "linear")
+
+
+@functools.cache
+def views() -> Scene:
+    """The built-in scene, which no test changes."""
+    return builtin_scene(40, train_views=9, test_views=5)
 
 
 def random_run(kind: str) -> Run:
@@ -91,13 +112,15 @@ def random_run(kind: str) -> Run:
     field = make()
     first = VoronoiDiagram(torch.rand(3, 3, generator=seeded()) - 0.5)
     router = VoronoiRouter(field, first.centres, **options)
-    router.subdivide(3, points=torch.rand(500, 3, generator=seeded()) * 1.6 - 0.8, weights=torch.ones(500))
+    points = torch.rand(500, 3, generator=seeded()) * 1.6 - 0.8
+    optimizer = Adam(router.parameters(), lr=0.1)  # without one, all objects of the process are looked at
+    router.subdivide(3, points=points, weights=torch.ones(500), optimizer=optimizer)
     assert router.diagram.depth == 2 and router.num_cells > 4
     with torch.no_grad():
         for parameter in router.parameters():
             wide = 2.0 if parameter.shape[-2:] == getattr(field, "features", torch.zeros(0, 0)).shape else 0.4
             parameter.copy_(wide * torch.randn(parameter.shape))
-    scene = replace(builtin_scene(40, train_views=9, test_views=5), contraction=contraction)
+    scene = replace(views(), contraction=contraction)
     box = scene.box if contraction is None else contraction.cube
     scene = scene if contraction is None else replace(scene, box=None, near=0.4, far=40.0)
     grid = OccupancyGrid(box, (9, 8, 11), threshold=1.0, contraction=contraction)
