@@ -1,0 +1,92 @@
+"""Modules of other code in VoronoiRouter: how each runs, and its errors beside a loop over masks.
+
+Those of public repositories (``ops/foreign_public.py``) are imported from checkouts, each ``owner+name`` in one folder.
+Without it, small modules in the manner of public code (``ops/foreign_kinds.py``) take their place.
+
+    python benchmarks/foreign_modules.py [--checkouts FOLDER] [--filter kilonerf] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from harness import Parser, metadata
+from ops.foreign_imports import repository
+from ops.foreign_kinds import KINDS
+from ops.foreign_public import PUBLIC
+from ops.foreign_rows import SEED, K, N, compare
+
+COMPARED = """with a loop over masks of distinct modules: values by the largest entry, gradients of parameters and float
+    arguments and those of (|d y/d x| - 1)^2 by the norm of each tensor, or 1e-6 of the largest norm"""
+STAND_INS = (
+    "CUDA encoders, tiny-cuda-nn and what is not installed are small PyTorch stand-ins; width 64 in most modules"
+)
+
+
+def public(checkouts: Path, pattern: str) -> Iterator[dict[str, Any]]:
+    """A result for each module of the repositories."""
+    for key, rows in PUBLIC.items():
+        path, _, file = key.partition(":")
+        owner, name, *inner = path.split("/")
+        chosen = [row for row in rows if re.search(pattern, f"{key} {row.module}")]
+        folder = checkouts / f"{owner}+{name}"
+        if not chosen:
+            continue
+        head = subprocess.run(["git", "-C", folder, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        origin = {"module": "", "repository": f"https://github.com/{owner}/{name}", "commit": head.stdout[:12]}
+        for row in chosen:
+            with repository(folder.joinpath(*inner)) as load:
+                found = compare(row, load(file))
+            yield origin | found
+
+
+def small(pattern: str) -> Iterator[dict[str, Any]]:
+    """A result for each small module."""
+    for kind, rows in KINDS.items():
+        for row in rows:
+            if re.search(pattern, f"{kind} {row.module}"):
+                yield {"kind": kind, **compare(row)}
+
+
+def counts(results: list[dict[str, Any]]) -> dict[str, int]:
+    """How many modules run in which way."""
+    ways = Counter(row["how"] for row in results)
+    repositories = {row.get("repository") for row in results}
+    classes = {(row.get("repository"), row["class"]) for row in results}
+    kinds = {"modules": len(results), "repositories": len(repositories), "classes": len(classes)}
+    fused = {name: ways[name] for name in ("fused", "fused in runs")}
+    return {**kinds, **fused, "others": len(results) - sum(fused.values())}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = Parser(prog="foreign_modules", description=__doc__)
+    parser.add_argument("--checkouts", type=Path, help="a folder with the repositories, each as owner+name")
+    parser.add_argument("--filter", default="", help="a regular expression of repositories, files and modules")
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args(arguments)
+    results = []
+    for row in public(given.checkouts, given.filter) if given.checkouts else small(given.filter):
+        results.append(row)
+        print(json.dumps(row), flush=True)
+    print(counts(results))
+    if given.json:
+        head = metadata(
+            benchmark="modules of public repositories in VoronoiRouter(fuse=True, way='fused')",
+            samples=N,
+            cells=K,
+            seed=SEED,
+            compared=" ".join(COMPARED.split()),
+            **{"stand-ins": STAND_INS},
+            **counts(results),
+        )
+        given.json.write_text(json.dumps({"metadata": head, "results": results}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

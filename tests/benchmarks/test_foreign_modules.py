@@ -1,0 +1,57 @@
+"""Modules in the manner of public code run fused, kind by kind."""
+
+import json
+import sys
+
+import foreign_modules
+import pytest
+import torch
+from ops import foreign_imports, foreign_kinds, foreign_rows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", foreign_kinds.KINDS)
+def test_modules_of_a_kind_are_fused_and_right(kind):
+    rows = list(foreign_modules.small(f"^{kind} "))
+    assert len(rows) >= 12
+    for row in rows:
+        assert row["how"] == "fused" or (kind in foreign_kinds.IN_RUNS and row["how"] == "fused in runs"), row
+        for name, error in row.items():
+            if name.endswith("error"):  # above ROUNDED, a unit on the kink of a ReLU: then float64 decides
+                assert error <= foreign_rows.ROUNDED or row[f"{name}_float64"] < 1e-9, row
+
+
+def test_wrong_results_and_refusals_are_in_the_row(monkeypatch):
+    loop, row = foreign_rows._loop, foreign_rows.Row("layer", lambda: torch.nn.Linear(3, 4), (3,))
+    monkeypatch.setattr(foreign_rows, "_loop", lambda *args: [value * 1.25 for value in loop(*args)])
+    found = foreign_rows.compare(row)
+    assert found["how"] == "fused" and found["class"] == "torch.nn.modules.linear.Linear"
+    assert {value for name, value in found.items() if "error" in name} == {0.2}
+    mixed = foreign_rows.Row("mixed", lambda: torch.nn.BatchNorm1d(3), (3,))
+    assert foreign_rows.compare(mixed)["how"].startswith("refused: VoronoiRouter: ")
+
+
+def test_files_are_imported_without_what_they_lack(tmp_path):
+    (tmp_path / "model.py").write_text(
+        "import no_such_module.inner as inner\nimport tinycudann as tcnn\nfrom helper import width\n"
+        "def network():\n    config = dict(n_neurons=width, n_hidden_layers=1, activation='ReLU')\n"
+        "    return tcnn.Network(3, 2, {**config, 'output_activation': 'None'})\n"
+    )
+    (tmp_path / "helper.py").write_text("width = 5\n")
+    path = list(sys.path)
+    with foreign_imports.repository(tmp_path) as load:
+        file = load("model")
+        assert file.network()(torch.ones(4, 3)).shape == (4, 2) and file.inner.anything() is not None
+        with pytest.raises(ModuleNotFoundError, match="no_such_file"):
+            load("no_such_file")
+    assert path == sys.path and not {"model", "helper", "no_such_module", "tinycudann"} & set(sys.modules)
+
+
+def test_the_script_writes_rows_and_counts(tmp_path, capsys):
+    foreign_modules.main(["--filter", "norms RMSNorm|tables embed", "--json", str(tmp_path / "rows.json")])
+    made = json.loads((tmp_path / "rows.json").read_text())
+    assert [row["module"] for row in made["results"]] == ["RMSNorm", "embedding"]
+    ways = {name: made["metadata"][name] for name in ("modules", "fused", "fused in runs", "others")}
+    assert ways == {"modules": 2, "fused": 1, "fused in runs": 1, "others": 0}
+    assert made["results"][1]["between"] == ["torch.nn.functional.embedding"]
+    assert '"RMSNorm"' in capsys.readouterr().out
