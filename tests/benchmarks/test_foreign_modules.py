@@ -1,12 +1,15 @@
-"""Modules in the manner of public code run fused, kind by kind."""
+"""Modules in the manner of public code run fused, kind by kind; those of public repositories have a result each."""
 
 import json
 import sys
+from pathlib import Path
 
 import foreign_modules
 import pytest
 import torch
-from ops import foreign_imports, foreign_kinds, foreign_rows
+from ops import foreign_imports, foreign_kinds, foreign_public, foreign_rows
+
+RESULT = Path(foreign_modules.__file__).parent / "results" / "foreign_modules.json"
 
 
 @pytest.mark.slow
@@ -55,3 +58,12 @@ def test_the_script_writes_rows_and_counts(tmp_path, capsys):
     assert ways == {"modules": 2, "fused": 1, "fused in runs": 1, "others": 0}
     assert made["results"][1]["between"] == ["torch.nn.functional.embedding"]
     assert '"RMSNorm"' in capsys.readouterr().out
+
+
+def test_the_result_has_every_row_of_the_table():
+    made = json.loads(RESULT.read_text())
+    rows = [(key.split(":")[0], row.module) for key, rows in foreign_public.PUBLIC.items() for row in rows]
+    names = [("/".join(path.split("/")[:2]), module) for path, module in rows]
+    found = [(row["repository"].removeprefix("https://github.com/"), row["module"]) for row in made["results"]]
+    assert found == names
+    assert foreign_modules.counts(made["results"]).items() <= made["metadata"].items()

@@ -106,7 +106,8 @@ def test_the_claims_of_the_first_page() -> None:
     assert f"{min(hashed):.0f} to {max(hashed):.0f} times" in page
     made = results("foreign_modules.json")["metadata"]
     fused = f"Of {made['modules']} modules of {made['repositories']} public codebases, "
-    assert f"{fused}{made['fused'] + made['fused in runs']} take" in page
+    taken = f"{made['fused'] + made['fused in runs']} take the fused path, {made['fused in runs']} of them in several"
+    assert f"{fused}{taken} pieces" in " ".join(page.split())
     laplacian = [
         row["alternatives"]["masks"] / row["alternatives"]["fuse=True"]
         for row in results("foreign_fields.json")["results"]
@@ -114,5 +115,8 @@ def test_the_claims_of_the_first_page() -> None:
     ]
     assert f"{min(laplacian):.1f} to {max(laplacian):.1f} times as fast as by a loop" in page
     assert f"They are {made['classes']} classes" in page
+    ways = f"{made['fused']} are fused whole and {made['fused in runs']} in runs"
+    kinds = f"Of {made['modules']} modules and methods ({made['classes']} classes) of {made['repositories']} public"
+    assert f"{kinds} repositories, {ways}" in " ".join((ROOT / "docs" / "foreign-fields.md").read_text().split())
     *_, bonsai = (r for r in results("photographs_strata.json")["results"] if r["scene"] == "bonsai" and "psnr" in r)
     assert f"three minutes on two cores {bonsai['scene']} is at {bonsai['psnr']:.1f} dB" in page
