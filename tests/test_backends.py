@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 import pytest
@@ -119,9 +121,32 @@ for backend, remedy in (("native", "pip install -e ."), ("warp", "voronerf[warp]
 rows = {(row.op, row.backend): row for row in backends.table()}
 assert not rows["nearest_centre", "native"].available
 assert not backends.describe()["native"]["available"]
+from voronerf.app.cli import main
+assert main(["info"]) == 1
 """
     result = run_python(code)
     assert result.returncode == 0, result.stderr
+    last = result.stderr.splitlines()[-1]
+    assert last.startswith("voronerf: error: voronerf in ") and "During handling" not in result.stderr
+
+
+def test_sources_without_their_compiled_module_say_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a checkout after ``pip install .``, where Python finds the sources first."""
+    monkeypatch.delitem(sys.modules, "voronerf.ops._core.native")
+    monkeypatch.setitem(sys.modules, "voronerf.ops._core._C", None)
+    backends._warn_once.cache_clear()
+    here = Path(backends.__file__).parents[3]
+    monkeypatch.setattr(sys, "path", [str(here), str(tmp_path)])
+    (folder := tmp_path / "voronerf/ops/_core").mkdir(parents=True)
+    for remedy in (
+        "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)",
+        f"start Python in another folder to import that of {tmp_path}, or build it with `pip install -e .`",
+    ):
+        said = rf"voronerf in {here} cannot load its compiled module \(.*_C.*\); {re.escape(remedy)}"
+        with pytest.warns(RuntimeWarning, match=rf"^{said}. Until then plain PyTorch runs in its place") as told:
+            reasons = {backends.missing("native", CPU) for _ in range(3)}
+        assert len(told) == 1 and re.fullmatch(said, *reasons)
+        (folder / f"_C{EXTENSION_SUFFIXES[0]}").touch()
 
 
 @pytest.mark.slow

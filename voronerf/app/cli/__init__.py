@@ -16,14 +16,18 @@ def main(args: list[str] | None = None) -> int:
     if sys.modules.get("torch") is None:
         _prepare()
     try:
+        import voronerf.ops._core.backends as backends
         from voronerf.app.cli.program import run
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
         line = "voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch"
-        print(f"voronerf: error: {line}", file=sys.stderr)
-        return 1
-    return run(args)
+    except backends.BackendUnavailable as error:  # the compiled module is missing or of another version
+        line = str(error)
+    else:
+        return run(args)
+    print(f"voronerf: error: {line}", file=sys.stderr)
+    return 1
 
 
 def _prepare() -> None:

@@ -182,6 +182,8 @@ def missing(backend: str, device: torch.device) -> str | None:
     try:
         module = _import(_PACKAGES[backend])
     except BackendUnavailable as error:
+        if backend == "native":
+            _warn_once(f"{error}. Until then plain PyTorch runs in its place, many times slower.")
         return str(error)
     reason: str | None = module.missing(device)
     return reason
@@ -213,7 +215,7 @@ def _import(module: str) -> ModuleType:
 
 
 @functools.cache
-def warn_once(line: str) -> None:
+def _warn_once(line: str) -> None:
     """Warns of what keeps a backend from being used, the first time in a process that it is asked for."""
     warnings.warn(line, RuntimeWarning, stacklevel=2)
 

@@ -18,6 +18,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,6 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import BackendUnavailable
-
-_REMEDY = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
 
 
 def _bind_openmp() -> None:
@@ -49,17 +48,27 @@ def _interface() -> int | None:
     return int(file.read_text()) if file.exists() else None
 
 
+def _why_missing(error: ImportError | OSError) -> str:
+    """Returns one line: the folder of these sources, why their compiled module cannot be loaded, and the remedy."""
+    here = Path(__file__).resolve().parents[4]
+    others = [place for place in sys.path if Path(place).resolve() != here]  # where a wheel may be installed
+    found = PathFinder.find_spec("_C", [os.path.join(place, "voronerf", "ops", "_core") for place in others])
+    remedy = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
+    if found is not None and found.origin is not None:
+        installed = Path(found.origin).parents[3]
+        remedy = f"start Python in another folder to import that of {installed}, or build it with `pip install -e .`"
+    return f"voronerf in {here} cannot load its compiled module ({error}); {remedy}"
+
+
 try:
     _bind_openmp()
-    from voronerf.ops._core import _C as compiled
+    import voronerf.ops._core._C as compiled
 except (ImportError, OSError) as error:
-    raise BackendUnavailable(
-        f"the compiled extension voronerf.ops._core._C cannot be loaded ({error}); {_REMEDY}"
-    ) from error
+    raise BackendUnavailable(_why_missing(error)) from None
 if getattr(compiled, "interface", "none") != _interface():
-    _reason = "the compiled module is of another version of voronerf; build it again with `pip install -e .`"
-    backends.warn_once(f"{_reason}. Until then plain PyTorch runs in its place, many times slower.")
-    raise BackendUnavailable(_reason)
+    raise BackendUnavailable(
+        "the compiled module is of another version of voronerf; build it again with `pip install -e .`"
+    )
 
 DTYPES = {
     "float32": torch.float32,
