@@ -1,9 +1,15 @@
 """`voronerf process` on pictures of two walls with a pattern, and on models that have faults."""
 
+import contextlib
+import itertools
 import json
+import os
 import re
 import shutil
+import signal
+import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -12,6 +18,7 @@ from helpers import refuses
 from PIL import Image
 from scene_files import write_images
 
+from voronerf.app.cli import main
 from voronerf.app.render.video import write_video
 from voronerf.app.scenes import SceneError, load_scene, process
 from voronerf.app.scenes.colmap import read_model
@@ -131,6 +138,22 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
     with pycolmap.Database.open(out / "colmap/trusted.db") as opened:
         assert opened.num_verified_image_pairs() == COUNT
     assert (out / "colmap/global_again/0/images.bin").is_file()
+
+
+def write_database(path, scales, matches=()):
+    """Writes a database of images 0.png, 1.png ... with features of these scales, and numbers of matches of pairs."""
+    with pycolmap.Database.open(path) as opened:
+        camera = opened.write_camera(pycolmap.Camera(model="SIMPLE_RADIAL", width=9, height=9, params=[9, 4, 4, 0]))
+        for number in range(max([0, *(image for pair in matches for image in pair)]) + 1):
+            image = opened.write_image(pycolmap.Image(name=f"{number}.png", camera_id=camera))
+            opened.write_keypoints(image, np.float32([[0, 0, scale, 0, 0, scale] for scale in scales]))
+            values = np.uint8(scales)[:, None].repeat(128, 1)
+            kind = pycolmap.FeatureExtractorType.SIFT
+            opened.write_descriptors(image, pycolmap.FeatureDescriptors(data=values, type=kind))
+        for (a, b), count in dict(matches).items():
+            geometry = pycolmap.TwoViewGeometry(inlier_matches=np.zeros((count, 2), np.uint32), config=2)
+            opened.write_two_view_geometry(a + 1, b + 1, geometry)
+    return path
 
 
 def models(tmp_path, monkeypatch, pictures, **found):
@@ -344,6 +367,72 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
     refuses("matching must be one of auto", process.process, tmp_path, tmp_path / "out", matching="all")
     refuses("max_features must be at least 100, got 5", process.process, tmp_path, tmp_path / "out", max_features=5)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a process of its own")
+@pytest.mark.parametrize(("count", "reason"), [(2, "must have at least 3 images, got 2"), (3, "COLMAP finds no model")])
+def test_a_process_that_is_killed_in_its_first_moments_goes_on(tmp_path, monkeypatch, count, reason):
+    """Before each change of a folder, while it begins and while it removes what it has begun."""
+    models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
+    write_images(tmp_path, [(12, 10)] * count)
+    for moment in range(1, 40):
+        if not (child := os.fork()):
+            changes = itertools.count(1)
+
+            def kill(event, _, moment=moment, changes=changes):
+                if event in ("os.mkdir", "os.rename", "os.remove", "os.rmdir") and next(changes) == moment:
+                    os.kill(os.getpid(), signal.SIGKILL)
+
+            sys.addaudithook(kill)
+            with contextlib.suppress(SceneError):
+                process.process(tmp_path / "images", tmp_path / "out", say=lambda _: None)
+            os._exit(0)
+        killed = os.waitpid(child, 0)[1]
+        refuses(reason, process.process, tmp_path / "images", tmp_path / "out", error=SceneError)
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        if not killed:
+            break
+    assert 7 < moment < 39, moment
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a process of its own")
+def test_a_process_that_is_killed_while_it_copies_features_goes_on(tmp_path, monkeypatch):
+    whole, few = write_database(tmp_path / "database.db", [3, 1, 2, 4]), tmp_path / "few.db"
+    if not (child := os.fork()):
+        monkeypatch.setattr(pycolmap.Database, "write_descriptors", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+        process._keep_largest(pycolmap, whole, few, 2)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL and (tmp_path / "few.part-wal").stat().st_size
+    process._keep_largest(pycolmap, whole, few, 3)
+    with pycolmap.Database.open(few) as opened:
+        assert opened.num_keypoints_for_image(1) == opened.num_descriptors_for_image(1) == 3
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_command_that_is_stopped_says_how_to_go_on(monkeypatch, capsys, number, status):
+    monkeypatch.setattr("voronerf.app.cli.process.make_scene", lambda *_, **__: os.kill(os.getpid(), number))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests without it
+    try:
+        assert main(["process", "in", "out"]) == status
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capsys.readouterr().out == "stopped; continue with the same command\n"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+@pytest.mark.parametrize("stage", ["images", "colmap/.incremental"])
+def test_sigterm_ends_the_command_without_the_stack_of_colmap(tmp_path, pictures, stage):
+    options = [str(pictures), str(tmp_path / "out"), "--mapper", "incremental", "--max-features", "300"]
+    command = [sys.executable, "-m", "voronerf", "process", *options]
+    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    while not (tmp_path / "out" / stage).is_dir():
+        assert run.poll() is None
+        time.sleep(0.02)
+    run.send_signal(signal.SIGTERM)
+    output = run.communicate()[0]
+    assert output.splitlines()[-1] == "stopped; continue with the same command" and "***" not in output
+    assert run.returncode == 128 + signal.SIGTERM
 
 
 def test_images_of_phones_become_jpeg(tmp_path, monkeypatch):

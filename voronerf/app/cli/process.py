@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 from datetime import timedelta
 from pathlib import Path
 from typing import Literal
@@ -12,6 +15,7 @@ from rich.text import Text
 
 from voronerf.app.cli.display import console, say
 from voronerf.app.cli.opening import check_counts
+from voronerf.app.scenes.process import MAPPER
 from voronerf.app.scenes.process import process as make_scene
 
 
@@ -44,20 +48,28 @@ def process(
     """
     check_counts(frames=frames, max_features=max_features, size=size)
     display = StageDisplay()
-    with display.progress:
-        make_scene(
-            source,
-            out,
-            frames=frames,
-            matching=matching,
-            camera_model=camera_model,
-            mapper=mapper,
-            max_features=max_features,
-            size=size,
-            verbose=verbose,
-            say=say,
-            progress=display.show,
-        )
+    try:
+        with display.progress:
+            make_scene(
+                source,
+                out,
+                frames=frames,
+                matching=matching,
+                camera_model=camera_model,
+                mapper=mapper,
+                max_features=max_features,
+                size=size,
+                verbose=verbose,
+                say=say,
+                progress=display.show,
+            )
+    except (KeyboardInterrupt, SystemExit) as stop:  # Ctrl-C, SIGTERM
+        say("stopped; continue with the same command")
+        status = int(getattr(stop, "code", 130))
+        if any(thread.name == MAPPER for thread in threading.enumerate()):
+            sys.stdout.flush()
+            os._exit(status)  # COLMAP's thread still runs, and crashes when Python's shutdown takes its memory
+        return status
     return 0
 
 

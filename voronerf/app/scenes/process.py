@@ -22,6 +22,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -82,6 +83,10 @@ LEAST_HELD = 15
 LARGEST_ERROR, ERROR_SHARE = 2.0, 1 / 800
 #: The global mapper places cameras by the longest tracks, until each image has so many; triangulation adds the others.
 TRACKS = 200
+#: The name of the mapper's thread, which cannot be stopped.
+MAPPER = "mapper"
+#: The name of the stages' folder until its settings are written.
+BEGUN = ".colmap"
 #: Reduced images are written while their longer side has so many pixels.
 LEAST_SIDE = 256
 
@@ -171,10 +176,13 @@ def process(
     if size < 64:
         raise ValueError(f"process: size must be at least 64, got {size}")
     os.environ.setdefault("GLOG_logbuflevel", "-1")  # COLMAP reads it when it is loaded: its log is not held back
+    stopping = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError:
         raise ImportError("voronerf process needs pycolmap: pip install 'voronerf[colmap]'") from None
+    with contextlib.suppress(ValueError):  # in another thread than the main one
+        signal.signal(signal.SIGTERM, stopping)  # importing pycolmap installs glog's handler, which prints a stack
     if not source.exists():
         raise SceneError(f"{source}: there is no such video or folder")
     settings = Settings(str(source.resolve()), frames, matching, camera_model, max_features, size)
@@ -245,10 +253,11 @@ def _begin(out: Path, settings: Settings) -> Path:
         if (out / "sparse" / "0").exists():
             raise SceneError(f"{out}: is a scene already")
         return work
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    part = out / BEGUN
+    if out.exists() and (not out.is_dir() or any(path != part for path in out.iterdir())):
         raise SceneError(f"{out}: must not exist yet, be an empty folder, or be that of a process that was stopped")
-    work.mkdir(parents=True)
-    write_text(noted, json.dumps(settings._asdict(), indent=1))
+    write_text(_emptied(part) / noted.name, json.dumps(settings._asdict(), indent=1))
+    os.replace(part, work)
     return work
 
 
@@ -279,9 +288,10 @@ def _gather(source: Path, out: Path, frames: int, say: Callable[[str], None]) ->
             hint = f"; {inside} has {len(listed_images(inside))}" if inside.is_dir() else ""
             raise SceneError(f"{source}: must have at least {LEAST_IMAGES} images, got {count}{hint}")
     except BaseException:
-        for made in (part, out / "colmap"):
-            shutil.rmtree(made, ignore_errors=True)
+        shutil.rmtree(part, ignore_errors=True)
         with contextlib.suppress(OSError):
+            os.replace(out / "colmap", out / BEGUN)  # a kill leaves no folder of the stages without settings
+            shutil.rmtree(out / BEGUN)
             out.rmdir()
         raise
     os.replace(part, out / "images")
@@ -424,8 +434,7 @@ def _match(stages: Stages, sizes: dict[str, Size], settings: Settings) -> None:
 
 def _keep_largest(colmap: Any, database: Path, few: Path, most: int) -> None:
     """Copies a database with the largest features of each image alone; to itself, as well."""
-    part = few.with_suffix(".part")
-    shutil.copyfile(database, part)
+    part = _copied(database, few.with_suffix(".part"))
     with colmap.Database.open(part) as opened:
         kept = {}
         for image in opened.read_all_images():
@@ -504,8 +513,7 @@ def _keep_pairs(colmap: Any, database: Path, pairs: Collection[Pair]) -> Path:
     kept = database.with_name("trusted.db")
     if kept.is_file():
         return kept
-    part = kept.with_suffix(".part")
-    shutil.copyfile(database, part)
+    part = _copied(database, kept.with_suffix(".part"))
     with colmap.Database.open(part) as opened:
         numbers = {image.name: image.image_id for image in opened.read_all_images()}
         fitted = {(numbers[a], numbers[b]): opened.read_two_view_geometry(numbers[a], numbers[b]) for a, b in pairs}
@@ -558,7 +566,7 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Se
                 errors.append(error)
 
         # In a thread, since Ctrl-C does not reach COLMAP.
-        thread = threading.Thread(target=find, daemon=True)
+        thread = threading.Thread(target=find, name=MAPPER, daemon=True)
         thread.start()
         while thread.is_alive():
             thread.join(0.5)
@@ -652,6 +660,14 @@ def _write_reduced(files: Sequence[Path], folder: Path, factor: int) -> None:
             shown = image.convert("RGBA" if read_header(path).alpha else "RGB") if indexed else image
             shown.reduce(factor).save(part / path.name, **kept)
     os.replace(part, folder)
+
+
+def _copied(database: Path, part: Path) -> Path:
+    """Copies a database over what a killed process left, whose write-ahead log SQLite would replay."""
+    for left in part.parent.glob(f"{part.name}*"):
+        left.unlink()
+    shutil.copyfile(database, part)
+    return part
 
 
 def _emptied(folder: Path) -> Path:
