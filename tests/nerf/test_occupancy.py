@@ -24,6 +24,7 @@ from voronerf.nerf import (
 )
 from voronerf.nerf.loss import RenderOutput
 from voronerf.nerf.radiance import radiance_of
+from voronerf.nerf.samplers import SETTLING_PART
 from voronerf.nerf.schedule import GROUP
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
@@ -117,6 +118,13 @@ def test_voxels_of_a_sampler_stay_empty():
         sampler.step_post_backward(RenderOutput(none, none, found.weights, found.density, found.samples, none))
         assert not bool(sampler.grid.occupied[empty].any()) and not bool(sampler.grid.density[empty].any())
     assert ball.asked > 64 and bool(sampler.grid.occupied[~empty].any())
+
+
+def test_a_ray_has_a_part_of_its_strata_while_the_grid_settles():
+    sampler, rays = Occupancy(OccupancyGrid(BOX, 8, threshold=0.1), 16), Rays(torch.zeros(1, 3), torch.eye(3)[:1])
+    for step, strata in ((sampler.settling_steps - 1, 16 // SETTLING_PART), (sampler.settling_steps, 16)):
+        sampler.step_pre_backward(Ball(), step, seeded(0))
+        assert len(sampler.sample(rays, torch.zeros(1), torch.ones(1), jitter=True).depths) == sampler.strata == strata
 
 
 @pytest.mark.parametrize(

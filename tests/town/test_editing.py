@@ -301,11 +301,8 @@ def test_a_run_of_parts_is_neither_opened_nor_trained_as_one_of_a_training(opene
 
 def test_runs_are_aligned_by_shared_images(scene) -> None:
     frame = Similarity.of((1, 2, 3), (10, 20, 30), 1.7)
-    moved = {
-        part: replace(split, cameras=editing.moved_cameras(split.cameras, frame.inverse))
-        for part, split in (("train", scene.train), ("test", scene.test))
-    }
-    found, error, count = editing.align(scene, replace(scene, **moved), "run")
+    moved = with_cameras(scene, lambda cameras: editing.moved_cameras(cameras, frame.inverse))
+    found, error, count = editing.align(scene, moved, "run")
     assert count == 8 and error < 1e-5
     assert abs(found.scale - 1.7) < 1e-5 and torch.allclose(found.translation, frame.translation, atol=1e-4)
     others = replace(
@@ -316,17 +313,29 @@ def test_runs_are_aligned_by_shared_images(scene) -> None:
         lambda: editing.align(scene, others, "run"),
         error=ConfigError,
     )
-    line = replace(
-        scene,
-        train=replace(scene.train, cameras=on_a_line(scene.train.cameras)),
-        test=replace(scene.test, cameras=on_a_line(scene.test.cameras)),
-    )
+    line = with_cameras(scene, lambda cameras: placed(cameras, torch.arange(len(cameras))[:, None] * torch.ones(3)))
     refuses("not on one line", lambda: editing.align(line, line, "run"), error=ConfigError)
 
 
-def on_a_line(cameras):
+@pytest.mark.parametrize("degrees", [(10, 20, 30), (200, 20, 30), (10, 200, 30), (10, 20, 200)])
+def test_cameras_of_one_height_are_aligned_without_a_mirror(scene, degrees) -> None:
+    """Which would move them as well."""
+    frame = Similarity.of((1, 2, 3), degrees, 1.7)
+    flat = with_cameras(scene, lambda cameras: placed(cameras, cameras.origins * torch.tensor([1.0, 1, 0])))
+    moved = with_cameras(flat, lambda cameras: editing.moved_cameras(cameras, frame))
+    found, error, _ = editing.align(moved, flat, "run")
+    assert error < 1e-5 and torch.allclose(found.rotation, frame.rotation, atol=1e-4)
+
+
+def with_cameras(scene, change):
+    """A scene whose cameras are changed by a function."""
+    parts = {"train": scene.train, "test": scene.test}
+    return replace(scene, **{name: replace(part, cameras=change(part.cameras)) for name, part in parts.items()})
+
+
+def placed(cameras, origins):
     poses = cameras.poses.clone()
-    poses[:, :3, 3] = torch.arange(len(poses))[:, None] * torch.tensor([1.0, 2, 3])
+    poses[:, :3, 3] = origins
     return replace(cameras, poses=poses)
 
 

@@ -326,6 +326,29 @@ def test_a_video_is_taken_apart(tmp_path, monkeypatch):
     assert len(list((tmp_path / "out/images").iterdir())) == 5
 
 
+def test_the_largest_features_are_kept(tmp_path):
+    few = tmp_path / "few.db"
+    process._keep_largest(pycolmap, write_database(tmp_path / "database.db", [2, 5, 1, 4]), few, 2)
+    with pycolmap.Database.open(few) as opened:
+        assert opened.read_keypoints(1)[:, 2].tolist() == opened.read_descriptors(1).data[:, 0].tolist() == [5, 4]
+
+
+def test_images_are_matched_with_those_that_share_most(tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "NEIGHBOURS", 1)
+    shared = {(0, 3): 90, (0, 4): 20, (1, 4): 90, (2, 5): 9}  # the fewest are no pair
+    pairs = process._choose_pairs(pycolmap, write_database(tmp_path / "few.db", [1], shared))
+    following = [(a, a + step) for a in range(6) for step in (1, 2) if a + step < 6]
+    assert pairs == sorted((f"{a}.png", f"{b}.png") for a, b in {(0, 3), (1, 4), *following})
+
+
+def test_half_transparent_pixels_have_features(tmp_path):
+    pixels = np.zeros((1, 3, 4), np.uint8)
+    pixels[..., 3] = 127, 128, 255
+    Image.fromarray(pixels).save(path := tmp_path / "a.png")
+    process._write_masks([path], tmp_path / "masks")
+    assert np.array(Image.open(tmp_path / "masks/a.png.png")).tolist() == [[False, True, True]]
+
+
 def test_reduced_images_keep_the_orientation_tag(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "LEAST_SIDE", 4)
     tag = Image.Exif()

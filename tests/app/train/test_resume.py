@@ -1,6 +1,7 @@
 """Runs that are stopped, loaded and resumed: bit for bit, and refused where they are another's."""
 
 import json
+import math
 import os
 import threading
 from dataclasses import replace
@@ -13,7 +14,7 @@ from tiny_runs import HIERARCHICAL, Each, assert_resumes, scores, small, tensors
 import voronerf.app.evaluate.scores as scores_module
 from voronerf.app import open_run
 from voronerf.app.evaluate.scores import evaluate
-from voronerf.app.train import Checkpoints, ConfigError, build, load, run, train
+from voronerf.app.train import Checkpoints, ConfigError, build, load, run, snapshot, train
 from voronerf.app.train.build import make_routers
 from voronerf.app.train.checkpoint import (
     CheckpointError,
@@ -131,6 +132,7 @@ def without(prefix):
         ("step, times and stages must be counts, got -1", lambda c: c.values.update(step=-1)),
         ("stage 1: cells must be an integer, got 4.5", lambda c: c.values["stages"][1].update(cells=4.5)),
         ("stage 0: split_cells missing", lambda c: c.values["stages"][0].pop("split_cells")),
+        ("step, times and stages must be counts, got 14, [inf", lambda c: c.values.update(seconds=math.inf)),
         ("rays must lie in 64 to 64 by its settings, got 65", lambda c: c.values.update(rays=65)),
         ("seconds missing", lambda c: c.values.pop("seconds")),
         ("settings: width must be an integer or null, got '8'", lambda c: c.values["config"].update(width="8")),
@@ -145,6 +147,14 @@ def test_what_a_checkpoint_lacks_is_named(tmp_path, scene, stopped, message, dam
     with pytest.raises((CheckpointError, ConfigError)) as caught:
         load(build(stopped, scene), load_checkpoint(path))
     assert str(caught.value).startswith(f"{path}: ") and message in str(caught.value)
+
+
+def test_steps_that_were_left_out_are_counted_on(scene, stopped):
+    checkpoint = load_checkpoint(checkpoint_path(stopped.out))
+    checkpoint.values["skipped"] = 3
+    load(state := build(stopped, scene), checkpoint)
+    state.training_step.guard.skipped.add_(1)
+    assert state.skipped == snapshot(state).values["skipped"] == 4
 
 
 def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):

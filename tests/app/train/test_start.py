@@ -1,10 +1,11 @@
 """The first steps of a training: a grid that does not empty all, and another draw where nothing is learnt."""
 
+import itertools
 from dataclasses import replace
 
 import pytest
 import torch
-from tiny_runs import small, steps_of
+from tiny_runs import Each, small, steps_of
 
 from voronerf.app.evaluate.scores import evaluate, mean_scores
 from voronerf.app.scenes import builtin_scene
@@ -41,6 +42,21 @@ def test_a_start_that_failed_begins_again_and_learns(scene, monkeypatch):
     assert len(state.strategy.reservoir) == 0 and state.learning_rate() < 0.1 * state.config.lr
     steps_of(state, 100)
     assert len(said) == 1 and state.sampler.grid.share == 1 and state.loss < 0.03
+
+
+def weight(state):
+    return state.router.module.trunk[0].weight.detach().clone()
+
+
+def test_every_new_start_is_another_draw(scene, monkeypatch):
+    monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 1)
+    monkeypatch.setattr("voronerf.app.train.start.JUDGED", 1)
+    monkeypatch.setattr("voronerf.app.train.start.why_nothing_is_learnt", lambda batch, output: "planted")
+    state = build(small(occupancy=True, cells=()), scene)
+    drawn = [weight(state)]
+    steps_of(state, 8, Each(lambda s: s.step in (2, 4, 6) and drawn.append(weight(s))))
+    assert [stage.started_at_step for stage in state.stages] == [0, 2, 4, 6]
+    assert not any(torch.equal(a, b) for a, b in itertools.combinations(drawn, 2))
 
 
 def test_a_start_of_one_colour_has_failed():

@@ -388,6 +388,8 @@ def test_bad_addresses(run, address, message) -> None:
         ("0.0.0.0", "192.0.2.7:{}", "http://192.0.2.7:{}", 101),  # by whatever address this machine has
         ("0.0.0.0", f"{socket.gethostname()}:{{}}", f"http://{socket.gethostname()}:{{}}", 101),
         ("0.0.0.0", "example.org:{}", "http://example.org:{}", 403),
+        ("0.0.0.0", f"{socket.gethostname()}.local:{{}}", None, 101),
+        ("0.0.0.0", "example.local:{}", None, 403),
         ("0.0.0.0", "192.0.2.7:{}", "https://example.com", 403),
         ("0.0.0.0", "[::1:{}", None, 403),  # no address
     ],
@@ -475,6 +477,13 @@ def test_a_client_harms_itself_at_most(viewer, scene, caplog, capfd) -> None:
     other.rest()
     other.close()
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_properties_beside_a_value_are_passed_over(viewer, tab) -> None:
+    tab.rest()
+    for updates in ({"value": 200, "update_cb": []}, {"value": 192}):
+        tab.send("GuiUpdateMessage", uuid=tab.gui["Pixels"]["uuid"], updates=updates)
+    tab.until(lambda: viewer.clients[0].longest == 192)
 
 
 def test_a_port_in_use_is_one_line(run, tmp_path, capsys) -> None:
