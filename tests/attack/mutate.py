@@ -106,7 +106,8 @@ def first_failure(tree: Path, tests: Sequence[str]) -> str | None:
         return f"{SECONDS} s"
     if done.returncode == 0:
         return None
-    failed = [line.split()[1] for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    lines = (line.partition(" ") for line in done.stdout.splitlines())
+    failed = [name.partition(" - ")[0] for word, _, name in lines if word in ("FAILED", "ERROR")]
     if not failed and done.returncode > 0:
         raise SystemExit(f"mutate: {' '.join(command)} ended with {done.returncode}: {done.stdout[-2000:]}")
     return failed[0] if failed else f"signal {-done.returncode}"
