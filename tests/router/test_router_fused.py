@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from convention_harness import randomised
 from convention_listed import uniform
+from router_fields import masked_loop, perturb, tensors
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
@@ -120,6 +121,95 @@ def test_a_step_of_the_program(name: str) -> None:
     ours, theirs = (derivatives(y, x, router, name not in ONCE) for y in (found, expected))
     for a, b in zip(ours, theirs, strict=True):
         torch.testing.assert_close(a, b if a.shape == b.shape else b.expand_as(a), rtol=2e-3, atol=2e-4)
+
+
+class Parts(nn.Module):
+    """Layers, and a ``forward`` that returns parts of what they give."""
+
+    def __init__(self, forward: Callable[[Any, Tensor], Any]) -> None:
+        super().__init__()
+        self.a, self.out, self.c, self.returns = nn.Linear(3, 8), nn.Linear(8, 4), nn.Linear(3, 2), [forward]
+
+    def raw(self, x: Tensor) -> Tensor:
+        return self.out(torch.tanh(self.a(x)))
+
+    def forward(self, x: Tensor) -> Any:
+        return self.returns[0](self, x)
+
+
+def named(net: Any, x: Tensor) -> Any:
+    rgb, sigma = torch.split(net.raw(x), [3, 1], -1)
+    return rgb, sigma
+
+
+def used(net: Any, x: Tensor) -> Any:
+    rgb, sigma = net.raw(x).split([3, 1], -1)
+    return torch.sigmoid(rgb), F.softplus(sigma)[:, 0]
+
+
+def layered(net: Any, x: Tensor) -> Any:
+    hidden, sigma = net.raw(x).split([3, 1], -1)
+    return net.c(hidden), sigma
+
+
+PARTS: dict[str, Callable[[Any, Tensor], Any]] = {
+    "a tuple": lambda net, x: torch.split(net.raw(x), [3, 1], -1),
+    "a list": lambda net, x: list(torch.split(net.raw(x), 2, -1)),
+    "a dict": lambda net, x: dict(zip("ab", torch.split(net.raw(x), [3, 1], -1))),
+    "one part": lambda net, x: torch.split(net.raw(x), [3, 1], -1)[1],
+    "parts by name": named,
+    "parts that are used": used,
+    "a part in a layer": layered,
+    "parts of a part": lambda net, x: net.raw(x).split([3, 1], -1)[0].split([1, 2], -1),
+    "chunk": lambda net, x: net.raw(x).chunk(2, -1),
+    "unbind": lambda net, x: torch.unbind(net.raw(x), -1),
+    "tensor_split": lambda net, x: torch.tensor_split(net.raw(x), 3, -1),
+    "broadcast_tensors": lambda net, x: torch.broadcast_tensors(net.raw(x)[:, :3], x[:, :1]),
+    "of an argument": lambda net, x: (net.raw(x), *x.split([1, 2], -1)),
+    "of an argument, beside a layer": lambda net, x: torch.broadcast_tensors(x, net.raw(x)[:, :1]),
+    "of what is joined": lambda net, x: torch.cat([x, net.raw(x)], -1).split([2, 5], -1),
+    "columns of what is joined": lambda net, x: (net.raw(x), torch.cat([x, net.raw(x)], -1)[:, :2]),
+    "of zeros": lambda net, x: (net.raw(x), *torch.zeros(len(x), 2).chunk(2, -1)),
+    "without columns": lambda net, x: (net.c(x.split([3, 0], -1)[0]), *net.raw(x).split([4, 0], -1)),
+}
+PARTS_BETWEEN: dict[str, Callable[[Any, Tensor], Any]] = {
+    "of an argument": lambda net, x: (net.raw(x), torch.lgamma(x.chunk(3, -1)[1])),
+    "of what torch computes": lambda net, x: net.c(torch.lgamma(net.raw(x) + 3).split([3, 1], -1)[0]),
+    "of what is joined": lambda net, x: net.c(torch.lgamma(torch.cat([x, net.raw(x)], -1).split([3, 4], -1)[0] + 2)),
+    "an argument's columns": lambda net, x: net.c(torch.lgamma(torch.cat([x, net.raw(x)], -1)[:, :3])),
+}
+
+
+@pytest.mark.parametrize(
+    ("forward", "between"),
+    [
+        *(pytest.param(forward, False, id=name) for name, forward in PARTS.items()),
+        *(pytest.param(forward, True, id=f"{name}, between") for name, forward in PARTS_BETWEEN.items()),
+    ],
+)
+def test_parts_of_what_is_split(forward: Callable[[Any, Tensor], Any], between: bool) -> None:
+    """Values, their structure and gradients are those of the loop, whatever is split and where its parts go."""
+    torch.manual_seed(0)
+    centres = torch.rand(K, 3) * 2 - 1
+    router = VoronoiRouter(Parts(forward), centres, coords="first3", fuse=True, way="fused")
+    perturb(router, torch.Generator().manual_seed(1))
+    x = uniform((90,)).requires_grad_()
+    result = router(x)
+    expected, modules = masked_loop(router, router.assign(x), [x])
+    assert router.explain().startswith("forward: fused in runs" if between else "forward: fused")
+    assert ("between" in router.explain()) == between
+    assert type(result) is type(modules[0](x))
+    torch.testing.assert_close(tensors(result), expected, rtol=1e-4, atol=1e-5)
+
+    def loss(results: list[Tensor]) -> Tensor:
+        return torch.stack([(y * torch.linspace(0.5, 1.5, y.numel()).view_as(y)).sum() for y in results]).sum()
+
+    names = [name for name, _ in router.module.named_parameters()]
+    own = [m.get_parameter(name) for name in names for m in modules]
+    ours = torch.autograd.grad(loss(tensors(result)), [x, *router.module.parameters()], materialize_grads=True)
+    theirs = torch.autograd.grad(loss(expected), [x, *own], materialize_grads=True)
+    stacks = [torch.stack(theirs[1 + K * i : 1 + K * (i + 1)]) for i in range(len(names))]
+    torch.testing.assert_close(ours, (theirs[0], *stacks), rtol=2e-3, atol=2e-4)
 
 
 class FourierKAN(nn.Module):

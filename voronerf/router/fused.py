@@ -153,6 +153,9 @@ class Fused:
             return
         try:
             self._lower(node)
+            if self._is_left_to_torch(node):
+                ready = max(self._ready[source] for source in node.all_input_nodes)
+                self._ready.update(dict.fromkeys((node, *node.meta["results"]), ready))
         except Exception as error:  # NotAStep, or arguments of a form that nobody wrote steps for: PyTorch computes it
             self._why[node] = f"{name_of(node.target)}{node.meta['line']}, which is no step: {error}"
             self._ready[node] = max((self._at(source) for source in node.all_input_nodes), default=0)
@@ -160,14 +163,19 @@ class Fused:
                 self._ready[value] = self._ready[node]
                 self._entries.pop(value, None)
 
+    def _is_left_to_torch(self, node: fx.Node) -> bool:
+        """Whether a node only moves entries of values that PyTorch computes, or is made of no tensor, as ``zeros``."""
+        sources = node.all_input_nodes
+        if not all(source in self._ready for source in sources):
+            return False
+        values = set().union(*(self._lowering.values(self._entries[value].codes) for value in node.meta["results"]))
+        return values <= self._lowering.sources.keys() or all(isinstance(s.meta.get("value"), int) for s in sources)
+
     def _at(self, node: fx.Node) -> int:
         """The first run that can read a value."""
         if node in self._ready:
             return self._ready[node]
-        lowering, levels = self._lowering, [0]
-        for value in {lowering.columns[i][0] for i in lowering.order(self._entries[node].codes)[1].tolist()}:
-            levels.append(lowering.level(value) + (value not in lowering.sources))
-        return max(levels)
+        return max(map(self._lowering.level, self._lowering.values(self._entries[node].codes)), default=-1) + 1
 
     def _known(self, node: fx.Node) -> Entries:
         """Where the entries of a node's value come from."""
@@ -195,8 +203,6 @@ class Fused:
             raise NotAStep("a custom function, whose backward is its own; write it with functions of PyTorch")
         if node.target in (torch.autograd.grad, differentiable):
             raise NotAStep("a gradient")
-        if any(source.meta.get("value") is None for source in node.all_input_nodes):
-            raise NotAStep("a part of a result")
         args, kwargs = map_arg((node.args, node.kwargs), own)
 
         def known(value: Tensor) -> Entries | None:
@@ -231,9 +237,8 @@ class Fused:
             node = waiting.pop()
             if node in needed or node in self._made:
                 continue
-            if node in self._ready or self._only_moves(node) or self._constant(node):
+            if node in self._ready:
                 needed.add(node)
-                self._ready.setdefault(node, self._at(node) if node.meta["on"] == SAMPLES else 0)
                 waiting += node.all_input_nodes
                 continue
             self._made[node] = self._whole(node)
@@ -259,27 +264,8 @@ class Fused:
         if not torch.equal(turned >> 32, torch.arange(self._lowering.rows)[:, None].expand_as(turned)):
             raise Unfusable(f"{name_of(node.target)}{node.meta.get('line', '')} mixes samples")
         node.meta["layout"] = [*shape[:at], *shape[at + 1 :]], at, shape[at] // self._lowering.rows
-        return self._lowering.operand(turned[0] & ((1 << 32) - 1))
-
-    def _only_moves(self, node: fx.Node) -> bool:
-        """Whether a value only rearranges values of PyTorch."""
-        lowering = self._lowering
-        numbers = lowering.order(self._entries[node].codes)[1].tolist()
-        return all(lowering.columns[i][0] in lowering.sources for i in numbers)
-
-    def _constant(self, node: fx.Node) -> bool:
-        """Whether a value is made of no tensor and the same for all samples, as ``zeros``: a program without inputs."""
-        if any(isinstance(source.meta["value"], Tensor) for source in node.all_input_nodes):
-            return False
-        lowering = self._lowering
-        numbers = lowering.order(self._entries[node].codes)[1].tolist()
-        waiting = {lowering.columns[i][0] for i in numbers}
-        while waiting:
-            step = lowering.builder.steps[waiting.pop()]
-            if step.op == "input":
-                return False
-            waiting |= {c.index for c in step.operands if c.of == VALUE}
-        return True
+        columns = self._lowering.operand(turned[0] & ((1 << 32) - 1))
+        return columns if columns.index not in self._lowering.sources else self._lowering.builder.apply("copy", columns)
 
     def _cut(self) -> dict[int, Segment]:
         """The steps in runs, by their level."""
@@ -293,13 +279,10 @@ class Fused:
             outputs: list[Any] = [step.out for step in chosen if step.out in later]
             kept = [Columns(VALUE, v, 0, steps[v].width) for v in outputs]
             for node, columns in self._made.items():
-                if level[columns.index] == number and columns.index not in lowering.sources:
+                if level[columns.index] == number:
                     outputs.append(node)
                     kept.append(columns)
             runs[number] = _renumbered(chosen, kept, lowering, outputs)
-        for node, columns in self._made.items():
-            if columns.index in lowering.sources:
-                raise Unfusable(f"{name_of(node.target)}{node.meta.get('line', '')} returns an argument")
         return runs
 
     # Running ----------------------------------------------------------------------------------------------------------

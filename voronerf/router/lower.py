@@ -282,6 +282,10 @@ class Lowering:
             raise NotAStep("the samples of a tensor differ in more than their values")
         return places, columns[0]
 
+    def values(self, codes: Tensor) -> set[int]:
+        """The values that a tensor of samples has columns of."""
+        return {self.columns[number][0] for number in (codes & _LOW).unique().tolist()}
+
     def parts(self, numbers: Tensor) -> list[tuple[Columns, int]]:
         """Columns by their numbers, in as few pieces as may be, each with its place."""
         parts: list[tuple[Columns, int]] = []
