@@ -53,6 +53,18 @@ STEPS: list[Callable[[Any, Tensor], Tensor]] = [
     lambda net, h: h * torch.stack(torch.unbind(net.square)).norm(),
     lambda net, h: F.linear(h, net.square, torch.ones(4).to(h)) + F.linear(h, torch.eye(4).to(h), net.vector),
     lambda net, h: h + torch.autograd.grad(net.vector.square().sum(), net.vector, create_graph=True)[0],
+    lambda net, h: torch.einsum("bid,iod->bo", h.view(-1, 2, 2), net.square.view(2, 4, 2)),
+    lambda net, h: torch.einsum("iod,dbi->bo", net.square.view(4, 2, 2), torch.stack([h.cos(), h.sin()])),
+    lambda net, h: torch.einsum("bxd , ode -> boxe", [h.view(-1, 2, 2), net.square.view(4, 2, 2)]).sum((2, 3)),
+    lambda net, h: torch.einsum("bi,oi->bio", h, net.square).sum(1) * torch.einsum("bi,i->b", h, net.vector)[:, None],
+    lambda net, h: torch.einsum("bix,iox->bo", h.view(-1, 2, 2), net.cube.view(2, 2, 2)).repeat(1, 2),
+    lambda net, h: torch.einsum("bix,iox->box", h.view(-1, 2, 2), net.cube.view(2, 2, 2)).flatten(1),
+    lambda net, h: torch.einsum("bi,oi->ob", h, net.square).t(),
+    lambda net, h: F.conv2d(h[..., None, None], net.square[..., None, None], net.vector)[..., 0, 0],
+    lambda net, h: F.conv1d(h.view(-1, 2, 2), net.cube.view(4, 2, 1)).sum(2),
+    lambda net, h: F.conv2d(h.t()[None, :, None], net.square[..., None, None])[0, :, 0].t(),
+    lambda net, h: F.conv1d(h.t(), net.square[..., None], net.vector, stride=1, padding=0).t(),
+    lambda net, h: F.conv1d(h[:, None], net.vector.view(1, 1, 4), padding="same")[:, 0],
 ]
 
 
@@ -127,7 +139,7 @@ scale_rows = seen("scale_rows")
 register(scale_rows, lambda run, rows, factor: rows * run.rows_of(factor).exp())
 
 SHARED = {"coords": "first3", "share": ["encoder.*", "table.weight"]}
-BY_CELL = {0, 1, 2, 3, 4, 13, 15, 18, 20, 21}
+BY_CELL = {0, 1, 2, 4, 13, 15, 18, 20, 21, 27, 28, 33}
 RULES = [
     Case("corners", Corners, one(3)),
     Case("planes", Planes, one(3)),

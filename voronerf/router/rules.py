@@ -106,18 +106,66 @@ def addmm(run: GroupedRun, input: Tensor, mat1: Tensor, mat2: Tensor, *, beta: f
     return product if product is NotImplemented else _elementwise(torch.add, run, run.mark(product), input)
 
 
-_CONTRACTION = re.compile(r"(\w+?)(\w+),(?:(\w)\2|\2(\w))->\1(?:\3|\4)")
+_PAIR = re.compile(r"(\w+),(\w+)->(\w+)")
 
 
 @rule(torch.einsum)
 def einsum(run: GroupedRun, equation: str, *operands: Any) -> Any:
-    """Rows with a parameter, whose letters are contracted and a new one: ``"ni,oi->no"``, ``"nij,ijo->no"``."""
-    match = _CONTRACTION.fullmatch(equation.replace(" ", ""))
-    if match is None or len(operands) != 2 or not isinstance(operands[1], PerCell):
+    """Rows with a parameter, their common letters all summed or all kept: ``"bid,iod->bo"``, ``"bi,oi->bio"``."""
+    operands = tuple(operands[0]) if isinstance(operands[0], (list, tuple)) else operands
+    match = _PAIR.fullmatch(equation.replace(" ", ""))
+    if match is None or len(operands) != 2:
         return NotImplemented
-    x, weight = operands[0], operands[1].stacked
-    weight = weight.flatten(2) if match[3] else weight.flatten(1, -2).transpose(1, 2)
-    return linear(run, run.mark(x.flatten(len(match[1]))) if run.is_rows(x) else x, PerCell(weight))
+    (x, weight), (of_x, of_weight, out) = operands, match.groups()
+    if isinstance(x, PerCell):
+        x, weight, of_x, of_weight = weight, x, of_weight, of_x
+    summed = "".join(letter for letter in of_x if letter not in out)
+    alone = set(of_x) ^ set(of_weight)
+    twice = any(len(set(letters)) != len(letters) for letters in (of_x, of_weight, out))
+    if not run.is_rows(x) or twice or not alone <= set(out) or out[0] in of_weight:
+        return NotImplemented
+    if not summed:
+
+        def spread(tensor: Tensor, letters: str) -> Tensor:
+            tensor = tensor.permute([letters.index(letter) for letter in out if letter in letters])
+            return tensor[tuple(slice(None) if letter in letters else None for letter in out)]
+
+        factor = PerCell(spread(weight.stacked, out[0] + of_weight))  # cells come where samples do
+        return _elementwise(torch.mul, run, run.mark(spread(x, of_x)), factor)
+    if set(of_x) & set(of_weight) != set(summed):
+        return NotImplemented
+    kept, new = "".join(filter(of_x.count, out)), "".join(filter(of_weight.count, out))
+    rows = x.permute([of_x.index(letter) for letter in kept + summed]).flatten(len(kept))
+    stacked = weight.stacked.permute([0, *(1 + of_weight.index(letter) for letter in new + summed)])
+    y = linear(run, run.mark(rows), PerCell(stacked.reshape(len(stacked), -1, rows.shape[-1])))
+    y = y.reshape(*rows.shape[:-1], *stacked.shape[1 : 1 + len(new)])
+    return y if kept + new == out else y.permute([(kept + new).index(letter) for letter in out])
+
+
+@rule(F.conv1d, F.conv2d, F.conv3d)
+def convolution(
+    run: GroupedRun,
+    input: Tensor,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    stride: Any = 1,
+    padding: Any = 0,
+    dilation: Any = 1,
+    groups: int = 1,
+) -> Any:
+    """A kernel of one place: rows [n * m, i, ...], or [i, ...] or [1, i, ...] with n places along one dimension."""
+    places, channel = weight.dim() - 2, input.dim() - weight.dim() + 1
+    if not run.is_rows(input) or set(weight.shape[2:]) != {1} or groups != 1:
+        return NotImplemented
+    if stride not in (1, (1,) * places) or padding not in (0, (0,) * places):
+        return NotImplemented
+    of_samples = [d for d in range(channel + 1, input.dim()) if input.shape[d] == run.n]
+    of_samples = of_samples if channel == 0 or input.shape[0] % run.n else [0]
+    if len(of_samples) != 1:
+        return NotImplemented
+    flat = PerCell(weight.stacked.flatten(2)) if isinstance(weight, PerCell) else weight.flatten(1)
+    y = linear(run, run.mark(input.movedim((of_samples[0], channel), (0, -1))), flat, bias)
+    return y if y is NotImplemented else y.movedim((0, -1), (of_samples[0], channel))
 
 
 # Scales and shifts ----------------------------------------------------------------------------------------------------
