@@ -23,6 +23,7 @@ from voronerf.router.grouping import Grouping
 _OP = "VoronoiRouter"
 DEEPEST = 6  # objects within objects that are searched for tensors
 _LEAVES = {type(None), type(...), bool, int, float, str, torch.Size, torch.dtype, torch.device}
+AS_TENSOR = "pass torch.as_tensor(points, dtype=torch.float32)"
 SAMPLE, RAY, BROADCAST, SHARED = "sample", "ray", "broadcast", "shared"
 
 
@@ -385,12 +386,15 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: in
         positions = rule
     elif callable(rule):
         positions = rule(*args, **kwargs)
+    elif not isinstance(rule, (str, slice)):
+        raise TypeError(f"{_OP}: coords must be a tensor, got {type(rule).__name__}; {AS_TENSOR}")
     else:
         source = first_tensor(args, kwargs)
         if source is None:
             got = ", ".join(type(value).__name__ for value in (*args, *kwargs.values())) or "nothing"
             raise ValueError(
-                f"{_OP}: coords={rule!r} must find a tensor among the arguments, got {got}; pass a function"
+                f"{_OP}: coords={rule!r} must find a tensor among the arguments, got {got}; {AS_TENSOR}, or as "
+                "coords a function of the arguments"
             )
         whole = isinstance(rule, str) and source.shape[-1] == d == int(rule[5:])
         positions = source if whole else source[..., : int(rule[5:])] if isinstance(rule, str) else source[..., rule]

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.routed_mlp import routed_mlp
+from voronerf.router.layout import AS_TENSOR
 
 
 @runtime_checkable
@@ -94,6 +95,8 @@ class Table:
         arguments = _arguments(*args, **kwargs)
         field, positions = router.module, arguments.pop("positions")
         features = 6 if field.layers.integrated else 3
+        if not isinstance(positions, Tensor):
+            raise TypeError(f"VoronoiRouter: positions must be a tensor, got {type(positions).__name__}; {AS_TENSOR}")
         if positions.ndim != 2 or positions.shape[1] != features:
             raise ValueError(f"VoronoiRouter: positions must have shape [n, {features}], got {list(positions.shape)}")
         arguments = arguments if field.layers.uses_directions else {}
