@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import operator
 import os
+import re
 import sys
 import threading
 import time
@@ -21,7 +22,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.router import rules  # noqa: F401  registers the rules
@@ -44,6 +45,7 @@ _TRACES = 8  # of one kind of call; a module that changes more often runs groupe
 _TURNS, _SECONDS = 8, 0.08  # a way is measured at most so often, and no more than twice after so many seconds
 _SLICE, _BEHIND = 8192, 1.5  # samples of a batch that are measured; times behind the fastest, so not measured again
 _EQUAL = 1.02  # of the least time: an earlier way of a plan is taken unless it is slower by more
+_OF_DTYPES = re.compile("dtype|scalar type|Input type")  # in messages of PyTorch
 _OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
 
 
@@ -349,10 +351,13 @@ class Dispatch:
         try:
             results = way.run(call, grouping)
         except Exception as error:
-            if len(layout.lead) > 1 and not layout.flat and len(error.args) == 1 and isinstance(error.args[0], str):
+            shown = _misfit(error, call) or error
+            if len(layout.lead) > 1 and not layout.flat and len(shown.args) == 1 and isinstance(shown.args[0], str):
                 hint = f"{_OP}: the module saw [n, 1, f] for [rays, samples, f]; layout='flat' gives it [n, f]"
-                error.args = (f"{error.args[0]}\n{hint}",)
-            raise
+                shown.args = (f"{shown.args[0]}\n{hint}",)
+            if shown is error:
+                raise
+            raise shown from error
         if grouping.k == 1 and isinstance(way, Loop):
             latest["the module itself"] = "there is one cell"
             return results
@@ -391,6 +396,28 @@ class Dispatch:
             level = next((i for i, file in enumerate(files) if not file.startswith(_OWN)), len(files))
             warnings.warn(f"{_OP}: {message}", stacklevel=level + 1)
         self._warned.add(topic)
+
+
+def _misfit(error: Exception, call: Call) -> Exception | None:
+    """The error to show in the place of PyTorch's where arguments do not fit the layers of the module; or None."""
+    tensors = {n: v for n, v in zip(call.names, (*call.args, *call.kwargs.values())) if isinstance(v, Tensor)}
+    own = {p.dtype for p in call.module.parameters() if p.is_floating_point()}
+    other = {name: x.dtype for name, x in tensors.items() if x.is_floating_point() and x.dtype not in own}
+    if isinstance(error, RuntimeError) and len(own) == 1 and other and _OF_DTYPES.search(str(error)):
+        (dtype,), names = own, ", ".join(other)
+        return TypeError(
+            f"{_OP}: {names} must be {dtype}, as the parameters of {type(call.module).__name__} are, got "
+            f"{', '.join(map(str, other.values()))}; pass {next(iter(other))}.to({dtype}), or call router.to(dtype)"
+        )
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    layer, x = frame.f_locals.get("self"), frame.f_locals.get("input")
+    if isinstance(layer, nn.Linear) and isinstance(x, Tensor) and x.shape[-1:] != (layer.in_features,):
+        return ValueError(
+            f"{_OP}: {', '.join(tensors)} must fit {call.name}, whose {layer} gets {x.shape[-1]} features, got "
+            f"{', '.join(str(list(x.shape)) for x in tensors.values())}; pass what the module itself takes, and "
+            "positions that are no part of it as coords="
+        )
+    return None
 
 
 def _kind_of(call: Call, device: torch.device) -> Any:
