@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -110,6 +112,23 @@ def listed() -> nn.Module:
     return module
 
 
+def holding(value: Any) -> nn.Module:
+    module = nn.Linear(3, 2)
+    module.held = value
+    return nn.Sequential(nn.Linear(3, 3), module)
+
+
+@dataclasses.dataclass
+class Compared(nn.Module):
+    """Has no hash, since instances are equal by their fields."""
+
+    width: int = 2
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        self.fc = nn.Linear(3, self.width)
+
+
 def split(parents: Any) -> None:
     router = layered()
     router.subdivide(router.diagram.refine({0: torch.randn(2, 3)})[0], torch.tensor(parents))
@@ -131,6 +150,12 @@ MODULES: Errors = [
     (lambda: single(nn.LSTM(3, 4)), TypeError, "a LSTM is recurrent"),
     (lambda: single(SPECTRAL(nn.Linear(3, 4))), TypeError, "keeps a state for each weight"),
     (lambda: single(listed()), TypeError, "keeps parameters in the plain list `extra`"),
+    (
+        lambda: single(holding([threading.Lock()])),
+        TypeError,
+        "but `1`, a Linear, keeps in `held` a list, which it refuses",
+    ),
+    (lambda: single(nn.Sequential(Compared())), TypeError, r"must have a hash, .* but a Compared .*\(eq=False\)"),
 ]
 OPTIONS: Errors = [
     (lambda: VoronoiRouter(Field(), torch.randn(8, 5)), ValueError, "centres must"),

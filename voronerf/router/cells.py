@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from voronerf.router.grouping import SHARED, cell_parameters, owned_parameters
+from voronerf.router.grouping import SHARED, cell_parameters, owned_parameters, parts_of
 from voronerf.router.layout import DEEPEST, contents, tensors_of
 
 _OP = "VoronoiRouter"
@@ -26,7 +26,31 @@ def clone_module(module: Any, memo: dict[int, Any] | None = None) -> Any:
     """A deep copy, also of a module that keeps results of its last call (which torch refuses to copy)."""
     memo = {} if memo is None else memo
     detach_results(module, memo)
-    return copy.deepcopy(module, memo)
+    before = dict(memo)
+    try:
+        return copy.deepcopy(module, memo)
+    except Exception as error:
+        for name, part in module.named_modules():
+            for attribute, value in vars(part).items():
+                if attribute not in ("_parameters", "_buffers", "_modules") and not _is_copied(value, dict(before)):
+                    raise TypeError(
+                        f"{_OP}: module must be one that copy.deepcopy takes, but {_named(name, part)} keeps in "
+                        f"`{attribute}` a {type(value).__name__}, which it refuses ({error}); make it outside of the "
+                        "module, or give its class __deepcopy__"
+                    ) from error
+        raise
+
+
+def _is_copied(value: Any, memo: dict[int, Any]) -> bool:
+    try:
+        copy.deepcopy(value, memo)
+    except Exception:
+        return False
+    return True
+
+
+def _named(name: str, part: nn.Module) -> str:
+    return f"`{name}`, a {type(part).__name__}," if name else f"a {type(part).__name__}"
 
 
 def detach_results(module: nn.Module, memo: dict[int, Any]) -> None:
@@ -41,11 +65,16 @@ def check_module(module: nn.Module) -> None:
     """Raises TypeError for what cannot be one network for each cell."""
     if not isinstance(module, nn.Module):
         raise TypeError(f"{_OP}: module must be an nn.Module, got {type(module).__name__}")
+    for part in parts_of(module).values():
+        if type(part).__hash__ is None:
+            raise TypeError(
+                f"{_OP}: module must have a hash, which torch needs, but a {type(part).__name__} has none; "
+                "define it by @dataclass(eq=False), or with __hash__ beside __eq__"
+            )
     for name, part in module.named_modules():
         reason = _refusal(part)
         if reason:
-            where = f"`{name}`, a {type(part).__name__}," if name else f"a {type(part).__name__}"
-            raise TypeError(f"{_OP}: module must treat samples one by one, but {where} {reason}")
+            raise TypeError(f"{_OP}: module must treat samples one by one, but {_named(name, part)} {reason}")
     _check_reach(module)
 
 
@@ -55,7 +84,6 @@ def _check_reach(module: nn.Module) -> None:
     objects = {id(p): f"parameter `{name}`" for name, p in module.named_parameters()}
     objects |= {id(part): f"part `{name}`" if name else "module" for name, part in module.named_modules()}
     for name, part in module.named_modules():
-        where = f"`{name}`, a {type(part).__name__}," if name else f"a {type(part).__name__}"
         kept = {key: value for key, value in vars(part).items() if key not in ("_parameters", "_buffers", "_modules")}
         for attribute, value in (kept | dict(part.named_buffers(recurse=False))).items():
             for leaf in _leaves(value):
@@ -68,7 +96,8 @@ def _check_reach(module: nn.Module) -> None:
                     reason = f"a function that holds the {held}, of which cells have their own (make it a method)"
                 if reason:
                     raise TypeError(
-                        f"{_OP}: module must reach parameters by name, but {where} keeps in `{attribute}` {reason}"
+                        f"{_OP}: module must reach parameters by name, but {_named(name, part)} keeps in `{attribute}` "
+                        f"{reason}"
                     )
 
 
