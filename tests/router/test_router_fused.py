@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -273,7 +274,16 @@ class Masked(nn.Module):
         return self.b(y)
 
 
+class Shaped(Masked):
+    """Shapes that are computed in tensors, as a size and as a number."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.a(x.reshape(torch.prod(torch.tensor(x.shape[:-1])), -1))
+        return self.b(torch.tanh(y)).reshape(int(torch.tensor(x.shape[:-1]).prod()), 2)
+
+
 MODULES: dict[str, Callable[[], nn.Module]] = {
+    "a shape in tensors": Shaped,
     "Fourier KAN": lambda: nn.Sequential(FourierKAN(3, 4), FourierKAN(4, 2)),
     **{
         f"convolution, {form}": lambda form=form: Convolved(form)
@@ -424,9 +434,39 @@ class Assigned(Around):
         return self.b(y)
 
 
+@torch.jit.script
+def bend(x: Tensor) -> Tensor:
+    return torch.sin(x) * 2
+
+
+class Scripted(Around):
+    def forward(self, x: Tensor) -> Tensor:
+        return self.b(bend(self.a(x)))
+
+
+class Foreign(Around):
+    def forward(self, x: Tensor) -> Tensor:
+        return self.b(self.a(x) * torch.from_numpy(np.ones((len(x), 8), "f4")))
+
+
+class Counted(Around):
+    def forward(self, x: Tensor) -> Tensor:
+        return self.b(self.a(x)) if int(torch.tensor(x.shape).sum()) > 3 else x
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (
+            Scripted,
+            r"in Scripted.forward a tensor comes from bend, which torch.jit has compiled \(.*; do without",
+        ),
+        (
+            Foreign,
+            r"a tensor comes from what is no PyTorch function or one of torch.jit \(.*np.ones.*; write it",
+        ),
+        (lambda step: nn.Sequential(Scripted(step), nn.Linear(2, 2)), "a tensor comes from bend, which torch.jit has"),
+        (Counted, r"__int__ is read \(.* so the path of the module depends on values"),
         (Gridded, r"Product.apply \(.* is a custom function that takes parameters of cells; write it with functions"),
         (Assigned, r"__getitem__ \(.* which has no row for each of 37 samples.*as torch.where does"),
     ],

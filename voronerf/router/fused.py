@@ -195,7 +195,7 @@ class Fused:
 
         def own(source: fx.Node) -> Any:
             value = source.meta["value"]
-            if isinstance(value, Tensor):
+            if isinstance(value, Tensor) and not source.meta.get("counts"):
                 values[id(value)] = source
             return value
 

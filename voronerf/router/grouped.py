@@ -16,6 +16,7 @@ import linecache
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any, Protocol
 
 import torch
@@ -203,20 +204,28 @@ def writes_in_place(function: Any) -> bool:
     return name == "__setitem__" or name in _INPLACE or (name.endswith("_") and not name.startswith("__"))
 
 
-def user_line() -> str:
-    """File, line and code of the routed module on the stack, or an empty text."""
+def user_frame() -> FrameType | None:
+    """The frame of the routed module's code on the stack."""
     frame, inside = inspect.currentframe(), False
     while frame is not None:
         file = frame.f_code.co_filename
         ours = file.startswith(_HERE)
         if ours and inside:
-            break  # the router that called the module
+            return None  # the router that called the module
         inside = inside or not ours
         if inside and not ours and not file.startswith(_TORCH):
-            code = linecache.getline(file, frame.f_lineno).strip()
-            return f" ({os.path.basename(file)}:{frame.f_lineno}{f': {code}' if code else ''})"
+            return frame
         frame = frame.f_back
-    return ""
+    return None
+
+
+def line_of(frame: FrameType | None) -> str:
+    """File, line and code of a frame, or an empty text."""
+    if frame is None:
+        return ""
+    file = frame.f_code.co_filename
+    code = linecache.getline(file, frame.f_lineno).strip()
+    return f" ({os.path.basename(file)}:{frame.f_lineno}{f': {code}' if code else ''})"
 
 
 class GroupedRun(TorchFunctionMode):
@@ -264,7 +273,7 @@ class GroupedRun(TorchFunctionMode):
 
     def fail(self, reason: str, of_batch: bool = False) -> Ungroupable:
         """The error to raise where the run cannot go on."""
-        self.failed = self.failed or Ungroupable(reason + user_line(), of_batch)
+        self.failed = self.failed or Ungroupable(reason + line_of(user_frame()), of_batch)
         return self.failed
 
     # Functions --------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from torch.fx.node import map_aggregate, map_arg
 from torch.overrides import TorchFunctionMode
 
 from voronerf.router.double import Double
-from voronerf.router.grouped import METADATA, RANDOM, find, name_of, user_line, writes_in_place
+from voronerf.router.grouped import METADATA, RANDOM, find, line_of, name_of, user_frame, writes_in_place
 from voronerf.router.grouping import cell_parameters, owned_parameters, parts_of
 from voronerf.router.layout import Call, rebuild, tensors_of
 from voronerf.router.watch import Inputs, lookup
@@ -62,7 +62,8 @@ class Trace(TorchFunctionMode):
     """Records the functions that the routed module calls with its first cell's parameters.
 
     The ``meta`` of a node has its ``value``, what it depends on (``on``), its ``line`` in the module, whether gradients
-    were on (``grad``), and whether it is its first argument, written to (``inplace``).
+    were on (``grad``), whether it is its first argument, written to (``inplace``), and whether it has no rows but
+    numbers that follow from the number of samples (``counts``), such as ``torch.tensor(x.shape)``.
 
     The rows of the arguments are given for ``self.rows`` samples, ``inputs`` are taken as values of each call, and
     ``reads`` are the attributes that were read. Raises :class:`Unfusable` for a step that cannot be done again for
@@ -71,13 +72,14 @@ class Trace(TorchFunctionMode):
 
     def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
         super().__init__()
-        module = call.module
+        self._module = module = call.module
         single = {id(p): p.detach()[0].requires_grad_(p.requires_grad) for p in cell_parameters(module)}
         self._of_cells = set(map(id, single.values()))
         self._places = {id(single.get(id(p), p)): i for i, (_, _, p) in enumerate(owned_parameters(module))}
         self.graph = fx.Graph()
         self.parameters: dict[fx.Node, int] = {}  # with their place among ``owned_parameters``
         self._running, self._line = False, ""
+        self._code: tuple[tuple[str, ...], dict[str, Any]] = (), {}  # names that the line's code uses, and globals
         self._nodes: dict[int, fx.Node] = {}  # by the id of their tensor, which ``meta`` keeps
         self.rows = rows_for(module, tensors)
         self.n = self._new(self.rows)
@@ -106,7 +108,7 @@ class Trace(TorchFunctionMode):
         node.meta.update(value=value, on=on)
         if isinstance(value, Tensor):
             self._nodes[id(value)] = node
-            if on == SAMPLES and not any(size and size % self.rows == 0 for size in value.shape):
+            if on == SAMPLES and not node.meta.get("counts") and not self._has_rows(value):
                 node.meta["mixes"] = (
                     f"{name_of(node.target)}{node.meta.get('line', '')} gives a tensor of shape {list(value.shape)}, "
                     f"which has no row for each of {self.rows} samples: it mixes or selects them; keep a row for each, "
@@ -115,6 +117,9 @@ class Trace(TorchFunctionMode):
                 if value.dim() or node.target not in _TOTALS:
                     raise Unfusable(node.meta["mixes"])
         return node
+
+    def _has_rows(self, value: Tensor) -> bool:
+        return any(size and size % self.rows == 0 for size in value.shape)
 
     def _argument(self, value: Any) -> Any:
         """What stands for an argument in the graph."""
@@ -127,8 +132,19 @@ class Trace(TorchFunctionMode):
             self.parameters[node] = self._places[id(value)]
             return node
         if value.requires_grad or value.shape[:1] == (self.rows,):
-            raise Unfusable(f"a tensor comes from what is no PyTorch function{self._line}")
+            if names := self._compiled():
+                raise Unfusable(f"a tensor comes from {names}, which torch.jit has compiled{self._line}; do without")
+            remedy = "write it with functions of PyTorch, or call it in a torch.autograd.Function"
+            raise Unfusable(
+                f"a tensor comes from what is no PyTorch function or one of torch.jit{self._line}; {remedy}"
+            )
         return value
+
+    def _compiled(self) -> str:
+        """The names of parts of the module, and of functions that its code calls, which ``torch.jit`` has compiled."""
+        names, known = self._code
+        parts = [name for name, part in self._module.named_modules() if isinstance(part, torch.jit.ScriptModule)]
+        return ", ".join(parts + [name for name in names if isinstance(known.get(name), torch.jit.ScriptFunction)])
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Calls a function and records it."""
@@ -175,7 +191,9 @@ class Trace(TorchFunctionMode):
 
     def _begin(self, func: Any, args: Any, kwargs: Any) -> _Begun:
         """Records a function that is about to be called, and how to call it."""
-        self._line = line = user_line()
+        frame = user_frame()
+        self._line = line = line_of(frame)
+        self._code = (frame.f_code.co_names, frame.f_globals) if frame else ((), {})
         operands = tensors_of((args, kwargs))
         if func is torch.Tensor.type_as:
             func, args = torch.Tensor.to, (args[0], args[1].device, args[1].dtype)
@@ -195,7 +213,9 @@ class Trace(TorchFunctionMode):
         idle = func is F.dropout and not (kwargs["training"] and kwargs["p"])
         if used and func in RANDOM and not idle:
             raise Unfusable(f"{name_of(func)} draws random numbers{line}; pass them as an argument")
-        if used and not outputs and result is not None:
+        counts = all(s.meta.get("counts") or type(s.meta["value"]) is int for s in used)
+        of_rows = counts and type(result) is int and result and result % self.rows == 0  # recognised where it is used
+        if used and not outputs and result is not None and not of_rows:
             name = "the truth of a tensor" if isinstance(result, bool) else name_of(node.target)
             raise Unfusable(
                 f"{name} is read{line}, so the path of the module depends on values; write it with torch.where"
@@ -203,7 +223,7 @@ class Trace(TorchFunctionMode):
         for source in used:
             if "mixes" in source.meta and func is not torch.autograd.grad:
                 raise Unfusable(source.meta["mixes"])
-        alone = func in _LIKE and not any(size and size % self.rows == 0 for size in outputs[0].shape)
+        alone = func in _LIKE and not self._has_rows(outputs[0])
         if not used or alone or not outputs or (not inplace and any(result is tensor for tensor in operands)):
             self.graph.erase_node(node)
             return
@@ -212,6 +232,7 @@ class Trace(TorchFunctionMode):
             nodes = [self.graph.call_function(operator.getitem, (node, i)) for i in range(len(outputs))]
         node.meta["results"] = nodes
         for value, tensor in zip(nodes, outputs, strict=True):
+            value.meta["counts"] = counts and not self._has_rows(tensor)
             self._new(tensor, value, on)
         node.meta["on"] = on
 
