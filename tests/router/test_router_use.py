@@ -14,7 +14,7 @@ from router_fields import Heads, Sine, SkipNet, masked_loop, perturb
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from voronerf import VoronoiDiagram
+from voronerf import NeRF, VoronoiDiagram
 from voronerf.ops._core.tolerances import FLOOR
 from voronerf.router import VoronoiRouter
 
@@ -256,6 +256,93 @@ def test_inference_mode(generator: torch.Generator) -> None:
         torch.testing.assert_close(found, before.clone())
         found.sum().backward()
         assert all(p.grad is not None for name, p in router.named_parameters() if ".net." in name)
+
+
+class Labelled(Tensor):
+    """Names of columns beside a tensor, as in PINA: results of functions are of this class, but have no names."""
+
+    @staticmethod
+    def of(x: Tensor, labels: list[str]) -> Labelled:
+        labelled = x.as_subclass(Labelled)
+        labelled._labels = labels
+        return labelled
+
+    def __getitem__(self, index: Any) -> Labelled:
+        return Labelled.of(super().__getitem__(index), self._labels)
+
+    def reshape(self, *shape: Any) -> Labelled:
+        return Labelled.of(super().reshape(*shape), self._labels)
+
+    def clone(self, **options: Any) -> Labelled:
+        return Labelled.of(super().clone(**options), self._labels)
+
+    def column(self, name: str) -> Tensor:
+        return self.as_subclass(Tensor)[..., self._labels.index(name)]
+
+
+class Named(nn.Module):
+    """Uses names of columns, in one of several ways."""
+
+    def __init__(self, use: str) -> None:
+        super().__init__()
+        self.fc, self.use = nn.Linear(3, 2), use
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.use == "always":
+            return self.fc(torch.stack([x.column(name) for name in "zyx"], -1))
+        if self.use == "where there are some" and isinstance(x, Labelled):
+            return -self.fc(x)
+        return Labelled.of(self.fc(x), ["u", "v"]) if self.use == "for results" else self.fc(x)
+
+
+WAYS: list[dict[str, Any]] = [{"fuse": True, "way": "fused"}, {"way": "grouped"}, {"way": "loop"}]
+
+
+@pytest.mark.parametrize("options", WAYS)
+def test_tensors_of_subclasses_are_taken_as_plain(generator: torch.Generator, options: dict[str, Any]) -> None:
+    router, x = router_of(SkipNet(), generator, **options), uniform(generator, 60, 15)
+    leaf = x.clone().requires_grad_()
+    expected = router(leaf)
+    (slope,) = torch.autograd.grad(expected.sum(), leaf)
+    labelled = Labelled.of(x.clone(), list("xyzabcdefghijkl")).requires_grad_()
+    for _ in range(2):
+        found = router(labelled)
+        assert type(found) is Tensor
+        torch.testing.assert_close(found, expected)
+        torch.testing.assert_close(torch.autograd.grad(found.sum(), labelled)[0].as_subclass(Tensor), slope)
+    torch.testing.assert_close(router(x, coords=Labelled.of(x[:, :3], list("xyz"))), expected)
+    torch.testing.assert_close(router(labelled.reshape(6, 10, 15)), expected.reshape(6, 10, 4))
+    assert router.explain().split(":")[1].split()[0] == options["way"].replace("loop", "cell")
+
+
+def test_a_layer_table_takes_subclasses_of_tensors(generator: torch.Generator) -> None:
+    router, x = VoronoiRouter(NeRF(width=16, depth=2), uniform(generator, 3, 3)), uniform(generator, 20, 3)
+    for a, b in zip(router(Labelled.of(x, list("xyz")), Labelled.of(x, list("xyz"))), router(x, x), strict=True):
+        assert type(a) is Tensor
+        torch.testing.assert_close(a, b)
+
+
+@pytest.mark.filterwarnings("ignore:.*cell by cell")
+@pytest.mark.parametrize("options", WAYS)
+def test_modules_that_need_a_subclass_of_tensors_are_told(generator: torch.Generator, options: dict[str, Any]) -> None:
+    x = uniform(generator, 60, 3)
+    labelled = Labelled.of(x, list("xyz"))
+    router = router_of(Named("always"), generator, **options)
+    with pytest.raises(
+        TypeError, match=r"Named.forward must do with plain .*needs a Labelled \(AttributeError: .*; take"
+    ):
+        router(labelled)
+    router = router_of(Named("where there are some"), generator, **options)
+    router(x)
+    for _ in range(2):
+        with pytest.raises(
+            TypeError, match=r"Named.forward must do with .* needs a Labelled \(its results differ\); take"
+        ):
+            router(labelled)
+    with pytest.raises(
+        TypeError, match="results must be plain tensors, got a Labelled; make it of the router's results"
+    ):
+        router_of(Named("for results"), generator, **options)(x)
 
 
 class Bent(nn.Module):

@@ -31,8 +31,8 @@ from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters, parts_of
 from voronerf.router.known import KnownCall
-from voronerf.router.layout import Call, Results, map_tensors
-from voronerf.router.probe import Options, Probe, check_rays
+from voronerf.router.layout import Call, Results, map_tensors, tensors_of
+from voronerf.router.probe import Options, Probe, check_rays, check_subclasses
 from voronerf.router.program import Activation, CellProgram
 from voronerf.router.table import LayeredField
 from voronerf.router.transforms import aside, is_watched, recorded
@@ -122,6 +122,7 @@ class Dispatch:
         self._known, self._trees = list[Any](), list[Any]()  # parameters, and parts of the module, at the last call
         self._k = 0  # cells, then
         self._inner: list[Any] = []  # shapes of one cell's parameters
+        self._subclasses: set[Any] = set()  # of tensors that methods do without
         self._warned: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
         self._activation: Activation | None = None
@@ -179,6 +180,7 @@ class Dispatch:
             frozen: bool [k]; samples in these cells are evaluated without gradients.
         """
         self._check_parameters(call, grouping.k, options.names)
+        call = self._plain(call)
         plan = self._plan(call, grouping, options)
         if frozen is None or not torch.is_grad_enabled() or not call.layout.n:
             results = self._run(plan, call, grouping)
@@ -189,6 +191,15 @@ class Dispatch:
                 self.known = {}
             self.known[call.like] = known
         return results
+
+    def _plain(self, call: Call) -> Call:
+        """The call with plain tensors; raises TypeError, the first time, where the module needs those of a subclass."""
+        if (plain := call.plain()) is not call:
+            key = call.method, frozenset(map(type, tensors_of((call.args, call.kwargs))))
+            if key not in self._subclasses:
+                check_subclasses(call, plain)
+            self._subclasses.add(key)
+        return plain
 
     def find(self, kind: Any, k: int) -> KnownCall | None:
         """The known call of a kind, if the module has not changed; while it compiles this is assumed."""

@@ -102,6 +102,14 @@ def map_tensors(value: Any, change: Callable[[Tensor], Any]) -> Any:
     return map_tree(value, lambda _, leaf, nested: change(leaf) if isinstance(leaf, Tensor) else leaf)
 
 
+def as_plain(value: Any) -> Any:
+    """A tensor of a subclass as a plain one, and any other value, or a tensor with a dispatch of its own, as it is."""
+    kind = type(value)
+    if kind is Tensor or kind is nn.Parameter or not isinstance(value, Tensor):
+        return value
+    return value.as_subclass(Tensor) if kind.__torch_dispatch__ is Tensor.__torch_dispatch__ else value
+
+
 def rebuild(value: Any, tensors: Iterable[Any]) -> Any:
     """A structure with other tensors in the order of :func:`tensors_of`."""
     following = iter(tensors)
@@ -264,6 +272,12 @@ class Call:
         call.changed(lambda tensor, kind: tensor)
         return call
 
+    def plain(self) -> Call:
+        """The same with plain tensors in the place of those of subclasses; itself where there are none."""
+        args, kwargs = map_tensors((self.args, self.kwargs), as_plain)
+        same = args is self.args and kwargs is self.kwargs
+        return self if same else dataclasses.replace(self, args=args, kwargs=kwargs)
+
     def part(self, most: int) -> tuple[Call, Tensor] | None:
         """A call with some of the samples, and int64 [m], which; None where all of them are few enough.
 
@@ -352,6 +366,9 @@ class Results:
                 raise ValueError(
                     f"{_OP}: results must have a row for each sample, got {list(tensor.shape)} for {n} samples"
                 )
+            if as_plain(tensor) is not tensor:
+                kind = type(tensor).__name__
+                raise TypeError(f"{_OP}: results must be plain tensors, got a {kind}; make it of the router's results")
         joined = [torch.cat(pieces) if len(pieces) > 1 else pieces[0] for pieces in zip(*parts, strict=True)]
         return Results(values[0], joined, order)
 
@@ -369,7 +386,7 @@ def first_tensor(args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor | None:
     """The first tensor among the arguments of a call."""
     for value in (*args, *kwargs.values()) if kwargs else args:
         if isinstance(value, Tensor) and value.dim():
-            return value
+            return as_plain(value)
     return None
 
 
@@ -383,9 +400,9 @@ def find_positions(rule: Any, args: Sequence[Any], kwargs: dict[str, Any], d: in
         )
     source = None
     if isinstance(rule, Tensor):
-        positions = rule
+        positions = as_plain(rule)
     elif callable(rule):
-        positions = rule(*args, **kwargs)
+        positions = as_plain(rule(*args, **kwargs))
     elif not isinstance(rule, (str, slice)):
         raise TypeError(f"{_OP}: coords must be a tensor, got {type(rule).__name__}; {AS_TENSOR}")
     else:

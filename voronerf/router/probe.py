@@ -20,12 +20,13 @@ from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters
-from voronerf.router.layout import RAY, Call, Results, map_tensors, tensors_of
+from voronerf.router.layout import RAY, Call, Results, as_plain, map_tensors, tensors_of
 from voronerf.router.trace import Unfusable, rows_for
 from voronerf.router.watch import Inputs
 
 _OP = "VoronoiRouter"
 _SAMPLES, _CELLS = (41, 43, 47, 53), 3  # numbers of samples of a probe, of which one is taken, and their cells
+_FEW = 8  # rows that show whether a module needs a subclass of tensors
 _PIECE = 8 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
 
 Outcome = tuple[Results, list[Tensor]]  # and gradients
@@ -274,3 +275,32 @@ def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
     cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
     with torch.no_grad(), NoRandomness():
         return [tensors_of(Double(call.module).run(small, rows, cell)) for rows in (tensors, small.arranged(None))]
+
+
+def check_subclasses(call: Call, plain: Call) -> None:
+    """Raises TypeError where a call gives something else for a few plain tensors than for those of a subclass."""
+    rows: list[Tensor] = []
+
+    def first(tensor: Tensor, kind: str) -> Tensor:
+        rows.append(tensor[:_FEW])
+        return tensor
+
+    call.changed(first)
+    cell = {id(parameter): parameter.detach()[0] for parameter in cell_parameters(call.module)}
+    with torch.no_grad(), NoRandomness():
+        try:
+            expected = tensors_of(Double(call.module).run(call, rows, cell))
+        except Exception:
+            return  # plain tensors alone will do, or the call itself says what is wrong
+        try:
+            results = tensors_of(Double(call.module).run(plain, map(as_plain, rows), cell))
+            same = len(results) == len(expected) and all(map(agree, map(as_plain, results), map(as_plain, expected)))
+            why = "" if same else "its results differ"
+        except Exception as error:
+            why = f"{type(error).__name__}: {error}"
+    if why:
+        kind = next(type(x).__name__ for x in tensors_of((call.args, call.kwargs)) if as_plain(x) is not x)
+        raise TypeError(
+            f"{_OP}: {call.name} must do with plain tensors, as rows of cells are, but needs a {kind} ({why}); take "
+            f"what it needs out of the {kind} before the call"
+        )

@@ -83,6 +83,7 @@ class VoronoiRouter(nn.Module):
 
     Arguments are per sample ``[..., f]``; per ray ``[rays, f]`` beside ``[rays, samples, f]``; numbers, flags, None and
     tensors of one element, which are passed on; and objects that hold tensors, such as nerfstudio's ``RaySamples``.
+    Tensors of a subclass are taken as plain ones; a module that gives other results for those is refused.
 
     Args:
         module: Any ``nn.Module`` that treats samples one by one; it is copied and never changed.

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.routed_mlp import routed_mlp
-from voronerf.router.layout import AS_TENSOR
+from voronerf.router.layout import AS_TENSOR, as_plain
 
 
 @runtime_checkable
@@ -107,7 +107,8 @@ class Table:
 
 def _arguments(positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> dict[str, Any]:
     """Those of a field's ``forward`` as `routed_mlp` takes them."""
-    return {"positions": positions, "directions": directions, "direction_index": ray_index}
+    directions, ray_index = as_plain(directions), as_plain(ray_index)
+    return {"positions": as_plain(positions), "directions": directions, "direction_index": ray_index}
 
 
 def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
