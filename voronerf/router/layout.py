@@ -386,7 +386,7 @@ def first_tensor(args: Sequence[Any], kwargs: dict[str, Any]) -> Tensor | None:
     """The first tensor among the arguments of a call."""
     for value in (*args, *kwargs.values()) if kwargs else args:
         if isinstance(value, Tensor) and value.dim():
-            return as_plain(value)
+            return value if type(value) is Tensor else as_plain(value)
     return None
 
 

@@ -93,6 +93,8 @@ class Table:
     def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """The results of a call; coords [..., d] are those that it was given."""
         arguments = _arguments(*args, **kwargs)
+        if type(arguments["positions"]) is not Tensor:
+            arguments = {name: as_plain(value) for name, value in arguments.items()}
         field, positions = router.module, arguments.pop("positions")
         features = 6 if field.layers.integrated else 3
         if not isinstance(positions, Tensor):
@@ -107,8 +109,7 @@ class Table:
 
 def _arguments(positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None) -> dict[str, Any]:
     """Those of a field's ``forward`` as `routed_mlp` takes them."""
-    directions, ray_index = as_plain(directions), as_plain(ray_index)
-    return {"positions": as_plain(positions), "directions": directions, "direction_index": ray_index}
+    return {"positions": positions, "directions": directions, "direction_index": ray_index}
 
 
 def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
