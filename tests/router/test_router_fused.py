@@ -171,6 +171,7 @@ PARTS: dict[str, Callable[[Any, Tensor], Any]] = {
     "of what is joined": lambda net, x: torch.cat([x, net.raw(x)], -1).split([2, 5], -1),
     "columns of what is joined": lambda net, x: (net.raw(x), torch.cat([x, net.raw(x)], -1)[:, :2]),
     "of zeros": lambda net, x: (net.raw(x), *torch.zeros(len(x), 2).chunk(2, -1)),
+    "of zeros, and a layer": lambda net, x: (*torch.zeros(len(x), 2).chunk(2, -1), net.raw(x)),
     "without columns": lambda net, x: (net.c(x.split([3, 0], -1)[0]), *net.raw(x).split([4, 0], -1)),
 }
 PARTS_BETWEEN: dict[str, Callable[[Any, Tensor], Any]] = {

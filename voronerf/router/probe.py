@@ -153,10 +153,10 @@ class Probe:
         """Results, and gradients of a weighted sum of them."""
         results, generator, total = self._run(way), torch.Generator().manual_seed(7), []
         for tensor in results.tensors:
+            tensor = torch.view_as_real(tensor) if tensor.is_complex() else tensor
+            weights = torch.randn(tensor.shape, generator=generator)  # also of a constant, for which ways may differ
             if tensor.requires_grad:
-                tensor = torch.view_as_real(tensor) if tensor.is_complex() else tensor
-                weights = torch.randn(tensor.shape, generator=generator).to(tensor)
-                total.append((tensor * weights).sum().float())
+                total.append((tensor * weights.to(tensor)).sum().float())
         if not total or not torch.is_grad_enabled():
             return results, []
         torch.stack(total).sum().backward()  # not torch.autograd.grad, which some checkpoints refuse
