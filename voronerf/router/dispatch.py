@@ -411,23 +411,25 @@ class Dispatch:
 
 def _misfit(error: Exception, call: Call) -> Exception | None:
     """The error to show in the place of PyTorch's where arguments do not fit the layers of the module; or None."""
+    if not isinstance(error, RuntimeError):
+        return None
     tensors = {n: v for n, v in zip(call.names, (*call.args, *call.kwargs.values())) if isinstance(v, Tensor)}
     own = {p.dtype for p in call.module.parameters() if p.is_floating_point()}
     other = {name: x.dtype for name, x in tensors.items() if x.is_floating_point() and x.dtype not in own}
-    if isinstance(error, RuntimeError) and len(own) == 1 and other and _OF_DTYPES.search(str(error)):
+    if len(own) == 1 and other and _OF_DTYPES.search(str(error)):
         (dtype,), names = own, ", ".join(other)
         return TypeError(
             f"{_OP}: {names} must be {dtype}, as the parameters of {type(call.module).__name__} are, got "
             f"{', '.join(map(str, other.values()))}; pass {next(iter(other))}.to({dtype}), or call router.to(dtype)"
         )
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    layer, x = frame.f_locals.get("self"), frame.f_locals.get("input")
-    if isinstance(layer, nn.Linear) and isinstance(x, Tensor) and x.shape[-1:] != (layer.in_features,):
-        return ValueError(
-            f"{_OP}: {', '.join(tensors)} must fit {call.name}, whose {layer} gets {x.shape[-1]} features, got "
-            f"{', '.join(str(list(x.shape)) for x in tensors.values())}; pass what the module itself takes, and "
-            "positions that are no part of it as coords="
-        )
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        layer, x = frame.f_locals.get("self"), frame.f_locals.get("input")
+        if isinstance(layer, nn.Linear) and isinstance(x, Tensor) and x.shape[-1:] != (layer.in_features,):
+            return ValueError(
+                f"{_OP}: {', '.join(tensors)} must fit {call.name}, whose {layer} gets {x.shape[-1]} features, got "
+                f"{', '.join(str(list(x.shape)) for x in tensors.values())}; pass what the module itself takes, and "
+                "positions that are no part of it as coords="
+            )
     return None
 
 
