@@ -190,6 +190,7 @@ def _second_optimizer(training: Training, rng: random.Random) -> None:
         training.optimizer.state.pop(parameter, None)
         training.other = torch.optim.SGD([parameter], lr=0.1)
         return
+    training.router.unfreeze()  # SGD, which was not given to freeze, would move frozen cells
     training.other.step()
     training.other.zero_grad()
     if rng.random() < 0.5:
