@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import copy
+import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
-from router_fields import Heads, Sine, perturb, tensors
+from router_fields import Heads, Sine, masked_loop, perturb, tensors
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
+from voronerf.router import dispatch
 from voronerf.router.dispatch import Dispatch
 
 Call = Callable[[VoronoiRouter], Any]
@@ -139,16 +142,92 @@ def test_autocast_rounds_alike(ordinary: Callable[..., list[Tensor]], calls: lis
     assert outcome(router, lambda r: r(rows(64)))[0].dtype is torch.float32
 
 
-@pytest.mark.parametrize("n", [2, 7, 64, 513])
+@pytest.mark.parametrize("n", [1, 2, 7, 64, 513])
 def test_of_any_number_of_samples(n: int, ordinary: Callable[..., list[Tensor]], calls: list[str]) -> None:
     router = routed(net())
     router(rows(64))
     found = outcome(router, lambda r: r(rows(n)))
     assert calls == ["forward"]
     assert all(map(torch.equal, found, ordinary(router, lambda r: r(rows(n)))))
-    for few in (0, 1):  # which have plans of their own
-        assert router(rows(few)).shape == (few, 4)
-    assert len(calls) == 4
+    assert router(rows(0)).shape == (0, 4)
+
+
+LEADS = [(1,), (2,), (7,), (300,), (1, 5), (6, 1), (1, 40), (9, 40)]
+
+
+@pytest.mark.parametrize("leads", [LEADS, LEADS[::-1]], ids=["small first", "large first"])
+@pytest.mark.parametrize("fuse", [True, False])
+def test_few_samples_are_as_well_known_as_many(
+    leads: list[tuple[int, ...]], fuse: bool, monkeypatch: pytest.MonkeyPatch, calls: list[str]
+) -> None:
+    router, probes, probe = routed(Named(), fuse=fuse, way="fastest"), list[Any](), dispatch.Probe
+    monkeypatch.setattr(dispatch, "Probe", lambda *made_of: probes.append(made_of) or probe(*made_of))
+    for turn in range(3):
+        del calls[:], probes[:]
+        for lead in leads:
+            x, d = rows(math.prod(lead)), rows(math.prod(lead), seed=1)
+            expected = masked_loop(router, router.assign(x), [x, d])[0]
+            for found, flat in zip(tensors(router(x.reshape(*lead, 3), d.reshape(*lead, 3))), expected, strict=True):
+                torch.testing.assert_close(found.flatten(0, len(lead) - 1), flat)
+        assert len(probes) == 0 if turn else len(probes) <= 6, "one a kind, and again for the first large batch"
+    assert calls == [] or not fuse
+
+
+class Given(nn.Module):
+    """Takes a vector that all samples share, or the rays do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Linear(6, 4)
+
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        t = t[:, None] if t.dim() < x.dim() else t
+        return self.layer(torch.cat([x, t.expand(*x.shape[:-1], -1)], -1))
+
+    def chosen(self, x: Tensor, t: Tensor) -> Tensor:
+        return self.layer(torch.cat([x, t[0].expand(len(x), -1)], -1))
+
+
+@pytest.mark.parametrize("sizes", [(1, 300, 1, 3, 1), (300, 1, 3)])
+@pytest.mark.parametrize("method", ["forward", "chosen"])
+@pytest.mark.parametrize("fuse", [True, False])
+def test_a_row_beside_one_sample_may_be_what_all_share(fuse: bool, method: str, sizes: tuple[int, ...]) -> None:
+    router, t = routed(Given(), fuse=fuse, way="fastest", methods=["chosen"]), rows(1, seed=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for n in sizes:
+            x = rows(n)
+            found = getattr(router, method)(x, t) if method != "forward" else router(x, t)
+            expected = masked_loop(router, router.assign(x), [x, t.expand(n, 3)])[0]
+            torch.testing.assert_close([found], expected)
+
+
+def test_a_row_beside_one_ray_is_of_that_ray_or_of_all_samples() -> None:
+    router = routed(Given(), way="fastest")
+    for r, s, rays in [(1, 6, 1), (1, 1, 1), (5, 9, 5), (1, 9, 1), (5, 9, 1), (5, 1, 5), (5, 1, 1), (1, 9, 1)]:
+        x, t = rows(r * s), rows(rays, seed=1)
+        each = t.expand(r, 3).repeat_interleave(s, 0)
+        for given in (t, t[:, None])[rays < r :]:  # [1, f] beside several rays is refused
+            expected = masked_loop(router, router.assign(x), [x, each])[0][0].reshape(r, s, 4)
+            torch.testing.assert_close(router(x.reshape(r, s, 3), given), expected)
+
+
+class Mean(nn.Linear):
+    """Mixes the samples of a call."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x - x.mean(0))
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter")
+@pytest.mark.parametrize("fuse", [True, False])
+def test_of_few_samples_a_module_that_mixes_them_runs_cell_by_cell(fuse: bool) -> None:
+    router = routed(Mean(3, 2), fuse=fuse, way="fastest")
+    for x in (torch.zeros(1, 3), rows(7), rows(2)):
+        torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0])
+    with pytest.raises(TypeError, match="it mixes samples"):
+        router(rows(40))
+    assert router.explain() == "forward: cell by cell: first calls of fewer than 8 samples"
 
 
 def test_gradients_to_arguments_and_second_derivatives(ordinary: Callable[..., list[Tensor]], calls: list[str]) -> None:

@@ -26,20 +26,19 @@ from torch import Tensor, nn
 
 from voronerf.ops._core.backends import BackendUnavailable
 from voronerf.router import rules  # noqa: F401  registers the rules
-from voronerf.router.double import Double
+from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters, parts_of
 from voronerf.router.known import KnownCall
 from voronerf.router.layout import Call, Results, map_tensors, tensors_of
-from voronerf.router.probe import Options, Probe, check_rays, check_subclasses
+from voronerf.router.probe import FEWEST, Options, Probe, check_rays, check_subclasses
 from voronerf.router.program import Activation, CellProgram
 from voronerf.router.table import LayeredField
 from voronerf.router.transforms import aside, is_watched, recorded
 from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup, same
 
 _OP = "VoronoiRouter"
-_FEWEST = 8  # samples; a first call of fewer is not probed and runs cell by cell
 _PLANS = 256  # kinds of calls that are remembered
 _TRACES = 8  # of one kind of call; a module that changes more often runs grouped
 _TURNS, _SECONDS = 8, 0.08  # a way is measured at most so often, and no more than twice after so many seconds
@@ -57,6 +56,7 @@ class CallPlan:
         ways: Those that give what the loop gives, the most promising first and the loop last.
         measured: Whether the first batch of each size decides between the ways; else the first one runs.
         open: Whether another batch may run grouped, though the first did not.
+        few: Whether it was made for fewer than ``FEWEST`` samples; the first larger call makes another.
         chosen: The fastest way and why, by the size of a batch and the number of cells.
         constants: What is no tensor among the arguments of the call that it was made for, if it is fused.
         watch: Values of the module that its trace read.
@@ -67,6 +67,7 @@ class CallPlan:
     ways: list[Way]
     measured: bool = False
     open: bool = False
+    few: bool = False
     chosen: dict[tuple[int, int], tuple[int, str]] = field(default_factory=dict)
     constants: dict[str, Any] = field(default_factory=dict)
     watch: Watch = field(default_factory=Watch)
@@ -80,9 +81,9 @@ class CallPlan:
 
     def takes_first(self, n: int, k: int) -> bool:
         """Whether n samples in k cells are known to go the first way."""
-        if self.skip:
+        if self.skip or (self.few and n >= FEWEST):
             return False
-        if not self.measured or len(self.ways) == 1 or n < _FEWEST:
+        if not self.measured or len(self.ways) == 1 or n < FEWEST:
             return True
         return self.chosen.get(self.size(n, k), (1, ""))[0] == 0
 
@@ -151,7 +152,8 @@ class Dispatch:
         if torch.is_autocast_enabled(device.type):
             return f"{call.name} rounds as autocast does"
         self._check_parameters(call, k, options.names)
-        plans, constants = self.plans.get(_kind_of(call, device), []), call.constants()
+        constants = call.constants()
+        plans = [plan for plan in self.plans.get(_kind_of(call, device), []) if plan.fused or not plan.few]
         plan = next((plan for plan in plans if not plan.changed(constants)), None)
         if plan is None and grouping is None:
             return f"{call.name} is traced at its {'next' if plans else 'first'} call"
@@ -252,37 +254,41 @@ class Dispatch:
     def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
         """The plan for calls of this kind, which the first of them makes, and one that finds other values."""
         layout, key = call.layout, _kind_of(call, grouping.device)
-        constants = call.constants() if options.fuse else {}
-        plans = self.plans.get(key, [])
+        constants, few = call.constants() if options.fuse else {}, layout.n < FEWEST
+        plans = [plan for plan in self.plans.get(key, []) if few or not plan.few]
         plan = next((plan for plan in plans if not plan.changed(constants)), None)
-        if plan is not None and (not (plan.open and plan.skip == 0 and layout.n >= _FEWEST) or recorded()):
+        if plan is not None and (few or not plan.open or plan.skip or recorded()):
             return plan
-        call.changed(lambda tensor, kind: tensor)  # arguments that are refused are so before anything is probed
+        if not layout.n:
+            return CallPlan([Loop("no samples yet")])
         generators = [grouping.device] if grouping.device.type == "cuda" else []
         with self._lock, torch.random.fork_rng(generators), aside(call) as beside:
-            if layout.n < _FEWEST:
-                if layout.n:
-                    Probe(beside, grouping).check_parameters()
-                return CallPlan([Loop(f"first calls of fewer than {_FEWEST} samples")])
             probe = Probe(beside, grouping)
             if plan is not None and not probe.is_groupable():
                 plan.postpone()
                 return plan
-            if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
-                check_rays(beside)
             inputs, over = self._inputs(call, constants, plans, key) if plan is None and plans else ([Inputs()], "")
             # What was fused once goes on grouped where it cannot be fused again.
             options = replace(options, several=options.several or bool(plans))
-            ways, is_open = probe.find_ways(options, self.warn_once, inputs, over)
+            try:
+                if len(layout.lead) > 1 and layout.lead[-1] > 1 and not layout.flat:
+                    check_rays(beside)
+                ways, is_open = probe.find_ways(options, (lambda *_: None) if few else self.warn_once, inputs, over)
+            except (TypeError, ValueError) as error:
+                if not few or isinstance(error, Forbidden):
+                    raise
+                ways, is_open = [Loop()], False  # a tensor [1, f] beside one sample may be what all samples share
+            if few and isinstance(ways[0], Loop):
+                ways[0].why = f"first calls of fewer than {FEWEST} samples"
         if len(self.plans) >= _PLANS:
             self.plans, self.known = {}, {}
-        made = CallPlan(ways, options.way == "fastest", is_open, constants=constants)
+        made = CallPlan(ways, options.way == "fastest", is_open, few, constants=constants)
         if made.fused is not None:
             made.watch = Watch.of(call.module, made.fused.reads, made.fused.inputs)
         if probe.refused and made.fused is not None:
             fixed = self._fixed.setdefault(key, (set(), probe.refused))[0]
             fixed.update(*(other.sources - made.fused.inputs.sources for other in inputs))
-        before = set(map(id, plans))
+        before = set(map(id, self.plans.get(key, [])))
         self.known = {like: other for like, other in self.known.items() if id(other.plan) not in before}
         if plans and [way.name for way in plans[0].ways] == [way.name for way in ways]:
             made.chosen = plans[0].chosen
@@ -325,7 +331,7 @@ class Dispatch:
         if plan.skip:
             plan.skip -= not recorded()
             ways = ways[-1:]
-        if not plan.measured or len(ways) == 1 or n < _FEWEST:
+        if not plan.measured or len(ways) == 1 or n < FEWEST:
             return ways[0], ways[0].why
         size, n = plan.size(n, k), min(n, measured_samples(ways))
         if size not in plan.chosen:
@@ -373,7 +379,7 @@ class Dispatch:
             latest["the module itself"] = "there is one cell"
             return results
         latest[way.name] = why
-        if why and warns and grouping.k > 1 and layout.n >= _FEWEST:
+        if why and warns and grouping.k > 1 and layout.n >= FEWEST:
             self.warn_once(f"cells {call.method}", f"{call.name} runs cell by cell: {why}")
         return results
 
@@ -434,14 +440,19 @@ def _misfit(error: Exception, call: Call) -> Exception | None:
 
 
 def _kind_of(call: Call, device: torch.device) -> Any:
-    """The key of plans: modes, and types and sizes of the arguments but for the number of samples."""
+    """The key of plans: modes, and kinds, types and sizes of the arguments but for the number of samples.
+
+    Raises ValueError for tensors that are neither per sample nor per ray, or could be both.
+    """
     autocast = torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None
-    d = len(call.layout.lead)
-    kind = [call.method, call.module.training, torch.is_grad_enabled(), autocast, tuple(call.kwargs), d]
+    lead, d = call.layout.lead, len(call.layout.lead)
+    call.changed(lambda tensor, kind: tensor)
+    several = d > 1 and lead[-1] > 1  # rays of one sample show nothing of a module that mixes the samples of a ray
+    modes = call.method, call.module.training, torch.is_grad_enabled(), autocast
+    kind: list[Any] = [*modes, tuple(call.kwargs), d, several, *call.kinds.items()]
     for value in (*call.args, *call.kwargs.values()):
         if isinstance(value, Tensor):
-            ones = tuple(size == 1 for size in value.shape[:d])
-            kind.append((tuple(value.shape[d:]), value.dim(), value.dtype, value.requires_grad, ones))
+            kind.append((tuple(value.shape[d:]), value.dim(), value.dtype, value.requires_grad))
         else:
             kind.append(value if isinstance(value, (type(None), bool, str)) else type(value))
     return tuple(kind)

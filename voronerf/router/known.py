@@ -58,7 +58,7 @@ class KnownCall:
         self._learns = torch.is_grad_enabled() and any(arguments[i].requires_grad for i in self._reads)
         self._module = call.module
         self.plan, self._method, self._run, self._how = plan, call.method, run_routed, How(program.text)
-        self._leading, self._one, device = len(call.layout.lead), call.layout.lead[0] == 1, grouping.device
+        self._leading, device = len(call.layout.lead), grouping.device
         half = torch.is_autocast_enabled(device.type) or any(arguments[i].dtype in HALF for i in self._tensors)
         ones = 0 if call.layout.flat else self._leading - 1
         self._results = [(shape[ones:], dtype if half and dtype in HALF else torch.float32) for shape, dtype in results]
@@ -111,7 +111,7 @@ class KnownCall:
             drawn = router.assignment == "stochastic" and router.training
             if drawn or router.methods or not self._in_graphs:
                 return None
-        elif (lead[0] == 1) != self._one or not self.plan.takes_first(n, k):
+        elif not self.plan.takes_first(n, k):
             return None
         for i in self._tensors:
             shape = (x := arguments[i]).shape

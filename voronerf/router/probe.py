@@ -25,6 +25,7 @@ from voronerf.router.trace import Unfusable, rows_for
 from voronerf.router.watch import Inputs
 
 _OP = "VoronoiRouter"
+FEWEST = 8  # samples; a batch of fewer is probed with others close to them
 _SAMPLES, _CELLS = (41, 43, 47, 53), 3  # numbers of samples of a probe, of which one is taken, and their cells
 _FEW = 8  # rows that show whether a module needs a subclass of tensors
 _PIECE = 8 << 20  # bytes of the largest tensor of a piece of rows on a CPU; larger ones are fetched from memory
@@ -48,13 +49,13 @@ class Probe:
     def __init__(self, call: Call, grouping: Grouping, dtype: torch.dtype | None = None) -> None:
         self._made_of = call, grouping
         self.refused = ""  # why what changed cannot be an input
-        device = grouping.device
+        device, generator = grouping.device, torch.Generator().manual_seed(0)
+        call = _widened(call, generator) if call.layout.n < FEWEST else call
         self._n = n = rows_for(call.module, tensors_of((call.args, call.kwargs)), _SAMPLES)
         picked = torch.arange(n, device=device) * call.layout.n // n
         cells = (torch.arange(n, device=device) * 7 % 5 // 2).int()
         self._entries = Grouping(cells, n, _CELLS, device, grouping.backend, rows=picked)
         self._entries.source, self._entries.occupied  # noqa: B018  found here: under a mode torch imports its compiler
-        generator = torch.Generator().manual_seed(0)
         memo = {id(p): _perturbed(p, generator) for p in cell_parameters(call.module)}
         module = clone_module(call.module, memo).to(dtype)
         self._leaves: list[Tensor] = []
@@ -124,16 +125,6 @@ class Probe:
         elif loop.again:
             ways = ways[:1]  # cannot be measured, since some checkpoints refuse torch.autograd.grad
         return [*ways, loop], is_open and not ways
-
-    def check_parameters(self) -> None:
-        """Raises TypeError where the module changes its parameters."""
-        try:
-            with torch.no_grad():
-                self._run(Loop())
-        except Forbidden:
-            raise
-        except Exception:
-            return  # the call itself says so
 
     def is_groupable(self) -> bool:
         """Whether the module runs for all cells at once on this batch, right or wrong."""
@@ -231,6 +222,27 @@ def _same(outcome: Outcome, expected: Outcome) -> bool:
 
 def _kinds(outcome: Outcome) -> list[tuple[torch.Size, torch.dtype]]:
     return [(tensor.shape, tensor.dtype) for tensors in (outcome[0].tensors, outcome[1]) for tensor in tensors]
+
+
+@torch.no_grad()
+def _widened(call: Call, generator: torch.Generator) -> Call:
+    """A call of ``FEWEST`` samples or more, some way off those of a call that has fewer.
+
+    Of samples that are all alike nothing shows that a module mixes them.
+    """
+    lead = call.layout.lead
+    count = -(-FEWEST // call.layout.n)
+
+    def widen(tensor: Tensor, kind: str) -> Tensor:
+        if tensor.shape[0] == 1 != lead[0]:  # the same for all of the first dimension
+            return tensor
+        rows = tensor.detach().repeat(count, *[1] * (tensor.dim() - 1))
+        if rows.is_floating_point():  # towards a number in the boxes that positions are in, [0, 1] or [-1, 1]
+            rows = rows.lerp(torch.full_like(rows, 0.3), 0.1 * torch.rand(rows.shape, generator=generator).to(rows))
+        return rows.requires_grad_(tensor.requires_grad)
+
+    args, kwargs = call.changed(widen)
+    return replace(call, layout=replace(call.layout, lead=(count * lead[0], *lead[1:])), args=args, kwargs=kwargs)
 
 
 @torch.no_grad()
