@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -128,6 +129,43 @@ def test_func_grad_and_vjp_give_what_autograd_gives(
     (second,) = torch.autograd.grad(first.square().sum(), own)
     twice = grad(lambda x: grad(lambda x: router(x).square().sum())(x).square().sum())(x)
     torch.testing.assert_close(twice, second, rtol=1e-4, atol=1e-5 * float(second.abs().max()))
+
+
+CONTEXTS: dict[str, Callable[[VoronoiRouter, Tensor], Tensor]] = {
+    "func": lambda router, x: grad(lambda x: router(x).square().sum())(x),
+    "func twice": lambda router, x: grad(lambda x: grad(lambda x: router(x).square().sum())(x).sum())(x),
+    "checkpoint": lambda router, x: by_autograd(checkpoint(router, x, use_reentrant=False), x),
+    "hooks": lambda router, x: by_autograd(_on_cpu(router, x), x),
+    "inference": lambda router, x: torch.inference_mode()(router)(x),
+}
+
+
+def by_autograd(y: Tensor, x: Tensor) -> Tensor:
+    return torch.autograd.grad(y.square().sum(), x)[0]
+
+
+def _on_cpu(router: VoronoiRouter, x: Tensor) -> Tensor:
+    with torch.autograd.graph.save_on_cpu():
+        y: Tensor = router(x)
+    return y
+
+
+@pytest.mark.measures
+@pytest.mark.parametrize("n", [4, 300])
+@pytest.mark.parametrize("context", CONTEXTS)
+@pytest.mark.parametrize("way", WAYS)
+def test_first_calls_of_frozen_cells(way: str, context: str, n: int, generator: torch.Generator) -> None:
+    router, x = router_of(net(), generator, **WAYS[way]), torch.rand(n, 3, generator=generator).requires_grad_()
+    router.freeze([0, 1, 5])
+    plain = copy.deepcopy(router)
+    plain.way, plain.fuse = "loop", False
+    found = CONTEXTS[context](router, x)
+    if context == "func twice":
+        (first,) = torch.autograd.grad(plain(x).square().sum(), x, create_graph=True)
+        expected = torch.autograd.grad(first.sum(), x)[0]
+    else:
+        expected = plain(x) if context == "inference" else by_autograd(plain(x), x)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_func_grad_of_several_methods(generator: torch.Generator) -> None:

@@ -7,7 +7,6 @@ size, or with ``way=`` the one that was named.
 
 from __future__ import annotations
 
-import contextlib
 import operator
 import os
 import re
@@ -35,7 +34,7 @@ from voronerf.router.layout import Call, Results, map_tensors, tensors_of
 from voronerf.router.probe import FEWEST, Options, Probe, check_rays, check_subclasses
 from voronerf.router.program import Activation, CellProgram
 from voronerf.router.table import LayeredField
-from voronerf.router.transforms import aside, is_watched, recorded
+from voronerf.router.transforms import aside, is_watched, outside, recorded
 from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup, same
 
 _OP = "VoronoiRouter"
@@ -385,20 +384,20 @@ class Dispatch:
 
     def _run_apart(self, plan: CallPlan, call: Call, grouping: Grouping, frozen: Tensor) -> Results:
         """Runs a call for samples in frozen cells, bool [k], without gradients, and for the others with them."""
-        n, cells = grouping.n, grouping.cells
-        cells = torch.zeros(n, dtype=torch.int32, device=grouping.device) if cells is None else cells
-        still = frozen.index_select(0, cells)
-        outcomes, rows = list[Results](), list[Tensor]()
-        for mask, context in ((~still, contextlib.nullcontext()), (still, torch.no_grad())):
-            rows.append(mask.nonzero()[:, 0])
-            if len(rows[-1]):
-                count, chosen = len(rows[-1]), cells[rows[-1]]
-                part = Grouping(chosen, count, grouping.k, grouping.device, grouping.backend, rows[-1])
-                with context:
+        k, device, backend, cells = grouping.k, grouping.device, grouping.backend, grouping.cells
+        with outside():  # within a transform of torch.func all that is computed belongs to it
+            cells = torch.zeros(grouping.n, dtype=torch.int32, device=device) if cells is None else cells
+            still = frozen.index_select(0, cells)
+            rows = [mask.nonzero()[:, 0] for mask in (~still, still)]
+            parts = [Grouping(cells[index], len(index), k, device, backend, index) for index in rows]
+        outcomes = list[Results]()
+        for part, learns in zip(parts, (True, False), strict=True):
+            if part.n:
+                with torch.set_grad_enabled(learns):
                     outcomes.append(self._run(plan, call, part))
         order, tensors = torch.cat(rows), []
-        for parts in zip(*(results.unsorted for results in outcomes), strict=True):
-            joined = torch.cat(parts)
+        for both in zip(*(results.unsorted for results in outcomes), strict=True):
+            joined = torch.cat(both)
             # The backward of index_copy is a gather, where that of an index would add up.
             joined = torch.zeros_like(joined).index_copy(0, order, joined)
             if joined.is_floating_point() and not len(rows[0]):  # a batch without samples to learn from is no error
