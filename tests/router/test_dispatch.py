@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import types
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 from convention_harness import uniform
 from router_fields import masked_loop
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from voronerf import VoronoiRouter
 from voronerf.router import dispatch
@@ -24,6 +26,7 @@ def network() -> nn.Module:
 @pytest.mark.parametrize("fastest", ["fused", "grouped", "cell by cell"])
 def test_the_fastest_is_taken_and_said(monkeypatch: pytest.MonkeyPatch, fastest: str) -> None:
     calls = []
+    monkeypatch.setattr(dispatch, "_LOOKS", 1)
 
     def measured(found: Any, call: Any, grouping: Any) -> list[float]:
         calls.append([way.name for way in found])
@@ -41,6 +44,38 @@ def test_the_fastest_is_taken_and_said(monkeypatch: pytest.MonkeyPatch, fastest:
     with torch.no_grad():
         router(x)
     assert len(calls) == 3
+
+
+@pytest.mark.parametrize(
+    ("fused", "taken"),
+    [
+        ([17.6, 0.8], "fused"),  # one noisy look
+        ([17.6, 17.6, 0.8], "fused"),
+        ([2.9], "fused"),  # slower, but not clearly
+        ([17.6, 17.6, 17.6], "grouped"),
+    ],
+)
+def test_a_fused_way_is_left_if_it_is_clearly_slower_again_and_again(
+    fused: list[float], taken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, looks = [0.0], list[float]()
+
+    def measured(found: Any, call: Any, grouping: Any) -> list[float]:
+        looks.append(now[0])
+        return [fused[len(looks) - 1], 2.4, 9.0]
+
+    monkeypatch.setattr(dispatch, "measure", measured)
+    monkeypatch.setattr(dispatch, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    router, x = VoronoiRouter(network(), CENTRES, coords="first3", fuse=True), uniform((200,))
+    for _ in range(6):
+        for _ in range(3):
+            router(x)
+        y = checkpoint(router, x, use_reentrant=False)
+        now[0] += 1.1
+        assert len(torch.autograd.grad(y.sum(), list(router.parameters()))) == 4, "the same way again"
+    assert len(looks) == len(fused) and looks == sorted(set(looks)), "one at a time"
+    assert router.explain().split("\n")[-1].startswith(f"forward: {taken}: "), router.explain()
+    assert "measured again" not in router.explain().split("\n")[-1]
 
 
 def test_what_is_about_as_fast_and_more_promising_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:

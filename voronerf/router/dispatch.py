@@ -42,6 +42,7 @@ _PLANS = 256  # kinds of calls that are remembered
 _TRACES = 8  # of one kind of call; a module that changes more often runs grouped
 _TURNS, _SECONDS = 8, 0.08  # a way is measured at most so often, and no more than twice after so many seconds
 _SLICE, _BEHIND = 8192, 1.5  # samples of a batch that are measured; times behind the fastest, so not measured again
+_LOOKS, _APART, _CLEAR = 3, 1.0, 1.3  # looks that a fused way must lose, seconds between them, by what factor of time
 _EQUAL = 1.02  # of the least time: an earlier way of a plan is taken unless it is slower by more
 _OF_DTYPES = re.compile("dtype|scalar type|Input type")  # in messages of PyTorch
 _OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
@@ -57,6 +58,7 @@ class CallPlan:
         open: Whether another batch may run grouped, though the first did not.
         few: Whether it was made for fewer than ``FEWEST`` samples; the first larger call makes another.
         chosen: The fastest way and why, by the size of a batch and the number of cells.
+        lost: By the same key, how often the fused way was clearly slower, the time of the next look, and what was said.
         constants: What is no tensor among the arguments of the call that it was made for, if it is fused.
         watch: Values of the module that its trace read.
         skip: The next calls that run cell by cell before another way is tried again.
@@ -68,6 +70,7 @@ class CallPlan:
     open: bool = False
     few: bool = False
     chosen: dict[tuple[int, int], tuple[int, str]] = field(default_factory=dict)
+    lost: dict[tuple[int, int], tuple[int, float, str]] = field(default_factory=dict)
     constants: dict[str, Any] = field(default_factory=dict)
     watch: Watch = field(default_factory=Watch)
     skip: int = 0
@@ -290,7 +293,7 @@ class Dispatch:
         before = set(map(id, self.plans.get(key, [])))
         self.known = {like: other for like, other in self.known.items() if id(other.plan) not in before}
         if plans and [way.name for way in plans[0].ways] == [way.name for way in ways]:
-            made.chosen = plans[0].chosen
+            made.chosen, made.lost = plans[0].chosen, plans[0].lost
         self.plans[key] = [made] if made.fused is None else [made, *(other for other in plans if other is not plan)]
         return made
 
@@ -333,16 +336,25 @@ class Dispatch:
         if not plan.measured or len(ways) == 1 or n < FEWEST:
             return ways[0], ways[0].why
         size, n = plan.size(n, k), min(n, measured_samples(ways))
+        lost, again, why = plan.lost.get(size, (0, 0.0, ""))
+        if lost and size not in plan.chosen and (recorded() or time.monotonic() < again):
+            return ways[0], why
         if size not in plan.chosen:
             with self._lock, aside(call) as beside:
                 times = measure(ways, beside, grouping)
-            first = next(i for i, time in enumerate(times) if time <= _EQUAL * min(times))
-            texts = [f"{way.name} {1e3 * time:.3g} ms" for way, time in zip(ways, times, strict=True)]
+            fused = isinstance(ways[0], Fused)  # who asked for it has it, unless it is clearly slower again and again
+            loses = fused and times[0] > _CLEAR * min(times)
+            lost += loses
+            first = next(i for i, seconds in enumerate(times) if seconds <= _EQUAL * min(times))
+            first = 0 if fused and not (loses and lost == _LOOKS) else first
+            texts = [f"{way.name} {1e3 * seconds:.3g} ms" for way, seconds in zip(ways, times, strict=True)]
             others = ", ".join(texts[:first] + texts[first + 1 :])
-            plan.chosen[size] = (
-                first,
-                f"{1e3 * times[first]:.3g} ms for {n} samples, {others}" if min(times) else "",
-            )
+            why = f"{1e3 * times[first]:.3g} ms for {n} samples, {others}" if min(times) else ""
+            if loses and first == 0:
+                why = "; ".join(filter(None, (ways[0].why, f"{why}, to be measured again")))
+                plan.lost[size] = lost, time.monotonic() + _APART, why
+                return ways[0], why
+            plan.chosen[size] = first, why
         first, why = plan.chosen[size]
         return ways[first], "; ".join(filter(None, (ways[first].why, why)))
 
