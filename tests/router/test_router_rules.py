@@ -169,3 +169,49 @@ def test_results_and_gradients_are_those_of_the_loop(name: str, n: int) -> None:
             assert not gradient.any(), path
         else:
             torch.testing.assert_close(parameter.grad, gradient, rtol=2e-3, atol=2e-3 * float(gradient.abs().max()))
+
+
+class Normed(nn.Module):
+    """Layer norms in three spellings, with weights and without."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a, self.b, self.out = nn.Linear(3, 8), nn.Linear(8, 8), nn.Linear(8, 1)
+        self.norm, self.scale = nn.LayerNorm(8), nn.Parameter(torch.rand(8))
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = torch.tanh(self.norm(self.a(x)))
+        x = torch.sin(F.layer_norm(self.b(x), (8,), self.scale))
+        return self.out(x * F.layer_norm(x, (8,)) + torch.layer_norm(x, (8,)))
+
+
+@pytest.mark.parametrize("n", [1, 40])
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("way", ["fused", "grouped", "loop"])
+def test_third_derivatives_of_layer_norms_are_right_in_every_way(way: Any, k: int, n: int) -> None:
+    generator = torch.Generator().manual_seed(3)
+    torch.manual_seed(0)
+    centres = torch.rand(k, 3, generator=generator)
+    router = perturb(VoronoiRouter(Normed().double(), centres, coords="first3", fuse=True, way=way), generator)
+    x = torch.rand(n, 3, dtype=torch.float64, generator=generator).requires_grad_()
+    leaves = [x, *router.parameters()]
+    along = [torch.randn(leaf.shape, generator=generator).double() * 1e-6 for leaf in leaves]
+
+    def laplacian() -> Tensor:
+        (slope,) = torch.autograd.grad(router(x).sum(), x, create_graph=True)
+        second = [torch.autograd.grad(slope[:, i].sum(), x, create_graph=True)[0][:, i] for i in range(3)]
+        return torch.stack(second).square().sum()
+
+    def moved(sign: int) -> Tensor:
+        with torch.no_grad():
+            for leaf, step in zip(leaves, along, strict=True):
+                leaf += sign * step
+        value = laplacian().detach()
+        with torch.no_grad():
+            for leaf, step in zip(leaves, along, strict=True):
+                leaf -= sign * step
+        return value
+
+    gradients = torch.autograd.grad(laplacian(), leaves, allow_unused=True, materialize_grads=True)
+    found = sum((g * step).sum() for g, step in zip(gradients, along, strict=True))
+    torch.testing.assert_close(found, (moved(1) - moved(-1)) / 2, rtol=1e-5, atol=0)

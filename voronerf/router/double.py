@@ -5,6 +5,7 @@ The module itself never changes, so other threads may save, copy or call it at a
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import operator
 import types
@@ -65,8 +66,10 @@ class Double:
             self._places += [(registry, name, id(p)) for name, p in registry.items() if p is not None]
             self._registries.append((twin, registry, set(registry)))
 
-    def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any]) -> Any:
+    def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any], mode: Any = None) -> Any:
         """A call with the rows of its arguments, and tensors by the id of the parameter in whose place they are.
+
+        The ``mode`` sees the functions of the method alone.
 
         Raises:
             Forbidden: Where the method adds, removes or replaces parameters, or writes into them.
@@ -75,7 +78,8 @@ class Double:
         versions = _versions(placed)
         copied = Call(self.module, call.method, call.layout, call.names, call.args, call.kwargs, call.kinds)
         try:
-            return copied.run(rows)
+            with mode or contextlib.nullcontext():
+                return copied.run(rows)
         finally:
             self._check(call.name, placed, versions)
             self._begin_again()

@@ -26,6 +26,7 @@ from torch.overrides import TorchFunctionMode
 from voronerf.router.double import Double
 from voronerf.router.grouping import Grouping, cell_parameters, cells_of
 from voronerf.router.layout import Call, Results, map_tensors, split_rows, tensors_of
+from voronerf.router.norms import EXACT
 
 _TORCH, _HERE = (os.path.dirname(os.path.abspath(file)) + os.sep for file in (torch.__file__, __file__))
 _INPLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "div", "floordiv", "mod", "pow", "and", "or")}
@@ -68,6 +69,22 @@ RANDOM = find(
 """What draws random numbers."""
 CREATE = find("zeros ones full empty rand randn randint", torch)
 """New tensors of given sizes; with n of them in front they are rows."""
+
+
+class Exact(TorchFunctionMode):
+    """Functions have right derivatives of any order.
+
+    Attributes:
+        needed: Whether one was called that has others of its own.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.needed = False
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.needed |= func in EXACT
+        return EXACT.get(func, func)(*args, **(kwargs or {}))
 
 
 class NoRandomness(TorchFunctionMode):
@@ -287,7 +304,8 @@ class GroupedRun(TorchFunctionMode):
         marked = [tensor for tensor in operands if self.is_rows(tensor)]
         if any(type(tensor) is PerCell for tensor in operands):
             return self._with_parameters(func, args, kwargs, operands, marked)
-        result = without_randomness(func, args, kwargs) if self.quiet else func(*args, **kwargs)
+        exact = EXACT.get(func, func)
+        result = without_randomness(exact, args, kwargs) if self.quiet else exact(*args, **kwargs)
         outputs = tensors_of(result)
         if marked:
             if writes_in_place(func):
@@ -395,7 +413,7 @@ class Loop:
 
     why: str = ""
     again: bool = False
-    open: bool = False  # another batch may be carried out in a faster way
+    exact: bool = True  # functions have right derivatives of any order; unless a first call has needed none
     name: str = "cell by cell"
 
     def run(self, call: Call, grouping: Grouping) -> Results:
@@ -407,9 +425,13 @@ class Loop:
         module, counts = call.module, [last - first for _, first, last in bounds]
         pieces = {id(p): cells_of(p) for p in cell_parameters(module)}
         values, double = [], Double(module)
-        for (cell, _, _), part in zip(bounds, split_rows(call.arranged(grouping), counts), strict=True):
+        arguments = call.arranged(grouping)
+        mode = Exact() if self.exact and torch.is_grad_enabled() else None
+        for (cell, _, _), part in zip(bounds, split_rows(arguments, counts), strict=True):
             double = Double(module) if self.again else double
-            values.append(double.run(call, part, {key: piece[cell] for key, piece in pieces.items()}))
+            values.append(double.run(call, part, {key: piece[cell] for key, piece in pieces.items()}, mode))
         if not self.again:
             double.end()
+        if mode is not None:
+            self.exact = mode.needed
         return Results.joined(values, counts, grouping)

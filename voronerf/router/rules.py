@@ -21,6 +21,7 @@ from voronerf.ops._core.memory import on_huge_pages
 from voronerf.router.grouped import GroupedRun, PerCell, find, register, writes_in_place
 from voronerf.router.grouping import cells_of
 from voronerf.router.layout import map_tensors, tensors_of
+from voronerf.router.norms import EXACT
 from voronerf.router.transforms import transformed
 
 _ELEMENTWISE = """
@@ -250,7 +251,7 @@ def _norm(func: Any, run: GroupedRun, x: Tensor, over: Any, weight: Any = None, 
 
 
 for _function in (F.layer_norm, F.rms_norm):
-    register(_function, functools.partial(_norm, _function))
+    register(_function, functools.partial(_norm, EXACT.get(_function, _function)))
 
 
 # Look-ups -------------------------------------------------------------------------------------------------------------
