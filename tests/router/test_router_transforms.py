@@ -64,7 +64,7 @@ def gradients(run: Callable[[Tensor], Tensor], router: VoronoiRouter, x: Tensor)
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("make", [net, Looked])
+@pytest.mark.parametrize("make", [net, Looked, lambda: nn.utils.parametrizations.weight_norm(nn.Linear(3, 4))])
 def test_a_checkpoint_around_first_calls_and_new_sizes(
     way: str, make: Callable[[], nn.Module], generator: torch.Generator
 ) -> None:

@@ -190,7 +190,7 @@ class Dispatch:
             results = self._run(plan, call, grouping)
         else:
             results = self._run_apart(plan, call, grouping, frozen)
-        if call.like is not None and (known := KnownCall.of(plan, call, grouping)):
+        if call.like is not None and not is_watched() and (known := KnownCall.of(plan, call, grouping)):
             if len(self.known) >= _PLANS:
                 self.known = {}
             self.known[call.like] = known
