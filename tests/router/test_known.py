@@ -322,6 +322,22 @@ def test_arguments_unlike_those_of_before(calls: list[str]) -> None:
     assert calls == ["forward"], "tensors of inference mode are copied where gradients are kept"
 
 
+@pytest.mark.parametrize("fuse", [True, False])
+def test_what_samples_share_may_be_of_inference_mode(fuse: bool) -> None:
+    with torch.inference_mode():
+        t, module = rows(1, seed=1), Given()
+        module.register_buffer("scale", 1 + rows(1, 6, seed=2))
+    router = routed(module, fuse=fuse)
+    router.module.layer.register_forward_pre_hook(lambda _, args: args[0] * router.module.scale)
+    x = rows(40).requires_grad_()
+    for argument in (t, rows(40)):
+        for _ in range(3):
+            found = outcome(router, lambda r: r(x, argument), x)  # noqa: B023
+        (expected,), _ = masked_loop(router, router.assign(x), [x, argument.clone().expand(40, 3)])
+        torch.testing.assert_close(found[0], expected)
+        torch.testing.assert_close(found[-1], torch.autograd.grad(expected.square().sum(), x)[0])
+
+
 def test_a_field_with_a_layer_table_explains_itself_as_any_other() -> None:
     given, traced = VoronoiRouter(NeRF(width=16, depth=2), rows(6)), routed(net())
     assert given.explain() == "forward: fused", "which is known beforehand"

@@ -23,7 +23,7 @@ from voronerf.ops._core.program import VALUE, Builder, Columns, Program, Step
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.router.grouped import GroupedRun, PerCell, Ungroupable, name_of
 from voronerf.router.grouping import Grouping, owned_parameters, parts_of
-from voronerf.router.layout import Call, Results, map_tensors, tensors_of
+from voronerf.router.layout import Call, Results, map_tensors, recordable, tensors_of
 from voronerf.router.lower import Entries, Lowering, NotAStep
 from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiable
 from voronerf.router.watch import Inputs, lookup
@@ -397,7 +397,7 @@ class Fused:
         rows = [_flat(values[source], n) for source in run.inputs]
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
         half = torch.is_autocast_enabled(grouping.device.type) or any(x.dtype in HALF for x in rows)
-        parameters = [taken.of_values(values).to(dtype) for taken in run.parameters]
+        parameters = [recordable(taken.of_values(values).to(dtype)) for taken in run.parameters]
         outputs = grouped_program(
             [x.to(dtype) for x in rows],
             parameters,

@@ -325,9 +325,7 @@ class Call:
             return torch.div(rows, layout.lead[-1], rounding_mode="floor")
 
         def arrange(tensor: Tensor, kind: str) -> Tensor:
-            rows = layout.flatten(tensor, kind)
-            if rows.is_inference() and not torch.is_inference_mode_enabled():
-                rows = rows.clone()  # which can be saved for a backward pass
+            rows = recordable(layout.flatten(tensor, kind))
             if not layout.n:  # no module is called without rows: placeholders give the shapes of its results
                 empty = rows.new_full((n, *rows.shape[1:]), 0.5 if rows.is_floating_point() else 0)
                 rows = torch.cat([rows[:0], empty])  # joined, so that results depend on the argument as ever
@@ -340,6 +338,11 @@ class Call:
 
         self.changed(arrange)
         return tensors
+
+
+def recordable(tensor: Tensor) -> Tensor:
+    """A tensor that can be saved for a backward pass: a copy of one of inference mode, outside of it."""
+    return tensor.clone() if tensor.is_inference() and not torch.is_inference_mode_enabled() else tensor
 
 
 def split_rows(rows: list[Tensor], sizes: list[int]) -> list[Sequence[Tensor]]:
