@@ -233,6 +233,7 @@ class Sequence:
         }
         self.router = VoronoiRouter(self.kind.make(), torch.rand(rng.randrange(1, 7), 3), coords="first3", **options)
         self.events = [f"{name} in {self.router.num_cells} cells, {options}"]
+        self.forms = [rng.random() for _ in range(3)]  # seeds of calls that are alike but for their samples
         self.differ()
         self.states = [copy.deepcopy(self.router.state_dict())]
 
@@ -242,6 +243,8 @@ class Sequence:
             self.call()
         else:
             change = self.rng.choice(CHANGES)
+            if isinstance(self.router.module, Changing) and self.rng.random() < 0.5:
+                change = attribute
             self.events.append(change.__name__)
             change(self)
 
@@ -253,14 +256,21 @@ class Sequence:
 
     def call(self) -> None:
         """Compares a call, and its gradients, with the loop over masks."""
-        rng, router, kind = self.rng, self.router, self.kind
-        lead, way = self._lead(), rng.choice(("plain", "plain", "no_grad", "inference", "checkpoint", "func", "twice"))
+        rng, router, kind = random.Random(self.rng.choice(self.forms)), self.router, self.kind
+        lead, way = (
+            self._lead(rng),
+            rng.choice(("plain", "plain", "no_grad", "inference", "checkpoint", "func", "twice")),
+        )
         if (way in ("func", "checkpoint") and not kind.plain) or (way == "twice" and not kind.twice):
             way = "plain"
-        flat, args = self.arguments(lead)
+        flat, args = self.arguments(lead, rng)
         method = rng.choice(("forward", *router.methods))
         flat, args = (flat[:1], args[:1]) if method != "forward" else (flat, args)
         x = args[0].requires_grad_(way in ("func", "twice") or rng.random() < 0.5)
+        if way == "plain" and not x.requires_grad and rng.random() < 0.3:
+            way = "of inference mode"
+            with torch.inference_mode():
+                args = [a.clone() for a in args]
         self.events.append(f"{method} {way} of {[list(a.shape) for a in args]} {'x' * x.requires_grad}")
         run = getattr(router, method)
         if not len(flat[0]):
@@ -317,16 +327,14 @@ class Sequence:
             return [torch.zeros_like(leaf) for leaf in leaves]
         return list(torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True))
 
-    def _lead(self) -> tuple[int, ...]:
+    def _lead(self, rng: random.Random) -> tuple[int, ...]:
         n = self.rng.choice(SAMPLES)
-        leads: list[tuple[int, ...]] = [(n,), (n,), (n, 1), (1, n)] if n else [(0,), (0, 3), (3, 0)]
-        leads += [(n // 2, 2)] if n in (8, 300) else []
-        lead = self.rng.choice(leads)
+        lead = rng.choice([(n,), (n,), (n, 1), (1, n), (n // 2, 2) if n in (0, 8, 300) else (n,)])
         return lead if len(lead) == 1 or lead[0] != lead[1] or lead == (1, 1) else (n,)
 
-    def arguments(self, lead: tuple[int, ...]) -> tuple[list[Tensor], list[Tensor]]:
+    def arguments(self, lead: tuple[int, ...], rng: random.Random) -> tuple[list[Tensor], list[Tensor]]:
         """Arguments with a row for each sample, and as the router takes them."""
-        rng, n = self.rng, math.prod(lead)
+        n = math.prod(lead)
         flat = [torch.rand(n, f, dtype=self.dtype) for f in self.kind.features]
         args = [a.reshape(*lead, a.shape[1]) for a in flat]
         if self.kind.per_ray and n and rng.random() < 0.4:
@@ -439,7 +447,7 @@ def requires(s: Sequence) -> None:
 def learn(s: Sequence) -> None:
     s.router.unfreeze()
     optimizer = torch.optim.SGD(s.router.parameters(), 1e-3)
-    total = torch.stack([t.square().mean() for t in tensors(s.router(*s.arguments((41,))[1]))]).sum()
+    total = torch.stack([t.square().mean() for t in tensors(s.router(*s.arguments((41,), s.rng)[1]))]).sum()
     if total.requires_grad:
         total.backward()
     optimizer.step()

@@ -42,7 +42,7 @@ _PLANS = 256  # kinds of calls that are remembered
 _TRACES = 8  # of one kind of call; a module that changes more often runs grouped
 _TURNS, _SECONDS = 8, 0.08  # a way is measured at most so often, and no more than twice after so many seconds
 _SLICE, _BEHIND = 8192, 1.5  # samples of a batch that are measured; times behind the fastest, so not measured again
-_LOOKS, _APART, _CLEAR = 3, 1.0, 1.3  # looks that a fused way must lose, seconds between them, by what factor of time
+_LOOKS, _APART, _CLEAR = 3, 1.0, 1.3  # measurements that a fused way must lose, seconds between them, factor of time
 _EQUAL = 1.02  # of the least time: an earlier way of a plan is taken unless it is slower by more
 _OF_DTYPES = re.compile("dtype|scalar type|Input type")  # in messages of PyTorch
 _OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
@@ -58,7 +58,7 @@ class CallPlan:
         open: Whether another batch may run grouped, though the first did not.
         few: Whether it was made for fewer than ``FEWEST`` samples; the first larger call makes another.
         chosen: The fastest way and why, by the size of a batch and the number of cells.
-        lost: By the same key, how often the fused way was clearly slower, the time of the next look, and what was said.
+        lost: The looks that the fused way has lost, by the same key: their number, the time of the next one, a text.
         constants: What is no tensor among the arguments of the call that it was made for, if it is fused.
         watch: Values of the module that its trace read.
         skip: The next calls that run cell by cell before another way is tried again.
@@ -451,7 +451,7 @@ def _misfit(error: Exception, call: Call) -> Exception | None:
 
 
 def _kind_of(call: Call, device: torch.device) -> Any:
-    """The key of plans: modes, and kinds, types and sizes of the arguments but for the number of samples.
+    """Returns the key of plans: modes, and kinds, types and sizes of arguments without the number of samples.
 
     Raises ValueError for tensors that are neither per sample nor per ray, or could be both.
     """

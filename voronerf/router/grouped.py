@@ -72,10 +72,10 @@ CREATE = find("zeros ones full empty rand randn randint", torch)
 
 
 class Exact(TorchFunctionMode):
-    """Functions have right derivatives of any order.
+    """A mode that replaces functions whose higher derivatives are wrong in PyTorch.
 
     Attributes:
-        needed: Whether one was called that has others of its own.
+        needed: Whether the module called such a function.
     """
 
     def __init__(self) -> None:
@@ -413,7 +413,7 @@ class Loop:
 
     why: str = ""
     again: bool = False
-    exact: bool = True  # functions have right derivatives of any order; unless a first call has needed none
+    exact: bool = True  # runs in :class:`Exact`, until a call has shown that the module does not need it
     name: str = "cell by cell"
 
     def run(self, call: Call, grouping: Grouping) -> Results:

@@ -1,6 +1,6 @@
-"""Layer norm with derivatives of any order.
+"""A layer norm with right derivatives of any order.
 
-The third derivative of PyTorch's own takes the mean and the deviation for constants.
+PyTorch's own takes the mean and the deviation for constants in its third derivative.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def layer_norm(
 
 
 EXACT: dict[Any, Any] = {F.layer_norm: layer_norm, torch.layer_norm: layer_norm}
-"""What takes the place of PyTorch's functions where gradients are recorded."""
+"""The replacements of PyTorch's functions, by function."""
 
 
 class _LayerNorm(torch.autograd.Function):

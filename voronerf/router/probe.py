@@ -226,9 +226,9 @@ def _kinds(outcome: Outcome) -> list[tuple[torch.Size, torch.dtype]]:
 
 @torch.no_grad()
 def _widened(call: Call, generator: torch.Generator) -> Call:
-    """A call of ``FEWEST`` samples or more, some way off those of a call that has fewer.
+    """Returns a call of at least ``FEWEST`` different samples near those of a call that has fewer.
 
-    Of samples that are all alike nothing shows that a module mixes them.
+    A module that mixes its samples could not be told by identical ones.
     """
     lead = call.layout.lead
     count = -(-FEWEST // call.layout.n)
