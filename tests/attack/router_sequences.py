@@ -99,7 +99,7 @@ class Split(nn.Module):
         position, direction = x.split([3, 3], -1)
         left, right = torch.tanh(self.a(torch.cat([direction, position], -1))).chunk(2, -1)
         colour, density = self.b(left * right).tensor_split([3], -1)
-        return colour.sigmoid(), density.exp(), [part + 1 for part in left.unbind(-1)[:2]]
+        return colour, density.exp(), list(left.unbind(-1)[:2])
 
 
 class OfRays(nn.Module):
