@@ -125,7 +125,7 @@ class Frame {
       case Type::Kind::text:
         if (!PyUnicode_Check(given)) return false;
         *static_cast<const char**>(place) = PyUnicode_AsUTF8(given);
-        keep(given);  // which has the letters
+        keep(given);  // which owns the characters
         return *static_cast<const char**>(place) != nullptr;
       case Type::Kind::tensor:
         return load_tensor(type, given, *static_cast<void**>(place));
@@ -348,18 +348,33 @@ void call(const Loaded& loaded, Result& result) {
   }
 }
 
-// The address of a tensor's memory; null and no error where it has none.
-const void* address_of(PyObject* tensor) {
-  static PyObject* const word = PyUnicode_InternFromString("data_ptr");
-  PyObject* const number = PyObject_CallMethodNoArgs(tensor, word);
-  const void* const address = number == nullptr ? nullptr : PyLong_AsVoidPtr(number);
-  PyErr_Clear();
-  Py_XDECREF(number);
-  return address;
-}
+// The address of a tensor's memory, and where it is asked for its layout there, size and stride; null without an
+// answer.
+struct Place {
+  py::object answers[3];
+
+  Place(PyObject* tensor, bool layout) {
+    static PyObject* const methods[] = {PyUnicode_InternFromString("data_ptr"), PyUnicode_InternFromString("size"),
+                                        PyUnicode_InternFromString("stride")};
+    for (int i = 0; i < (layout ? 3 : 1); ++i) {
+      answers[i] = py::reinterpret_steal<py::object>(PyObject_CallMethodNoArgs(tensor, methods[i]));
+    }
+    PyErr_Clear();
+  }
+  const void* address() const { return answers[0] ? PyLong_AsVoidPtr(answers[0].ptr()) : nullptr; }
+  bool operator==(const Place& other) const {
+    for (int i = 0; i < 3; ++i) {
+      PyObject *const one = answers[i].ptr(), *const two = other.answers[i].ptr();
+      if (one == nullptr && two == nullptr) continue;
+      if (one == nullptr || two == nullptr || PyObject_RichCompareBool(one, two, Py_EQ) != 1)
+        return PyErr_Clear(), false;
+    }
+    return true;
+  }
+};
 
 // Members of dictionaries that must stay the same objects, but for that of the key `skip`, and tensors that must stay
-// where they are. Their storages are held too: memory that a tensor has left (`x.data = y`) is not freed.
+// where and as they are. Their storages are held too: memory that a tensor has left (`x.data = y`) is not freed.
 class Guards {
  public:
   void add(const py::dict& members, const std::string& skip) {
@@ -370,9 +385,9 @@ class Guards {
     }
     guards_.push_back(std::move(guard));
   }
-  void add_tensor(const py::object& tensor) {
+  void add_tensor(const py::object& tensor, bool layout) {
     if (!known_.insert(tensor.ptr()).second) return;
-    tensors_.push_back({tensor, tensor.attr("untyped_storage")(), address_of(tensor.ptr())});
+    tensors_.push_back({tensor, tensor.attr("untyped_storage")(), Place(tensor.ptr(), layout), layout});
   }
   // Compares addresses alone: between the kernels of a loop, whatever is looked at must come from memory.
   bool hold() const {
@@ -386,7 +401,7 @@ class Guards {
       if (i != guard.values.size()) return false;
     }
     return std::all_of(tensors_.begin(), tensors_.end(),
-                       [](const Held& held) { return address_of(held.tensor.ptr()) == held.address; });
+                       [](const Held& held) { return Place(held.tensor.ptr(), held.layout) == held.place; });
   }
 
  private:
@@ -396,11 +411,12 @@ class Guards {
   };
   struct Held {
     py::object tensor, storage;
-    const void* address;
+    Place place;
+    bool layout;
   };
   std::vector<Guard> guards_;
   std::vector<Held> tensors_;
-  std::set<PyObject*> known_;  // of these
+  std::set<PyObject*> known_;  // the tensors
 };
 
 // Calls of a step in their order, with what they have taken, to be made again on the same memory, which is held. A
@@ -413,16 +429,22 @@ class Recording {
     counts_.clear();
     obstacle_.clear();
     tensors_ = {};
+    made_.clear();
     recorded() = this;
   }
   void end() { recorded() = nullptr; }
 
   void count(const py::object& memory, int64_t most) {
-    tensors_.add_tensor(memory);
-    counts_.push_back({static_cast<const int64_t*>(address_of(memory.ptr())), most});
+    add_tensor(memory);
+    counts_.push_back({static_cast<const int64_t*>(Place(memory.ptr(), false).address()), most});
   }
-  // A tensor that is read or written, or of which one that is, is a view.
-  void add_tensor(const py::object& tensor) { tensors_.add_tensor(tensor); }
+  // A tensor that a call takes, or of which such a tensor is a view. Nobody lays out anew what is made for the calls.
+  void add_tensor(const py::object& tensor) {
+    const bool made = made_.count(py::cast<std::uintptr_t>(tensor.attr("untyped_storage")().attr("data_ptr")())) != 0;
+    tensors_.add_tensor(tensor, !made);
+  }
+  // The storage at an address is new memory for the calls.
+  void made(std::uintptr_t address) { made_.insert(address); }
   const Count* count_of(int64_t rows) {
     const Count* found = nullptr;
     for (const Count& count : counts_) {
@@ -488,6 +510,7 @@ class Recording {
   std::deque<Count> counts_;
   std::string obstacle_;
   Guards tensors_;
+  std::set<std::uintptr_t> made_;
 };
 
 const Count* count_of(Recording& recording, int64_t rows) { return recording.count_of(rows); }
@@ -583,7 +606,7 @@ constexpr const char* kStub =
     "\n"
     "class Guards:\n"
     "    def add(self, members: Any, skip: str) -> None: ...\n"
-    "    def add_tensor(self, tensor: Tensor) -> None: ...\n"
+    "    def add_tensor(self, tensor: Tensor, layout: bool) -> None: ...\n"
     "    def hold(self) -> bool: ...\n"
     "\n"
     "class Recording:\n"
@@ -593,6 +616,7 @@ constexpr const char* kStub =
     "    def end(self) -> None: ...\n"
     "    def count(self, memory: Tensor, most: int) -> None: ...\n"
     "    def add_tensor(self, tensor: Tensor) -> None: ...\n"
+    "    def made(self, address: int) -> None: ...\n"
     "    def replay(self, threads: int, times: int, drawn: int, places: list[int], bytes: int) -> int: ...\n"
     "\n"
     "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n"
@@ -713,6 +737,7 @@ void bind_all(PyObject* python) {
       .def("end", &Recording::end)
       .def("count", &Recording::count)
       .def("add_tensor", &Recording::add_tensor)
+      .def("made", &Recording::made)
       .def("replay", &Recording::replay)
       .def("__len__", &Recording::size)
       .def_property_readonly("obstacle", &Recording::obstacle);

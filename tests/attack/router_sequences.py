@@ -20,6 +20,7 @@ from attempts import RIGHT, Failed
 from torch import Tensor, nn
 from torch.func import functional_call, grad
 from torch.nn.utils.parametrizations import weight_norm
+from torch.utils._pytree import tree_structure
 from torch.utils.checkpoint import checkpoint
 
 from voronerf import VoronoiRouter
@@ -274,16 +275,13 @@ class Sequence:
         self.events.append(f"{method} {way} of {[list(a.shape) for a in args]} {'x' * x.requires_grad}")
         run = getattr(router, method)
         if not len(flat[0]):
-            some = [torch.rand(2, f, dtype=self.dtype) for f in kind.features[: len(args)]]
-            shapes = [(*lead, *e.shape[1:]) for e in self._expected(method, some)[0]]
-            if [tuple(t.shape) for t in tensors(run(*args))] != shapes:
-                raise Failed(f"no samples do not give {shapes}")
+            self._tensors(run(*args), method, lead)
             return
         leaf = flat[0].clone().requires_grad_(x.requires_grad)
         expected, modules = self._expected(method, [leaf, *flat[1:]])
         if way in ("no_grad", "inference"):
             with torch.no_grad() if way == "no_grad" else torch.inference_mode():
-                found = tensors(run(*args))
+                found = self._tensors(run(*args), method, lead)
             if any(t.requires_grad for t in found):
                 raise Failed("a result has a gradient")
             self._compare("value", found, expected)
@@ -310,7 +308,8 @@ class Sequence:
         elif way == "func":
             parameters, gradients = {}, [grad(transformed)(x.detach(), parameters)]
         else:
-            found = tensors(checkpoint(run, *args, use_reentrant=False) if way == "checkpoint" else run(*args))
+            result = checkpoint(run, *args, use_reentrant=False) if way == "checkpoint" else run(*args)
+            found = self._tensors(result, method, lead)
             self._compare("value", found, expected)
             gradients = self._gradients(loss(found, x), [*[x] * x.requires_grad, *parameters.values()])
 
@@ -345,6 +344,16 @@ class Sequence:
                 args[1] = args[1][:, 0].clone()
                 flat[1] = args[1].repeat_interleave(lead[1], 0)
         return flat, args
+
+    @torch.no_grad()
+    def _tensors(self, result: Any, method: str, lead: tuple[int, ...]) -> list[Tensor]:
+        """The tensors of a result, which has the structure and the shapes that the module itself gives."""
+        some = [torch.rand(2, f, dtype=self.dtype) for f in self.kind.features]
+        plain = getattr(self.router.cell(0), method)(*(some if method == "forward" else some[:1]))
+        shapes = [(*lead, *tensor.shape[1:]) for tensor in tensors(plain)]
+        if tree_structure(result) != tree_structure(plain) or [tuple(t.shape) for t in tensors(result)] != shapes:
+            raise Failed(f"{method} gives {result}, not {tree_structure(plain)} of {shapes}")
+        return tensors(result)
 
     def _expected(self, method: str, flat: list[Tensor]) -> tuple[list[Tensor], list[nn.Module]]:
         """The results of a mask and a plain module for each cell; those in frozen cells are constants."""

@@ -76,7 +76,7 @@ def captured(replays):
     return ["register", "capture", *["replay"] * replays]
 
 
-@pytest.mark.parametrize("which", ["parameter", "gradient", "moment", "grid", "pictures", "centres"])
+@pytest.mark.parametrize("which", ["parameter", "gradient", "moment", "grid", "pictures", "centres", "poses", "guard"])
 def test_moved_memory_is_captured_anew(which):
     """The graph goes on with the addresses that it has, so what lies there is held, and no longer used."""
     with emulated(), graphs() as seen:
@@ -90,6 +90,8 @@ def test_moved_memory_is_captured_anew(which):
             "grid": state.sampler.grid.density,
             "pictures": state.training_step.batches.images,
             "centres": state.router.diagram.centres,
+            "poses": state.training_step.batches.cameras.poses,
+            "guard": state.guard.skipped,
         }[which]
         before = seen.calls.count("capture")
         steps(state, 2)

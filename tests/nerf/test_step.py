@@ -189,7 +189,7 @@ def new_vector(training):
     torch.nn.utils.vector_to_parameters(torch.nn.utils.parameters_to_vector(parameters), parameters)
 
 
-#: What moves tensors to other memory, while the objects stay.
+#: Ways in which tensors move to other memory, or lie in it otherwise, while the objects stay.
 MOVES = {
     "gradients": lambda t: new_data(*(p.grad for p in t.router.parameters() if p.grad is not None)),
     "moments": lambda t: new_data(*(state["exp_avg"] for state in t.optimizer.state.values())),
@@ -197,9 +197,13 @@ MOVES = {
     "averages": lambda t: new_data(*(state["average"] for state in t.optimizer.state.values())),
     "densities": lambda t: new_data(t.sampler.grid.density),
     "occupied voxels": lambda t: new_data(t.sampler.grid.occupied),
+    "transposed images": lambda t: setattr(t.batches.images, "data", t.batches.images.data.transpose(1, 2)),
+    "transposed images in place": lambda t: t.batches.images.transpose_(1, 2),
+    "one image for all": lambda t: setattr(t.batches.images, "data", t.batches.images.data[:1].expand(3, -1, -1, -1)),
     "images": lambda t: new_data(t.batches.images),
     "background": lambda t: setattr(t.batches.background, "data", torch.tensor([0.5, 0.0, 1.0])),
     "centres": lambda t: setattr(t.router.diagram.centres, "data", t.router.diagram.centres.data.flip(0)),
+    "one pose": lambda t: setattr(t.batches.cameras.poses, "data", t.batches.cameras.poses.data[:1].expand(3, -1, -1)),
     "poses": lambda t: setattr(t.batches.cameras.poses, "data", t.batches.cameras.poses.data.flip(0)),
     "parameters": lambda t: new_data(*t.router.parameters()),
     "a vector": new_vector,
@@ -224,8 +228,8 @@ def test_what_moves_is_followed():
             recorded = training.recorded
             move(training)
             steps[name] = [*training.train(1, as_it_is=as_it_is), training.step(64, 2, at=1023).loss.clone()]
-            where = name in ("averages", "nothing")  # those are of the part after a step
-            assert as_it_is or training.recorded == recorded + (not where), name
+            still = name in ("averages", "nothing")  # those are of the part after a step
+            assert as_it_is or (training.recorded > recorded) != still, name
             steps[name] += [each.detach().clone() for each in training.everything() if each is not None]
         found.append(steps)
     for name, steps in found[0].items():
@@ -305,7 +309,7 @@ def test_a_second_optimizer_learns(field):
     assert same(*moved) and all(not torch.equal(*moved[0][i : i + 3 : 2]) for i in (1, 3))
 
 
-@pytest.mark.parametrize("steps", [1, 6, 7, 10, 32])
+@pytest.mark.parametrize("steps", [6, 7, 10, 32])
 def test_any_number_of_steps_of_a_call_keeps_averages_and_decay(steps):
     """And the grid begins to learn where it does, not at the end of a call."""
     found = []

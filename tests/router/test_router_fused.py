@@ -460,13 +460,13 @@ class Counted(Around):
     [
         (
             Scripted,
-            r"in Scripted.forward a tensor comes from bend, which torch.jit has compiled \(.*; do without",
+            r"in Scripted.forward a tensor comes from what .*\(.*\), perhaps bend, which torch.jit has compiled; use",
         ),
         (
             Foreign,
-            r"a tensor comes from what is no PyTorch function or one of torch.jit \(.*np.ones.*; write it",
+            r"a tensor comes from what is no PyTorch function \(.*np.ones.*, write it",
         ),
-        (lambda step: nn.Sequential(Scripted(step), nn.Linear(2, 2)), "a tensor comes from bend, which torch.jit has"),
+        (lambda step: nn.Sequential(Scripted(step), nn.Linear(2, 2)), r"perhaps bend, which torch.jit has"),
         (Counted, r"__int__ is read \(.* so the path of the module depends on values"),
         (Gridded, r"Product.apply \(.* is a custom function that takes parameters of cells; write it with functions"),
         (Assigned, r"__getitem__ \(.* which has no row for each of 37 samples.*as torch.where does"),

@@ -172,17 +172,21 @@ def test_results_and_gradients_are_those_of_the_loop(name: str, n: int) -> None:
 
 
 class Normed(nn.Module):
-    """Layer norms in three spellings, with weights and without."""
+    """Layer norms in six spellings, with weights and without; one is left out of some calls."""
 
     def __init__(self) -> None:
         super().__init__()
         self.a, self.b, self.out = nn.Linear(3, 8), nn.Linear(8, 8), nn.Linear(8, 1)
-        self.norm, self.scale = nn.LayerNorm(8), nn.Parameter(torch.rand(8))
+        self.norm, self.scale, self.on = nn.LayerNorm(8), nn.Parameter(torch.rand(8)), False
 
     def forward(self, x: Tensor) -> Tensor:
+        if not self.on:
+            return self.out(torch.tanh(self.a(x)))
         x = torch.tanh(self.norm(self.a(x)))
         x = torch.sin(F.layer_norm(self.b(x), (8,), self.scale))
-        return self.out(x * F.layer_norm(x, (8,)) + torch.layer_norm(x, (8,)))
+        y = x * F.layer_norm(x, normalized_shape=(8,)) + torch.layer_norm(x, (8,), None, None, 1e-3, False)
+        y = y + torch.layer_norm(input=x.sin(), normalized_shape=[8], cudnn_enable=False)
+        return self.out(y * torch.native_layer_norm(x.cos(), [8], None, None, 1e-4)[0])
 
 
 @pytest.mark.parametrize("n", [1, 40])
@@ -194,6 +198,8 @@ def test_third_derivatives_of_layer_norms_are_right_in_every_way(way: Any, k: in
     centres = torch.rand(k, 3, generator=generator)
     router = perturb(VoronoiRouter(Normed().double(), centres, coords="first3", fuse=True, way=way), generator)
     x = torch.rand(n, 3, dtype=torch.float64, generator=generator).requires_grad_()
+    router(x)  # of a call without norms nothing is concluded
+    router.module.on = True
     leaves = [x, *router.parameters()]
     along = [torch.randn(leaf.shape, generator=generator).double() * 1e-6 for leaf in leaves]
 

@@ -329,20 +329,36 @@ def test_modules_that_need_a_subclass_of_tensors_are_told(generator: torch.Gener
     labelled = Labelled.of(x, list("xyz"))
     router = router_of(Named("always"), generator, **options)
     with pytest.raises(
-        TypeError, match=r"Named.forward must do with plain .*needs a Labelled \(AttributeError: .*; take"
+        TypeError, match=r"Named.forward must work with plain .*needs a Labelled \(AttributeError: .*; extract"
     ):
         router(labelled)
     router = router_of(Named("where there are some"), generator, **options)
     router(x)
     for _ in range(2):
         with pytest.raises(
-            TypeError, match=r"Named.forward must do with .* needs a Labelled \(its results differ\); take"
+            TypeError, match=r"Named.forward must work with .* needs a Labelled \(its results differ\); extract"
         ):
             router(labelled)
     with pytest.raises(
         TypeError, match="results must be plain tensors, got a Labelled; make it of the router's results"
     ):
         router_of(Named("for results"), generator, **options)(x)
+
+
+class Unsliced(Tensor):
+    """A subclass whose pieces lack what it needs."""
+
+    def column(self, name: str) -> Tensor:
+        return self.as_subclass(Tensor)[..., self._labels.index(name)]
+
+
+@pytest.mark.filterwarnings("ignore:.*cell by cell")
+@pytest.mark.parametrize("options", WAYS)
+def test_a_subclass_of_tensors_whose_pieces_do_not_work(generator: torch.Generator, options: dict[str, Any]) -> None:
+    x = uniform(generator, 60, 3).as_subclass(Unsliced)
+    x._labels = list("xyz")
+    with pytest.raises(TypeError, match=r"Named.forward must work with plain .*needs a Unsliced \(AttributeError: "):
+        router_of(Named("always"), generator, **options)(x)
 
 
 class Bent(nn.Module):
@@ -360,7 +376,7 @@ def test_compiled_parts_have_no_parameters(generator: torch.Generator) -> None:
     router, x = router_of(module, generator), uniform(generator, 60, 3)
     torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
     router = router_of(module, generator, fuse=True)
-    with pytest.raises(ValueError, match=r"comes from 1, which torch\.jit has compiled; do without"):
+    with pytest.raises(ValueError, match=r"perhaps part '1', which torch\.jit has compiled; use"):
         router(x)
 
 

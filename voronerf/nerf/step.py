@@ -24,6 +24,7 @@ from voronerf.ops._core.capture import Capture
 from voronerf.ops._core.custom_op import is_watched
 from voronerf.ops._core.recording import Recording
 from voronerf.ops.adam.reference import judge
+from voronerf.router.layout import tensors_of
 
 
 class StepOutput:
@@ -146,6 +147,8 @@ class TrainingStep:
         """Whether steps are replayed, and what keeps them from it."""
         if isinstance(self._recording, Capture):
             return "step: captured and replayed as a CUDA graph"
+        if self._recording is not None and self._left:
+            return f"step: runs as it is {self._left} times more, since the last recordings were not replayed"
         if self._recording is not None:
             return f"step: recorded and replayed, {len(self._recording)} calls"
         if parts := sum(part.recorded for part in self._parts.values()):
@@ -261,7 +264,7 @@ class TrainingStep:
             self.strategy.step_post_backward(output)
 
     def _make_all(self, steps: int, same: bool | None) -> tuple[StepOutput, bool | None]:
-        """Makes so many steps; arguments and results as of :meth:`_make`."""
+        """Makes all of so many steps; ``same`` and the results are those of :meth:`_make`."""
         while True:
             made, output, same = self._make(steps, same)
             steps -= made
@@ -456,10 +459,9 @@ class TrainingStep:
         for group in optimizer.param_groups:
             self._guards.add(group, "lr")
         if self._on_gpu():  # a capture does not see which tensors it takes, as a recording does
-            members = [each for dictionary in dictionaries for each in dictionary.values()]
-            for tensor in members + [gradient for _, gradient in self._gradients]:
-                if isinstance(tensor, Tensor):
-                    self._guards.add_tensor(tensor)
+            owners = self.batches, renderer.sampler, self.strategy, self.guard, optimizer.state, self._gradients
+            for tensor in (*tensors_of(owners), *field.parameters(), *field.buffers()):
+                self._guards.add_tensor(tensor, True)
         learning = (p for group in optimizer.param_groups for p in group["params"])
         self._parameters = [*dict.fromkeys((*field.parameters(), *learning))]
         self._objects, self._values = self._current()

@@ -44,7 +44,7 @@ _TURNS, _SECONDS = 8, 0.08  # a way is measured at most so often, and no more th
 _SLICE, _BEHIND = 8192, 1.5  # samples of a batch that are measured; times behind the fastest, so not measured again
 _LOOKS, _APART, _CLEAR = 3, 1.0, 1.3  # measurements that a fused way must lose, seconds between them, factor of time
 _EQUAL = 1.02  # of the least time: an earlier way of a plan is taken unless it is slower by more
-_OF_DTYPES = re.compile("dtype|scalar type|Input type")  # in messages of PyTorch
+_OF_DTYPES = re.compile("same dtype|expected scalar type|Input type")  # in messages of PyTorch
 _OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
 
 
@@ -56,7 +56,7 @@ class CallPlan:
         ways: Those that give what the loop gives, the most promising first and the loop last.
         measured: Whether the first batch of each size decides between the ways; else the first one runs.
         open: Whether another batch may run grouped, though the first did not.
-        few: Whether it was made for fewer than ``FEWEST`` samples; the first larger call makes another.
+        few: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another.
         chosen: The fastest way and why, by the size of a batch and the number of cells.
         lost: The looks that the fused way has lost, by the same key: their number, the time of the next one, a text.
         constants: What is no tensor among the arguments of the call that it was made for, if it is fused.
@@ -280,7 +280,7 @@ class Dispatch:
                 if not few or isinstance(error, Forbidden):
                     raise
                 ways, is_open = [Loop()], False  # a tensor [1, f] beside one sample may be what all samples share
-            if few and isinstance(ways[0], Loop):
+            if few and isinstance(ways[0], Loop) and options.way != "loop":
                 ways[0].why = f"first calls of fewer than {FEWEST} samples"
         if len(self.plans) >= _PLANS:
             self.plans, self.known = {}, {}
@@ -441,12 +441,13 @@ def _misfit(error: Exception, call: Call) -> Exception | None:
         )
     for frame, _ in traceback.walk_tb(error.__traceback__):
         layer, x = frame.f_locals.get("self"), frame.f_locals.get("input")
-        if isinstance(layer, nn.Linear) and isinstance(x, Tensor) and x.shape[-1:] != (layer.in_features,):
-            return ValueError(
-                f"{_OP}: {', '.join(tensors)} must fit {call.name}, whose {layer} gets {x.shape[-1]} features, got "
-                f"{', '.join(str(list(x.shape)) for x in tensors.values())}; pass what the module itself takes, and "
-                "positions that are no part of it as coords="
-            )
+        if not isinstance(layer, nn.Linear) or not isinstance(x, Tensor) or x.shape[-1:] == (layer.in_features,):
+            continue
+        shapes = ", ".join(str(list(tensor.shape)) for tensor in tensors.values())
+        rule = f"{_OP}: {', '.join(tensors)} must fit {call.name}, whose {layer} gets {x.shape[-1]} features"
+        given = any(tensor.shape[-1:] == x.shape[-1:] for tensor in tensors.values())
+        remedy = "; pass what the module itself takes, and positions that are no part of it as coords=" if given else ""
+        return ValueError(f"{rule}, got {shapes}{remedy}")
     return None
 
 

@@ -72,18 +72,9 @@ CREATE = find("zeros ones full empty rand randn randint", torch)
 
 
 class Exact(TorchFunctionMode):
-    """A mode that replaces functions whose higher derivatives are wrong in PyTorch.
-
-    Attributes:
-        needed: Whether the module called such a function.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.needed = False
+    """A mode that replaces functions whose higher derivatives are wrong in PyTorch."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.needed |= func in EXACT
         return EXACT.get(func, func)(*args, **(kwargs or {}))
 
 
@@ -413,7 +404,6 @@ class Loop:
 
     why: str = ""
     again: bool = False
-    exact: bool = True  # runs in :class:`Exact`, until a call has shown that the module does not need it
     name: str = "cell by cell"
 
     def run(self, call: Call, grouping: Grouping) -> Results:
@@ -426,12 +416,10 @@ class Loop:
         pieces = {id(p): cells_of(p) for p in cell_parameters(module)}
         values, double = [], Double(module)
         arguments = call.arranged(grouping)
-        mode = Exact() if self.exact and torch.is_grad_enabled() else None
+        mode = Exact() if torch.is_grad_enabled() and not self.again else None
         for (cell, _, _), part in zip(bounds, split_rows(arguments, counts), strict=True):
             double = Double(module) if self.again else double
             values.append(double.run(call, part, {key: piece[cell] for key, piece in pieces.items()}, mode))
         if not self.again:
             double.end()
-        if mode is not None:
-            self.exact = mode.needed
         return Results.joined(values, counts, grouping)

@@ -15,25 +15,36 @@ from torch import Tensor
 from voronerf.router.transforms import transformed
 
 
+def native_layer_norm(
+    input: Tensor, normalized_shape: Sequence[int], weight: Tensor | None, bias: Tensor | None, eps: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns ``torch.native_layer_norm`` of the same arguments; of half precision it is PyTorch's own."""
+    dtypes = {tensor.dtype for tensor in (input, weight, bias) if tensor is not None}
+    plain = torch.is_autocast_enabled(input.device.type) or dtypes not in ({torch.float32}, {torch.float64})
+    if plain or not torch.is_grad_enabled():
+        return torch.native_layer_norm(input, normalized_shape, weight, bias, eps)
+    apply = _LayerNorm.apply if transformed() else _apply_directly
+    results: tuple[Tensor, Tensor, Tensor] = apply(input, list(normalized_shape), weight, bias, eps)
+    return results
+
+
 def layer_norm(
-    x: Tensor,
-    shape: Sequence[int],
+    input: Tensor,
+    normalized_shape: Sequence[int],
     weight: Tensor | None = None,
     bias: Tensor | None = None,
     eps: float = 1e-5,
-    *_: Any,
+    cudnn_enable: bool = True,
 ) -> Tensor:
-    """Returns ``F.layer_norm`` of the same arguments; of half precision it is PyTorch's own."""
-    dtypes = {tensor.dtype for tensor in (x, weight, bias) if tensor is not None}
-    plain = torch.is_autocast_enabled(x.device.type) or dtypes not in ({torch.float32}, {torch.float64})
-    if plain or not torch.is_grad_enabled():
-        return F.layer_norm(x, shape, weight, bias, eps)
-    apply = _LayerNorm.apply if transformed() else _apply_directly
-    y: Tensor = apply(x, list(shape), weight, bias, eps)[0]
-    return y
+    """Returns ``torch.layer_norm`` of the same arguments; see :func:`native_layer_norm`."""
+    return native_layer_norm(input, normalized_shape, weight, bias, eps)[0]
 
 
-EXACT: dict[Any, Any] = {F.layer_norm: layer_norm, torch.layer_norm: layer_norm}
+EXACT: dict[Any, Any] = {
+    F.layer_norm: layer_norm,
+    torch.layer_norm: layer_norm,
+    torch.native_layer_norm: native_layer_norm,
+}
 """The replacements of PyTorch's functions, by function."""
 
 

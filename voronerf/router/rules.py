@@ -237,11 +237,13 @@ def repeat(run: GroupedRun, source: Tensor, *sizes: Any) -> Any:
 # Norms ----------------------------------------------------------------------------------------------------------------
 
 
-def _norm(func: Any, run: GroupedRun, x: Tensor, over: Any, weight: Any = None, bias: Any = None, **more: Any) -> Any:
+def _norm(
+    func: Any, run: GroupedRun, input: Tensor, normalized_shape: Any, weight: Any = None, bias: Any = None, **more: Any
+) -> Any:
     """A norm over the last dimensions: without its parameters, then those."""
-    if not run.is_rows(x):
+    if not run.is_rows(input):
         return NotImplemented
-    x = func(x, over, **more)
+    x = func(input, normalized_shape, **more)
     for parameter, join in ((weight, torch.mul), (bias, torch.add)):
         if isinstance(parameter, PerCell):
             x = _elementwise(join, run, run.mark(x), parameter)

@@ -132,18 +132,20 @@ class Trace(TorchFunctionMode):
             self.parameters[node] = self._places[id(value)]
             return node
         if value.requires_grad or value.shape[:1] == (self.rows,):
-            if names := self._compiled():
-                raise Unfusable(f"a tensor comes from {names}, which torch.jit has compiled{self._line}; do without")
-            remedy = "write it with functions of PyTorch, or call it in a torch.autograd.Function"
-            raise Unfusable(
-                f"a tensor comes from what is no PyTorch function or one of torch.jit{self._line}; {remedy}"
+            names = self._compiled()
+            remedy = (
+                f"perhaps {names}, which torch.jit has compiled; use what it was compiled from"
+                if names
+                else "write it with functions of PyTorch, or call it in a torch.autograd.Function"
             )
+            raise Unfusable(f"a tensor comes from what is no PyTorch function{self._line}, {remedy}")
         return value
 
     def _compiled(self) -> str:
         """The names of parts of the module, and of functions that its code calls, which ``torch.jit`` has compiled."""
         names, known = self._code
-        parts = [name for name, part in self._module.named_modules() if isinstance(part, torch.jit.ScriptModule)]
+        compiled = torch.jit.ScriptModule
+        parts = [f"part {name!r}" for name, part in self._module.named_modules() if isinstance(part, compiled)]
         return ", ".join(parts + [name for name in names if isinstance(known.get(name), torch.jit.ScriptFunction)])
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:

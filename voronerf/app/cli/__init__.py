@@ -16,16 +16,19 @@ def main(args: list[str] | None = None) -> int:
     if sys.modules.get("torch") is None:
         _prepare()
     try:
-        import voronerf.ops._core.backends as backends
-        from voronerf.app.cli.program import run
+        from voronerf.ops._core.backends import BackendUnavailable
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        line = "voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch"
-    except backends.BackendUnavailable as error:  # the compiled module is missing or of another version
-        line = str(error)
-    else:
-        return run(args)
+        return _fail("voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch")
+    try:
+        from voronerf.app.cli.program import run
+    except BackendUnavailable as error:  # the compiled module is missing or of another version
+        return _fail(str(error))
+    return run(args)
+
+
+def _fail(line: str) -> int:
     print(f"voronerf: error: {line}", file=sys.stderr)
     return 1
 

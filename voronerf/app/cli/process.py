@@ -65,7 +65,7 @@ def process(
             )
     except (KeyboardInterrupt, SystemExit) as stop:  # Ctrl-C, SIGTERM
         say("stopped; continue with the same command")
-        status = int(getattr(stop, "code", 130))
+        status = stop.code if isinstance(stop, SystemExit) and isinstance(stop.code, int) else 130
         if any(thread.name == MAPPER for thread in threading.enumerate()):
             sys.stdout.flush()
             os._exit(status)  # COLMAP's thread still runs, and crashes when Python's shutdown takes its memory

@@ -6,7 +6,7 @@ runs, random integers are drawn again for each of them, and views change nothing
 would be missing later, so it keeps the function from being replayed: :attr:`Recording.obstacle` says what it is.
 
 A recording holds the storages of all tensors that its calls take. Where one of these tensors, or one that they are
-views of, has moved to other memory (``x.data = y``), the calls are not made: :meth:`Recording.replay` says so.
+views of, has moved (``x.data = y``), the calls are not made: :meth:`Recording.replay` says so.
 
 What changes lies in memory: numbers of rows (:meth:`Recording.count`, :func:`read_count`), other numbers
 (:func:`varying`), random integers, and what earlier calls have computed. Several runs can be made in one call; between
@@ -246,9 +246,12 @@ class Recording(TorchDispatchMode):
                     args[args.index(size)] = [most + more, *size[1:]]
                     memory: Tensor = func(*args, **kwargs)
                     self._compiled.advise_huge_pages(memory, memory.nbytes)
-                    self._memory[memory.untyped_storage().data_ptr()] = memory
+                    address = memory.untyped_storage().data_ptr()
+                    self._memory[address] = memory
+                    self._calls.made(address)
                     return memory[: rows + more]
         found: Tensor = func(*args, **kwargs)
+        self._calls.made(found.untyped_storage().data_ptr())
         return found
 
 
