@@ -33,7 +33,7 @@ class Scaled(torch.nn.Module):
 class Training:
     """A small training, whose grid empties a part of the box, so that its numbers of samples vary.
 
-    As of a photograph it has points of a sparse model, and rays from where no camera was.
+    With ``photograph`` it has points of a sparse model, and rays from where no camera was.
     """
 
     def __init__(self, cells=1, field=None, sampler=Occupancy, photograph=False, **options):
@@ -69,7 +69,7 @@ class Training:
         self.step._standing_obstacle = lambda: "a test"
 
     def train(self, steps, rays=lambda step: 64, as_it_is=False):
-        """Steps, of which some are as they are; gives what they have found."""
+        """Makes steps, without recording if ``as_it_is``; returns their results."""
         found = []
         for step in range(steps):
             if as_it_is:

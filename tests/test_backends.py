@@ -140,7 +140,7 @@ def test_sources_without_their_compiled_module_say_where_it_is(tmp_path: Path, m
     (folder := tmp_path / "voronerf/ops/_core").mkdir(parents=True)
     for remedy in (
         "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)",
-        f"start Python in another folder to import that of {tmp_path}, or build it with `pip install -e .`",
+        f"run Python in another folder to import that of {tmp_path}, or build it with `pip install -e .`",
     ):
         said = rf"voronerf in {here} cannot load its compiled module \(.*_C.*\); {re.escape(remedy)}"
         with pytest.warns(RuntimeWarning, match=rf"^{said}. Until then plain PyTorch runs in its place") as told:

@@ -155,7 +155,7 @@ MODULES: Errors = [
         TypeError,
         "but `1`, a Linear, keeps in `held` a list, which it refuses",
     ),
-    (lambda: single(nn.Sequential(Compared())), TypeError, r"must have a hash, .* but a Compared .*\(eq=False\)"),
+    (lambda: single(nn.Sequential(Compared())), TypeError, r"must be hashable, .* but a Compared .*\(eq=False\)"),
 ]
 OPTIONS: Errors = [
     (lambda: VoronoiRouter(Field(), torch.randn(8, 5)), ValueError, "centres must"),

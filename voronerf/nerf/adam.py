@@ -114,7 +114,7 @@ class Adam(torch.optim.Adam):
         """Adds a group of parameters, as ``torch.optim.Adam``.
 
         Raises:
-            ValueError: An option of ``torch.optim.Adam`` that this one does not have.
+            ValueError: The group sets an option of ``torch.optim.Adam`` that is not supported.
         """
         _check_group(param_group)
         inspect.unwrap(torch.optim.Adam.add_param_group)(self, param_group)
@@ -209,7 +209,7 @@ class Adam(torch.optim.Adam):
             loss: [], of the step; with it the guard judges first.
 
         Raises:
-            ValueError: A group has an option of ``torch.optim.Adam`` that this one does not have.
+            ValueError: A group sets an option of ``torch.optim.Adam`` that is not supported.
         """
         for group in self.param_groups:
             _check_group(group)
@@ -241,7 +241,7 @@ class Adam(torch.optim.Adam):
 def _check_group(group: Mapping[str, Any]) -> None:
     for option in ("weight_decay", "amsgrad", "maximize", "differentiable"):
         if group.get(option):
-            remedy = "; shrink=RATE is weight decay apart from the gradients" if option == "weight_decay" else ""
+            remedy = "; use shrink=RATE for decoupled weight decay" if option == "weight_decay" else ""
             raise ValueError(f"Adam: {option} of a group must be 0 or False, got {group[option]}{remedy}")
 
 

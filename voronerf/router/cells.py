@@ -68,7 +68,7 @@ def check_module(module: nn.Module) -> None:
     for part in parts_of(module).values():
         if type(part).__hash__ is None:
             raise TypeError(
-                f"{_OP}: module must have a hash, which torch needs, but a {type(part).__name__} has none; "
+                f"{_OP}: module must be hashable, as torch requires, but a {type(part).__name__} is not; "
                 "define it by @dataclass(eq=False), or with __hash__ beside __eq__"
             )
     for name, part in module.named_modules():

@@ -103,7 +103,7 @@ def map_tensors(value: Any, change: Callable[[Tensor], Any]) -> Any:
 
 
 def as_plain(value: Any) -> Any:
-    """A tensor of a subclass as a plain one, and any other value, or a tensor with a dispatch of its own, as it is."""
+    """Returns a tensor of a subclass as a plain one; other values, and tensors with a dispatch of their own, stay."""
     kind = type(value)
     if kind is Tensor or kind is nn.Parameter or not isinstance(value, Tensor):
         return value
@@ -273,7 +273,7 @@ class Call:
         return call
 
     def plain(self) -> Call:
-        """The same with plain tensors in the place of those of subclasses; itself where there are none."""
+        """Returns the call with plain tensors instead of subclasses, or itself if it has none."""
         args, kwargs = map_tensors((self.args, self.kwargs), as_plain)
         same = args is self.args and kwargs is self.kwargs
         return self if same else dataclasses.replace(self, args=args, kwargs=kwargs)

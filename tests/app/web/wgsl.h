@@ -65,7 +65,7 @@ template <class T, int N, class... X>
 constexpr int lanes_of<vec<T, N>, X...> = N;
 template <class T, class... X>
 constexpr int lanes_of<T, X...> = lanes_of<X...>;
-// f of each lane.
+// Applies f to each lane.
 template <class F, class... X>
 auto each(F f, const X&... x) {
   constexpr int kLanes = lanes_of<X...>;

@@ -22,7 +22,7 @@ def declared(members: str, end: str) -> str:
 
 
 def lanes(names: str) -> str:
-    """Of a vector, one by its number, or several as a vector."""
+    """Returns C++ for a swizzle: ``[i]`` for one lane, ``.lanes<...>()`` for several."""
     places = ["xyzwrgba".index(name) % 4 for name in names]
     return f"[{places[0]}]" if len(places) == 1 else f".lanes<{str(places)[1:-1]}>()"
 

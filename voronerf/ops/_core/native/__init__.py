@@ -56,7 +56,7 @@ def _why_missing(error: ImportError | OSError) -> str:
     remedy = "install a wheel, or build it with `pip install -e .` (needs a C++17 compiler)"
     if found is not None and found.origin is not None:
         installed = Path(found.origin).parents[3]
-        remedy = f"start Python in another folder to import that of {installed}, or build it with `pip install -e .`"
+        remedy = f"run Python in another folder to import that of {installed}, or build it with `pip install -e .`"
     return f"voronerf in {here} cannot load its compiled module ({error}); {remedy}"
 
 
