@@ -154,7 +154,7 @@ def convolution(
     dilation: Any = 1,
     groups: int = 1,
 ) -> Any:
-    """A convolution of one place: rows [n * m, i, ...], or [i, ...] or [1, i, ...] with n places along one dimension."""
+    """Kernels of one place: rows [n * m, i, ...], or [i, ...] or [1, i, ...] with n places along one dimension."""
     places, channel = weight.dim() - 2, input.dim() - weight.dim() + 1
     if not run.is_rows(input) or set(weight.shape[2:]) != {1} or groups != 1:
         return NotImplemented
