@@ -55,7 +55,7 @@ def small(pattern: str) -> Iterator[dict[str, Any]]:
 
 
 def counts(results: list[dict[str, Any]]) -> dict[str, int]:
-    """How many modules run in which way."""
+    """Counts modules by the way in which they run."""
     ways = Counter(row["how"] for row in results)
     repositories = {row.get("repository") for row in results}
     classes = {(row.get("repository"), row["class"]) for row in results}

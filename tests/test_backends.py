@@ -131,7 +131,7 @@ assert main(["info"]) == 1
 
 
 def test_sources_without_their_compiled_module_say_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in a checkout after ``pip install .``, where Python finds the sources first."""
+    """A checkout after ``pip install .``: Python finds the sources first."""
     monkeypatch.delitem(sys.modules, "voronerf.ops._core.native")
     monkeypatch.setitem(sys.modules, "voronerf.ops._core._C", None)
     backends._warn_once.cache_clear()

@@ -76,7 +76,7 @@ class FreqEncoder(nn.Module):
 
 
 class SHEncoder(nn.Module):
-    """As many products of coordinates as there are spherical harmonics of a degree."""
+    """A stand-in for spherical harmonics: as many products of coordinates."""
 
     def __init__(self, input_dim: int = 3, degree: int = 4) -> None:
         super().__init__()

@@ -204,7 +204,7 @@ Field = namedtuple("Field", ["rgb", "sigma"])
 
 
 def spelled(name: str, call: Callable[[Tensor], Any]) -> Row:
-    """What becomes of four outputs."""
+    """Ways to return four outputs."""
     return own(name, lambda s, x: call(s.net(x)))
 
 

@@ -157,7 +157,7 @@ class Kind:
 
     Attributes:
         make: Makes the field.
-        features: Of each argument.
+        features: The columns of each argument.
         share: Names of parameters that cells may share.
         methods: Further methods, which take the first argument.
         twice: Whether second derivatives are compared, which a custom function may not have.

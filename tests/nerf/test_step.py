@@ -121,7 +121,7 @@ def test_numbers_of_rows_that_are_much_the_same():
 
 
 def test_a_replay_refuses_what_a_call_finds_wrong():
-    """As the call did: cells that came to lie out of range while it was replayed."""
+    """Cells that came to lie out of range between replays are refused, as by the call itself."""
     cells = torch.tensor([0, 2, 1, 2, 0, 1], dtype=torch.int32)
     with Recording() as recording:
         recording.count(lambda: 6)
@@ -178,7 +178,7 @@ def test_what_changes_is_followed(change):
 
 
 def new_data(*tensors):
-    """As many codes do it: other memory with the same or, for images, other values."""
+    """Gives tensors other memory with the same values, or for images with others."""
     for tensor in tensors:
         tensor.data = 255 - tensor.data if tensor.dtype == torch.uint8 else tensor.data.clone()
 

@@ -1,4 +1,4 @@
-"""What the shaders of a page compute, without a browser: the picture that `Run.render` renders."""
+"""Shaders of a page draw, without a browser, the picture that `Run.render` renders."""
 
 from __future__ import annotations
 
