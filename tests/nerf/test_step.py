@@ -236,6 +236,19 @@ def test_what_moves_is_followed():
         assert same(steps, found[1][name]), name
 
 
+def test_recordings_that_are_never_replayed_are_made_less_often():
+    training = Training()
+    training.train(4)
+    said = []
+    for _ in range(12):
+        new_data(training.batches.images)
+        training.train(1)
+        said.append(training.step.explain())
+    assert training.recorded < 8 and any("runs as it is 3 times more" in each for each in said), said
+    training.train(8)
+    assert "recorded and replayed" in training.step.explain()
+
+
 def test_gradients_that_were_dropped_are_given_back():
     """Any of them, also where a loop has put another tensor in its place, or one where there was none."""
     one, other = Training(), Training()
