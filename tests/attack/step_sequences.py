@@ -121,6 +121,7 @@ def _write(training: Training, rng: random.Random) -> None:
     with torch.no_grad():
         rng.choice(_parameters(training)).mul_(0.9)
     pictures = rng.choice((training.batches.images, training.batches.cameras.poses))
+    pictures.data = pictures.data.contiguous()  # of one for all
     pictures.copy_(pictures.flip(0))
 
 

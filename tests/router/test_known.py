@@ -173,6 +173,14 @@ def test_few_samples_are_as_well_known_as_many(
     assert calls == [] or not fuse
 
 
+def test_what_few_samples_have_shown_is_looked_at_again_with_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    router, probes, probe = routed(Named()), list[Any](), dispatch.Probe
+    monkeypatch.setattr(dispatch, "Probe", lambda *made_of: probes.append(made_of) or probe(*made_of))
+    for n, count in ((1, 1), (7, 1), (300, 2), (1, 2), (40, 2)):
+        router(rows(n), rows(n))
+        assert len(probes) == count, n
+
+
 class Given(nn.Module):
     """Takes a vector that all samples share, or the rays do."""
 
