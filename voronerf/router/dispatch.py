@@ -58,7 +58,7 @@ class CallPlan:
         open: Whether another batch may run grouped, though the first did not.
         few: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another.
         chosen: The fastest way and why, by the size of a batch and the number of cells.
-        lost: The looks that the fused way has lost, by the same key: their number, the time of the next one, a text.
+        lost: Measurements that the fused way has lost, by the same key: count, time of the next one, explanation.
         constants: What is no tensor among the arguments of the call that it was made for, if it is fused.
         watch: Values of the module that its trace read.
         skip: The next calls that run cell by cell before another way is tried again.
@@ -125,7 +125,7 @@ class Dispatch:
         self._known, self._trees = list[Any](), list[Any]()  # parameters, and parts of the module, at the last call
         self._k = 0  # cells, then
         self._inner: list[Any] = []  # shapes of one cell's parameters
-        self._subclasses: set[Any] = set()  # of tensors that methods do without
+        self._subclasses: set[Any] = set()  # methods and tensor types that are known to work with plain tensors
         self._warned: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
         self._activation: Activation | None = None
