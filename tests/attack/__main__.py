@@ -32,8 +32,8 @@ PARTS = {
     for part, long, short in (
         (Part("valid-calls", op_attacks.valid_call, 60, 200, peak=3 * MEMORY), 140_000, 150),
         (Part("invalid-calls", op_attacks.invalid_call, 20, 200, MEMORY // 2), 60_000, 150),
-        (Part("steps", step_sequences.changed_steps, 120, 20, peak=2 * MEMORY), 500, 10),
-        (Part("routers", router_sequences.random_sequence, 60, 10), 500, 12),
+        (Part("steps", step_sequences.changed_steps, 120, 20, peak=2 * MEMORY), 500, 5),
+        (Part("routers", router_sequences.random_sequence, 60, 10), 500, 6),
         (Part("kills", training_attacks.killed_training, 300, 1, prepare=given.prepare_scenes), 20, 1),
         (Part("ranks", rank_attacks.harmed_ranks, 600), 16, 0),
         (Part("bits", run_attacks.flipped_bit, 60, 20, prepare=given.prepare_runs), 500, 15),
