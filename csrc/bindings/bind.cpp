@@ -348,8 +348,7 @@ void call(const Loaded& loaded, Result& result) {
   }
 }
 
-// The address of a tensor's memory, and where it is asked for its layout there, size and stride; null without an
-// answer.
+// The address of a tensor's memory and, with its layout, size and stride; null without an answer.
 struct Place {
   py::object answers[3];
 
@@ -389,7 +388,7 @@ class Guards {
     if (!known_.insert(tensor.ptr()).second) return;
     tensors_.push_back({tensor, tensor.attr("untyped_storage")(), Place(tensor.ptr(), layout), layout});
   }
-  // Compares addresses alone: between the kernels of a loop, whatever is looked at must come from memory.
+  // Compares as little as may be: between the kernels of a loop, whatever is looked at must come from memory.
   bool hold() const {
     for (const Guard& guard : guards_) {
       size_t i = 0;
