@@ -96,7 +96,7 @@ class _Fields:
             if kind is None:
                 found.append(given)
             else:
-                found += (None,) * len(kind._fields) if given is None else given
+                found.extend((None,) * len(kind._fields) if given is None else given)  # torch 2.11 traces no +=
         return found
 
 

@@ -14,7 +14,7 @@ from voronerf.ops._core.declare import declare
     native=Implementation(EVERYWHERE, FLOATS),
     warp=Implementation(EVERYWHERE, FLOATS),
     smooth=["x"],
-    sizes={"w": lambda given: given.d * (given.include_input + 2 * given.octaves)},
+    sizes={"w": lambda given: given.d * (int(given.include_input) + 2 * given.octaves)},
 )
 def frequency_encode(
     x: Annotated[Tensor, "floating [n, d]"],

@@ -159,7 +159,7 @@ def check_tensors(
         check_shape(op, f"parameters[{i}]", p, (1 if p.shape[:1] == (1,) else "k", *shape), sizes)
         known = (inputs[0].dtype, *(_TABLES if _among(i, program.tables) else ()))
         check_dtype(op, f"parameters[{i}]", p, tuple(dict.fromkeys(known)))
-    if (ray_index is not None) != bool(program.rays):
+    if (ray_index is not None) != (len(program.rays) > 0):
         rule = "given for a program with" if program.rays else "None for a program without"
         came = "None" if ray_index is None else "an index"
         raise ValueError(f"{op}: ray_index must be {rule} inputs of rays, got {came}")
