@@ -20,7 +20,7 @@ SOURCES := $(shell find csrc -type f) setup.py pyproject.toml
 
 PAPER_ARGS ?= --out runs/paper-small --budget 16 --downscale 8 --rays 512 --samples 48 --evaluations 6 --eval-views 4 --final-views 10
 
-.PHONY: demo wheel test test-all bench paper docs check cuda-check warp-check arm-check isa-check gpu-check emulate-cuda sanitize attack clean
+.PHONY: demo wheel test test-all bench paper docs check cuda-check warp-check arm-check isa-check gpu-check gpu-prebuilt emulate-cuda sanitize attack clean
 
 demo: $(VENV)/.built
 	@$(BIN)/voronerf demo
@@ -74,12 +74,16 @@ isa-check-%: $(VENV)/.built
 	@VORONERF_ISA=$* OMP_NUM_THREADS=1 $(BIN)/pytest -q -n $(JOBS) -p no:cacheprovider tests/ops \
 	    -k "native-cpu and not compiles and not opcheck"
 
-# Everything to be learnt from a machine with a GPU, in three calls of ten minutes: CALL=1, 2 and 3. OUT is a folder for
-# the two files that a call leaves.
+# Everything to be learnt from fifteen minutes of a GPU, in two calls: CALL=first and second. OUT is a folder for the two
+# files that a call leaves; GPU_CHECK_ARGS=--emulated tries it without a GPU. There it links what gpu-prebuilt has
+# compiled here for one architecture, where build/prebuilt is carried, and compiles otherwise.
 OUT ?= build/gpu-check
-CALL ?= 1
+CALL ?= first
+ARCHITECTURE ?= 90
 gpu-check:
 	@$(PYTHON) benchmarks/gpu/gpu_check.py $(CALL) --out $(OUT) $(GPU_CHECK_ARGS)
+gpu-prebuilt: $(VENV)/.installed
+	@$(BIN)/python benchmarks/gpu/prebuilt.py make build/prebuilt $(ARCHITECTURE)
 
 # The tests of the operations on CUDA kernels that run on the CPU, threads in several orders.
 emulate-cuda: $(VENV)/.built

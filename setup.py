@@ -63,14 +63,18 @@ class NinjaBuildExt(build_ext):
         if jobs := os.environ.get("MAX_JOBS") or (str(self.parallel) if self.parallel else ""):
             command += ["-j", jobs]
         subprocess.run(command, check=True)
-        target = Path(self.get_ext_fullpath(ext.name))
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(module, target)
-        if stub := stub_of(module):
-            for folder in (ROOT / "voronerf/ops/_core", target.parent):
-                write_if_changed(folder / "_C.pyi", stub)
-                write_if_changed(folder / "interface.txt", f"{zlib.crc32(stub.encode())}\n")
+        put(module, Path(self.get_ext_fullpath(ext.name)))
         print(f"voronerf: {cuda.outcome}")
+
+
+def put(module: Path, target: Path) -> None:
+    """Copy the module to where it is imported from, and note what it binds."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(module, target)
+    if stub := stub_of(module):
+        for folder in (ROOT / "voronerf/ops/_core", target.parent):
+            write_if_changed(folder / "_C.pyi", stub)
+            write_if_changed(folder / "interface.txt", f"{zlib.crc32(stub.encode())}\n")
 
 
 def build_folder() -> Path:

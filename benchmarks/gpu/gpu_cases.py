@@ -1,4 +1,4 @@
-"""What ``gpu_parts.py`` tries: every operation once against float64, and the steps that it captures."""
+"""What ``gpu_parts.py`` tries: every operation once against float64, and steps in CUDA graphs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,20 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
+
+CHECKED = (
+    *("adam", "average", "composite packed", "march_rays", "draw_pixels", "grouped_mlp hashed", "routed_mlp nested"),
+    *("grouped_linear", "hash_encode features=8", "locate_cell", "nearest_centre k=700", "observe_occupancy"),
+    *("pixel_rays", "render_loss", "resample", "cell_sort 5000 3 by counting", "grouped_mlp wide tf32"),
+    *("grouped_mlp skips bfloat16 forward", "grouped_mlp of a hash grid for each cell bfloat16", "unaligned views"),
+)
+"""The small cases for memcheck: every kernel that finds its own addresses."""
+RACING = (
+    *("cell_sort 5000 3 by counting", "cell_sort 4200 1022 by counting", "composite packed", "march_rays", "resample"),
+    *("render_loss", "grouped_mlp branched bfloat16", "grouped_mlp wide tf32", "grouped_mlp broad float32"),
+    "routed_mlp",
+)
+"""Those for racecheck and synccheck: kernels whose threads share memory."""
 
 STEPS: dict[str, tuple[int, str, bool, int]] = {
     "width 64": (64, "float32", False, 8),
@@ -176,10 +190,13 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     networks |= {"harmonics": (HARMONICS, 3)}
     cases: list[tuple[str, Callable[[], None]]] = [
         *(
-            (f"{op} {', '.join(map(str, pins.values()))}".strip(), functools.partial(of_case, op, pins))
+            (f"{op} {kind}".strip(), functools.partial(of_case, op, pins))
             for op in backends.ops("native", "cuda")
             if cases_of_ops[op].comparable
-            for pins in (*cases_of_ops[op].kinds.values(), *cases_of_ops[op].on_devices)
+            for kind, pins in (
+                *cases_of_ops[op].kinds.items(),
+                *((", ".join(f"{name}={value}" for name, value in p.items()), p) for p in cases_of_ops[op].on_devices),
+            )
         ),
         *(
             (f"cell_sort {n} {k} by {way}", functools.partial(sort, n, k, way))
@@ -217,19 +234,43 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             for own in (False, True)
             for precision in ("float32", "bfloat16")
         ),
-        ("routed_mlp", route),
+        ("routed_mlp wide", route),
         ("routed_mlp of unaligned views", functools.partial(route, shifted)),
         ("unaligned views", views),
     ]
     return cases
 
 
-def captured_steps(device: str, n: int = 4096) -> list[tuple[str, Callable[..., list[Any]]]]:
-    """Names and steps: nearest centre, sort, networks and the gradients of their parameters."""
-    return [(name, _step(*settings, device, n)) for name, settings in STEPS.items()]
+def captured_steps(device: str, n: int = 4096) -> list[tuple[str, Callable[[], None]]]:
+    """Names and checks: replays of a step find what it finds, which is right."""
+    return [(name, functools.partial(_replay, settings, device, n)) for name, settings in STEPS.items()]
+
+
+def _replay(settings: tuple[int, str, bool, int], device: str, n: int) -> None:
+    import torch
+    from gpu_journal import settling
+
+    from voronerf.ops._core.capture import Capture
+
+    step = _step(*settings, device, n)
+    expected = [part.clone() for part in step()]
+    allowed = 1e-5 if settings[1] == "float32" else 8e-2  # rounding moves samples across kinks
+    for part, exact in zip(expected, step("reference", torch.float64), strict=True):
+        assert (part.double() - exact).norm() <= allowed * exact.norm() + 1e-7, list(part.shape)
+    captured = Capture(torch.device(device), torch.Generator(device))
+    captured.warm_up(step)
+    assert captured.obstacle is None, captured.obstacle
+    found, settle = captured.capture(step), settling(device)
+    for _ in range(3):
+        for part in found:
+            part.zero_()
+        captured.replay(1)
+        settle()
+        assert all(torch.equal(a, b) for a, b in zip(expected, found, strict=True)), "a replay is not the step itself"
 
 
 def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -> Callable[..., list[Any]]:
+    """Nearest centre, sort, networks and the gradients of their parameters."""
     import torch
 
     import voronerf
@@ -264,14 +305,14 @@ def _step(width: int, dtype: str, directed: bool, k: int, device: str, n: int) -
     return step
 
 
-def captured_trainings(device: str, steps: int = 20, **small: Any) -> list[tuple[str, Callable[[], str]]]:
+def captured_trainings(device: str, count: int = 20, **small: Any) -> list[tuple[str, Callable[[], str]]]:
     """Names and trainings: steps that are replayed as a graph find what steps as they are do."""
     whole: dict[str, Any] = {"cells": (), "split_at": ()}
     kinds = {"training": whole, "training of a nerf": {**whole, "field": "nerf"}, "training before a split": {}}
-    return [(name, functools.partial(_train_both, {**own, **small}, device, steps)) for name, own in kinds.items()]
+    return [(name, functools.partial(_train_both, {**own, **small}, device, count)) for name, own in kinds.items()]
 
 
-def _train_both(options: dict[str, Any], device: str, steps: int) -> str:
+def _train_both(options: dict[str, Any], device: str, count: int) -> str:
     """Within a hundredth, since atomic operations add up the gradients of a hash grid's table in any order."""
     import torch
     from gpu_journal import settling
@@ -286,14 +327,14 @@ def _train_both(options: dict[str, Any], device: str, steps: int) -> str:
         step, losses, begin = state.training_step, list[torch.Tensor](), 0.0
         if as_it_is:
             step.__dict__["_standing_obstacle"] = lambda: "it is asked to"
-        for number in range(3 + steps):  # one that prepares, one that is captured, and a first replay
+        for number in range(3 + count):  # one that prepares, one that is captured, and a first replay
             if number == 3:
                 settle()
                 begin = time.perf_counter()
             state.optimizer.set_learning_rate(1e-4 * (1 + number))
             losses.append(step(state.rays).loss.clone())
         settle()
-        milliseconds.append(1e3 * (time.perf_counter() - begin) / steps)
+        milliseconds.append(1e3 * (time.perf_counter() - begin) / count)
         assert as_it_is or "CUDA graph" in step.explain(), step.explain()
         parts = [torch.stack(losses), *state.router.parameters()]
         found.append(torch.cat([part.detach().reshape(-1) for part in parts]))

@@ -1,38 +1,31 @@
-"""Everything to be learnt from a machine with a GPU, in three calls of ten minutes: ``gpu_check.py CALL --out DIR``.
+"""Everything to be learnt from fifteen minutes of a GPU, in two calls: ``gpu_check.py {first,second} --out DIR``.
 
-For a bare machine: torch with CUDA, nvcc and ninja, no network. The parts of a call run one after another, each for
-itself: one that fails or runs into its limit is reported with its last lines, and the next one begins. The limits of a
-call add up to less than its time, the most telling part first. ``--parts`` takes some of all parts, ``--data DIR``
-is a Blender scene for the trainings.
+For a bare machine: torch with CUDA, nvcc, ninja, no network. The parts of a call run one after another. One that fails
+or that its time ends is reported with its last lines, and the next one begins; what a part leaves of its time is the
+next ones'.
 
-    1   machine    versions, and what is missing
-        build      the extension for this GPU alone
-        small      every operation once against float64, each case for itself and with a time limit of its own
-        large      networks at 2^22 samples against float64, with gradients
-        captured   steps of the route in CUDA graphs, fused and layer by layer; steps of trainings, with times
-        warp       every operation of Warp beside native, where Warp is installed
-        memcheck   compute-sanitizer over the small cases, where it is installed
-    2   roofs      networks, look-ups and sorts at full size, beside the machine's own limits
-        sizes      a network at 2^13 to 2^22 samples, 1 to 4,096 cells, all precisions, beside torch's products
-        step       what surrounds the networks in a step, and hash grids, beside the same in plain torch
-        profile    a default step: launches, the share of the time that the device works, waits of the host
-        rivals     a network by torch.compile, Triton and tiny-cuda-nn (VORONERF_TCNN names a benchmark of it), where
-                   they are
-    3   training   trainings on --data or the built-in scene, with PSNR over seconds
-        tests      the tests of the operations on CUDA, a process for each file
-        counters   ncu over eight kernels, where it is installed
-        racecheck, synccheck, initcheck   compute-sanitizer over the small cases
+    first, 390 s    build      links the objects of --prebuilt (prebuilt.py), else compiles
+                    cases      gpu_parts.py: every operation, networks at 2^22 samples, steps in CUDA graphs, rows of
+                               timings, a step by torch.profiler, two trainings
+                    counters   ncu over six launches, where it is installed
+                    memcheck   compute-sanitizer over 20 of the small cases, where it is installed
+    second, 240 s   build      as above
+                    cases      those of --cases, such as the ones that were wrong, and the rows again
+                    tests      tests/ops on CUDA, a process for each file
+                    racecheck, synccheck   compute-sanitizer over 10 small cases
 
-DIR gets two files: summary-CALL.json, with the outcome of every part and all that it has found (each case, timing,
-training and file of tests), and parts-CALL.tar.gz, with what each part said. The last lines printed are the verdict;
-the exit status counts failures.
+DIR gets two files: summary-CALL.json, with the command, the outcome and the findings of every part, and
+parts-CALL.tar.gz, with what each said. The last lines printed are the verdict, fewer than 11,000 characters; the exit
+status counts failures. ``--emulated`` tries the call on a machine without a GPU, with small cases.
+
+Nothing here changes the settings of the card: ncu leaves its clocks alone.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
+import csv
 import json
 import os
 import shutil
@@ -42,76 +35,84 @@ import sys
 import tarfile
 import tempfile
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = sys.executable
-TAIL = 40
+TAIL = 30
 """Lines of a failure that are printed."""
-SPLIT = "--split-compile=0"
-JUDGED = (
-    *("small", "large", "captured", "warp", "roofs", "sizes", "step", "profile", "rivals", "training"),
-    *("memcheck", "racecheck", "synccheck", "initcheck"),
-)
-"""Parts that have cases, each right or wrong."""
-SHORTEST = 10.0
+SHORTEST = 5.0
 """Seconds for which a part is not begun."""
+LINE, VERDICT = 100, 10_900
+"""Characters of a line of the verdict, and of all of it."""
+MOST_WRONG = 40
+"""Lines of what is wrong."""
+KERNELS = 10
+"""Of a profiled step that are told."""
+CALLS = ("first", "second")
+SANITIZER_SAYS = (
+    "Invalid ",
+    "Misaligned ",
+    "Race reported",
+    "Barrier error",
+    "Program hit",
+    "Error: ",
+    "ERROR SUMMARY",
+)
+COUNTED = {
+    "ms": ("gpu__time_duration.sum", 1e-6),
+    "SM %": ("sm__throughput.avg.pct_of_peak_sustained_elapsed", 1.0),
+    "memory %": ("gpu__compute_memory_throughput.avg.pct_of_peak_sustained_elapsed", 1.0),
+    "issued %": ("smsp__issue_active.avg.per_cycle_active", 100.0),
+    "warps %": ("sm__warps_active.avg.pct_of_peak_sustained_active", 1.0),
+}
+"""Metrics of ncu that are told, by their names there, and factors."""
+STALLED = "smsp__average_warps_issue_stalled_", "_per_issue_active.ratio"
+"""Around the reason of a stall in the name of its metric."""
+SECTIONS = ("SpeedOfLight", "WarpStateStats", "SchedulerStats", "MemoryWorkloadAnalysis", "Occupancy", "LaunchStats")
 
 
 @dataclass(frozen=True)
 class Part:
-    """One part: its command, or why it is left out, the seconds it may take, and the JSON that it leaves."""
+    """One part: its commands, of which the next runs where one fails, or why it is left out; the seconds of the call
+    after which it is ended; and the file that it leaves."""
 
-    command: list[str] | str
-    seconds: int
+    commands: list[list[str]] | str
+    until: float
     environment: tuple[tuple[str, str], ...] = ()
     found: Path | None = None
-
-
-CALLS = {
-    "1": ("machine", "build", "small", "large", "captured", "warp", "memcheck"),
-    "2": ("build", "roofs", "sizes", "step", "profile", "rivals"),
-    "3": ("build", "training", "tests", "counters", "racecheck", "synccheck", "initcheck"),
-}
-"""Parts of each call. All begin with the build, which takes no time where an earlier call's is there."""
-SECONDS = 575.0
-"""Of a call."""
 
 
 def main(arguments: list[str]) -> int:
     """Run the parts and return the number of those that failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("call", choices=tuple(CALLS), help="which of the three calls")
+    parser.add_argument("call", choices=CALLS, help="which of the two calls")
     parser.add_argument("--out", type=Path, required=True, help="folder for the summary and the archive")
+    parser.add_argument("--cases", nargs="+", default=[], help="of the second call: names, in which * may stand")
     parser.add_argument("--parts", nargs="+", help="some of the parts, in this order")
-    parser.add_argument("--data", type=Path, help="a Blender scene for the trainings, else the built-in one")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="for all parts together")
+    parser.add_argument("--prebuilt", type=Path, default=ROOT / "build/prebuilt", help="objects that are carried")
+    parser.add_argument("--emulated", action="store_true", help="small cases on the emulated device of the tests")
     given = parser.parse_args(arguments)
     given.out = given.out.resolve()  # the parts run elsewhere
-    given.data = given.data and given.data.resolve()
+    given.out.mkdir(parents=True, exist_ok=True)
+    begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
-        known = parts(scratch, given.data)
-        chosen = given.parts or list(CALLS[given.call])
+        known = parts(given.call, scratch, given.prebuilt.resolve(), given.cases, emulated=given.emulated)
+        chosen = given.parts or list(known)
         if unknown := [name for name in chosen if name not in known]:
             parser.error(f"--parts takes {', '.join(known)}, got {', '.join(unknown)}")
-        given.out.mkdir(parents=True, exist_ok=True)
-        results = {}
-        end = time.perf_counter() + given.seconds
+        results: dict[str, Any] = {}
         for name in chosen:
-            print(f"gpu-check: {name} ...", flush=True)
-            results[name] = run(name, known[name], scratch, end - time.perf_counter())
+            results[name] = run(name, known[name], scratch, known[name].until - time.perf_counter() + begin)
             # Kept after every part, should this be stopped from outside.
-            said = json.dumps({"device": device(), "parts": results}, indent=1) + "\n"
+            said = json.dumps({"device": device(), "call": arguments, "parts": results}, indent=1) + "\n"
             (given.out / f"summary-{given.call}.json").write_text(said)
             pack(scratch, given.out / f"parts-{given.call}.tar.gz")
-    print(f"\ngpu-check on {device()}:")
-    for line in highlights({name: result.get("found") for name, result in results.items()}):
-        print(f"  {line}")
-    for name, result in results.items():
-        print(f"  {name:10} {result['outcome']:8} {result['seconds']:6.1f} s  {result['last']}")
+    print(verdict(given.call, results))
     return sum(result["outcome"] == "failed" for result in results.values())
 
 
@@ -119,150 +120,222 @@ def pack(folder: Path, archive: Path) -> None:
     """What the parts have said and found, but not the runs of trainings."""
     with tarfile.open(archive, "w:gz") as tar:
         for path in sorted(folder.rglob("*")):
-            if path.suffix in (".txt", ".json", ".csv", ".jsonl"):
+            if path.suffix in (".txt", ".json", ".csv"):
                 tar.add(path, path.relative_to(folder))
 
 
-def parts(out: Path, data: Path | None) -> dict[str, Part]:
-    """The parts by name; ``out`` is for what they leave."""
+def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: bool) -> dict[str, Part]:
+    """The parts of a call by name; ``out`` is for what they leave."""
     places = os.environ.get("PATH", "") + ":/usr/local/cuda/bin"
     sanitizer, profiler = shutil.which("compute-sanitizer", path=places), shutil.which("ncu", path=places)
-    architecture = capability()
     # nvcc optimises the kernels of a file in parallel, where it can.
-    built = (("VORONERF_CUDA", "1"), ("VORONERF_CUDA_ARCHITECTURES", architecture or ""), ("NVCC_APPEND_FLAGS", SPLIT))
-    own = [PYTHON, str(ROOT / "benchmarks" / "gpu" / "gpu_parts.py")]
-    # Each allocation for itself, so that what reads or writes beyond one leaves all of them.
-    apart = (("PYTORCH_NO_CUDA_MEMORY_CACHING", "1"),)
+    built = (("VORONERF_CUDA", "1"), ("NVCC_APPEND_FLAGS", "--split-compile=0"))
+    built += (("VORONERF_CUDA_ARCHITECTURES", capability() or "90"),)
+    program, small = [PYTHON, str(ROOT / "benchmarks/gpu/gpu_parts.py")], ["--emulated"] * emulated
 
-    def part(
-        command: list[str], seconds: int, environment: tuple[tuple[str, str], ...] = (), found: Path | None = None
-    ) -> Part:
-        return Part(command, seconds, environment, found) if architecture else Part("torch sees no GPU", 0)
+    def tried(until: float, *rest: str) -> Part:
+        return Part([[*program, "cases", str(out), *rest, *small]], until, (), out / "cases.json")
 
-    def program(name: str, seconds: int, *rest: str) -> Part:
-        return part([*own, name, str(out), *rest], seconds, (), out / f"{name}.json")
+    def on_gpu(until: float, command: list[str] | None, found: Path, **environment: str) -> Part:
+        """A part that no emulation has, by a program that may be missing."""
+        if emulated or command is None:
+            return Part("no GPU" if emulated else "not installed", until)
+        return Part([command], until, tuple(environment.items()), found)
 
-    def sanitized(tool: str, seconds: int, environment: tuple[tuple[str, str], ...] = ()) -> Part:
-        if sanitizer is None:
-            return Part("no compute-sanitizer", 0)
-        command = [sanitizer, "--error-exitcode", "9", "--target-processes", "all", "--tool", tool, *own, "small"]
-        found = out / tool
-        return part([*command, str(found), "--case-seconds", "30"], seconds, environment, found / "small.json")
+    def sanitized(tool: str, until: float, names: str, **environment: str) -> Part:
+        # Of torch's kernels nothing is checked: their instrumentation would take minutes.
+        options = ["--tool", tool, "--kernel-name", "kns=voronerf", "--error-exitcode", "9", "--print-limit", "20"]
+        checked = [*program, "cases", str(out / tool), "--parts", "small", "--names", names, "--patience", "4"]
+        command = None if sanitizer is None else [sanitizer, *options, *checked]
+        return on_gpu(until, command, out / tool / "cases.json", **environment)
 
-    counted = ["--launch-count", "8", "--set", "basic", "--csv", "--log-file", str(out / "counters.csv")]
-    return {
-        "machine": Part([*own, "machine", str(out)], 15, (), out / "machine.json"),
-        "build": part([PYTHON, "setup.py", "build_ext", "--inplace"], 270, built),
-        "small": program("small", 75),
-        "large": program("large", 85),
-        "captured": program("captured", 40),
-        "warp": program("warp", 35) if importlib.util.find_spec("warp") else Part("no warp", 0),
-        "roofs": program("roofs", 80),
-        "sizes": program("sizes", 80),
-        "step": program("step", 65),
-        "rivals": program("rivals", 40),
-        "profile": program("profile", 40),
-        "training": program("training", 120, "builtin" if data is None else str(data)),
-        "tests": program("tests", 75) if importlib.util.find_spec("pytest") else Part("no pytest", 0),
-        "counters": part([profiler, *counted, *own, "profile", str(out / "counted")], 40)
-        if profiler
-        else Part("no ncu", 0),
-        "memcheck": sanitized("memcheck", 55, apart),
-        "racecheck": sanitized("racecheck", 30),
-        "synccheck": sanitized("synccheck", 20),
-        "initcheck": sanitized("initcheck", 20),
+    linked = [PYTHON, str(ROOT / "benchmarks/gpu/prebuilt.py"), "try" if emulated else "link", str(prebuilt)]
+    compiled = [[PYTHON, "setup.py", "build_ext", "--inplace"]] if not emulated else []
+    first = call == "first"
+    # Linking takes some ten seconds; compiling takes longer, at the expense of what follows.
+    common = {"build": Part([linked, *compiled], 150 if first else 100, built)}
+    if first:
+        # ncu would lock the clocks of the card, which others may share.
+        options = ["--clock-control", "none", "--profile-from-start", "off", "--launch-count", "6"]
+        options += ["--kernel-name-base", "demangled", "--kernel-name", "regex:voronerf"]
+        options += [each for section in SECTIONS for each in ("--section", section)]
+        options += ["--csv", "--page", "raw", "--print-units", "base", "--log-file", str(out / "counters.csv")]
+        counted = None if profiler is None else [profiler, *options, *program, "counted", str(out)]
+        # Each allocation for itself, so that what reads or writes beyond one leaves all of them.
+        return common | {
+            "cases": tried(285),
+            "counters": on_gpu(330, counted, out / "counters.csv"),
+            "memcheck": sanitized("memcheck", 390, "@checked", PYTORCH_NO_CUDA_MEMORY_CACHING="1"),
+        }
+    return common | {
+        "cases": tried(110, "--parts", "small", "large", "captured", "rows", "--names", "rows", *cases),
+        "tests": on_gpu(170, [*program, "tests", str(out)], out / "tests.json"),
+        "racecheck": sanitized("racecheck", 210, "@racing"),
+        "synccheck": sanitized("synccheck", 240, "@racing"),
     }
 
 
-def run(name: str, part: Part, out: Path, left: float) -> dict[str, Any]:
-    """Outcome, seconds and the last line of one part, which has ``left`` at most; what it said goes to a file."""
-    if isinstance(part.command, str):
-        return {"outcome": "left out", "seconds": 0.0, "last": part.command}
-    limit = min(part.seconds, left)
+def run(name: str, part: Part, out: Path, limit: float) -> dict[str, Any]:
+    """Outcome, seconds and the last line of one part; what it said goes to a file."""
+    if isinstance(part.commands, str):
+        return {"outcome": "left out", "seconds": 0.0, "last": part.commands}
     if limit < SHORTEST:
         return {"outcome": "left out", "seconds": 0.0, "last": "no time left"}
+    print(f"gpu-check: {name}, {limit:.0f} s at most: {' || '.join(map(' '.join, part.commands))}", flush=True)
     paths = os.pathsep.join(path for path in (str(ROOT), os.environ.get("PYTHONPATH")) if path)
     environment = {**os.environ, **dict(part.environment), "PYTHONPATH": paths}
     if part.found is not None:
         part.found.unlink(missing_ok=True)  # an earlier run's
     begin = time.perf_counter()
     with (out / f"{name}.txt").open("w+", errors="replace") as log:
-        try:
-            status = run_group(part.command, environment, log, limit)
-        except OSError as error:
-            status = str(error)
+        status: int | str = 0
+        for command in part.commands:
+            try:
+                status = run_group(command, environment, log, limit - time.perf_counter() + begin)
+            except OSError as error:
+                status = str(error)
+            if status == 0 or isinstance(status, str):
+                break
         log.seek(0)
         lines = [line for line in log.read().splitlines() if line.strip()]
     if status != 0:
-        print("\n".join(f"    {line}" for line in lines[-TAIL:]))
+        print("\n".join(f"    {line[:200]}" for line in lines[-TAIL:]))
     last = lines[-1][:160] if lines else ""
     return {
         "outcome": "passed" if status == 0 else "failed",
         "seconds": time.perf_counter() - begin,
         "last": last if isinstance(status, int) else f"{status}; {last}",
+        "commands": part.commands,
         "found": read(part.found),
+        "sanitizer": [line[10:] for line in lines if line.startswith("=========") and _of_note(line)][:20],
     }
 
 
-def read(path: Path | None) -> object:
-    """What a part has left as JSON; the reason where that cannot be read, as after an end in the middle of a line."""
+def _of_note(line: str) -> bool:
+    return any(each in line for each in SANITIZER_SAYS)
+
+
+def read(path: Path | None) -> Any:
+    """What a part has left; the reason where that cannot be read, as after an end in the middle of a line."""
     if path is None or not path.exists():
         return None
+    text = path.read_text()
+    if path.suffix == ".csv":
+        return counters(text)
     try:
-        return json.loads(path.read_text())
+        return json.loads(text)
     except ValueError as error:
         return f"{path.name}: {error}"
 
 
-def highlights(found: dict[str, Any]) -> list[str]:
-    """What the parts have found, a line each: timings beside what was aimed at, trainings, and what is wrong."""
-
-    def rows(part: str, kind: str) -> list[dict[str, Any]]:
-        kept = found.get(part)
-        return kept.get(kind, []) if isinstance(kept, dict) else []
-
-    lines = []
-    timed = [row for part in ("warp", "roofs", "sizes", "step", "rivals") for row in rows(part, "rows")]
-    for row in timed:
-        aim = row["aim"]
-        verdict = "" if aim is None else f", {'reached' if row['share'] >= aim else 'MISSED'} {100 * aim:.0f} %"
-        share = f"{100 * row['share']:5.1f} % of {row['limit']}"
-        lines.append(f"{row['name']:32} {1e3 * row['seconds']:8.3f} ms {share}{verdict}")
-    times = {row["name"]: row["seconds"] for row in timed}
-    for name, seconds in times.items():
-        radix = times.get(name.replace("by counting", "by radix"))
-        if name.endswith("by counting") and radix is not None:
-            lines.append(f"{name}: {seconds / radix:.2f} x the time of radix")
-        for other, its in times.items():
-            if other.startswith(f"{name} by "):
-                lines.append(f"{name}: {seconds / its:.2f} x the time of {other.removeprefix(f'{name} by ')}")
-    lines += [f"RULE {line}" for line in ruled(times)]
-    lines += [f"left out: {row['name']}: {row['reason']}" for row in rows("rivals", "skipped")]
-    for row in rows("profile", "steps"):
-        said = f"{row['launches']} launches, {row['waits']} waits, busy {100 * row['busy']:.0f} %"
-        lines.append(f"step {row['name']}: {said}, {row['nanoseconds']:.1f} ns a sample")
-    for row in rows("training", "trainings"):
-        said = f"{row['milliseconds']:.2f} ms a step, PSNR {row['psnr']:.2f} after {row['steps']} steps"
-        lines.append(f"training {row['name']}: {said}")
-    lines += [f"{row['name']}: {row['said']}" for row in rows("captured", "cases") if row["right"] and row["said"]]
-    for part in JUDGED:
-        lines += [f"WRONG in {part}: {row['name']}: {row['said']}" for row in rows(part, "cases") if not row["right"]]
-    lines += [f"WRONG in tests: {row['name']}: {row['said']}" for row in rows("tests", "files") if not row["right"]]
-    return lines
+def counters(text: str) -> dict[str, Any]:
+    """The launches of ncu's raw page: a line of names, one of units, and one of values for each."""
+    rows = [row for row in csv.reader(text.splitlines()) if len(row) > 20]  # lines of ncu's own are among them
+    found = []
+    for row in rows[2:]:
+        values = {}
+        for name, value in zip(rows[0], row, strict=False):
+            with contextlib.suppress(ValueError):
+                values[name] = float(value.replace(",", ""))
+        kernel = dict(zip(rows[0], row, strict=False)).get("Kernel Name", "")
+        found.append({"kernel": kernel, "values": values})
+    return {"launches": found}
 
 
-def ruled(times: dict[str, float]) -> list[str]:
-    """What docs/cuda.md says is to be kept or deleted, by seconds of each row."""
-    lines = []
-    pairs = [
-        (times.get(f"cell_sort k={k} by counting"), times.get(f"cell_sort k={k} by radix")) for k in (16, 256, 1022)
+def verdict(call: str, results: dict[str, Any]) -> str:
+    """What was found, the most telling first, in as many characters as come back."""
+    found = {name: result.get("found") for name, result in results.items()}
+    lines = [f"gpu-check {call} on {device()}:"]
+    for name, result in results.items():
+        lines.append(f"  {name:10} {result['outcome']:8} {result['seconds']:6.1f} s  {result['last']}")
+    for part, value in found.items():
+        lines += [f"TORN {part}: {value}"] * isinstance(value, str)
+    lines += _wrong(found)
+    for name, result in results.items():
+        lines += [f"{name}: {line}" for line in result.get("sanitizer", ())[:6] if "SUMMARY: 0" not in line]
+    cases = _cases(found)
+    lines += [
+        f"{row['name']}: {row['said']}" for row in cases if row["part"] in ("captured", "training") and row["said"]
     ]
-    known = [(counting, radix) for counting, radix in pairs if counting and radix]
-    if known:
-        slower = sum(counting > radix for counting, radix in known)
-        lost = {0: "counting up to 1,022 cells stays", len(known): "delete sorting by counting"}
-        lines.append(f"sort: {lost.get(slower, 'move the limit between counting and radix')}")
+    for row in cases:
+        if "share" in row:
+            most = f", by count {100 * row['most']:.0f}" if row["most"] else ""
+            share = f"{100 * row['share']:5.1f} % of {row['limit']}{most}"
+            lines.append(f"{row['name']:50} {1e3 * row['seconds']:9.3f} ms {share}")
+        elif row["name"] == "limits":
+            lines.append(f"limits: {row['said']}")
+    lines += _beside(cases)
+    lines += [line for launch in _launches(found) for line in _counted(launch)]
+    for row in cases:
+        if row["part"] == "profile" and row["right"]:
+            lines.append(f"step {row['name']}: {row['said']}")
+            for kernel in row["kernels"][:KERNELS]:
+                lines.append(f"  {kernel['microseconds']:8.1f} us in {kernel['launches']:4.1f} x {kernel['name']}")
+    return cut(lines)
+
+
+def cut(lines: Iterable[str]) -> str:
+    """Lines of their length at most, as many as there is space for."""
+    kept, size = [], 0
+    for line in lines:
+        size += len(line[:LINE]) + 1
+        if size > VERDICT - 40:
+            return "\n".join([*kept, "and more, in the summary"])
+        kept.append(line[:LINE])
+    return "\n".join(kept)
+
+
+def _cases(found: dict[str, Any]) -> list[dict[str, Any]]:
+    cases = found.get("cases")
+    kept = cases.get("cases", []) if isinstance(cases, dict) else []
+    return [row for row in kept if row["right"]]
+
+
+def _wrong(found: dict[str, Any]) -> list[str]:
+    """Cases that are wrong, and how many were left out."""
+    lines, left_out = [], 0
+    for part, value in found.items():
+        if isinstance(value, dict):
+            for row in value.get("cases", ()):
+                if not row["right"]:
+                    where = row["part"] if part == "cases" else part
+                    lines.append(f"WRONG {where}: {row['name']}: {row['said']}")
+                    lines += [f"  {line}" for line in row.get("wrong", ())[:3]]
+            left_out += len(value.get("left out", ()))
+    rest = [f"and {len(lines) - MOST_WRONG} more that are wrong"] * (len(lines) > MOST_WRONG)
+    return [*lines[:MOST_WRONG], *rest, *[f"left out for want of time: {left_out} cases"] * (left_out > 0)]
+
+
+def _beside(cases: list[dict[str, Any]]) -> list[str]:
+    """How rows compare with those of the same name by something else."""
+    times = {row["name"]: row["seconds"] for row in cases if "share" in row}
+    lines = []
+    for name, seconds in times.items():
+        own, _, other = name.partition(" by ")
+        if other == "radix" and f"{own} by counting" in times:
+            lines.append(f"{own}: counting takes {times[f'{own} by counting'] / seconds:.2f} x the time of radix")
+        elif other and own in times:
+            lines.append(f"{own}: {times[own] / seconds:.2f} x the time of {other}")
     return lines
+
+
+def _launches(found: dict[str, Any]) -> list[dict[str, Any]]:
+    kept = found.get("counters")
+    return kept["launches"] if isinstance(kept, dict) else []
+
+
+def _counted(launch: dict[str, Any]) -> list[str]:
+    """Two lines of a launch: its kernel, and what was counted, with the two reasons for which warps wait longest."""
+    values, (before, after) = launch["values"], STALLED
+    told = [f"{values[key] * by:.3g} {name}" for name, (key, by) in COUNTED.items() if key in values]
+    stalls = {
+        key.removeprefix(before).removesuffix(after): value
+        for key, value in values.items()
+        if key.startswith(before) and key.endswith(after) and "not_issued" not in key
+    }
+    longest = sorted(stalls, key=lambda key: -stalls[key])[:2]
+    told += [f"{name} {stalls[name]:.1f}" for name in longest]
+    return [f"ncu {launch['kernel']}", f"  {', '.join(told)}"]
 
 
 def run_group(command: list[str], environment: dict[str, str], log: TextIO, limit: float) -> int | str:
@@ -271,7 +344,7 @@ def run_group(command: list[str], environment: dict[str, str], log: TextIO, limi
         command, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
     )
     try:
-        return process.wait(limit)
+        return process.wait(max(limit, 0.1))
     except subprocess.TimeoutExpired:
         return f"stopped after {limit:.0f} s"
     finally:
@@ -283,22 +356,25 @@ def run_group(command: list[str], environment: dict[str, str], log: TextIO, limi
             process.wait(10)
 
 
+def asked_of_the_driver(what: str) -> str | None:
+    """What nvidia-smi says of the first GPU; None without one. It takes no process that imports torch."""
+    try:
+        command = ["nvidia-smi", f"--query-gpu={what}", "--format=csv,noheader"]
+        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return said.strip().splitlines()[0] if said.strip() else None
+
+
 def capability() -> str | None:
     """Compute capability of the GPU, such as "90"; None without one."""
-    import torch
-
-    if not torch.cuda.is_available():
-        return None
-    major, minor = torch.cuda.get_device_capability()
-    return f"{major}{minor}"
+    said = asked_of_the_driver("compute_cap")
+    return said.replace(".", "") if said else None
 
 
 def device() -> str:
-    """The GPU and the versions that belong to it."""
-    import torch
-
-    name = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
-    return f"{name}, torch {torch.__version__}, CUDA {torch.version.cuda}"
+    """The GPU and its driver."""
+    return asked_of_the_driver("name,driver_version") or "no GPU"
 
 
 if __name__ == "__main__":

@@ -17,48 +17,54 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-CASE_SECONDS = 10.0
-"""For one case, after which it is said to hang."""
-
 
 class Journal:
-    """What a part has found so far, kept in OUT/PART.json; a process that goes on finds it there."""
+    """What has been found so far, kept in a file after every case; a process that goes on finds it there."""
 
-    def __init__(self, out: Path, part: str, *, begun: bool = False) -> None:
-        out.mkdir(parents=True, exist_ok=True)
-        self.path = out / f"{part}.json"
-        self.found: dict[str, Any] = json.loads(self.path.read_text()) if begun and self.path.exists() else {}
+    def __init__(self, path: Path, *, begun: bool = False) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self.found: dict[str, Any] = json.loads(path.read_text()) if begun and path.exists() else {}
 
     def add(self, kind: str, row: dict[str, Any]) -> None:
         """One more row of a kind."""
         self.put(kind, [*self.found.get(kind, []), row])
 
     def put(self, kind: str, value: Any) -> None:
-        """Replaces a value for a while."""
+        """A value by itself."""
         self.found[kind] = value
         self.path.write_text(json.dumps(self.found, indent=1) + "\n")
 
 
 @dataclass(frozen=True)
+class Case:
+    """One thing to try.
+
+    Attributes:
+        part: which of the parts it belongs to.
+        name: of the case.
+        run: raises, or returns what is kept of it: values by name, of which ``said`` is printed, or that alone.
+        seconds: after which it is said to hang.
+    """
+
+    part: str
+    name: str
+    run: Callable[[], dict[str, Any] | str | None]
+    seconds: float = 10.0
+
+
+@dataclass(frozen=True)
 class Again:
-    """Where a part begins, and how it starts itself anew: its arguments, its first case and the cases failed before."""
+    """How a program starts itself anew: its arguments, its first case and the cases failed before."""
 
     arguments: tuple[str, ...]
     start: int = 0
     failed: int = 0
-    case_seconds: float = CASE_SECONDS
 
-    def go_on(self, number: int, failed: int, said: str = "") -> None:
+    def go_on(self, number: int, failed: int) -> None:
         """The cases from ``number`` on, in a process that takes the place of this one."""
-        if said:
-            print(said, flush=True)
-        state = {"start": number, "failed": failed, "case-seconds": self.case_seconds}
-        options = [part for name, value in state.items() for part in (f"--{name}", str(value))]
+        options = ["--start", str(number), "--failed", str(failed)]
         os.execv(sys.executable, [sys.executable, sys.argv[0], *self.arguments, *options])
-
-
-Case = tuple[str, Callable[[], "str | None"]]
-"""A name, and a function that raises, or returns a line to print."""
 
 
 def settling(device: str) -> Callable[[], None]:
@@ -68,38 +74,56 @@ def settling(device: str) -> Callable[[], None]:
     return torch.cuda.synchronize if device == "cuda" else lambda: None
 
 
-def one_by_one(cases: list[Case], again: Again, settle: Callable[[], None], journal: Journal) -> int:
+def one_by_one(
+    cases: list[Case], budgets: dict[str, float], again: Again, settle: Callable[[], None], journal: Journal
+) -> int:
     """Every case for itself; after one that leaves the device unusable, or does not end, the rest in a new process.
 
-    ``settle()`` waits for the device, and raises where that is of no use any more.
+    Args:
+        cases: in their order.
+        budgets: seconds of each part, in the order of the parts. What one leaves is the next ones'; of a part whose
+            time is over the other cases are left out.
+        again: where to begin.
+        settle: waits for the device, and raises where that is of no use any more.
+        journal: gets a row of ``cases`` for each.
+
+    Returns:
+        The number of cases that failed.
     """
     settle()  # makes the context, in the time of no case
     failed = again.failed
+    if "ends" not in journal.found:
+        end, ends = time.time(), {}
+        for part, seconds in budgets.items():
+            ends[part] = end = end + seconds
+        journal.put("ends", ends)
 
-    def keep(name: str, right: bool, said: str) -> None:
-        journal.add("cases", {"name": name, "right": right, "said": said, "seconds": time.perf_counter() - begin})
+    def keep(case: Case, right: bool, found: dict[str, Any]) -> None:
+        """One line and one row."""
+        said = found.setdefault("said", "")
+        print(f"{'right' if right else 'WRONG'}  {case.part}: {case.name}{f': {said}' * bool(said)}", flush=True)
+        row = {"part": case.part, "name": case.name, "right": right, **found}
+        journal.add("cases", {**row, "took": time.perf_counter() - begin})
 
-    def hangs(name: str, number: int) -> None:
-        said = f"hangs, stopped after {again.case_seconds:g} s"
-        keep(name, False, said)
-        again.go_on(number + 1, failed + 1, f"WRONG  {name}: {said}")
+    def hangs(case: Case, number: int) -> None:
+        keep(case, False, {"said": f"hangs, stopped after {case.seconds:g} s"})
+        again.go_on(number + 1, failed + 1)
 
     for number in range(again.start, len(cases)):
-        name, run = cases[number]
-        begin = time.perf_counter()
-        watch = threading.Timer(again.case_seconds, hangs, (name, number))
+        case, begin = cases[number], time.perf_counter()
+        if time.time() > journal.found["ends"][case.part]:
+            journal.add("left out", {"part": case.part, "name": case.name})
+            continue
+        watch = threading.Timer(case.seconds, hangs, (case, number))
         watch.daemon = True
         watch.start()
         try:
-            result = run()
+            found = case.run()
             settle()
-            print(f"right  {name}{f': {result}' if result else ''}", flush=True)
-            keep(name, True, result or "")
+            keep(case, True, {"said": found} if isinstance(found, str) else found or {})
         except Exception as error:
             failed += 1
-            reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-            print(f"WRONG  {name}: {reason}", flush=True)
-            keep(name, False, reason)
+            keep(case, False, {"said": f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"})
             traceback.print_exc(file=sys.stdout)
             sys.stdout.flush()
             try:
@@ -109,5 +133,6 @@ def one_by_one(cases: list[Case], again: Again, settle: Callable[[], None], jour
                 again.go_on(number + 1, failed)
         finally:
             watch.cancel()
-    print(f"{len(cases) - failed} of {len(cases)} cases are right")
+    left_out = len(journal.found.get("left out", ()))
+    print(f"{len(cases) - failed - left_out} of {len(cases)} cases are right, {left_out} left out for want of time")
     return failed

@@ -1,4 +1,4 @@
-"""Networks at full size, on some rows against the reference, and gradients against those of float32 products.
+"""Networks at full size against the reference on some rows, and their gradients in 16 bits against those in float32.
 
 The small cases are one tile of rows a task on a device with 132 multiprocessors. Here a task walks over many tiles, the
 last of them short, and sums are added up over tiles and tasks.
@@ -15,37 +15,44 @@ N = 1 << 22
 """Samples, at which every loop of the kernels is walked several times."""
 SUBSET = 1 << 12
 """Rows of each cell, at most, that the reference computes in float64."""
-ALLOWED = {"float32": 2e-4, "bfloat16": 4e-2, "float16": 2e-2}
-"""Norm of a difference in norms of what is right; of gradients, to which a rounding beside a kink matters, thrice."""
+ALLOWED = {"bfloat16": (2e-2, 0.25), "float32": (2e-4, 3e-2)}
+"""Norm of a difference in norms of what is right, of outputs and of gradients: a rounding beside a kink of ReLU matters
+to these, .12 in bfloat16 and .011 behind a hash grid on a CPU."""
 
 
 def large_cases(device: str, n: int = N) -> list[tuple[str, Callable[[], str]]]:
     """Names and checks, which raise, or say how far results are from what is right."""
     return [
         (f"{name} {precision}", functools.partial(compare, device, name, precision, n))
-        for name in ("w64d4", "nerf64", "hash32")
         for precision in ALLOWED
+        for name in ("w64d4", "hash32", "nerf64")
     ]
 
 
 def compare(device: str, name: str, precision: str, n: int) -> str:
-    """Outputs beside those in float64, gradients beside those of products in float32."""
+    """Outputs beside those in float64; gradients beside those of products in float32, and those of float32 of some rows
+    beside float64."""
     import torch
 
     given = batch(device, name, precision, n)
     found = evaluate(given)
     assert all(bool(part.isfinite().all()) for part in found), "not finite"
     exact, rows = in_float64(given)
-    apart = [distance(found[0][rows], exact)]
-    assert apart[0] <= ALLOWED[precision], f"outputs are {apart[0]:.1e} from float64"
-    if precision != "float32":
+    pairs = [(found[0][rows], exact[0])]
+    if precision == "float32":
+        seen = torch.zeros_like(given["gradient"]).index_copy_(0, rows, given["gradient"][rows])
+        pairs += zip(evaluate({**given, "gradient": seen})[1:], exact[1:], strict=True)
+    else:
         wide = [weight.detach().float().requires_grad_() for weight in given["weights"]]
-        for number, (one, other) in enumerate(zip(found[1:], evaluate({**given, "weights": wide})[1:]), start=1):
-            apart.append(distance(one, other))
-            assert apart[-1] <= 3 * ALLOWED[precision], f"part {number} is {apart[-1]:.1e} from float32"
+        pairs += zip(found[1:], evaluate({**given, "weights": wide})[1:], strict=True)
+    apart = [distance(*pair) for pair in pairs]
+    of_outputs, of_gradients = ALLOWED[precision]
+    assert apart[0] <= of_outputs, f"outputs are {apart[0]:.1e} from float64"
+    worst = max(range(1, len(apart)), key=apart.__getitem__)
+    assert apart[worst] <= of_gradients, f"part {worst} of the gradients is {apart[worst]:.1e} from right"
     if device == "cuda":
         torch.cuda.empty_cache()
-    return f"outputs {apart[0]:.1e}" + f", gradients {max(apart[1:]):.1e}" * (len(apart) > 1)
+    return f"outputs {apart[0]:.1e}, gradients {apart[worst]:.1e}"
 
 
 def distance(one: Any, other: Any) -> float:
@@ -62,7 +69,7 @@ def batch(device: str, name: str, precision: str, n: int) -> dict[str, Any]:
     import voronerf
     from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator(device).manual_seed(0)  # the processor would draw for seconds
     layers = NETS.get(name)
     if layers is None:
         rest = MLP((Layer((POSITIONS,), 32, "relu"), Layer((0,), 32, "relu"), Layer((1,), 4)), (2,))
@@ -73,23 +80,21 @@ def batch(device: str, name: str, precision: str, n: int) -> dict[str, Any]:
     k, kind = len(counts), getattr(torch, precision)
 
     def drawn(*shape: int) -> Any:
-        return torch.randn(*shape, generator=generator)
+        return torch.randn(*shape, generator=generator, device=device)
 
-    leaves = [(drawn(k, o, i) / i**0.5).to(device, kind).requires_grad_() for o, i in layers.weight_shapes(3)]
-    table = drawn(*layers.grid.table_shape).to(device).requires_grad_() if layers.grid is not None else None
+    leaves = [(drawn(k, o, i) / i**0.5).to(kind).requires_grad_() for o, i in layers.weight_shapes(3, 3)]
+    table = drawn(*layers.grid.table_shape).requires_grad_() if layers.grid is not None else None
     rays = max(1, n // 64)
     return {
-        "positions": torch.rand(n, 3, generator=generator).to(device),
+        "positions": torch.rand(n, 3, generator=generator, device=device),
         "offsets": torch.tensor([0, *counts], dtype=torch.int32).cumsum(0).int().to(device),
         "counts": counts,
         "weights": leaves,
         "layers": layers,
         "features": table,
-        "directions": torch.nn.functional.normalize(drawn(rays, 3), dim=1).to(device)
-        if layers.uses_directions
-        else None,
-        "index": (torch.arange(n, dtype=torch.int32) // 64).clamp(max=rays - 1).to(device),
-        "gradient": drawn(n, layers.out_features).to(device),
+        "directions": torch.nn.functional.normalize(drawn(rays, 3), dim=1) if layers.uses_directions else None,
+        "index": (torch.arange(n, dtype=torch.int32, device=device) // 64).clamp(max=rays - 1),
+        "gradient": drawn(n, layers.out_features),
     }
 
 
@@ -121,8 +126,8 @@ def evaluate(given: dict[str, Any]) -> list[Any]:
     return [out.detach(), *torch.autograd.grad(out, leaves, given["gradient"].to(out.dtype))]
 
 
-def in_float64(given: dict[str, Any]) -> tuple[Any, Any]:
-    """Outputs of the last rows of every cell by the reference, and which rows these are."""
+def in_float64(given: dict[str, Any]) -> tuple[list[Any], Any]:
+    """Outputs of the last rows of every cell by the reference and the gradients that they make, and which rows."""
     import torch
 
     rows, counts, begin = [], [], 0
@@ -132,16 +137,18 @@ def in_float64(given: dict[str, Any]) -> tuple[Any, Any]:
         begin += count
     chosen = torch.cat(rows).to(given["positions"].device)
     offsets = torch.tensor([0, *counts], dtype=torch.int32).cumsum(0).int().to(chosen.device)
-    table, directions = given["features"], given["directions"]
-    with torch.no_grad():
-        exact = call(
-            given,
-            given["positions"][chosen].double(),
-            offsets,
-            given["index"][chosen],
-            [weight.double() for weight in given["weights"]],
-            features=None if table is None else table.double(),
-            directions=None if directions is None else directions.double(),
-            backend="reference",
-        )
-    return exact, chosen
+    directions = given["directions"]
+    weights = [weight.detach().double().requires_grad_() for weight in given["weights"]]
+    table = None if given["features"] is None else given["features"].detach().double().requires_grad_()
+    out = call(
+        given,
+        given["positions"][chosen].double(),
+        offsets,
+        given["index"][chosen],
+        weights,
+        features=table,
+        directions=None if directions is None else directions.double(),
+        backend="reference",
+    )
+    leaves = [*weights, *([] if table is None else [table])]
+    return [out.detach(), *torch.autograd.grad(out, leaves, given["gradient"][chosen].double())], chosen

@@ -1,158 +1,152 @@
-"""Parts of ``gpu_check.py`` that are programs of their own: ``gpu_parts.py PART [OUT] [DATA] [--case-seconds S]``.
+"""Programs of ``gpu_check.py``: ``gpu_parts.py PROGRAM OUT``.
 
-    machine    what a build and the tests need, each with what is missing
-    small      every operation once, forward and backward, against float64: each case for itself
-    large      networks at full size
-    captured   steps of the route, and of trainings, in CUDA graphs
-    tests      tests/ops on CUDA, a process for each file
-    roofs      the networks, look-ups and sorts at full size, beside the machine's own copy and products
-    sizes      a network at many sizes and precisions, beside torch's products
-    rivals     a network by torch.compile, Triton and tiny-cuda-nn, where they are
-    step       what surrounds the networks in a training step, beside the same in plain torch
-    profile    launches and waits of a default step
-    training   short trainings
+    cases     the parts of --parts in one process, each case for itself
+                  small      every operation once, forward and backward, against float64
+                  large      networks at 2^22 samples, with gradients
+                  captured   steps of the route, and of trainings, in CUDA graphs
+                  rows       networks, look-ups and sorts at full size, beside the machine's limits and torch's products
+                  profile    a default step: launches, waits of the host, the kernels that take longest
+                  training   short trainings, with PSNR
+    counted   six launches between cudaProfilerStart and cudaProfilerStop, for ncu
+    tests     tests/ops on CUDA, a process for each file
 
-Each leaves what it has found in OUT/PART.json as well, after every case, and ``gpu_check.py`` takes it from there.
+What it finds is kept in OUT/PROGRAM.json after every case. ``--emulated`` runs small versions of the cases on the
+emulated device of the tests, so that a slip of theirs is not found on a GPU.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import dataclasses
+import fnmatch
 import functools
-import importlib.util
-import os
-import re
-import shutil
 import subprocess
 import sys
-import sysconfig
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), *(str(ROOT / place) for place in ("benchmarks/gpu", "benchmarks", "tests/cuda_emulation"))]
 
-from gpu_cases import captured_steps, captured_trainings, small_cases  # noqa: E402
-from gpu_journal import CASE_SECONDS, Again, Case, Journal, one_by_one, settling  # noqa: E402
+from gpu_cases import CHECKED, RACING, captured_steps, captured_trainings, small_cases  # noqa: E402
+from gpu_journal import Again, Case, Journal, one_by_one, settling  # noqa: E402
 from gpu_large import large_cases  # noqa: E402
-from gpu_timings import profile, rivals, roofs, sizes, step, warp  # noqa: E402, warp
+from gpu_timings import counted, profile, rows  # noqa: E402
 
+BUDGETS = {"small": 60.0, "large": 25.0, "captured": 35.0, "rows": 65.0, "profile": 30.0, "training": 35.0}
+"""Seconds of each part, in their order. What one leaves is the next ones'."""
+TRAININGS: dict[str, dict[str, Any]] = {"default": {}, "4,096 rays, bf16": {"rays": 4096, "precision": "bf16"}}
 FILE_SECONDS = 60.0
 """For one file of the tests."""
-OTHER_TESTS = (
-    "app/train/test_training.py",
-    "diagram/test_diagram.py",
-    "native/test_native.py",
-    "nerf/test_rays_and_sampling.py",
-)
-"""Of tests/, beside those of the operations."""
+PROCESSES = 12
+"""Of the tests, most of whose time goes into imports and contexts."""
+LISTS = {"@checked": CHECKED, "@racing": RACING}
+"""Names of cases by one name."""
+STEP: dict[str, Any] = {"width": 16, "samples": (8,), "rays": 16, "cells": (), "split_at": ()}
+LITTLE: dict[str, dict[str, Any]] = {
+    "large": {"n": 300},
+    "captured": {"n": 40},
+    "trainings": {"count": 3, **STEP},
+    "rows": {"n": 512, "fewer": 256, "seconds": 0.2},
+    "profile": {"seconds": 0.1, **STEP},
+    "training": {"budget": 1.0, **STEP},
+}
+"""What the emulated device can make, by part."""
 
 
-def machine(out: Path) -> int:
-    """Versions, and what is missing with what needs it."""
+def cases_of(parts: list[str], device: str, journal: Journal, *, emulated: bool = False) -> list[Case]:
+    """The cases of some parts."""
     import torch
 
-    journal = Journal(out, "machine")
-
-    needed = {"setuptools": "the build", "pytest": "the tests", "numpy": "everything", "PIL": "the data"}
-    needed |= {"safetensors": "checkpoints", "matplotlib": "curves", "scipy": "some tests"}
-    print(f"python {sys.version.split()[0]}, torch {torch.__version__}, CUDA {torch.version.cuda}")
-    journal.put("python", sys.version.split()[0])
-    journal.put("torch", torch.__version__)
-    journal.put("cuda", torch.version.cuda)
-    journal.put("cores", os.cpu_count())
-    missing = []
-    if torch.cuda.is_available():
-        properties = torch.cuda.get_device_properties(0)
-        print(f"{properties.name}: sm_{properties.major}{properties.minor}, {properties.multi_processor_count} SMs")
-        journal.put("device", str(properties))
-    else:
-        missing.append("a GPU that torch sees (everything)")
-    for name, use in needed.items():
-        if importlib.util.find_spec(name) is None:
-            missing.append(f"the package {name} ({use})")
-    if importlib.util.find_spec("ninja") is None and shutil.which("ninja") is None:
-        missing.append("ninja (the build)")
-    if importlib.util.find_spec("pybind11") is None:
-        headers = Path(torch.__file__).parent / "include" / "pybind11"
-        print(f"pybind11: {'the headers in torch' if headers.exists() else 'none'}")
-        if not headers.exists():
-            missing.append("pybind11 (the build)")
-    if not Path(sysconfig.get_path("include"), "Python.h").exists():
-        missing.append(f"Python.h in {sysconfig.get_path('include')} (the build; a package such as python3-dev)")
-    for program, places in (
-        ("nvcc", ":/usr/local/cuda/bin"),
-        ("c++", ""),
-        ("compute-sanitizer", ":/usr/local/cuda/bin"),
-    ):
-        found = shutil.which(program, path=os.environ.get("PATH", "") + places)
-        if found is None:
-            missing.append(f"{program} ({'the sanitizer' if 'sanitizer' in program else 'the build'})")
-            continue
-        said = subprocess.run([found, "--version"], capture_output=True, text=True).stdout.splitlines()
-        version = next((line for line in said if re.search("[0-9][.][0-9]", line)), "")
-        print(f"{found}: {version}")
-        journal.put(program, version)
-    print(f"missing: {'; '.join(missing) or 'nothing'}")
-    journal.put("missing", missing)
-    return int(any("build" in name or "GPU" in name for name in missing))
-
-
-def small(again: Again, journal: Journal) -> int:
-    """Every operation, forward and backward."""
-    import torch
+    from voronerf.app.scenes import builtin_scene, load_scene
 
     def seeded(run: Callable[[], None]) -> None:
         torch.manual_seed(0)
         run()
 
-    cases: list[Case] = [(name, functools.partial(seeded, run)) for name, run in small_cases("cuda")]
-    return one_by_one(cases, again, settling("cuda"), journal)
+    scene = builtin_scene(12) if emulated else load_scene("builtin")
+    small: dict[str, dict[str, Any]] = LITTLE if emulated else {}
+    found: list[Case] = []
+    for part in parts:
+        options = small.get(part, {})
+        if part == "small":
+            found += [Case(part, name, functools.partial(seeded, run)) for name, run in small_cases(device)]
+        elif part == "large":
+            found += [Case(part, *case, 20.0) for case in large_cases(device, **options)]
+        elif part == "captured":
+            found += [Case(part, *case) for case in captured_steps(device, **options)]
+            found += [Case(part, *case, 30.0) for case in captured_trainings(device, **small.get("trainings", {}))]
+        elif part == "rows":
+            found += rows(device, journal, **options)
+        elif part == "profile":
+            found += profile(scene, device, **options)
+        else:
+            for name, given in TRAININGS.items():
+                run = functools.partial(train, scene, device, {**given, **options})
+                found.append(Case(part, name, run, 60.0))
+    return found
 
 
-def large(again: Again, journal: Journal) -> int:
-    """Networks at full size."""
-    cases: list[Case] = list(large_cases("cuda"))
-    return one_by_one(cases, again, settling("cuda"), journal)
+def chosen(cases: list[Case], names: list[str]) -> list[Case]:
+    """The cases of some names or parts, in which * may stand; one that fails for each name that there is not."""
+
+    def absent() -> None:
+        raise LookupError("there is no case of this name")
+
+    found = [case for case in cases if any(fnmatch.filter((case.name, case.part), name) for name in names)]
+    known = {name for case in found for name in names if fnmatch.filter((case.name, case.part), name)}
+    return [*(Case(cases[0].part, name, absent) for name in names if name not in known), *found]
 
 
-def captured(again: Again, journal: Journal) -> int:
-    """Steps captured once and replayed: nearest centre, sort, networks and their gradients; and whole trainings."""
-    cases: list[Case] = [(name, functools.partial(capture, step)) for name, step in captured_steps("cuda")]
-    cases += captured_trainings("cuda")
-    return one_by_one(cases, again, settling("cuda"), journal)
+def train(scene: Any, device: str, options: dict[str, Any]) -> dict[str, Any]:
+    """A training of 12 seconds: milliseconds of a step, and PSNR."""
+    from voronerf.app.train import Scores, TrainConfig, build, run
+
+    given: dict[str, Any] = {"budget": 12.0, "cells": (12,), "evaluations": 4, "eval_views": 5, **options}
+    scores = Scores(None)
+    run(build(TrainConfig(device=device, **given), scene), [scores])
+    summary = scores.summary
+    milliseconds = 1e3 * summary["seconds"] / summary["steps"]
+    said = f"{summary['steps']} steps of {milliseconds:.2f} ms, PSNR {summary['psnr']:.2f}"
+    over = [(row["seconds"], row["psnr"]) for row in scores.metrics]
+    return {"settings": options, "milliseconds": milliseconds, "psnr over seconds": over, **summary, "said": said}
 
 
-def capture(step: Callable[[], list[Any]]) -> None:
-    """Three replays of a step have the results of the step itself."""
+def about() -> dict[str, Any]:
+    """The machine, its versions, and what the library says of itself."""
     import torch
 
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        expected = [part.clone() for part in step()]
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        found = step()
-    for _ in range(3):
-        for part in found:
-            part.zero_()
-        graph.replay()
-        torch.cuda.synchronize()
-        assert all(torch.equal(a, b) for a, b in zip(expected, found)), "a replay differs from the step itself"
+    from voronerf.ops._core import backends
+
+    properties = str(torch.cuda.get_device_properties(0)) if torch.cuda.is_available() else "no GPU"
+    return {"device": properties, "cuda": torch.version.cuda, **backends.describe()}
+
+
+def run_counted(device: str) -> None:
+    """Every launch once before it is counted."""
+    import torch
+
+    settle = settling(device)
+    made = counted(device, **({} if device == "cuda" else {"n": 256}))
+    for name, before, launch in made:
+        before()
+        launch()
+        before()
+        settle()
+        print(f"counted: {name}", flush=True)
+        with torch.cuda.profiler.profile() if device == "cuda" else contextlib.nullcontext():
+            launch()
+            settle()
 
 
 def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECONDS) -> int:
-    """Every file of tests/ops, and what else has tests for CUDA, in a process of its own, several at a time; its
-    output goes to ``out``."""
-    journal = Journal(out, "tests")
-    files = files or [
-        *sorted((ROOT / "tests" / "ops").glob("test_*.py")),
-        *(ROOT / "tests" / name for name in OTHER_TESTS),
-    ]
+    """Every file of tests/ops, several at a time; its output goes to ``out``."""
+    journal = Journal(out / "tests.json")
+    files = files or sorted((ROOT / "tests" / "ops").glob("test_*.py"))
     options = ["-q", "-p", "no:cacheprovider", "--tb=short", "-k", "cuda", "--require", "native,cuda"]
 
     def run(file: Path) -> tuple[Path, int | str, list[str]]:
@@ -168,8 +162,7 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
             return file, status, log.read().splitlines()
 
     failed = 0
-    # Most of a file's time goes into imports and compilers.
-    with ThreadPoolExecutor(max(4, min(12, (os.cpu_count() or 4) // 2))) as pool:
+    with ThreadPoolExecutor(PROCESSES) as pool:
         for done in as_completed([pool.submit(run, file) for file in files]):
             file, status, lines = done.result()
             # 5: no test of this file is for CUDA.
@@ -177,82 +170,52 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
             said = "; ".join([status] * isinstance(status, str) + lines[-1:])
             print(f"{'passed' if status in (0, 5) else 'FAILED'}  {file.name}: {said}", flush=True)
             wrong = [line[:200] for line in lines if line.startswith(("FAILED", "ERROR", "E  "))]
-            for line in wrong:
-                print(f"    {line}", flush=True)
-            journal.add("files", {"name": file.name, "right": status in (0, 5), "said": said, "wrong": wrong})
+            found = {"part": "tests", "name": file.name, "right": status in (0, 5), "said": said, "wrong": wrong}
+            journal.add("cases", found)
     print(f"{len(files) - failed} of {len(files)} files passed")
     return failed
 
 
-def training(out: Path, data: str, again: Again, device: str = "cuda", seconds: float = 6.0) -> int:
-    """Steps, milliseconds of one and PSNR of short trainings of the same number of seconds."""
-    from voronerf.app.scenes import load_scene
-    from voronerf.app.train import Scores, TrainConfig, build, run
+@contextlib.contextmanager
+def on_the_emulated_device() -> Iterator[None]:
+    """Tensors of the processor say that they are of a GPU, and the emulation is the GPU."""
+    import torch
+    from emulated import emulated
+    from graphs import graphs
 
-    journal = Journal(out, "training", begun=again.start > 0)
-    # Lego at 100 x 100 and at 400 x 400; the built-in scene has one size.
-    scenes = {size: load_scene(data, downscale=by) for size, by in ([("", 1)] if data == "builtin" else SIZES)}
-    common: dict[str, Any] = {"data": data, "device": device, "budget": seconds, "cells": (12,), "rays": 4096}
-    common |= {"evaluations": 4, "eval_views": 5}
-
-    def train(name: str, size: str, options: dict[str, Any]) -> str:
-        scores = Scores(None)
-        run(build(TrainConfig(**{**common, **options}), scenes[size]), [scores])
-        summary = scores.summary
-        milliseconds = 1e3 * summary["seconds"] / summary["steps"]
-        over = [(row["seconds"], row["psnr"]) for row in scores.metrics]
-        found = {"name": name, "settings": options, "milliseconds": milliseconds, "psnr over seconds": over}
-        journal.add("trainings", {**found, **summary})
-        return f"{summary['steps']} steps of {milliseconds:.2f} ms, PSNR {summary['psnr']:.2f} on 5 views"
-
-    cases: list[Case] = [
-        (name + size, functools.partial(train, name + size, size, options))
-        for size in scenes
-        for name, options in TRAININGS.items()
-    ]
-    return one_by_one(cases, again, settling(device), journal)
-
-
-SIZES = ((" at 100", 8), (" at 400", 2))
-"""Trainings on a Blender scene of 800 x 800: a name and the downscale of each."""
-NERF: dict[str, Any] = {"field": "nerf", "occupancy": False}
-TRAININGS: dict[str, dict[str, Any]] = {
-    "default": {},
-    "default, every sample": {"occupancy": False},
-    "default, bf16": {"precision": "bf16"},
-    "nerf": NERF,
-    "nerf, bf16": {**NERF, "precision": "bf16"},
-    "nerf, fp16": {**NERF, "precision": "fp16"},
-}
-"""What each training sets."""
+    with emulated(), graphs(), mock.patch.multiple(torch.Tensor, is_cpu=False, is_cuda=True):
+        yield
 
 
 def main(arguments: list[str]) -> int:
-    """Run one part."""
+    """Run one program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=tuple(PARTS))
-    parser.add_argument("out", nargs="?", type=Path, default=ROOT / "build" / "gpu-check")
-    parser.add_argument("data", nargs="?", default="builtin")
-    parser.add_argument("--case-seconds", type=float, help="for one case, after which it is said to hang")
-    parser.add_argument("--start", type=int, default=0, help="the first case")
+    parser.add_argument("program", choices=("cases", "counted", "tests"))
+    parser.add_argument("out", type=Path, help="folder for what it finds")
+    parser.add_argument("--parts", nargs="+", choices=tuple(BUDGETS), default=list(BUDGETS))
+    parser.add_argument("--names", nargs="+", help="some cases: names, in which * may stand, parts, @checked, @racing")
+    parser.add_argument("--patience", type=float, default=1.0, help="times the seconds of a case")
+    parser.add_argument("--emulated", action="store_true")
+    parser.add_argument("--start", type=int, default=0, help="the first case, where it was begun before")
     parser.add_argument("--failed", type=int, default=0, help="cases before it that failed")
     given = parser.parse_args(arguments)
-    seconds = given.case_seconds or PARTS[given.part] * CASE_SECONDS
-    again = Again((given.part, str(given.out), given.data), given.start, given.failed, seconds)
-    checks = {"small": small, "large": large, "captured": captured}
-    timings = {"roofs": roofs, "sizes": sizes, "step": step, "profile": profile, "rivals": rivals, "warp": warp}
-    if given.part in checks:
-        return checks[given.part](again, Journal(given.out, given.part, begun=given.start > 0))
-    if given.part in timings:
-        return timings[given.part](given.out, again)
-    if given.part == "training":
-        return training(given.out, given.data, again)
-    return {"machine": machine, "tests": tests}[given.part](given.out)
-
-
-PARTS = {"machine": 1, "small": 1, "large": 3, "captured": 1, "roofs": 2, "sizes": 2, "step": 2, "profile": 3}
-PARTS |= {"rivals": 2, "training": 4, "tests": 1, "warp": 3}
-"""Times ``CASE_SECONDS`` that a case may take: a timing makes a batch as well, and a training is one."""
+    device = "cpu" if given.emulated else "cuda"
+    with on_the_emulated_device() if given.emulated else contextlib.nullcontext():
+        if given.program == "counted":
+            run_counted(device)
+            return 0
+        if given.program == "tests":
+            return tests(given.out)
+        journal = Journal(given.out / "cases.json", begun=given.start > 0)
+        if not given.start:
+            journal.put("about", about())
+        cases = cases_of(given.parts, device, journal, emulated=given.emulated)
+        if given.names:
+            cases = chosen(cases, [name for each in given.names for name in LISTS.get(each, (each,))])
+        cases = [dataclasses.replace(case, seconds=given.patience * case.seconds) for case in cases]
+        again = Again(tuple(arguments), given.start, given.failed)  # of options given twice the last one counts
+        budgets = {part: BUDGETS[part] for part in given.parts}
+        return one_by_one(cases, budgets, again, settling(device), journal)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """The programs of ``make gpu-check`` on the CPU, so that their first run on a GPU does not end in a slip of theirs."""
 
-import functools
 import importlib.util
 import itertools
 import subprocess
@@ -9,19 +8,15 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 from emulated import emulated
-from graphs import graphs
 from helpers import read_json
 
-from voronerf.app import train as app_train
-from voronerf.app.scenes import builtin_scene
-
 ROOT = Path(__file__).resolve().parent.parent.parent
+GPU = ROOT / "benchmarks" / "gpu"
 
 
 def program(name):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / "gpu" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, GPU / f"{name}.py")
     assert spec is not None and spec.loader is not None
     loaded = sys.modules[name] = importlib.util.module_from_spec(spec)  # its dataclasses look for it there
     spec.loader.exec_module(loaded)
@@ -35,44 +30,57 @@ def parts(monkeypatch):
 
 
 @pytest.fixture
-def timings(parts):
-    return sys.modules["gpu_timings"]
-
-
-@pytest.fixture
 def check():
     return program("gpu_check")
 
 
 @pytest.mark.slow
-def test_every_small_case_is_right_on_the_emulated_device(parts):
-    with emulated():
-        for name, run in parts.small_cases("cpu"):
-            try:
-                run()
-            except Exception as error:
-                raise AssertionError(name) from error
-
-
-def test_steps_to_capture_are_right_on_the_emulated_device(parts):
-    with emulated():
-        for name, step in parts.captured_steps("cpu", 40):
-            allowed = 8e-2 if "bfloat16" in name else 1e-5  # rounding moves samples across kinks
-            for found, exact in zip(step(), step("reference", torch.float64)):
-                difference = (found.double() - exact).norm()
-                assert difference <= allowed * exact.norm() + 1e-7, (name, list(found.shape))
-    assert len(parts.captured_steps("cpu", 1)) == 6
+@pytest.mark.native
+def test_the_first_call_on_the_emulated_device(tmp_path):
+    """Every case of it, small, in its own processes, and the verdict."""
+    command = [sys.executable, str(GPU / "gpu_check.py"), "first", "--emulated", "--parts", "cases", "counters"]
+    result = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["parts-first.tar.gz", "summary-first.json"]
+    found = read_json(tmp_path / "summary-first.json")["parts"]["cases"]["found"]
+    assert all(row["right"] for row in found["cases"]) and "left out" not in found
+    names = [(row["part"], row["name"]) for row in found["cases"]]
+    assert len(set(names)) == len(names)
+    rows = [row for row in found["cases"] if "share" in row]
+    assert len(rows) == 24 and all(row["seconds"] > 0 and row["floor"] > 0 for row in rows)
+    assert sum(row.get("graph", "").endswith("calls") for row in rows) > 12, "kernels of ours are captured"
+    assert sum(part == "captured" for part, _ in names) == 9 and sum(part == "large" for part, _ in names) == 6
+    shown = result.stdout[result.stdout.index("gpu-check first on") :]
+    assert len(shown) < 11_000 and all(len(line) <= 100 for line in shown.splitlines())
+    for part, name in names:
+        if part in ("rows", "profile", "training") and name != "limits":
+            assert name in shown
 
 
 @pytest.mark.native
-def test_trainings_to_capture_are_right_on_the_emulated_device(parts, monkeypatch):
-    monkeypatch.setattr(torch.Tensor, "is_cpu", False)
-    monkeypatch.setattr(torch.Tensor, "is_cuda", True)
-    small = {"width": 16, "samples": (8,), "rays": 16, "cells": (), "split_at": ()}
-    with emulated(), graphs() as seen:
-        for name, run in parts.captured_trainings("cpu", 3, **small):
-            assert run().endswith("as a graph, the same bits"), name
-    assert seen.calls == 3 * ["register", "capture", *["replay"] * 4]
+def test_cases_by_name(parts, tmp_path):
+    journal = parts.Journal(tmp_path / "cases.json")
+    with emulated():
+        cases = parts.cases_of(["small", "captured"], "cpu", journal, emulated=True)
+    for each, count in (("@checked", 20), ("@racing", 10)):
+        assert [case.part for case in parts.chosen(cases, list(parts.LISTS[each]))] == ["small"] * count
+    found = parts.chosen(cases, ["width 64*", "adam", "capturd"])
+    assert [case.name for case in found] == ["capturd", "adam", "width 64", *[case.name for case in found[3:]]]
+    assert len(found) == 5
+    with pytest.raises(LookupError, match="no case of this name"):
+        found[0].run()
+
+
+def test_counted_launches(parts, capsys):
+    """One launch of this project's kernels each."""
+    with emulated() as module:
+        made = parts.counted("cpu", 256)
+        for name, before, launch in made:
+            before()
+            launched = module.launches()
+            launch()
+            assert module.launches() > launched, name
+    assert len(made) == 6
 
 
 AFTER_FAULTS = """
@@ -92,75 +100,43 @@ def breaks():
     synchronize()
 
 cuda = types.SimpleNamespace(synchronize=synchronize)
-sys.modules["torch"] = types.SimpleNamespace(cuda=cuda, manual_seed=lambda seed: None)
+sys.modules["torch"] = types.SimpleNamespace(cuda=cuda)
 cases = [("first", lambda: None), ("breaks", breaks), ("between", lambda: None)]
 cases += [("hangs", lambda: threading.Event().wait(60)), ("last", lambda: None)]
-gpu_parts.small_cases = lambda device: cases
+cases = [gpu_parts.Case("small", *case, 0.5) for case in cases]
+gpu_parts.cases_of = lambda *_, **__: cases
+gpu_parts.about = dict
 sys.exit(gpu_parts.main(sys.argv[1:]))
 """
 
 
 def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(tmp_path):
     """In processes that truly start themselves anew, with a device that stays broken."""
-    (tmp_path / "faults.py").write_text(AFTER_FAULTS.format(ci=str(ROOT / "benchmarks" / "gpu")))
-    command = [sys.executable, "faults.py", "small", "out", "--case-seconds", "0.5"]
+    (tmp_path / "faults.py").write_text(AFTER_FAULTS.format(ci=str(GPU)))
+    command = [sys.executable, "faults.py", "cases", "out", "--parts", "small"]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=50)
     told = [line for line in result.stdout.splitlines() if line.startswith(("right", "WRONG"))]
     assert told == [
-        "right  first",
-        "WRONG  breaks: RuntimeError: an illegal memory access was encountered",
-        "right  between",
-        "WRONG  hangs: hangs, stopped after 0.5 s",
-        "right  last",
+        "right  small: first",
+        "WRONG  small: breaks: RuntimeError: an illegal memory access was encountered",
+        "right  small: between",
+        "WRONG  small: hangs: hangs, stopped after 0.5 s",
+        "right  small: last",
     ]
-    assert result.stdout.endswith("3 of 5 cases are right\n") and result.returncode == 2
-    kept = read_json(tmp_path / "out" / "small.json")["cases"]
-    names = [line.split()[1].removesuffix(":") for line in told]
+    assert result.stdout.endswith("3 of 5 cases are right, 0 left out for want of time\n") and result.returncode == 2
+    kept = read_json(tmp_path / "out" / "cases.json")["cases"]
+    names = [line.split()[2].removesuffix(":") for line in told]
     assert [(row["name"], row["right"]) for row in kept] == list(zip(names, (True, False) * 2 + (True,), strict=False))
 
 
-@pytest.mark.native
-def test_roofs(parts, monkeypatch, tmp_path):
-    """Every row is measured, on the CPU's kernels, and what a first process measured stays."""
-    import harness  # of benchmarks/, to which gpu_parts.py has led
-
-    monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
-    again = parts.Again(("roofs",), case_seconds=60.0)
-    assert parts.roofs(tmp_path, again, "cpu", 256) == 0
-    rows = read_json(tmp_path / "roofs.json")["rows"]
-    assert len(rows) == 31 and all(row["seconds"] > 0 and row["share"] > 0 for row in rows)
-    assert all(row["floor"] == row["work"] / 1e12 for row in rows)
-    again = parts.Again(("roofs",), start=30, failed=1, case_seconds=60.0)
-    assert parts.roofs(tmp_path, again, "cpu", 256) == 1
-    after = read_json(tmp_path / "roofs.json")["rows"]
-    assert after[:31] == rows and [row["name"] for row in after[31:]] == [rows[30]["name"]]
-
-
-@pytest.mark.native
-def test_what_surrounds_the_networks_is_timed_beside_plain_torch(parts, monkeypatch, tmp_path):
-    import harness
-
-    monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
-    assert parts.step(tmp_path, parts.Again(("step",), case_seconds=60.0), "cpu", 256) == 0
-    rows = read_json(tmp_path / "step.json")["rows"]
-    own = [row["name"] for row in rows if " by " not in row["name"]]
-    assert len(own) == 13 and all(row["limit"] == "copy" and row["work"] > 0 for row in rows)
-    assert all(any(row["name"].startswith(f"{name} by ") for row in rows) for name in own)
-
-
-def test_training(parts, tmp_path, capsys, monkeypatch):
-    # A step takes twenty milliseconds however busy the machine is.
-    ticks = itertools.count()
-    ticking = functools.partial(app_train.run, clock=lambda: 0.0201 * next(ticks))
-    monkeypatch.setattr("voronerf.app.train.run", ticking)
-    monkeypatch.setattr("voronerf.app.scenes.load_scene", lambda *_, **__: builtin_scene(16))
-    small = {name: {**options, "width": 16, "samples": (16,), "rays": 256} for name, options in parts.TRAININGS.items()}
-    monkeypatch.setattr(parts, "TRAININGS", small)
-    assert parts.training(tmp_path, "builtin", parts.Again(("training",), case_seconds=60.0), "cpu", 0.5) == 0
-    assert capsys.readouterr().out.count("PSNR") == len(small)
-    kept = read_json(tmp_path / "training.json")["trainings"]
-    assert [row["name"] for row in kept] == list(small)
-    assert all(row["psnr"] > 0 and row["milliseconds"] > 0 for row in kept)
+def test_cases_that_the_time_is_too_short_for_are_left_out(parts, tmp_path):
+    """What the first part leaves of its time is the second one's; the third has none."""
+    journal, slow = parts.Journal(tmp_path / "cases.json"), lambda: time.sleep(0.3)
+    cases = [parts.Case(part, str(number), slow) for part, number in (("a", 1), ("b", 2), ("b", 3), ("c", 4))]
+    again, settle = parts.Again(()), lambda: None
+    assert parts.one_by_one(cases, {"a": 0.45, "b": 0.0, "c": 0.0}, again, settle, journal) == 0
+    assert [row["name"] for row in journal.found["cases"]] == ["1", "2"]
+    assert [row["name"] for row in journal.found["left out"]] == ["3", "4"]
 
 
 def test_a_file_of_tests_that_hangs_fails_alone(parts, tmp_path, capsys):
@@ -183,7 +159,7 @@ def test_a_file_of_tests_that_hangs_fails_alone(parts, tmp_path, capsys):
     assert outcomes["passes.py:"].startswith("passed") and "1 passed" in outcomes["passes.py:"]
     assert outcomes["wrong.py:"].startswith("FAILED") and outcomes["other.py:"].startswith("passed")
     assert said[-1] == "2 of 4 files passed"
-    kept = {row["name"]: row for row in read_json(tmp_path / "out" / "tests.json")["files"]}
+    kept = {row["name"]: row for row in read_json(tmp_path / "out" / "tests.json")["cases"]}
     assert kept["test_planted_passes.py"]["right"] and not kept["test_planted_hangs.py"]["right"]
     assert any(line.endswith("assert (1 + 1) == 3") for line in kept["test_planted_wrong.py"]["wrong"])
 
@@ -192,7 +168,7 @@ def test_a_part_that_hangs_is_ended_with_all_that_it_started(check, monkeypatch,
     monkeypatch.setattr(check, "SHORTEST", 0.0)
     child = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
     script = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
-    result = check.run("hangs", check.Part([sys.executable, "-c", script], 2), tmp_path, 100.0)
+    result = check.run("hangs", check.Part([[sys.executable, "-c", script]], 2), tmp_path, 2.0)
     assert result["outcome"] == "failed" and result["last"].startswith("stopped after 2 s")
     child_pid = int((tmp_path / "pid").read_text())
     for _ in range(100):
@@ -211,132 +187,160 @@ def test_the_summary_has_all_that_a_part_has_found(check, monkeypatch, tmp_path)
 
     def part(name, *program):
         path = tmp_path / f"{name}.json"
-        return check.Part([sys.executable, "-c", program[0], str(path), *program[1:]], 20, (), path)
+        return check.Part([[sys.executable, "-c", program[0], str(path), *program[1:]]], 100, (), path)
 
     known = {"good": part("good", write, '{"a": [1]}'), "torn": part("torn", write, '{"a"'), "old": part("old", "pass")}
-    known["absent"] = check.Part("not here", 0)
-    monkeypatch.setattr(check, "parts", lambda out, data: known)
-    monkeypatch.setitem(check.CALLS, "2", tuple(known))
-    assert check.main(["2", "--out", str(tmp_path / "out"), "--seconds", "400"]) == 0
-    kept = read_json(tmp_path / "out" / "summary-2.json")["parts"]
+    known["late"] = check.Part(known["good"].commands, 1)
+    known["absent"] = check.Part("not here", 100)
+    known["second"] = check.Part([["false"], [sys.executable, "-c", "print('instead')"]], 100)
+    monkeypatch.setattr(check, "parts", lambda *_, **__: known)
+    assert check.main(["second", "--out", str(tmp_path / "out")]) == 0
+    kept = read_json(tmp_path / "out" / "summary-second.json")["parts"]
     assert kept["good"]["found"] == {"a": [1]} and kept["torn"]["found"].startswith("torn.json: ")
     assert kept["old"]["found"] is None and kept["absent"]["outcome"] == "left out"
+    assert kept["late"]["last"] == "no time left" and kept["second"]["last"] == "instead"
+    assert kept["good"]["commands"] == known["good"].commands
 
 
-def test_calls_fit_their_time_and_leave_two_files(check, monkeypatch, tmp_path):
-    """Without a GPU every part says why it is left out, but for the one that says what is missing."""
-    monkeypatch.setattr(check, "capability", lambda: "90")
-    monkeypatch.setattr(check.shutil, "which", lambda name, **_: name)
-    known = check.parts(tmp_path, None)
-    assert {name for call in check.CALLS.values() for name in call} == set(known)
-    for call in check.CALLS.values():
-        assert sum(known[name].seconds for name in call) <= check.SECONDS
-    monkeypatch.undo()
-    for call in check.CALLS:
-        # "machine" fails for want of a GPU; it is not begun in so little time.
-        assert check.main([call, "--out", str(tmp_path), "--seconds", "1"]) == 0
-        outcomes = read_json(tmp_path / f"summary-{call}.json")["parts"]
-        assert list(outcomes) == list(check.CALLS[call])
-        assert all(row["outcome"] == "left out" and row["last"] for row in outcomes.values())
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        f"{kind}-{call}.{end}" for kind, end in (("summary", "json"), ("parts", "tar.gz")) for call in check.CALLS
-    )
+def test_calls_fit_their_time(check, parts, monkeypatch, tmp_path):
+    """The parts follow each other, the last one ends with the call, and what checks kernels leaves the card alone."""
+    monkeypatch.setattr(check.shutil, "which", lambda name, **_: f"/bin/{name}")
+    for call, seconds in (("first", 390), ("second", 240)):
+        known = check.parts(call, tmp_path, tmp_path, ["adam"], emulated=False)
+        ends = [part.until for name, part in known.items() if name != "build"]
+        assert ends == sorted(ends) and ends[-1] == seconds and known["build"].until < ends[-1]
+        for name, part in known.items():
+            (*_, command) = part.commands
+            assert ("kns=voronerf" in command) == name.endswith("check")
+            assert ("regex:voronerf" in command) == (name == "counters")
+            if name == "counters":
+                assert command[command.index("--clock-control") + 1] == "none"
+        # 20 s to link, 15 s for imports and a context.
+        assert call == "second" or sum(parts.BUDGETS.values()) + 35 <= known["cases"].until
 
 
-@pytest.mark.native
-def test_large_cases(parts, monkeypatch):
-    """Small, on the emulated device; and gradients that are wrong are found."""
-    large = sys.modules["gpu_large"]
-    monkeypatch.setattr(large, "SUBSET", 16)
-    with emulated():
-        run = dict(large.large_cases("cpu", 300))["w64d4 bfloat16"]
-        assert run().count("e-") == 2
-        whole = large.evaluate
-        twice = itertools.count()
-
-        def spoilt(given):
-            parts_of = whole(given)
-            if next(twice) == 1:
-                parts_of[1] = parts_of[1] * 1.5
-            return parts_of
-
-        monkeypatch.setattr(large, "evaluate", spoilt)
-        with pytest.raises(AssertionError, match="part 1 is"):
-            run()
-
-
-@pytest.mark.native
-def test_sizes_and_a_profiled_step(parts, timings, monkeypatch, tmp_path):
-    import harness
-
-    monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
-    assert timings.sizes(tmp_path, parts.Again(("sizes",), case_seconds=60.0), "cpu", (1 << 10,), (1, 16)) == 0
-    rows = read_json(tmp_path / "sizes.json")["rows"]
-    assert len(rows) == 14 and all(row["seconds"] > 0 for row in rows)
-    monkeypatch.setattr("voronerf.app.scenes.load_scene", lambda *_, **__: builtin_scene(12))
-    assert timings.profile(tmp_path, parts.Again(("profile",), case_seconds=60.0), "cpu", 2) == 0
-    (row,) = read_json(tmp_path / "profile.json")["steps"]
-    assert row["seconds"] > 0 and row["launches"] == row["waits"] == 0
-
-
-@pytest.mark.warp
-@pytest.mark.native
-def test_operations_of_warp_beside_native_ones(parts, timings, monkeypatch, tmp_path):
-    import harness
-
-    monkeypatch.setattr(harness, "_cuda_peak", lambda kind, device: 1e12)
-    assert timings.warp(tmp_path, parts.Again(("warp",), case_seconds=60.0), "cpu", 300) == 0
-    names = {row["name"] for row in read_json(tmp_path / "warp.json")["rows"]}
-    assert {"grouped_mlp n=300", "grouped_mlp n=300 by Warp", "render_loss_gradient n=300 by Warp"} <= names
-
-
-def test_the_summary_says_what_was_reached_and_what_is_wrong(check):
-    row = {"limit": "copy", "seconds": 2e-5, "share": 0.5, "aim": None}
-    timed = [{**row, "name": f"cell_sort k=16 by {way}"} for way in ("counting", "torch.sort")]
-    timed += [{**row, "name": "cell_sort k=16 by radix", "seconds": 4e-5}]
-    timed += [{**row, "name": "near", "aim": 0.6}, {**row, "name": "far", "aim": 0.4}]
-    timed += [{**row, "name": "far by torch.bmm", "seconds": 8e-5}]
-    found = {
-        "roofs": {"rows": timed, "cases": [{"name": "slow", "right": False, "said": "hangs"}]},
-        "training": {
-            "trainings": [{"name": "plain", "psnr": 21.5, "steps": 90, "milliseconds": 8.25}],
-            "cases": [{"name": "plain", "right": True, "said": ""}, {"name": "bf16", "right": False, "said": "no"}],
-        },
-        "small": {"cases": [{"name": "fine", "right": True, "said": ""}]},
-        "captured": "captured.json: torn",
-        "tests": {"files": [{"name": "test_a.py", "right": False, "said": "1 failed"}]},
-        "memcheck": None,
-        "rivals": {"skipped": [{"name": "far by Triton", "reason": "no package triton"}]},
-        "step": {"rows": [{**row, "name": name} for name in ("loss", "loss by torch, sums by rays")]},
+def test_the_verdict_is_short_and_says_the_most_telling_first(check):
+    row = {"part": "rows", "right": True, "limit": "copy", "seconds": 2e-5, "share": 0.5, "most": None, "said": ""}
+    rows = [{**row, "name": "near", "most": 0.6}, {**row, "name": "near by torch.bmm", "seconds": 8e-5}]
+    rows += [{**row, "name": f"sort by {way}"} for way in ("counting", "radix")]
+    wrong = [{"part": "small", "name": f"case {i}", "right": False, "said": "x" * 300} for i in range(200)]
+    kernels = [{"name": f"kernel {i}", "microseconds": 9.0, "launches": 1.0} for i in range(50)]
+    step = {"part": "profile", "name": "default", "right": True, "said": "2 ms a step", "kernels": kernels}
+    values = {
+        "gpu__time_duration.sum": 2e6,
+        **{"".join((check.STALLED[0], f"r{i}", check.STALLED[1])): i for i in range(9)},
     }
-    said = check.highlights(found)
-    assert len(said) == 17
-    assert said[3].endswith("0.020 ms  50.0 % of copy, MISSED 60 %") and said[4].endswith("copy, reached 40 %")
-    assert said[8:] == [
-        "cell_sort k=16 by counting: 0.50 x the time of radix",
-        "far: 0.25 x the time of torch.bmm",
-        "loss: 1.00 x the time of torch, sums by rays",
-        "RULE sort: counting up to 1,022 cells stays",
-        "left out: far by Triton: no package triton",
-        "training plain: 8.25 ms a step, PSNR 21.50 after 90 steps",
-        "WRONG in roofs: slow: hangs",
-        "WRONG in training: bf16: no",
-        "WRONG in tests: test_a.py: 1 failed",
-    ]
-    assert check.highlights({}) == []
+    torn = {"outcome": "failed", "seconds": 2.0, "last": "stopped", "found": "cases.json: torn"}
+    done = {"outcome": "passed", "seconds": 1.0, "last": "fine"}
+    results = {
+        "cases": {**done, "found": {"cases": [*wrong, *rows, step], "left out": [{}] * 7}},
+        "counters": {**done, "found": {"launches": [{"kernel": "void voronerf::kernel()", "values": values}]}},
+        "memcheck": {**torn, "sanitizer": ["Invalid __global__ read of size 4", "ERROR SUMMARY: 1 error"]},
+    }
+    said = check.verdict("first", results)
+    lines = said.splitlines()
+    assert len(said) < 11_000 and all(len(line) <= 100 for line in lines)
+    for part in (
+        *("and 160 more that are wrong", "left out for want of time: 7 cases", "TORN memcheck: cases.json: torn"),
+        *("memcheck: Invalid __global__ read of size 4", "near: 0.25 x the time of torch.bmm"),
+        *("sort: counting takes 1.00 x the time of radix", "  2 ms, r8 8.0, r7 7.0", "step default: 2 ms a step"),
+    ):
+        assert part in lines, part
+    assert any(line.startswith("near ") and line.endswith("50.0 % of copy, by count 60") for line in lines)
+    assert sum("kernel " in line for line in lines) == check.KERNELS
+    assert lines.index("TORN memcheck: cases.json: torn") < next(i for i, line in enumerate(lines) if "WRONG" in line)
+    long = check.cut(f"line {i:04} {'x' * 200}" for i in range(1000))
+    assert len(long) < 11_000 and long.endswith("and more, in the summary")
+    assert check.verdict("second", {}).startswith("gpu-check second on")
 
 
-def test_programs_of_a_bare_machine_import_what_it_has():
+def test_launches_that_ncu_counted(check, tmp_path):
+    """Of its raw page, among lines of its own."""
+    names = ["ID", "Kernel Name", "gpu__time_duration.sum", *(f"m{i}" for i in range(20))]
+    lines = [names, ["", "", "ns", *[""] * 20], ["0", "voronerf::k(int, int)", "1,234", *["7"] * 20]]
+    text = "==PROF== Connected\n" + "\n".join(",".join(f'"{each}"' for each in line) for line in lines)
+    (tmp_path / "counters.csv").write_text(text)
+    (launch,) = check.read(tmp_path / "counters.csv")["launches"]
+    assert launch["kernel"] == "voronerf::k(int, int)" and launch["values"]["gpu__time_duration.sum"] == 1234
+    (tmp_path / "counters.csv").write_text("==ERROR== no permission\n")
+    assert check.read(tmp_path / "counters.csv") == {"launches": []}
+
+
+@pytest.mark.native
+def test_gradients_at_full_size_that_are_wrong_are_found(parts, monkeypatch):
+    large = sys.modules["gpu_large"]
+    with emulated():
+        runs = dict(large.large_cases("cpu", 300))
+        whole = large.evaluate
+        for precision in large.ALLOWED:
+            twice = itertools.count()
+
+            def spoilt(given, twice=twice):
+                parts_of = whole(given)
+                if next(twice) == 1:
+                    parts_of[1] = parts_of[1] * 1.5
+                return parts_of
+
+            monkeypatch.setattr(large, "evaluate", spoilt)
+            with pytest.raises(AssertionError, match="part 1 of the gradients is"):
+                runs[f"w64d4 {precision}"]()
+
+
+PREBUILT = """rule cxx
+  command = c++ $flags -c $in -o $out
+rule link
+  command = c++ $in -o $out
+build bindings.cpp.o: cxx bindings.cpp
+  flags = -O1
+build a/b.cpp.o: cxx ../a/b.cpp
+  flags = -O2
+build _C.so: link bindings.cpp.o a/b.cpp.o
+default _C.so
+"""
+
+
+def test_objects_that_are_carried_are_linked_and_not_compiled(monkeypatch, tmp_path):
+    """With ninja; and those of other sources, or for another GPU, are refused."""
+    prebuilt = program("prebuilt")
+    monkeypatch.setattr(prebuilt, "module_name", lambda: "_C.so")
+    (tmp_path / "a").mkdir()
+    compiled = ["c++", "-shared", "-fPIC", "-x", "c++", "-c", "-", "-o"]
+    subprocess.run([*compiled, str(tmp_path / "a/b.cpp.o")], input="int there() { return 3; }", text=True, check=True)
+    text = PREBUILT.replace("c++ $in -o", "c++ -shared $in -o").replace("-O1", "-fPIC")
+    source = "int there(); int twice() { return 2 * there(); }"
+    build = {
+        "find_cuda": lambda: None,
+        "ninja_file": lambda module, cuda, folder: text,
+        "bindings": lambda: source,
+        "build_info": lambda cuda: "",
+        "write_if_changed": lambda path, said: path.write_text(said),
+        "architectures_there": lambda: ("90",),
+        "ninja": lambda: [sys.executable, "-m", "ninja"],
+    }
+    with pytest.raises(SystemExit, match="must hold what `prebuilt"):
+        prebuilt.link(build, tmp_path)
+    (tmp_path / "made").write_text(f"90 {prebuilt.digest()}")
+    assert "_C.so linked" in prebuilt.link(build, tmp_path) and (tmp_path / "_C.so").exists()
+    assert list(prebuilt.edges((tmp_path / "build.ninja").read_text())) == ["bindings.cpp.o", "_C.so"]
+    build["architectures_there"] = lambda: ("80",)
+    with pytest.raises(SystemExit, match="must be for this GPU, sm_80, got sm_90"):
+        prebuilt.link(build, tmp_path)
+    (tmp_path / "made").write_text("90 0badf00d")
+    with pytest.raises(SystemExit, match="must be those of csrc and setup"):
+        prebuilt.link(build, tmp_path)
+
+
+def test_programs_of_a_bare_machine_import_what_it_has(tmp_path):
     """torch, and what comes with Python: pytest, tyro, rich and warp may be absent until the tests themselves run."""
     absent = ("pytest", "_pytest", "tyro", "rich", "warp", "scipy", "imageio_ffmpeg")
     code = f"""
 import sys
 for name in {absent!r}:
     sys.modules[name] = None
-sys.path[:0] = [{str(ROOT / "benchmarks" / "gpu")!r}]
-import gpu_parts, gpu_check
-gpu_parts.small_cases("cpu"), gpu_parts.captured_steps("cpu", 4)
-import harness, throughput, ops.networks, ops.case
+sys.path[:0] = [{str(GPU)!r}]
+import gpu_parts, gpu_check, prebuilt
+journal = gpu_parts.Journal(gpu_parts.Path({str(tmp_path / "cases.json")!r}))
+assert len(gpu_parts.cases_of(list(gpu_parts.BUDGETS), "cpu", journal, emulated=True)) > 130
 import voronerf.app.train
 print("imported")
 """
