@@ -157,7 +157,7 @@ def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: b
     if first:
         # ncu would lock the clocks of the card, which others may share.
         options = ["--clock-control", "none", "--profile-from-start", "off", "--launch-count", "6"]
-        options += ["--kernel-name-base", "demangled", "--kernel-name", "regex:voronerf"]
+        options += ["--kernel-name-base", "function", "--kernel-name", "regex:program_kernel|hash_encode"]
         options += [each for section in SECTIONS for each in ("--section", section)]
         options += ["--csv", "--page", "raw", "--print-units", "base", "--log-file", str(out / "counters.csv")]
         counted = None if profiler is None else [profiler, *options, *program, "counted", str(out)]
@@ -207,6 +207,7 @@ def run(name: str, part: Part, out: Path, limit: float) -> dict[str, Any]:
         "last": last if isinstance(status, int) else f"{status}; {last}",
         "commands": part.commands,
         "found": read(part.found),
+        "counted": [line.removeprefix("counted: ") for line in lines if line.startswith("counted: ")],
         "sanitizer": [line[10:] for line in lines if line.startswith("=========") and _of_note(line)][:20],
     }
 
@@ -265,7 +266,7 @@ def verdict(call: str, results: dict[str, Any]) -> str:
         elif row["name"] == "limits":
             lines.append(f"limits: {row['said']}")
     lines += _beside(cases)
-    lines += [line for launch in _launches(found) for line in _counted(launch)]
+    lines += _counted(results.get("counters", {}))
     for row in cases:
         if row["part"] == "profile" and row["right"]:
             lines.append(f"step {row['name']}: {row['said']}")
@@ -319,23 +320,22 @@ def _beside(cases: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def _launches(found: dict[str, Any]) -> list[dict[str, Any]]:
-    kept = found.get("counters")
-    return kept["launches"] if isinstance(kept, dict) else []
-
-
-def _counted(launch: dict[str, Any]) -> list[str]:
-    """Two lines of a launch: its kernel, and what was counted, with the two reasons for which warps wait longest."""
-    values, (before, after) = launch["values"], STALLED
-    told = [f"{values[key] * by:.3g} {name}" for name, (key, by) in COUNTED.items() if key in values]
-    stalls = {
-        key.removeprefix(before).removesuffix(after): value
-        for key, value in values.items()
-        if key.startswith(before) and key.endswith(after) and "not_issued" not in key
-    }
-    longest = sorted(stalls, key=lambda key: -stalls[key])[:2]
-    told += [f"{name} {stalls[name]:.1f}" for name in longest]
-    return [f"ncu {launch['kernel']}", f"  {', '.join(told)}"]
+def _counted(result: dict[str, Any]) -> list[str]:
+    """Two lines of a launch: what it is, and what was counted, with the two reasons for which warps wait longest."""
+    found, (before, after), lines = result.get("found"), STALLED, []
+    launches = found["launches"] if isinstance(found, dict) else []
+    names = [*result.get("counted", ()), *["?"] * len(launches)]
+    for name, launch in zip(names, launches, strict=False):
+        values = launch["values"]
+        told = [f"{values[key] * by:.3g} {what}" for what, (key, by) in COUNTED.items() if key in values]
+        stalls = {
+            key.removeprefix(before).removesuffix(after): value
+            for key, value in values.items()
+            if key.startswith(before) and key.endswith(after) and "not_issued" not in key
+        }
+        told += [f"{reason} {stalls[reason]:.1f}" for reason in sorted(stalls, key=lambda key: -stalls[key])[:2]]
+        lines += [f"ncu {name}: {launch['kernel']}", f"  {', '.join(told)}"]
+    return lines
 
 
 def run_group(command: list[str], environment: dict[str, str], log: TextIO, limit: float) -> int | str:

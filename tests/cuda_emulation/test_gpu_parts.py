@@ -212,7 +212,7 @@ def test_calls_fit_their_time(check, parts, monkeypatch, tmp_path):
         for name, part in known.items():
             (*_, command) = part.commands
             assert ("kns=voronerf" in command) == name.endswith("check")
-            assert ("regex:voronerf" in command) == (name == "counters")
+            assert ("regex:program_kernel|hash_encode" in command) == (name == "counters")
             if name == "counters":
                 assert command[command.index("--clock-control") + 1] == "none"
         # 20 s to link, 15 s for imports and a context.
@@ -234,7 +234,7 @@ def test_the_verdict_is_short_and_says_the_most_telling_first(check):
     done = {"outcome": "passed", "seconds": 1.0, "last": "fine"}
     results = {
         "cases": {**done, "found": {"cases": [*wrong, *rows, step], "left out": [{}] * 7}},
-        "counters": {**done, "found": {"launches": [{"kernel": "void voronerf::kernel()", "values": values}]}},
+        "counters": {**done, "counted": ["w"], "found": {"launches": [{"kernel": "program_kernel", "values": values}]}},
         "memcheck": {**torn, "sanitizer": ["Invalid __global__ read of size 4", "ERROR SUMMARY: 1 error"]},
     }
     said = check.verdict("first", results)
@@ -243,7 +243,12 @@ def test_the_verdict_is_short_and_says_the_most_telling_first(check):
     for part in (
         *("and 160 more that are wrong", "left out for want of time: 7 cases", "TORN memcheck: cases.json: torn"),
         *("memcheck: Invalid __global__ read of size 4", "near: 0.25 x the time of torch.bmm"),
-        *("sort: counting takes 1.00 x the time of radix", "  2 ms, r8 8.0, r7 7.0", "step default: 2 ms a step"),
+        *(
+            "sort: counting takes 1.00 x the time of radix",
+            "ncu w: program_kernel",
+            "  2 ms, r8 8.0, r7 7.0",
+            "step default: 2 ms a step",
+        ),
     ):
         assert part in lines, part
     assert any(line.startswith("near ") and line.endswith("50.0 % of copy, by count 60") for line in lines)
