@@ -249,6 +249,8 @@ def verdict(call: str, results: dict[str, Any]) -> str:
     lines = [f"gpu-check {call} on {device()}:"]
     for name, result in results.items():
         lines.append(f"  {name:10} {result['outcome']:8} {result['seconds']:6.1f} s  {result['last']}")
+    if took := _took(found):
+        lines.append(f"  of cases: {', '.join(f'{part} {seconds:.1f} s' for part, seconds in took.items())}")
     for part, value in found.items():
         lines += [f"TORN {part}: {value}"] * isinstance(value, str)
     lines += _wrong(found)
@@ -290,6 +292,14 @@ def _cases(found: dict[str, Any]) -> list[dict[str, Any]]:
     cases = found.get("cases")
     kept = cases.get("cases", []) if isinstance(cases, dict) else []
     return [row for row in kept if row["right"]]
+
+
+def _took(found: dict[str, Any]) -> dict[str, float]:
+    """Seconds of each part of the cases."""
+    cases, seconds = found.get("cases"), dict[str, float]()
+    for row in cases.get("cases", ()) if isinstance(cases, dict) else ():
+        seconds[row["part"]] = seconds.get(row["part"], 0.0) + row.get("took", 0.0)
+    return seconds
 
 
 def _wrong(found: dict[str, Any]) -> list[str]:

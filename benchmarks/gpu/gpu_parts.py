@@ -44,6 +44,8 @@ FILE_SECONDS = 60.0
 """For one file of the tests."""
 PROCESSES = 12
 """Of the tests, most of whose time goes into imports and contexts."""
+CHOICE = "cuda and not reference-cuda and not compiles and not opcheck"
+"""Of the tests: kernels of ours; torch traces the same on every device."""
 LISTS = {"@checked": CHECKED, "@racing": RACING}
 """Names of cases by one name."""
 STEP: dict[str, Any] = {"width": 16, "samples": (8,), "rays": 16, "cells": (), "split_at": ()}
@@ -147,7 +149,7 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
     """Every file of tests/ops, several at a time; its output goes to ``out``."""
     journal = Journal(out / "tests.json")
     files = files or sorted((ROOT / "tests" / "ops").glob("test_*.py"))
-    options = ["-q", "-p", "no:cacheprovider", "--tb=short", "-k", "cuda", "--require", "native,cuda"]
+    options = ["-q", "-p", "no:cacheprovider", "--tb=short", "-k", CHOICE, "--require", "native,cuda"]
 
     def run(file: Path) -> tuple[Path, int | str, list[str]]:
         command = [sys.executable, "-m", "pytest", *options, str(file)]

@@ -2,7 +2,7 @@
 
     prebuilt.py make FOLDER [ARCHITECTURE]    every object but that of bindings.cpp, the only file that needs Python
     prebuilt.py link FOLDER                   compiles bindings.cpp, links, and puts the module where it is imported
-    prebuilt.py try FOLDER                    links, and leaves the module where it is
+    prebuilt.py try FOLDER                    links, looks whether the module loads, and leaves nothing
 
 Both machines must be Linux on x86-64; the one that links needs a C++ compiler, nvcc, ninja and Python's headers, and a
 C library no older than the other's. It refuses objects of other sources or for another GPU.
@@ -39,6 +39,9 @@ def main(arguments: list[str]) -> int:
         done = link(build, folder)
         if arguments[0] == "link":
             build["put"](folder / module_name(), ROOT / "voronerf/ops/_core" / module_name())
+        else:
+            for name in (OBJECT_OF_BINDINGS, module_name()):  # which would be carried
+                (folder / name).unlink()
     print(f"prebuilt: {done} in {time.perf_counter() - begin:.1f} s")
     return 0
 
@@ -73,6 +76,8 @@ def link(build: dict[str, Any], folder: Path) -> str:
     chosen = [line for name in kept for line in edges(text)[name]]
     (folder / "build.ninja").write_text("\n".join([*rules, *chosen, ""]))
     subprocess.run([*build["ninja"](), "-C", str(folder)], check=True)
+    if not build["stub_of"](folder / module_name()):
+        raise SystemExit("prebuilt: the linked module does not load")
     return f"{module_name()} linked, {(folder / module_name()).stat().st_size / 1e6:.1f} MB,"
 
 

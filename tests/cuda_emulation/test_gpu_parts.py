@@ -321,12 +321,16 @@ def test_objects_that_are_carried_are_linked_and_not_compiled(monkeypatch, tmp_p
         "write_if_changed": lambda path, said: path.write_text(said),
         "architectures_there": lambda: ("90",),
         "ninja": lambda: [sys.executable, "-m", "ninja"],
+        "stub_of": lambda module: "loads",
     }
     with pytest.raises(SystemExit, match="must hold what `prebuilt"):
         prebuilt.link(build, tmp_path)
     (tmp_path / "made").write_text(f"90 {prebuilt.digest()}")
     assert "_C.so linked" in prebuilt.link(build, tmp_path) and (tmp_path / "_C.so").exists()
     assert list(prebuilt.edges((tmp_path / "build.ninja").read_text())) == ["bindings.cpp.o", "_C.so"]
+    build["stub_of"] = lambda module: ""
+    with pytest.raises(SystemExit, match="does not load"):
+        prebuilt.link(build, tmp_path)
     build["architectures_there"] = lambda: ("80",)
     with pytest.raises(SystemExit, match="must be for this GPU, sm_80, got sm_90"):
         prebuilt.link(build, tmp_path)
