@@ -70,7 +70,8 @@ def cases_of(parts: list[str], device: str, journal: Journal, *, emulated: bool 
         torch.manual_seed(0)
         run()
 
-    scene = builtin_scene(12) if emulated else load_scene("builtin")
+    if {"profile", "training"}.intersection(parts):
+        scene = builtin_scene(12) if emulated else load_scene("builtin")
     small: dict[str, dict[str, Any]] = LITTLE if emulated else {}
     found: list[Case] = []
     for part in parts:
