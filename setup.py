@@ -127,8 +127,8 @@ def architectures_there() -> tuple[str, ...] | None:
     """The architectures of this machine's GPUs; () where the driver does not tell, None without a GPU."""
     try:
         command = ["nvidia-smi", "--query-gpu=compute_cap", "--format=csv,noheader"]
-        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
-    except (OSError, subprocess.CalledProcessError):
+        said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.split()
+    except (OSError, subprocess.SubprocessError):
         said = []
     found = tuple(sorted({cap.replace(".", "") for cap in said if cap.replace(".", "").isdigit()}, key=int))
     return found if found or any(Path(device).exists() for device in ("/dev/nvidiactl", "/dev/dxg")) else None

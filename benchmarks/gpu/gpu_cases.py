@@ -9,18 +9,19 @@ from dataclasses import replace
 from typing import Any
 
 CHECKED = (
-    *("adam", "average", "composite packed", "march_rays", "draw_pixels", "grouped_mlp hashed", "routed_mlp nested"),
-    *("grouped_linear", "hash_encode features=8", "locate_cell", "nearest_centre k=700", "observe_occupancy"),
-    *("pixel_rays", "render_loss", "resample", "cell_sort 5000 3 by counting", "grouped_mlp wide tf32"),
-    *("grouped_mlp skips bfloat16 forward", "grouped_mlp of a hash grid for each cell bfloat16", "unaligned views"),
+    *("adam", "composite packed", "march_rays", "draw_pixels", "grouped_mlp hashed", "routed_mlp nested"),
+    *("spherical_harmonics", "hash_encode features=8", "locate_cell", "nearest_centre k=700", "observe_occupancy"),
+    *("pixel_rays", "render_loss", "resample", "cell_sort 5000 3 by counting", "cell_sort 20000 4096 by automatic"),
+    *("grouped_mlp wide tf32", "grouped_mlp skips bfloat16 forward", "unaligned views"),
+    "grouped_mlp of a hash grid for each cell bfloat16",
 )
-"""The small cases for memcheck: every kernel that finds its own addresses."""
+"""Small cases for memcheck, which reach nearly all kernels."""
 RACING = (
     *("cell_sort 5000 3 by counting", "cell_sort 4200 1022 by counting", "composite packed", "march_rays", "resample"),
     *("render_loss", "grouped_mlp branched bfloat16", "grouped_mlp wide tf32", "grouped_mlp broad float32"),
-    "routed_mlp",
+    *("routed_mlp", "nearest_centre k=700", "spherical_harmonics", "adam"),
 )
-"""Those for racecheck and synccheck: kernels whose threads share memory."""
+"""Small cases for racecheck and synccheck: every kernel whose threads share memory."""
 
 STEPS: dict[str, tuple[int, str, bool, int]] = {
     "width 64": (64, "float32", False, 8),
@@ -31,6 +32,13 @@ STEPS: dict[str, tuple[int, str, bool, int]] = {
     "many cells, sorted by radix": (16, "float32", False, 1030),
 }
 """Steps to capture: the width, the type of the weights, whether there are directions, and the number of cells."""
+
+
+def near(one: Any, other: Any, allowed: float = 1e-5, absolute: float = 1e-6) -> None:
+    """Raises AssertionError unless a tensor is near another by the norm of the difference; NaN is not."""
+    difference, size = float((one.double() - other.double()).norm()), float(other.double().norm())
+    if not difference <= allowed * size + absolute:
+        raise AssertionError(f"{list(one.shape)}: off by {difference:.1e} of {size:.1e}, allowed {allowed:.0e}")
 
 
 def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
@@ -83,8 +91,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             outcomes.append(found)
         for one, other in zip(*outcomes, strict=True):
             if case.differentiable:
-                difference = (one.double() - other.double()).norm()
-                assert difference <= 1e-5 * other.double().norm() + 1e-6, (list(one.shape), one.isfinite().all())
+                near(one, other)
             else:
                 torch.testing.assert_close(one, other, rtol=1e-5, atol=2e-6, equal_nan=True)
 
@@ -108,10 +115,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
             )
             outcomes.append([*parts, *torch.autograd.grad(total, given, allow_unused=True, materialize_grads=True)])
         for part, exact in zip(*outcomes):
-            assert (part.double() - exact).norm() <= 1e-5 * exact.norm() + 1e-6, (
-                list(part.shape),
-                part.isfinite().all(),
-            )
+            near(part, exact)
 
     def shifted(tensor: Any) -> Any:
         """The same numbers, beginning four bytes (eight in float64) into their memory: nothing wider is aligned."""
@@ -148,7 +152,7 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
         torch.testing.assert_close(inside, before, rtol=size, atol=size * float(before.detach().abs().max()))
         pairs = zip(*(torch.autograd.grad(out.square().sum(), given) for out in (inside, before)), strict=True)
         for one, other in pairs:
-            assert (one.double() - other.double()).norm() <= size * other.double().norm()
+            near(one, other, size, 0.0)
 
     def views() -> None:
         """Of every other operation that takes floating-point numbers."""
@@ -256,7 +260,7 @@ def _replay(settings: tuple[int, str, bool, int], device: str, n: int) -> None:
     expected = [part.clone() for part in step()]
     allowed = 1e-5 if settings[1] == "float32" else 8e-2  # rounding moves samples across kinks
     for part, exact in zip(expected, step("reference", torch.float64), strict=True):
-        assert (part.double() - exact).norm() <= allowed * exact.norm() + 1e-7, list(part.shape)
+        near(part, exact, allowed, 1e-7)
     captured = Capture(torch.device(device), torch.Generator(device))
     captured.warm_up(step)
     assert captured.obstacle is None, captured.obstacle

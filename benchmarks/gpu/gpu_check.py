@@ -26,6 +26,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import functools
+import itertools
 import json
 import os
 import shutil
@@ -40,18 +42,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+from gpu_journal import unfinished
+
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = sys.executable
 TAIL = 30
 """Lines of a failure that are printed."""
 SHORTEST = 5.0
 """Seconds for which a part is not begun."""
-LINE, VERDICT = 100, 10_900
-"""Characters of a line of the verdict, and of all of it."""
-MOST_WRONG = 40
-"""Lines of what is wrong."""
+LINE, WRONG, VERDICT = 100, 160, 10_900
+"""Characters of a line of the verdict, of one that says what is wrong, and of all of it."""
+MOST_WRONG = 30
+"""Lines that say what is wrong."""
 KERNELS = 10
-"""Of a profiled step that are told."""
+"""Kernels of a profiled step that are told."""
 CALLS = ("first", "second")
 SANITIZER_SAYS = (
     "Invalid ",
@@ -62,8 +66,11 @@ SANITIZER_SAYS = (
     "Error: ",
     "ERROR SUMMARY",
 )
+WORDY = ("void ", "voronerf::", "(anonymous namespace)::", "<unnamed>::", "at::native::")
+"""What is left out of the names of kernels."""
 COUNTED = {
     "ms": ("gpu__time_duration.sum", 1e-6),
+    "M instructions": ("smsp__inst_executed.sum", 1e-6),
     "SM %": ("sm__throughput.avg.pct_of_peak_sustained_elapsed", 1.0),
     "memory %": ("gpu__compute_memory_throughput.avg.pct_of_peak_sustained_elapsed", 1.0),
     "issued %": ("smsp__issue_active.avg.per_cycle_active", 100.0),
@@ -72,7 +79,10 @@ COUNTED = {
 """Metrics of ncu that are told, by their names there, and factors."""
 STALLED = "smsp__average_warps_issue_stalled_", "_per_issue_active.ratio"
 """Around the reason of a stall in the name of its metric."""
-SECTIONS = ("SpeedOfLight", "WarpStateStats", "SchedulerStats", "MemoryWorkloadAnalysis", "Occupancy", "LaunchStats")
+SECTIONS = (
+    *("SpeedOfLight", "WarpStateStats", "SchedulerStats", "MemoryWorkloadAnalysis", "ComputeWorkloadAnalysis"),
+    *("InstructionStats", "Occupancy", "LaunchStats"),
+)
 
 
 @dataclass(frozen=True)
@@ -99,7 +109,8 @@ def main(arguments: list[str]) -> int:
     given.out = given.out.resolve()  # the parts run elsewhere
     given.out.mkdir(parents=True, exist_ok=True)
     begin = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
+    device()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         scratch = Path(folder)
         known = parts(given.call, scratch, given.prebuilt.resolve(), given.cases, emulated=given.emulated)
         chosen = given.parts or list(known)
@@ -117,7 +128,7 @@ def main(arguments: list[str]) -> int:
 
 
 def pack(folder: Path, archive: Path) -> None:
-    """What the parts have said and found, but not the runs of trainings."""
+    """Keep what the parts have said and found, but not the runs of trainings."""
     with tarfile.open(archive, "w:gz") as tar:
         for path in sorted(folder.rglob("*")):
             if path.suffix in (".txt", ".json", ".csv"):
@@ -125,8 +136,9 @@ def pack(folder: Path, archive: Path) -> None:
 
 
 def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: bool) -> dict[str, Part]:
-    """The parts of a call by name; ``out`` is for what they leave."""
+    """Make the parts of a call, by name; ``out`` is for what they leave."""
     places = os.environ.get("PATH", "") + ":/usr/local/cuda/bin"
+    places += "".join(f":{path.parent}" for path in Path("/opt/nvidia/nsight-compute").glob("*/ncu"))
     sanitizer, profiler = shutil.which("compute-sanitizer", path=places), shutil.which("ncu", path=places)
     # nvcc optimises the kernels of a file in parallel, where it can.
     built = (("VORONERF_CUDA", "1"), ("NVCC_APPEND_FLAGS", "--split-compile=0"))
@@ -145,6 +157,8 @@ def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: b
     def sanitized(tool: str, until: float, names: str, **environment: str) -> Part:
         # Of torch's kernels nothing is checked: their instrumentation would take minutes.
         options = ["--tool", tool, "--kernel-name", "kns=voronerf", "--error-exitcode", "9", "--print-limit", "20"]
+        # An error ends its kernel alone, and what torch asks of the driver in vain is none.
+        options += ["--destroy-on-device-error", "kernel", "--report-api-errors", "no", "--show-backtrace", "device"]
         checked = [*program, "cases", str(out / tool), "--parts", "small", "--names", names, "--patience", "4"]
         command = None if sanitizer is None else [sanitizer, *options, *checked]
         return on_gpu(until, command, out / tool / "cases.json", **environment)
@@ -194,6 +208,12 @@ def run(name: str, part: Part, out: Path, limit: float) -> dict[str, Any]:
                 status = run_group(command, environment, log, limit - time.perf_counter() + begin)
             except OSError as error:
                 status = str(error)
+            while part.found is not None and part.found.name == "cases.json" and not isinstance(status, str):
+                number = unfinished(part.found, status)
+                if number is None:
+                    break
+                left = limit - time.perf_counter() + begin
+                status = run_group([*command, "--start", str(number)], environment, log, left)
             if status == 0 or isinstance(status, str):
                 break
         log.seek(0)
@@ -208,29 +228,36 @@ def run(name: str, part: Part, out: Path, limit: float) -> dict[str, Any]:
         "commands": part.commands,
         "found": read(part.found),
         "counted": [line.removeprefix("counted: ") for line in lines if line.startswith("counted: ")],
-        "sanitizer": [line[10:] for line in lines if line.startswith("=========") and _of_note(line)][:20],
+        "sanitizer": sanitizer_says(lines),
     }
 
 
-def _of_note(line: str) -> bool:
-    return any(each in line for each in SANITIZER_SAYS)
+def sanitizer_says(lines: list[str]) -> list[str]:
+    """Select what a sanitizer says of errors, each with the place in a kernel that follows it."""
+    own, found = [line.removeprefix("========= ") for line in lines if line.startswith("=========")], list[str]()
+    for line, after in itertools.pairwise([*own, ""]):
+        if any(each in line for each in SANITIZER_SAYS):
+            found.append(f"{line}, {after.strip()}" if after.strip().startswith("at ") else line)
+    return found[:20]
 
 
 def read(path: Path | None) -> Any:
-    """What a part has left; the reason where that cannot be read, as after an end in the middle of a line."""
+    """Read what a part has left; a text says why it cannot be read, as after an end in the middle of a line."""
     if path is None or not path.exists():
         return None
     text = path.read_text()
     if path.suffix == ".csv":
-        return counters(text)
+        return (
+            counters(text) or f"{path.name}: {([line for line in text.splitlines() if '==' in line] or ['empty'])[-1]}"
+        )
     try:
         return json.loads(text)
     except ValueError as error:
         return f"{path.name}: {error}"
 
 
-def counters(text: str) -> dict[str, Any]:
-    """The launches of ncu's raw page: a line of names, one of units, and one of values for each."""
+def counters(text: str) -> dict[str, Any] | None:
+    """Parse ncu's raw page: a line of names, one of units, and one of values for each launch. None without launches."""
     rows = [row for row in csv.reader(text.splitlines()) if len(row) > 20]  # lines of ncu's own are among them
     found = []
     for row in rows[2:]:
@@ -240,7 +267,7 @@ def counters(text: str) -> dict[str, Any]:
                 values[name] = float(value.replace(",", ""))
         kernel = dict(zip(rows[0], row, strict=False)).get("Kernel Name", "")
         found.append({"kernel": kernel, "values": values})
-    return {"launches": found}
+    return {"launches": found} if found else None
 
 
 def verdict(call: str, results: dict[str, Any]) -> str:
@@ -262,7 +289,7 @@ def verdict(call: str, results: dict[str, Any]) -> str:
     ]
     for row in cases:
         if "share" in row:
-            most = f", by count {100 * row['most']:.0f}" if row["most"] else ""
+            most = f", {100 * row['most']:.0f} at most by count" if row["most"] else ""
             share = f"{100 * row['share']:5.1f} % of {row['limit']}{most}"
             lines.append(f"{row['name']:50} {1e3 * row['seconds']:9.3f} ms {share}")
         elif row["name"] == "limits":
@@ -273,19 +300,28 @@ def verdict(call: str, results: dict[str, Any]) -> str:
         if row["part"] == "profile" and row["right"]:
             lines.append(f"step {row['name']}: {row['said']}")
             for kernel in row["kernels"][:KERNELS]:
-                lines.append(f"  {kernel['microseconds']:8.1f} us in {kernel['launches']:4.1f} x {kernel['name']}")
+                lines.append(
+                    f"  {kernel['microseconds']:8.1f} us in {kernel['launches']:4.1f} x {brief(kernel['name'])}"
+                )
     return cut(lines)
 
 
 def cut(lines: Iterable[str]) -> str:
     """Lines of their length at most, as many as there is space for."""
-    kept, size = [], 0
+    kept, size = list[str](), 0
     for line in lines:
-        size += len(line[:LINE]) + 1
+        kept.append(line[: WRONG if line.startswith(("WRONG", "memcheck", "racecheck", "synccheck")) else LINE])
+        size += len(kept[-1]) + 1
         if size > VERDICT - 40:
-            return "\n".join([*kept, "and more, in the summary"])
-        kept.append(line[:LINE])
+            return "\n".join([*kept[:-1], "and more, in the summary"])
     return "\n".join(kept)
+
+
+def brief(kernel: str) -> str:
+    """A kernel's name without what all have."""
+    for each in WORDY:
+        kernel = kernel.replace(each, "")
+    return kernel
 
 
 def _cases(found: dict[str, Any]) -> list[dict[str, Any]]:
@@ -318,7 +354,7 @@ def _wrong(found: dict[str, Any]) -> list[str]:
 
 
 def _beside(cases: list[dict[str, Any]]) -> list[str]:
-    """How rows compare with those of the same name by something else."""
+    """Compare rows with those of the same name by something else."""
     times = {row["name"]: row["seconds"] for row in cases if "share" in row}
     lines = []
     for name, seconds in times.items():
@@ -331,7 +367,7 @@ def _beside(cases: list[dict[str, Any]]) -> list[str]:
 
 
 def _counted(result: dict[str, Any]) -> list[str]:
-    """Two lines of a launch: what it is, and what was counted, with the two reasons for which warps wait longest."""
+    """Tell a launch in two lines: what it is, and its counters, with the two reasons for which warps wait longest."""
     found, (before, after), lines = result.get("found"), STALLED, []
     launches = found["launches"] if isinstance(found, dict) else []
     names = [*result.get("counted", ()), *["?"] * len(launches)]
@@ -344,7 +380,7 @@ def _counted(result: dict[str, Any]) -> list[str]:
             if key.startswith(before) and key.endswith(after) and "not_issued" not in key
         }
         told += [f"{reason} {stalls[reason]:.1f}" for reason in sorted(stalls, key=lambda key: -stalls[key])[:2]]
-        lines += [f"ncu {name}: {launch['kernel']}", f"  {', '.join(told)}"]
+        lines += [f"ncu {name}: {brief(launch['kernel'])}", f"  {', '.join(told)}"]
     return lines
 
 
@@ -366,12 +402,13 @@ def run_group(command: list[str], environment: dict[str, str], log: TextIO, limi
             process.wait(10)
 
 
+@functools.cache
 def asked_of_the_driver(what: str) -> str | None:
-    """What nvidia-smi says of the first GPU; None without one. It takes no process that imports torch."""
+    """Ask nvidia-smi, once, for it may hang beside a kernel that does; None without a GPU. No process imports torch."""
     try:
         command = ["nvidia-smi", f"--query-gpu={what}", "--format=csv,noheader"]
-        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    except (OSError, subprocess.CalledProcessError):
+        said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout
+    except (OSError, subprocess.SubprocessError):
         return None
     return said.strip().splitlines()[0] if said.strip() else None
 

@@ -1,7 +1,7 @@
 """Cases that are tried one by one, and the journal of what they have found.
 
-A CUDA error of a kernel ends all that its process could still do, and so does a kernel that does not end: the program
-then starts itself anew with the case after it.
+A CUDA error of a kernel ends all that its process could still do, and so do a kernel that does not end and a crash. The
+program then ends, and its caller starts it again with the case that :func:`unfinished` tells.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+BROKEN = 101
+"""Exit status of a process that has to be started again; others count the cases that failed."""
+
 
 class Journal:
     """What has been found so far, kept in a file after every case; a process that goes on finds it there."""
@@ -27,13 +30,15 @@ class Journal:
         self.found: dict[str, Any] = json.loads(path.read_text()) if begun and path.exists() else {}
 
     def add(self, kind: str, row: dict[str, Any]) -> None:
-        """One more row of a kind."""
+        """Append a row to those of a kind."""
         self.put(kind, [*self.found.get(kind, []), row])
 
     def put(self, kind: str, value: Any) -> None:
-        """A value by itself."""
+        """Set an entry; the file is whole whenever the process is killed."""
         self.found[kind] = value
-        self.path.write_text(json.dumps(self.found, indent=1) + "\n")
+        new = self.path.with_suffix(".new")
+        new.write_text(json.dumps(self.found, indent=1) + "\n")
+        new.replace(self.path)
 
 
 @dataclass(frozen=True)
@@ -53,86 +58,90 @@ class Case:
     seconds: float = 10.0
 
 
-@dataclass(frozen=True)
-class Again:
-    """How a program starts itself anew: its arguments, its first case and the cases failed before."""
-
-    arguments: tuple[str, ...]
-    start: int = 0
-    failed: int = 0
-
-    def go_on(self, number: int, failed: int) -> None:
-        """The cases from ``number`` on, in a process that takes the place of this one."""
-        options = ["--start", str(number), "--failed", str(failed)]
-        os.execv(sys.executable, [sys.executable, sys.argv[0], *self.arguments, *options])
-
-
 def settling(device: str) -> Callable[[], None]:
-    """What waits for all that a device has been given."""
+    """A function that waits for a device, and raises where the device or torch's generator is of no use any more."""
     import torch
 
-    return torch.cuda.synchronize if device == "cuda" else lambda: None
+    def settle() -> None:
+        torch.cuda.synchronize()
+        torch.rand(1, device=device)  # a capture that went wrong leaves the generator unusable, and nothing else
+
+    return settle if device == "cuda" else lambda: None
 
 
 def one_by_one(
-    cases: list[Case], budgets: dict[str, float], again: Again, settle: Callable[[], None], journal: Journal
+    cases: list[Case], budgets: dict[str, float], settle: Callable[[], None], journal: Journal, start: int = 0
 ) -> int:
-    """Every case for itself; after one that leaves the device unusable, or does not end, the rest in a new process.
+    """Try every case for itself; a case that leaves the device unusable, or does not end, ends the process.
 
     Args:
         cases: in their order.
         budgets: seconds of each part, in the order of the parts. What one leaves is the next ones'; of a part whose
             time is over the other cases are left out.
-        again: where to begin.
-        settle: waits for the device, and raises where that is of no use any more.
+        settle: waits for the device, and raises where it is of no use any more.
         journal: gets a row of ``cases`` for each.
+        start: the case to begin with.
 
     Returns:
-        The number of cases that failed.
+        The number of cases that failed, or ``BROKEN``.
     """
-    settle()  # makes the context, in the time of no case
-    failed = again.failed
     if "ends" not in journal.found:
         end, ends = time.time(), {}
         for part, seconds in budgets.items():
             ends[part] = end = end + seconds
         journal.put("ends", ends)
 
-    def keep(case: Case, right: bool, found: dict[str, Any]) -> None:
-        """One line and one row."""
-        said = found.setdefault("said", "")
+    def keep(number: int, right: bool, found: dict[str, Any]) -> None:
+        """Print a line and keep a row."""
+        case, said = cases[number], found.setdefault("said", "")
         print(f"{'right' if right else 'WRONG'}  {case.part}: {case.name}{f': {said}' * bool(said)}", flush=True)
-        row = {"part": case.part, "name": case.name, "right": right, **found}
+        row = {"number": number, "part": case.part, "name": case.name, "right": right, **found}
         journal.add("cases", {**row, "took": time.perf_counter() - begin})
 
-    def hangs(case: Case, number: int) -> None:
-        keep(case, False, {"said": f"hangs, stopped after {case.seconds:g} s"})
-        again.go_on(number + 1, failed + 1)
+    def hangs(number: int) -> None:
+        keep(number, False, {"said": f"hangs, stopped after {cases[number].seconds:g} s"})
+        os._exit(BROKEN)
 
-    for number in range(again.start, len(cases)):
+    for number in range(start, len(cases)):
         case, begin = cases[number], time.perf_counter()
         if time.time() > journal.found["ends"][case.part]:
             journal.add("left out", {"part": case.part, "name": case.name})
             continue
-        watch = threading.Timer(case.seconds, hangs, (case, number))
+        journal.put("at", {"number": number, "part": case.part, "name": case.name})
+        watch = threading.Timer(case.seconds, hangs, (number,))
         watch.daemon = True
         watch.start()
         try:
             found = case.run()
             settle()
-            keep(case, True, {"said": found} if isinstance(found, str) else found or {})
+            keep(number, True, {"said": found} if isinstance(found, str) else found or {})
         except Exception as error:
-            failed += 1
-            keep(case, False, {"said": f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"})
+            keep(number, False, {"said": f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"})
             traceback.print_exc(file=sys.stdout)
             sys.stdout.flush()
             try:
                 settle()
             except Exception:
                 watch.cancel()
-                again.go_on(number + 1, failed)
+                return BROKEN
         finally:
             watch.cancel()
+    journal.put("done", True)
+    failed = sum(not row["right"] for row in journal.found.get("cases", ()))
     left_out = len(journal.found.get("left out", ()))
     print(f"{len(cases) - failed - left_out} of {len(cases)} cases are right, {left_out} left out for want of time")
-    return failed
+    return min(failed, BROKEN - 1)
+
+
+def unfinished(path: Path, status: int | str) -> int | None:
+    """The case with which a program goes on that has ended before its last one; None where it has not.
+
+    A case that ended the process, such as by a crash, is noted as wrong.
+    """
+    journal = Journal(path, begun=True)
+    at = journal.found.get("at")
+    if at is None or journal.found.get("done"):
+        return None
+    if all(row["number"] != at["number"] for row in journal.found.get("cases", ())):
+        journal.add("cases", {**at, "right": False, "said": f"ended its process, status {status}"})
+    return int(at["number"]) + 1

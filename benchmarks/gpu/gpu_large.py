@@ -127,13 +127,14 @@ def evaluate(given: dict[str, Any]) -> list[Any]:
 
 
 def in_float64(given: dict[str, Any]) -> tuple[list[Any], Any]:
-    """Outputs of the last rows of every cell by the reference and the gradients that they make, and which rows."""
+    """Outputs of rows all over every cell, its last one included, by the reference; the gradients that these rows make;
+    and which rows they are."""
     import torch
 
     rows, counts, begin = [], [], 0
     for count in given["counts"]:
         counts.append(min(count, SUBSET))
-        rows.append(torch.arange(begin + count - counts[-1], begin + count))
+        rows.append(begin + (torch.arange(counts[-1]) + 1) * count // max(counts[-1], 1) - 1)
         begin += count
     chosen = torch.cat(rows).to(given["positions"].device)
     offsets = torch.tensor([0, *counts], dtype=torch.int32).cumsum(0).int().to(chosen.device)

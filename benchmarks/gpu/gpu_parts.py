@@ -5,13 +5,14 @@
                   large      networks at 2^22 samples, with gradients
                   captured   steps of the route, and of trainings, in CUDA graphs
                   rows       networks, look-ups and sorts at full size, beside the machine's limits and torch's products
-                  profile    a default step: launches, waits of the host, the kernels that take longest
                   training   short trainings, with PSNR
+                  profile    a default step: launches, waits of the host, the kernels that take longest
     counted   six launches between cudaProfilerStart and cudaProfilerStop, for ncu
     tests     tests/ops on CUDA, a process for each file
 
-What it finds is kept in OUT/PROGRAM.json after every case. ``--emulated`` runs small versions of the cases on the
-emulated device of the tests, so that a slip of theirs is not found on a GPU.
+What it finds is kept in OUT/PROGRAM.json after every case; after a case that ends the process, ``--start`` goes on
+with another one. ``--emulated`` runs small versions of the cases on the emulated device of the tests, so that a slip of
+theirs is not found on a GPU.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import faulthandler
 import fnmatch
 import functools
 import subprocess
@@ -33,21 +35,21 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), *(str(ROOT / place) for place in ("benchmarks/gpu", "benchmarks", "tests/cuda_emulation"))]
 
 from gpu_cases import CHECKED, RACING, captured_steps, captured_trainings, small_cases  # noqa: E402
-from gpu_journal import Again, Case, Journal, one_by_one, settling  # noqa: E402
+from gpu_journal import Case, Journal, one_by_one, settling  # noqa: E402
 from gpu_large import large_cases  # noqa: E402
 from gpu_timings import counted, profile, rows  # noqa: E402
 
-BUDGETS = {"small": 60.0, "large": 25.0, "captured": 35.0, "rows": 65.0, "profile": 30.0, "training": 35.0}
+BUDGETS = {"small": 60.0, "large": 25.0, "captured": 35.0, "rows": 65.0, "training": 35.0, "profile": 30.0}
 """Seconds of each part, in their order. What one leaves is the next ones'."""
 TRAININGS: dict[str, dict[str, Any]] = {"default": {}, "4,096 rays, bf16": {"rays": 4096, "precision": "bf16"}}
 FILE_SECONDS = 60.0
 """For one file of the tests."""
 PROCESSES = 12
-"""Of the tests, most of whose time goes into imports and contexts."""
+"""Tests at a time: most of theirs goes into imports and contexts."""
 CHOICE = "cuda and not reference-cuda and not compiles and not opcheck"
-"""Of the tests: kernels of ours; torch traces the same on every device."""
+"""Which tests: those of this project's kernels; torch traces the same on every device."""
 LISTS = {"@checked": CHECKED, "@racing": RACING}
-"""Names of cases by one name."""
+"""Several cases by one name."""
 STEP: dict[str, Any] = {"width": 16, "samples": (8,), "rays": 16, "cells": (), "split_at": ()}
 LITTLE: dict[str, dict[str, Any]] = {
     "large": {"n": 300},
@@ -66,9 +68,9 @@ def cases_of(parts: list[str], device: str, journal: Journal, *, emulated: bool 
 
     from voronerf.app.scenes import builtin_scene, load_scene
 
-    def seeded(run: Callable[[], None]) -> None:
+    def seeded(run: Callable[[], Any]) -> Any:
         torch.manual_seed(0)
-        run()
+        return run()
 
     if {"profile", "training"}.intersection(parts):
         scene = builtin_scene(12) if emulated else load_scene("builtin")
@@ -77,7 +79,7 @@ def cases_of(parts: list[str], device: str, journal: Journal, *, emulated: bool 
     for part in parts:
         options = small.get(part, {})
         if part == "small":
-            found += [Case(part, name, functools.partial(seeded, run)) for name, run in small_cases(device)]
+            found += [Case(part, *case) for case in small_cases(device)]
         elif part == "large":
             found += [Case(part, *case, 20.0) for case in large_cases(device, **options)]
         elif part == "captured":
@@ -91,7 +93,7 @@ def cases_of(parts: list[str], device: str, journal: Journal, *, emulated: bool 
             for name, given in TRAININGS.items():
                 run = functools.partial(train, scene, device, {**given, **options})
                 found.append(Case(part, name, run, 60.0))
-    return found
+    return [dataclasses.replace(case, run=functools.partial(seeded, case.run)) for case in found]
 
 
 def chosen(cases: list[Case], names: list[str]) -> list[Case]:
@@ -176,7 +178,7 @@ def tests(out: Path, files: list[Path] | None = None, seconds: float = FILE_SECO
             found = {"part": "tests", "name": file.name, "right": status in (0, 5), "said": said, "wrong": wrong}
             journal.add("cases", found)
     print(f"{len(files) - failed} of {len(files)} files passed")
-    return failed
+    return min(failed, 100)
 
 
 @contextlib.contextmanager
@@ -199,9 +201,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--names", nargs="+", help="some cases: names, in which * may stand, parts, @checked, @racing")
     parser.add_argument("--patience", type=float, default=1.0, help="times the seconds of a case")
     parser.add_argument("--emulated", action="store_true")
-    parser.add_argument("--start", type=int, default=0, help="the first case, where it was begun before")
-    parser.add_argument("--failed", type=int, default=0, help="cases before it that failed")
+    parser.add_argument("--start", type=int, default=0, help="the case to go on with")
     given = parser.parse_args(arguments)
+    faulthandler.enable()
     device = "cpu" if given.emulated else "cuda"
     with on_the_emulated_device() if given.emulated else contextlib.nullcontext():
         if given.program == "counted":
@@ -216,10 +218,10 @@ def main(arguments: list[str]) -> int:
         if given.names:
             cases = chosen(cases, [name for each in given.names for name in LISTS.get(each, (each,))])
         cases = [dataclasses.replace(case, seconds=given.patience * case.seconds) for case in cases]
-        again = Again(tuple(arguments), given.start, given.failed)  # of options given twice the last one counts
-        budgets = {part: BUDGETS[part] for part in given.parts}
-        return one_by_one(cases, budgets, again, settling(device), journal)
+        budgets, settle = {part: BUDGETS[part] for part in given.parts}, settling(device)
+        settle()  # makes the context, in the time of no case
+        return one_by_one(cases, budgets, settle, journal, given.start)
 
 
 if __name__ == "__main__":
-    sys.exit(min(main(sys.argv[1:]), 100))
+    sys.exit(main(sys.argv[1:]))

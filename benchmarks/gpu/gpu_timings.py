@@ -9,17 +9,20 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from gpu_journal import Case, Journal, settling
 
 SECONDS = 1.5
-"""Of a row's timings at most, but for a call that takes longer."""
+"""The time of a row, but for a call that takes longer."""
 MOST_CALLS = 8
-"""In one graph."""
+"""Calls in a graph."""
 LIMITS = ("bfloat16", "float32", "copy")
 SETS = 4
-"""Of the points of look-ups, and a quarter of those of sorts: with the results more than the caches of a GPU hold."""
+"""Inputs of look-ups that take turns, and a quarter of those of sorts: more than the caches of a GPU hold."""
+CLOCK = 1.98e9
+"""Highest clock of a Hopper GPU, where torch does not tell."""
 
 Run = Callable[[], Any]
 Work = dict[str, float]
@@ -52,12 +55,11 @@ def clock(run: Run, device: Any, seconds: float) -> dict[str, Any]:
     if calls < 1:
         return found
     graph = Capture(device, torch.Generator(device))
-    try:
-        graph.warm_up(run)
-        graph.capture(lambda: [run() for _ in range(calls)])
-        replayed, repeats = middle(lambda: graph.replay(1), calls, seconds / 2)
-    except Exception as error:
-        return {**found, "graph": graph.obstacle or f"{type(error).__name__}: {error}"[:200]}
+    graph.warm_up(run)
+    if graph.obstacle is not None:
+        return {**found, "graph": graph.obstacle}
+    graph.capture(lambda: [run() for _ in range(calls)])
+    replayed, repeats = middle(lambda: graph.replay(1), calls, seconds / 2)
     return {**found, "seconds": replayed, "repeats": repeats, "graph": f"{calls} calls"}
 
 
@@ -65,7 +67,7 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
     """The machine's limits, then the rows, the largest first: networks, look-ups and sorts, and what surrounds them."""
     import torch
     from harness import _cuda_peak
-    from ops.case import BACKWARD, FORWARD, generator
+    from ops.case import BACKWARD, FORWARD
     from ops.case import Work as Prepared
     from ops.cases_hash import hash_work, network_work
     from ops.cases_step import adam_work, loss_work
@@ -77,25 +79,37 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
     where, cases = torch.device(device), list[Case]()
 
     def limits() -> str:
-        found = {kind: _cuda_peak(kind, where) if device == "cuda" else 1e12 for kind in LIMITS}
+        """Operations and bytes a second that torch reaches, and the instructions that all warps may issue."""
+        if device != "cuda":
+            found = dict.fromkeys((*LIMITS, "issue"), 1e12)
+        else:
+            card = torch.cuda.get_device_properties(where)
+            clock_rate = 1e3 * getattr(card, "clock_rate", 0) or CLOCK
+            found = {"issue": 4 * card.multi_processor_count * clock_rate}
+            found |= {kind: _cuda_peak(kind, where) for kind in LIMITS}
         journal.put("limits", found)
         return ", ".join(f"{kind} {value / 1e12:.2f} T/s" for kind, value in found.items())
 
-    def row(name: str, prepare: Callable[[], tuple[Run, Work]], most: float | None = None) -> None:
-        """``most``: the share of a limit that the instructions or bytes of the code as it is allow, where counted."""
+    def row(name: str, prepare: Callable[[], tuple[Run, Work]], counted: Work | None = None) -> None:
+        """``counted``: instructions that warps issue, or bytes that are moved, of the code as it is."""
 
         def case() -> dict[str, Any]:
             if device == "cuda":
                 torch.cuda.empty_cache()
             run, work = prepare()
-            times = clock(run, where, seconds)
-            floors = {limit: amount / journal.found["limits"][limit] for limit, amount in work.items()}
+            times, known = clock(run, where, seconds), journal.found.get("limits", {})
+            found = {**times, "work": work, "counted": counted, "said": f"{1e3 * times['seconds']:.3f} ms"}
+            floors = {limit: amount / known[limit] for limit, amount in work.items() if limit in known}
+            if not floors:
+                return found
             limit = max(floors, key=lambda kind: floors[kind])
             share = floors[limit] / times["seconds"]
-            said = f"{1e3 * times['seconds']:.3f} ms ({1e3 * times['launched']:.3f} launched), {100 * share:.1f} %"
-            said += f" of {limit}" + (f", by count {100 * most:.0f} %" if most else "")
-            row = {"work": work, "limit": limit, "floor": floors[limit], "share": share, "most": most, "said": said}
-            return {**times, **row}
+            said = f"{found['said']} ({1e3 * times['launched']:.3f} launched), {100 * share:.1f} % of {limit}"
+            most = None
+            if counted is not None:
+                most = floors[limit] / max(floors[limit], *(amount / known[of] for of, amount in counted.items()))
+                said += f", at most {100 * most:.0f} % by count"
+            return {**found, "limit": limit, "floor": floors[limit], "share": share, "most": most, "said": said}
 
         cases.append(Case("rows", name, case, 30.0))
 
@@ -125,9 +139,9 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
         """The layers of w64d4 over cells of one size, which need neither a sort nor offsets, nor an encoding."""
         # Multiples of 16, for _grouped_mm.
         shapes = [(i + -i % 16, o + -o % 16) for o, i in NETS["w64d4"].weight_shapes(3)]
-        kind, draw = torch.bfloat16, generator(7)
-        weights = [(torch.randn(k, *shape, generator=draw) / shape[0] ** 0.5).to(where, kind) for shape in shapes]
-        first = torch.rand(k, m // k, shapes[0][0], generator=draw).to(where, kind)
+        given: dict[str, Any] = {"dtype": torch.bfloat16, "device": where}
+        weights = [torch.randn(k, *shape, **given) / shape[0] ** 0.5 for shape in shapes]
+        first = torch.rand(k, m // k, shapes[0][0], **given)
         ends = torch.arange(1, k + 1, dtype=torch.int32, device=where) * (m // k)
 
         def run() -> Any:
@@ -137,7 +151,7 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
             return x
 
         # What every layer reads and writes: nothing stays on the chip between them.
-        return run, {"bfloat16": cost(NETS["w64d4"]).forward * m, "copy": 4.0 * m * sum(map(sum, shapes)) / 2}
+        return run, {"bfloat16": cost(NETS["w64d4"]).forward * m, "copy": 2.0 * m * sum(map(sum, shapes))}
 
     def find(k: int) -> tuple[Run, Work]:
         centres = torch.rand(k, 3, device=where)
@@ -157,23 +171,27 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
         work = {made.bound: made.amount, **({} if made.moved is None else {"copy": made.moved})}
         return lambda: run(next(calls)), work
 
-    def networks(name: str, k: int, m: int, precision: str, most: float | None = None) -> None:
+    def networks(name: str, k: int, m: int, precision: str, counted: Work | None = None) -> None:
         title = f"{name} {precision} k={k} n={m}"
-        row(title, functools.partial(network, name, k, m, precision, False), most)
+        row(title, functools.partial(network, name, k, m, precision, False), counted)
         row(f"{title} + backward", functools.partial(network, name, k, m, precision, True))
 
+    def tiles(m: int) -> Work:
+        """w64d4 in 16 bits: 8 warps issue 1,680 instructions each for 64 rows of a layer, and as many for encoding;
+        the last layer is narrow."""
+        return {"issue": 8 * 1680 * 5.5 * m / 64}
+
     cases.append(Case("rows", "limits", limits, 30.0))
-    # A tile of 64 rows of a layer of 64 columns is 1,680 instructions of each of 8 warps, 16 of them products.
-    counted = 0.03
-    networks("w64d4", 16, n, "bfloat16", counted)
+    networks("w64d4", 16, n, "bfloat16", tiles(n))
     row(f"w64d4 bfloat16 k=16 n={n} by torch.bmm", functools.partial(products, 16, n, False))
-    # A centre is 11 instructions and a quarter of a load for two flops of each of four units, 5 of them at half speed.
-    row(f"nearest_centre k=512 n={n}", functools.partial(find, 512), 0.32)
-    row(f"nearest_centre k=16 n={n}", functools.partial(find, 16), 0.6)
-    # By counting cells are read twice; by radix keys and rows are written first, and a pass moves both.
-    for k, way, most in ((16, "counting", 8 / 12), (16, "radix", 8 / 24), (4096, "radix", 8 / 36)):
-        row(f"cell_sort k={k} n={n} by {way}", functools.partial(sort, k, way), most)
-    networks("w64d4", 16, fewer, "bfloat16", counted)
+    for k in (512, 16):
+        # For 2 points and 4 centres a warp issues 101 instructions in the loop, and some 60 for a point around it.
+        row(f"nearest_centre k={k} n={n}", functools.partial(find, k), {"issue": (k * 101 / 8 + 60) * n / 32})
+    # By counting, cells are read twice and rows written; by radix, keys of 2 bytes and rows are written first, keys are
+    # read for counts, and both are moved once for each 8 bits.
+    for k, way, moved in ((16, "counting", 12), (16, "radix", 24), (4096, "radix", 36)):
+        row(f"cell_sort k={k} n={n} by {way}", functools.partial(sort, k, way), {"copy": float(moved * n)})
+    networks("w64d4", 16, fewer, "bfloat16", tiles(fewer))
     row(f"w64d4 bfloat16 k=16 n={fewer} by torch.bmm", functools.partial(products, 16, fewer, False))
     row(f"w64d4 bfloat16 k=16 n={fewer} by torch._grouped_mm", functools.partial(products, 16, fewer, True))
     for precision in ("tf32", "float32"):
@@ -187,7 +205,7 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
     for direction in (FORWARD, BACKWARD):
         name = f"hash + MLP n={fewer} {direction}"
         row(name, functools.partial(prepared, functools.partial(network_work, fewer, direction)))
-    row(f"adam {8 * fewer} numbers", functools.partial(prepared, functools.partial(adam_work, 4 * fewer, 1.0)))
+    row(f"adam {32 * fewer} numbers", functools.partial(prepared, functools.partial(adam_work, 16 * fewer, 1.0)))
     rays = n >> 6
     row(f"render_loss b={rays} m={n}", functools.partial(prepared, functools.partial(loss_work, rays, n)))
     return cases
@@ -218,7 +236,7 @@ def counted(device: str, n: int = 1 << 18) -> list[tuple[str, Run, Run]]:
 
 
 def _pair(name: str, forward: Run, leaves: list[Any], backward: bool) -> list[tuple[str, Run, Run]]:
-    """The forward pass, and the backward pass behind another one."""
+    """A forward pass, and a backward pass behind another forward pass."""
     import torch
 
     held = list[Any]()
@@ -251,8 +269,8 @@ def _profile(scene: Any, device: str, seconds: float, options: dict[str, Any]) -
     from voronerf.nerf.schedule import WARMUP_STEPS
 
     cuda, settle = device == "cuda", settling(device)
-    given: dict[str, Any] = {"steps": 100_000, "cells": (16,), "evaluations": 1, **options}
-    state = build(TrainConfig(device=device, **given), scene)
+    given: dict[str, Any] = {"steps": 100_000, "cells": (16,), "split_at": (WARMUP_STEPS + 16,), "evaluations": 1}
+    state = build(TrainConfig(device=device, **{**given, **options}), scene)
 
     def more() -> tuple[float, int]:
         """Seconds of a step, and the steps."""
@@ -262,16 +280,20 @@ def _profile(scene: Any, device: str, seconds: float, options: dict[str, Any]) -
         made = state.step - before
         return (time.perf_counter() - begin) / made, made
 
-    while state.step < (WARMUP_STEPS + 32 if cuda else 1):  # until the grid learns
+    while state.step < (WARMUP_STEPS + 64 if cuda else 1):  # until the grid learns, and the cells are split
         more()
     each = more()[0]
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         torch.cuda.set_sync_debug_mode("warn")
-        watched = more()[1]
-        torch.cuda.set_sync_debug_mode("default")
-    with profiled(activities=[ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]) as seen:
-        steps = more()[1]
+        try:
+            watched = more()[1]
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    activities = [ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]
+    # The profiler watches torch's operations in its own thread, where a step would run as it is; and all of the device.
+    with profiled(activities=activities) as seen, ThreadPoolExecutor(1) as beside:
+        steps = beside.submit(more).result()[1]
     times, counts = Counter[str](), Counter[str]()
     for event in seen.events():
         if event.device_type == torch.autograd.DeviceType.CUDA:
@@ -279,10 +301,12 @@ def _profile(scene: Any, device: str, seconds: float, options: dict[str, Any]) -
             counts[event.name] += 1
     waits = sum("synchroniz" in str(warning.message) for warning in told) / watched
     launches, busy = counts.total() / steps, sum(times.values()) / 1e6 / steps / each
-    said = f"{1e3 * each:.3f} ms a step, {launches:.1f} launches, {waits:.2f} waits, busy {100 * busy:.0f} %"
+    said = f"{1e3 * each:.3f} ms, {launches:.1f} launches, {waits:.2f} waits, busy {100 * busy:.0f} %"
+    how = state.training_step.explain()
     kernels = [
         {"name": name, "microseconds": spent / steps, "launches": counts[name] / steps}
         for name, spent in times.most_common()
     ]
-    found = {"seconds": each, "samples": state.rays * state.config.samples[0], "launches": launches, "waits": waits}
-    return {**found, "busy": busy, "kernels": kernels, "said": said}
+    found = {"seconds": each, "samples": state.rays * state.config.samples[0], "cells": state.router.num_cells}
+    found |= {"launches": launches, "waits": waits, "busy": busy, "kernels": kernels}
+    return {**found, "explained": how, "said": f"{said}, {state.router.num_cells} cells, {how}"}
