@@ -143,7 +143,7 @@ def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: b
     # nvcc optimises the kernels of a file in parallel, where it can.
     built = (("VORONERF_CUDA", "1"), ("NVCC_APPEND_FLAGS", "--split-compile=0"))
     built += (("VORONERF_CUDA_ARCHITECTURES", capability() or "90"),)
-    program, small = [PYTHON, str(ROOT / "benchmarks/gpu/gpu_parts.py")], ["--emulated"] * emulated
+    program, small = [PYTHON, str(ROOT / "benchmarks/gpu/gpu_parts.py")], ["--emulated", "--patience", "10"] * emulated
 
     def tried(until: float, *rest: str) -> Part:
         return Part([[*program, "cases", str(out), *rest, *small]], until, (), out / "cases.json")
@@ -284,16 +284,15 @@ def verdict(call: str, results: dict[str, Any]) -> str:
     for name, result in results.items():
         lines += [f"{name}: {line}" for line in result.get("sanitizer", ())[:6] if "SUMMARY: 0" not in line]
     cases = _cases(found)
-    lines += [
-        f"{row['name']}: {row['said']}" for row in cases if row["part"] in ("captured", "training") and row["said"]
-    ]
+    told = [row for row in cases if row["part"] in ("captured", "training") and row["said"]]
+    lines += [f"{row['part']} {row['name']}: {row['said']}" for row in told]
     for row in cases:
         if "share" in row:
             most = f", {100 * row['most']:.0f} at most by count" if row["most"] else ""
             share = f"{100 * row['share']:5.1f} % of {row['limit']}{most}"
             lines.append(f"{row['name']:50} {1e3 * row['seconds']:9.3f} ms {share}")
-        elif row["name"] == "limits":
-            lines.append(f"limits: {row['said']}")
+        elif row["part"] == "rows":
+            lines.append(f"{row['name']}: {row['said']}")
     lines += _beside(cases)
     lines += _counted(results.get("counters", {}))
     for row in cases:

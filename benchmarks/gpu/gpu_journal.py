@@ -93,10 +93,10 @@ def one_by_one(
 
     def keep(number: int, right: bool, found: dict[str, Any]) -> None:
         """Print a line and keep a row."""
-        case, said = cases[number], found.setdefault("said", "")
+        case, said = cases[number], found.get("said", "")
         print(f"{'right' if right else 'WRONG'}  {case.part}: {case.name}{f': {said}' * bool(said)}", flush=True)
-        row = {"number": number, "part": case.part, "name": case.name, "right": right, **found}
-        journal.add("cases", {**row, "took": time.perf_counter() - begin})
+        row = {"number": number, "part": case.part, "name": case.name, "right": right, "said": said}
+        journal.add("cases", {**found, **row, "took": time.perf_counter() - begin})
 
     def hangs(number: int) -> None:
         keep(number, False, {"said": f"hangs, stopped after {cases[number].seconds:g} s"})
