@@ -288,7 +288,7 @@ def verdict(call: str, results: dict[str, Any]) -> str:
     lines += [f"{row['part']} {row['name']}: {row['said']}" for row in told]
     for row in cases:
         if "share" in row:
-            most = f", {100 * row['most']:.0f} at most by count" if row["most"] else ""
+            most = f", by count {100 * row['most']:.0f}" if row["most"] else ""
             share = f"{100 * row['share']:5.1f} % of {row['limit']}{most}"
             lines.append(f"{row['name']:50} {1e3 * row['seconds']:9.3f} ms {share}")
         elif row["part"] == "rows":
