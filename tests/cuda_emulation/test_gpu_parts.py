@@ -85,8 +85,8 @@ def test_a_row_of_a_network_is_captured(parts, tmp_path):
     """With its gradients, which the emulated device takes too long for in the whole call; not what has an obstacle."""
     timings, journal = sys.modules["gpu_timings"], parts.Journal(tmp_path / "cases.json")
     with parts.on_the_emulated_device():
-        cases = {case.name: case.run for case in timings.rows("cpu", journal, 32, 32, 5.0)}
-        found = cases["w64d4 bfloat16 k=16 n=32 + backward"]()
+        cases = {case.name: case.run for case in timings.rows("cpu", journal, 32, 32, 2.5)}
+        found = cases["w64d4 float32 k=16 n=32 + backward"]()
         waits = timings.clock(lambda: torch.ones(3).sum().item(), torch.device("cpu"), 0.01)
     assert found["graph"].endswith("calls") and "share" not in found, "the limits are not known"
     assert waits["graph"].startswith("the host waits for the device") and waits["seconds"] == waits["launched"]
@@ -153,6 +153,23 @@ def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(check, tmp_pat
         (5, "spoils", False, "RuntimeError: an illegal memory access was encountered"),
         (6, "last", True, ""),
     ]
+
+
+def test_cases_that_no_process_begins_any_more_are_not_tried_for_ever(check, tmp_path):
+    """As where the first one has left a device that no other process may use."""
+    script = f"""
+import sys
+sys.path.insert(0, {str(GPU)!r})
+import gpu_journal
+if "--start" not in sys.argv:
+    journal = gpu_journal.Journal(gpu_journal.Path({str(tmp_path / "cases.json")!r}))
+    journal.put("at", {{"number": 4, "part": "small", "name": "fifth"}})
+sys.exit(7)
+"""
+    part = check.Part([[sys.executable, "-c", script]], 20, (), tmp_path / "cases.json")
+    result = check.run("cases", part, tmp_path, 20.0)
+    assert result["outcome"] == "failed" and result["seconds"] < 10
+    assert [row["said"] for row in result["found"]["cases"]] == ["ended its process, status 7"]
 
 
 def test_cases_that_the_time_is_too_short_for_are_left_out(parts, tmp_path):

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 
 #: Small, since a CPU draws it.
-WINDOW = {"width": 160, "height": 160, "deviceScaleFactor": 1, "mobile": False}
+WINDOW = {"width": 112, "height": 112, "deviceScaleFactor": 1, "mobile": False}
 PICTURE = """
 const [camera, done] = arguments;
 voronerf.started.then(() => voronerf.picture(camera)).then(
@@ -238,6 +238,7 @@ def test_without_webgpu_the_page_says_so_and_turns_a_picture(page, runs):
     browser = page(run)
     gone = {"source": "Object.defineProperty(Navigator.prototype, 'gpu', {value: undefined})"}
     script = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", gone)
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", {**WINDOW, "height": 200})  # beneath the text
     try:
         page(run)
         until(lambda: "This browser has no WebGPU." in browser.find_element("id", "note").text)
@@ -245,3 +246,4 @@ def test_without_webgpu_the_page_says_so_and_turns_a_picture(page, runs):
         assert still_picture.is_displayed() and still_picture.get_property("naturalWidth") == 40
     finally:
         browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", script)
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", WINDOW)
