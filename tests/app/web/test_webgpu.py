@@ -238,7 +238,8 @@ def test_without_webgpu_the_page_says_so_and_turns_a_picture(page, runs):
     browser = page(run)
     gone = {"source": "Object.defineProperty(Navigator.prototype, 'gpu', {value: undefined})"}
     script = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", gone)
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", {**WINDOW, "height": 200})  # beneath the text
+    larger = {**WINDOW, "width": 160, "height": 160}  # there is space beneath the text
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", larger)
     try:
         page(run)
         until(lambda: "This browser has no WebGPU." in browser.find_element("id", "note").text)
