@@ -42,8 +42,9 @@ assert not {"torch._dynamo", "sympy"} & sys.modules.keys()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.native
-@pytest.mark.parametrize("code", [START, pytest.param(TRAINING, marks=pytest.mark.slow)], ids=["calls", "training"])
+@pytest.mark.parametrize("code", [START, TRAINING], ids=["calls", "training"])
 def test_neither_first_calls_nor_a_training_print_or_import_compilers(code: str) -> None:
     """Each compiler takes about as long as torch itself."""
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

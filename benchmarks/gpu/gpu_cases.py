@@ -1,4 +1,4 @@
-"""What ``gpu_parts.py`` tries: every operation once against float64, and steps in CUDA graphs."""
+"""Cases of ``gpu_parts.py``: every operation once against float64, and steps in CUDA graphs."""
 
 from __future__ import annotations
 

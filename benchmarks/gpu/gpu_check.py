@@ -67,7 +67,7 @@ SANITIZER_SAYS = (
     "ERROR SUMMARY",
 )
 WORDY = ("void ", "voronerf::", "(anonymous namespace)::", "<unnamed>::", "at::native::")
-"""What is left out of the names of kernels."""
+"""Parts of the names of kernels that are not told."""
 COUNTED = {
     "ms": ("gpu__time_duration.sum", 1e-6),
     "M instructions": ("smsp__inst_executed.sum", 1e-6),
@@ -78,7 +78,7 @@ COUNTED = {
 }
 """Metrics of ncu that are told, by their names there, and factors."""
 STALLED = "smsp__average_warps_issue_stalled_", "_per_issue_active.ratio"
-"""Around the reason of a stall in the name of its metric."""
+"""Name of a stall's metric, before and after its reason."""
 SECTIONS = (
     *("SpeedOfLight", "WarpStateStats", "SchedulerStats", "MemoryWorkloadAnalysis", "ComputeWorkloadAnalysis"),
     *("InstructionStats", "Occupancy", "LaunchStats"),
@@ -190,7 +190,7 @@ def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: b
 
 
 def run(name: str, part: Part, out: Path, limit: float) -> dict[str, Any]:
-    """Outcome, seconds and the last line of one part; what it said goes to a file."""
+    """Run a part, and give its outcome, seconds and last line; what it says goes to a file."""
     if isinstance(part.commands, str):
         return {"outcome": "left out", "seconds": 0.0, "last": part.commands}
     if limit < SHORTEST:
@@ -278,7 +278,7 @@ def counters(text: str) -> dict[str, Any] | None:
 
 
 def verdict(call: str, results: dict[str, Any]) -> str:
-    """What was found, the most telling first, in as many characters as come back."""
+    """Tell what was found, the most telling first, in as many characters as come back."""
     found = {name: result.get("found") for name, result in results.items()}
     lines = [f"gpu-check {call} on {device()}:"]
     for name, result in results.items():

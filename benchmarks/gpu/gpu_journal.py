@@ -22,7 +22,7 @@ BROKEN = 101
 
 
 class Journal:
-    """What has been found so far, kept in a file after every case; a process that goes on finds it there."""
+    """The findings so far, kept in a file after every case; a process that goes on finds them there."""
 
     def __init__(self, path: Path, *, begun: bool = False) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,7 @@ BUDGETS = {"small": 60.0, "large": 25.0, "captured": 35.0, "rows": 65.0, "traini
 """Seconds of each part, in their order. What one leaves is the next ones'."""
 TRAININGS: dict[str, dict[str, Any]] = {"default": {}, "4,096 rays, bf16": {"rays": 4096, "precision": "bf16"}}
 FILE_SECONDS = 60.0
-"""For one file of the tests."""
+"""Limit of one file of the tests."""
 PROCESSES = 12
 """Tests at a time: most of theirs goes into imports and contexts."""
 CHOICE = "cuda and not reference-cuda and not compiles and not opcheck"
@@ -59,7 +59,7 @@ LITTLE: dict[str, dict[str, Any]] = {
     "profile": {"seconds": 0.1, **STEP},
     "training": {"budget": 0.3, **STEP},
 }
-"""What the emulated device can make, by part."""
+"""Options of each part that the emulated device can make."""
 
 
 def cases_of(parts: list[str], device: str, journal: Journal, *, emulated: bool = False) -> list[Case]:

@@ -27,7 +27,7 @@ of warps a second."""
 
 Run = Callable[[], Any]
 Work = dict[str, float]
-"""Operations or bytes of a call, by the limit of the machine that they are held against."""
+"""Amounts of a call, operations or bytes, by the limit of the machine that they are held against."""
 
 
 def clock(run: Run, device: Any, seconds: float) -> dict[str, Any]:
@@ -90,7 +90,7 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
         return ", ".join(f"{kind} {value / 1e12:.2f} T/s" for kind, value in found.items())
 
     def row(name: str, prepare: Callable[[], tuple[Run, Work]], counted: Work | None = None) -> None:
-        """``counted``: instructions that warps issue, or bytes that are moved, of the code as it is."""
+        """Add a row; ``counted`` are the instructions that warps issue, or bytes that the code as it is moves."""
 
         def case() -> dict[str, Any]:
             if device == "cuda":
@@ -176,8 +176,8 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
         row(f"{title} + backward", functools.partial(network, name, k, m, precision, True))
 
     def tiles(m: int) -> Work:
-        """w64d4 in 16 bits: 8 warps issue 1,680 instructions each for 64 rows of a layer, and as many for encoding;
-        the last layer is narrow."""
+        """Count w64d4 in 16 bits: 8 warps issue 1,680 instructions each for 64 rows of a layer, and as many for
+        encoding; the last layer is narrow."""
         return {"issue": 8 * 1680 * 5.5 * m / 64}
 
     cases.append(Case("rows", "limits", limits, 30.0))
@@ -211,7 +211,7 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
 
 
 def counted(device: str, n: int = 1 << 18) -> list[tuple[str, Run, Run]]:
-    """What ncu counts, one launch of a kernel each: a name, what prepares it, and the launch."""
+    """Launches that ncu counts, one of a kernel each: a name, a function that prepares it, and the launch."""
     import torch
     from ops.case import BACKWARD
     from ops.networks import NETS, make_batch

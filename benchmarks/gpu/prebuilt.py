@@ -112,7 +112,7 @@ def module_name() -> str:
 
 
 def digest() -> str:
-    """Of everything that the objects are made from."""
+    """Checksum of everything that the objects are made from."""
     paths = [*sorted(path for path in (ROOT / "csrc").rglob("*") if path.is_file()), ROOT / "setup.py"]
     found = 0
     for path in paths:

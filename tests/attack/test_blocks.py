@@ -15,6 +15,7 @@ def test_constants_of_kernels_are_found():
     assert {127, 128, 129, 385, 4097, 16383} <= set(blocks.sizes(20_000)) and max(blocks.sizes(20_000)) <= 20_000
 
 
+@pytest.mark.slow
 @pytest.mark.native
 @pytest.mark.parametrize("op", COMPARED)
 def test_over_the_blocks_of_kernels(op):

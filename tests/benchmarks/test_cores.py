@@ -5,6 +5,7 @@ import pytest
 from helpers import read_json
 
 
+@pytest.mark.slow
 def test_steps_and_regions_are_measured(tmp_path, capsys):
     path = tmp_path / "cores.json"
     cores.main(["--quick", "--json", str(path)])

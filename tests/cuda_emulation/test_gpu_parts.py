@@ -156,7 +156,7 @@ def test_a_fault_and_a_kernel_that_hangs_end_their_own_case_alone(check, tmp_pat
 
 
 def test_cases_that_no_process_begins_any_more_are_not_tried_for_ever(check, tmp_path):
-    """As where the first one has left a device that no other process may use."""
+    """Such a case may leave a device that no other process can use."""
     script = f"""
 import sys
 sys.path.insert(0, {str(GPU)!r})
@@ -173,7 +173,7 @@ sys.exit(7)
 
 
 def test_cases_that_the_time_is_too_short_for_are_left_out(parts, tmp_path):
-    """What the first part leaves of its time is the second one's; the third has none."""
+    """The second part has the time that the first one leaves; the third has none."""
     journal, slow = parts.Journal(tmp_path / "cases.json"), lambda: time.sleep(0.3)
     cases = [parts.Case(part, str(number), slow) for part, number in (("a", 1), ("b", 2), ("b", 3), ("c", 4))]
     assert parts.one_by_one(cases, {"a": 0.45, "b": 0.0, "c": 0.0}, lambda: None, journal) == 0
@@ -181,6 +181,7 @@ def test_cases_that_the_time_is_too_short_for_are_left_out(parts, tmp_path):
     assert [row["name"] for row in journal.found["left out"]] == ["3", "4"]
 
 
+@pytest.mark.slow
 def test_a_file_of_tests_that_hangs_fails_alone(parts, tmp_path, capsys):
     (tmp_path / "conftest.py").write_text("def pytest_addoption(parser):\n    parser.addoption('--require')\n")
     bodies = {
@@ -206,6 +207,7 @@ def test_a_file_of_tests_that_hangs_fails_alone(parts, tmp_path, capsys):
     assert any(line.endswith("assert (1 + 1) == 3") for line in kept["test_planted_wrong.py"]["wrong"])
 
 
+@pytest.mark.slow
 def test_a_part_that_hangs_is_ended_with_all_that_it_started(check, monkeypatch, tmp_path):
     monkeypatch.setattr(check, "SHORTEST", 0.0)
     child = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
@@ -314,7 +316,7 @@ def test_the_verdict_is_short_and_says_the_most_telling_first(check):
 
 
 def test_launches_that_ncu_counted(check, tmp_path):
-    """Of its raw page, among lines of its own."""
+    """They are rows of its raw page, among lines of its own."""
     names = ["ID", "Kernel Name", "gpu__time_duration.sum", *(f"m{i}" for i in range(20))]
     lines = [names, ["", "", "ns", *[""] * 20], ["0", "voronerf::k(int, int)", "1,234", *["7"] * 20]]
     text = "==PROF== Connected\n" + "\n".join(",".join(f'"{each}"' for each in line) for line in lines)

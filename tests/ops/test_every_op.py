@@ -106,6 +106,7 @@ def assert_close(found, expected):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @first_kinds
 def test_compiles_for_any_size(device, backend, name):
     if backend == "reference" and not CASES[name.partition(", ")[0]].compiles:

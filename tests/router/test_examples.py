@@ -53,6 +53,7 @@ def test_three_lines_are_changed() -> None:
     assert sum(line.endswith("# changed") for line in lines) == 3
 
 
+@pytest.mark.slow
 def test_conditions_on_faces_join_the_solutions_of_cells(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

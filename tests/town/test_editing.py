@@ -104,6 +104,7 @@ def test_runs_of_different_fields_are_joined(opened, runs, tmp_path) -> None:
     assert [contents(run) for run in runs] == before
 
 
+@pytest.mark.slow
 def test_a_joined_run_is_the_same_when_opened_again(opened, tmp_path, scene) -> None:
     frames = [Similarity(), Similarity.of((0.5, 0, 0), (0, 0, 45), 0.8)]
     first = joined_run(opened, tmp_path / "joined", frames=frames)
@@ -113,6 +114,7 @@ def test_a_joined_run_is_the_same_when_opened_again(opened, tmp_path, scene) -> 
     assert again.config.samples[0] > 16
 
 
+@pytest.mark.slow
 def test_a_joined_run_is_joined_and_cut_again(opened, tmp_path) -> None:
     frames = [Similarity(), Similarity.of((3, 0, 0))]
     pair = joined_run(opened, tmp_path / "pair", frames=frames)
@@ -131,6 +133,7 @@ def test_a_joined_run_is_joined_and_cut_again(opened, tmp_path) -> None:
     assert torch.allclose(back.router(*asked)[1], pair.router(*asked)[1], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_grid_has_all_that_the_grids_of_the_runs_have(opened, tmp_path) -> None:
     frames = [Similarity(), Similarity.of((0.7, 0.2, 0.1), (20, 30, 40), 0.6)]
     joined = joined_run(opened, tmp_path / "joined", frames=frames)
@@ -160,6 +163,7 @@ def test_a_region_is_cut_exactly(opened, tmp_path) -> None:
     assert size["kept"] <= size["rest"] < sum(map(len, contents(run.path).values()))
 
 
+@pytest.mark.slow
 def test_cells_are_cut(opened, tmp_path) -> None:
     run = opened[1]
     kept = cut_run(run, [1, 2], tmp_path / "kept")
@@ -179,6 +183,7 @@ def test_cells_are_cut(opened, tmp_path) -> None:
     assert not (tmp_path / "no").exists()
 
 
+@pytest.mark.slow
 def test_an_object_is_placed_on_top(opened, tmp_path) -> None:
     thing = cut_run(opened[0], Solid(ball=(0, 0, 0, 0.5)), tmp_path / "thing")
     both = placed_run(opened[1], thing, (0.1, 0.2, 0.5), tmp_path / "both", scale=0.5)
@@ -280,6 +285,7 @@ def test_what_cannot_be_joined(runs, tmp_path) -> None:
     assert not (tmp_path / "no").exists()
 
 
+@pytest.mark.slow
 def test_pictures_are_where_the_joined_run_has_their_cameras(opened, scene, tmp_path) -> None:
     frames = [Similarity.of((3, 0, 0), (0, 0, 90), 0.5), Similarity.of((0, 0, 1), (40, 0, 0))]
     joined = joined_run(opened, tmp_path / "joined", frames=frames)
@@ -339,6 +345,7 @@ def placed(cameras, origins):
     return replace(cameras, poses=poses)
 
 
+@pytest.mark.slow
 def test_an_unbounded_run_is_cut_and_gets_an_object(tmp_path, scene) -> None:
     open_space = replace(scene, box=None, kind="unbounded", near=0.05, far=20.0)
     small = {"steps": 40, "width": 8, "rays": 128, "samples": (16,), "evaluations": 1, "field_options": SMALL}

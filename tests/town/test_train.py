@@ -111,6 +111,7 @@ def test_a_run_that_was_stopped_and_continued_is_the_same(whole, resumed):
     assert last.with_name("last-1.safetensors").is_file() and same(whole, resumed)
 
 
+@pytest.mark.slow
 def test_a_run_continues_on_another_number_of_ranks_that_need_not_name_its_territories(tmp_path, whole):
     run = tmp_path / "run"
     assert on_ranks(is_asked_to_stop, command(run), 12, folder=tmp_path)[0] == [130, 130]
@@ -119,6 +120,7 @@ def test_a_run_continues_on_another_number_of_ranks_that_need_not_name_its_terri
     assert same(whole, run)
 
 
+@pytest.mark.slow
 def test_a_rank_that_is_killed(tmp_path, whole):
     """The other says so; started again as by torchrun, the run ends bit for bit as one that nothing happened to."""
     args = command(tmp_path / "run", "--checkpoint-every", "1e-6")
@@ -129,6 +131,7 @@ def test_a_rank_that_is_killed(tmp_path, whole):
     assert same(whole, tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_a_rank_that_is_killed_before_the_others_meet_it(tmp_path):
     codes, texts = on_ranks(dies_at_the_start, command(tmp_path / "run"), folder=tmp_path, size=3)
     assert codes == [1, -signal.SIGKILL, 1] and len(complaints(texts)) == 1
@@ -215,6 +218,7 @@ def build_some(out, steps, count=3, **more):
     return train.build_town(config, scene, count, group.Group(torch.device("cpu")))
 
 
+@pytest.mark.slow
 def test_parts_of_steps_are_replayed(tmp_path, monkeypatch):
     """With the same bits as steps that run as they are, beyond a split and looks at empty space."""
     found = []

@@ -75,6 +75,7 @@ def test_pictures_and_videos(run, tmp_path, options):
     assert next(frames)["size"] == (16, 16) and len(list(frames)) == 3
 
 
+@pytest.mark.slow
 def test_videos_along_a_path(run, tmp_path, fails):
     succeeds("render", run, "--frames 2 --size 30x20")
     assert next(imageio_ffmpeg.read_frames(str(run / "video.mp4")))["size"] == (30, 20)
@@ -206,6 +207,7 @@ def test_folders_with_brackets_and_spaces_are_told_as_they_are(run, tmp_path, ca
     assert f"wrote {copy / 'eval.json'}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_demo_shows_a_run_and_writes_over_none(tmp_path, capsys, monkeypatch, fails):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("voronerf.app.cli.demo.SIZE", 16)
@@ -349,6 +351,7 @@ def test_image_names_that_are_too_long_for_panels(tmp_path, monkeypatch, fails):
     assert (tmp_path / "a" / "images" / f"{'x' * 251}.png").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 def test_signals_leave_a_usable_checkpoint(tmp_path, monkeypatch, capsys):
     """SIGTERM in a process of its own, the others in this one."""

@@ -129,6 +129,7 @@ OVERSIZED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="units of ru_maxrss")
 def test_shapes_are_compared_before_memory_is_taken(trained, tmp_path):
     for name, (change, _) in OVERSIZED.items():

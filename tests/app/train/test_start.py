@@ -15,6 +15,7 @@ from voronerf.nerf import Batch, Rays, RenderOutput
 from voronerf.nerf.volume import Samples
 
 
+@pytest.mark.slow
 @pytest.mark.native
 def test_steps_of_many_rays_do_not_empty_the_grid_before_the_field_is_dense():
     """A seed whose training stayed without a sample, at 9 dB."""

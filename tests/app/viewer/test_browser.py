@@ -12,6 +12,7 @@ from PIL import Image
 
 from voronerf.app.viewer.pictures import cell_at
 
+pytestmark = pytest.mark.slow
 pytest.importorskip("viser", reason="viser is not installed")
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 

@@ -116,6 +116,7 @@ def test_a_narrow_canvas_opens_at_all_of_the_first_view(viewer, scene, tab) -> N
         again.close()
 
 
+@pytest.mark.slow
 def test_the_line_about_the_picture(viewer, scene, tab) -> None:
     def said():
         return " ".join(part["_markdown"] or "" for part in tab.gui.values() if "_markdown" in part)
@@ -130,6 +131,7 @@ def test_the_line_about_the_picture(viewer, scene, tab) -> None:
     assert min(len(picture) for picture in tab.pictures) >= 96
 
 
+@pytest.mark.slow
 def test_cells_are_described_hidden_and_kept_alone(run, scene, tab) -> None:
     tab.rest()
     tab.set("Show", "cells")
@@ -222,6 +224,7 @@ def test_centres_and_cameras_are_drawn_into_the_scene(run, scene, tab) -> None:
     assert not any(name.startswith("/cameras/") for name in tab.nodes)
 
 
+@pytest.mark.slow
 def test_keyframes_become_a_path_that_render_takes(run, scene, tab) -> None:
     tab.rest()
     for index in (0, 1):
@@ -317,6 +320,7 @@ def test_a_canvas_without_pixels_is_passed_over(scene, tab) -> None:
     tab.until(lambda: tab.viewer.tasks.empty())
 
 
+@pytest.mark.slow
 def test_a_training_is_the_same_with_a_viewer(tmp_path, scene, monkeypatch) -> None:
     monkeypatch.setattr("voronerf.app.viewer.client.SHARP", 128)
     config = TrainConfig(steps=40, cells=(3,), split_at=(20,), rays=128, samples=(16,), evaluations=2)
@@ -454,6 +458,7 @@ ODD = {
 }
 
 
+@pytest.mark.slow
 def test_a_client_harms_itself_at_most(viewer, scene, caplog, capfd) -> None:
     other = Tab(viewer, scene.test.cameras)
     other.rest()
