@@ -329,7 +329,7 @@ def test_launches_that_ncu_counted(check, tmp_path):
 
 @pytest.mark.native
 def test_gradients_at_full_size_that_are_wrong_are_found(parts, monkeypatch):
-    """As are rows of a task anywhere in a cell."""
+    """And so are rows of a task anywhere in a cell."""
     large = sys.modules["gpu_large"]
     monkeypatch.setattr(large, "SUBSET", 16)
     with emulated():
