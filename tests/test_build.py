@@ -270,12 +270,11 @@ def test_cuda_check_notes_the_architectures_it_was_asked_for(check, monkeypatch,
 
 @pytest.fixture
 def installed(tmp_path):
-    """Runs programs of a new environment with the wheel of `make wheel`, or of VORONERF_WHEEL, and its requirements.
+    """Runs programs of a new environment with the wheel of `make wheel` and its requirements.
 
     Nothing is fetched or compiled: the environment has links to what this one has of them.
     """
-    made = os.environ.get("VORONERF_WHEEL")
-    wheels = [Path(made)] if made else sorted((ROOT / "dist").glob("voronerf-*.whl"), key=os.path.getmtime)
+    wheels = sorted((ROOT / "dist").glob("voronerf-*.whl"), key=os.path.getmtime)
     if not wheels:
         pytest.skip("there is no wheel in dist: make wheel")
     venv.create(tmp_path / "venv", with_pip=True, symlinks=True)

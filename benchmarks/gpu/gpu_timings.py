@@ -16,8 +16,8 @@ from gpu_journal import Case, Journal, settling
 
 SECONDS = 1.5
 """The time of a row, but for a call that takes longer."""
-MOST_CALLS = 8
-"""Calls in a graph."""
+MOST_CALLS, MOST_REPEATS = 8, 30
+"""Calls in a graph, and timings of a row."""
 LIMITS = ("bfloat16", "float32", "copy")
 SETS = 4
 """Inputs of look-ups that take turns, and a quarter of those of sorts: more than the caches of a GPU hold."""
@@ -45,7 +45,7 @@ def clock(run: Run, device: Any, seconds: float) -> dict[str, Any]:
 
     def middle(work: Run, calls: int, budget: float) -> tuple[float, int]:
         times = [stopwatch(lambda _: work(), 0, 1)]
-        for _ in range(min(30, max(0, int(budget / max(times[0], 1e-6)) - 1))):
+        for _ in range(min(MOST_REPEATS, max(0, int(budget / max(times[0], 1e-6)) - 1))):
             times.append(stopwatch(lambda _: work(), 0, 1))
         return statistics.median(times) / calls, len(times)
 
