@@ -109,7 +109,7 @@ def main(arguments: list[str]) -> int:
     given.out = given.out.resolve()  # the parts run elsewhere
     given.out.mkdir(parents=True, exist_ok=True)
     begin = time.perf_counter()
-    device()
+    device()  # later the driver may not answer, beside a kernel that hangs
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         scratch = Path(folder)
         known = parts(given.call, scratch, given.prebuilt.resolve(), given.cases, emulated=given.emulated)
@@ -254,9 +254,8 @@ def read(path: Path | None) -> Any:
         return None
     text = path.read_text()
     if path.suffix == ".csv":
-        return (
-            counters(text) or f"{path.name}: {([line for line in text.splitlines() if '==' in line] or ['empty'])[-1]}"
-        )
+        said = [line for line in text.splitlines() if "==" in line]
+        return counters(text) or f"{path.name}: {said[-1] if said else 'empty'}"
     try:
         return json.loads(text)
     except ValueError as error:
@@ -413,7 +412,7 @@ def run_group(command: list[str], environment: dict[str, str], log: TextIO, limi
 
 @functools.cache
 def asked_of_the_driver(what: str) -> str | None:
-    """Ask nvidia-smi, once, for it may hang beside a kernel that does; None without a GPU. No process imports torch."""
+    """Ask nvidia-smi of the first GPU, once; None without one. torch would take seconds to import."""
     try:
         command = ["nvidia-smi", f"--query-gpu={what}", "--format=csv,noheader"]
         said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout
