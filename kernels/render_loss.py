@@ -70,7 +70,7 @@ def softplus(x: wp.float32) -> wp.float32:
 class Inputs:
     """Outputs of networks for the samples of rays, and what the rays are compared with.
 
-    ``activated``: the outputs are colour and density as they are.
+    ``activated``: the outputs are colour and density as they are. ``seen``: the number of rays with a colour to learn.
     """
 
     raw: wp.array2d(dtype=wp.float32)
@@ -82,6 +82,7 @@ class Inputs:
     activated: wp.bool
     hidden: wp.float32
     robust: wp.float32
+    seen: wp.int32
 
 
 @wp.struct
@@ -135,6 +136,12 @@ def _render_loss_kernel(given: Inputs, found: Found) -> None:
     slopes = off * share
     for k in range(3):
         found.colour[ray, k] = seen[k]
+    if ray >= given.seen:
+        found.error[ray] = 0.0
+        for i in range(begin, end):
+            for k in range(4):
+                found.gradient[i, k] = 0.0
+        return
     found.error[ray] = wp.dot(off, off)
     behind = left * wp.dot(slopes, shown)
     for reverse in range(end - begin):
@@ -182,7 +189,7 @@ def _render_loss(given: Any, found: Any) -> None:
         of_strays.zero_()
     behind = target.new_empty(0, 3) if given.background is None else given.background.expand_as(target)
     compared = {"target": target, "background": behind, "hidden": given.hidden, "robust": given.robust}
-    rule = {"scale": given.density_scale, "activated": given.activated}
+    rule = {"scale": given.density_scale, "activated": given.activated, "seen": r - 3 * given.triples}
     inputs = filled(Inputs(), raw=raw, deltas=given.deltas, offsets=given.ray_offsets, **compared, **rule)
     outputs = {name: getattr(found, name) for name in ("colour", "weights", "error", "gradient")}
     launch(_render_loss_kernel, r, [inputs, filled(Found(), **outputs)], raw)

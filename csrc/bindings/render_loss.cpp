@@ -5,7 +5,7 @@
 namespace voronerf {
 
 VN_STRUCT(RenderLossInputs, raw, deltas, offsets, target, background, background_per_ray, density_scale, activated,
-          hidden, robust, r, m);
+          hidden, robust, triples, r, m);
 VN_STRUCT(RenderLossOutputs, loss, colour, weights, density, error, gradient);
 
 VN_BINDINGS(module) {

@@ -4,8 +4,8 @@
 
 namespace voronerf {
 
-VN_STRUCT(SmoothDepth, density, depths, deltas, weights, offsets, far, factor, robust, hidden, edge, density_scale,
-          activated, triples, r, m);
+VN_STRUCT(SmoothDepth, density, depths, deltas, weights, offsets, far, factor, hidden, edge, density_scale, activated,
+          triples, r, m);
 
 VN_BINDINGS(module) { module.cpu("smooth_depth_gradient", VN_CPU(smooth_depth_gradient_cpu)); }
 

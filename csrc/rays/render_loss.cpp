@@ -44,7 +44,11 @@ void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, I
   check_ray_offsets("render_loss", in.offsets, in.r, in.m);
   strays_of(isa, in, out, 0, in.offsets[0]);
   strays_of(isa, in, out, in.offsets[in.r], in.m);
-  each_block(in.r, threads, [&](int64_t begin, int64_t end) { rays_of(isa, in, out, begin, end); });
+  each_block(in.r, threads, [&](int64_t begin, int64_t end) {
+    const int64_t middle = std::clamp(in.r - 3 * in.triples, begin, end);
+    rays_of(isa, in, out, begin, middle);
+    rays_of(isa, in, out, middle, end);
+  });
   double sum = 0.0;
   for (int64_t i = 0; i < in.r; ++i) sum += static_cast<double>(ray_loss(out.error[i], in.robust));
   *out.loss = static_cast<float>(sum / (3.0 * static_cast<double>(in.r)));

@@ -24,6 +24,10 @@ __device__ float4 load_row(const float* raw, int64_t i, bool aligned) {
   return aligned ? *reinterpret_cast<const float4*>(row) : make_float4(row[0], row[1], row[2], row[3]);
 }
 
+__device__ void store_row(float* gradient, int64_t i, float4 row) {
+  *reinterpret_cast<float4*>(gradient + 4 * i) = row;
+}
+
 // A sample after its activations, if it needs any; of no extent and no colour where a lane has none.
 struct Sample {
   float rgb[3] = {};
@@ -82,7 +86,12 @@ __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs 
     slopes[k] = colour - in.target[3 * ray + k];
     error += slopes[k] * slopes[k];
   }
-  if (lane == 0) out.error[ray] = error;
+  const bool has_target = ray < in.r - 3 * in.triples;
+  if (lane == 0) out.error[ray] = has_target ? error : 0.0f;
+  if (!has_target) {  // a whole warp
+    for (int64_t i = range.begin + lane; i < range.end; i += 32) store_row(out.gradient, i, {});
+    return;
+  }
   const float scale = share * ray_loss_slope(error, in.robust);
   Carry behind;
   for (int k = 0; k < 3; ++k) {
@@ -108,8 +117,8 @@ __global__ void __launch_bounds__(kThreads) render_loss_kernel(RenderLossInputs 
     const float of_optical = own * (arriving * expf(-sample.optical)) - taken;
     if (!active) continue;
     float4 row = make_float4(of_raw[0], of_raw[1], of_raw[2], of_optical * sample.delta * sample.slope);
-    if (arriving <= in.hidden) row = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-    *reinterpret_cast<float4*>(out.gradient + 4 * i) = row;
+    if (arriving <= in.hidden) row = {};
+    store_row(out.gradient, i, row);
   }
 }
 

@@ -17,9 +17,10 @@ struct RenderLossInputs {
   const float* background;  // [r,3], or [3], or null
   bool background_per_ray;
   float density_scale;
-  bool activated;  // colour and density as they are, without scale
-  float hidden;    // share of the light; samples that no more than it reaches have no gradient
-  float robust;    // scale of the errors that count less than squared, see render_loss_math.h; 0 for none
+  bool activated;    // colour and density as they are, without scale
+  float hidden;      // share of the light; samples that no more than it reaches have no gradient
+  float robust;      // scale of the errors that count less than squared, see render_loss_math.h; 0 for none
+  RowCount triples;  // the last 3 * triples rays have no colour to learn: neither loss, error nor gradient
   RowCount r, m;
 };
 
@@ -39,9 +40,9 @@ void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, I
 void render_loss_cuda(const RenderLossInputs& in, const RenderLossOutputs& out, void* stream);
 
 // The same in two halves, for runs, which are pieces of rays: offsets are theirs, r counts them, and there is neither
-// target nor background. The first gives the partial sums [r,6]: colour as if nothing were in front, optical depth,
-// depth of the first sample, ray. What is known of whole rays answers each sum with [r,6]: the gradient of the loss to
-// the ray's colour, what the light behind the run adds to it, the optical depth in front, the error of the ray.
+// target, background nor triples. The first gives the partial sums [r,6]: colour as if nothing were in front, optical
+// depth, depth of the first sample, ray. What is known of whole rays answers each sum with [r,6]: the gradient of the
+// loss to the ray's colour, what the light behind the run adds to it, the optical depth in front, the error of the ray.
 // `importance` is that error times the weights.
 void run_sums_cpu(const RenderLossInputs& in, const float* depths, const int32_t* ray_index, float* density,
                   float* sums, Isa isa, int threads);

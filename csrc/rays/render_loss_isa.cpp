@@ -5,7 +5,7 @@
 // rays go by together, forwards in chunks that stay in the first-level cache, until the colours and so the gradients to
 // them are known, and backwards with the sum of what is behind. Only sums along a ray are taken one by one. Rays of one
 // chunk are activated once. The samples of a longer ray are activated again on the way back; the optical depth in front
-// of them waits where the gradient of the density is to be.
+// of them waits where the gradient of the density is to be. Rays without a colour to learn go by forwards alone.
 #include "rays/render_loss_isa.h"
 
 #include "rays/render_loss_math.h"
@@ -40,6 +40,7 @@ VN_INLINE void forward(const RenderLossInputs& in, const RenderLossOutputs& out,
     sums.front[ray] = front;
   });
   weigh(count, chunk);
+  if (out.weights != nullptr) put(out.weights + first, chunk.weights, count);
   for (int64_t i = 0; i < count; i += kLanes) {
     for (int k = 0; k < 3; ++k) store(chunk.shade[k] + i, load(chunk.weights + i) * load(chunk.rgb[k] + i));
   }
@@ -50,6 +51,9 @@ VN_INLINE void forward(const RenderLossInputs& in, const RenderLossOutputs& out,
   });
   for (int64_t i = 0; !together && i < count; ++i) out.gradient[4 * (first + i) + 3] = chunk.front[i];
 }
+
+// Whether a ray has a colour to learn.
+VN_INLINE bool has_target(const RenderLossInputs& in, int64_t ray) { return ray < in.r - 3 * in.triples; }
 
 // The colours of rays, their errors, and the gradients to them.
 VN_INLINE void compare(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t from, int64_t to, Sums& sums) {
@@ -75,7 +79,7 @@ VN_INLINE void compare(const RenderLossInputs& in, const RenderLossOutputs& out,
       sums.slopes[k][ray - from] = slope;
       behind += static_cast<double>(slope) * (background == nullptr ? 0.0f : background[k]) * left;
     }
-    out.error[ray] = error;
+    out.error[ray] = has_target(in, ray) ? error : 0.0f;
     sums.behind[ray - from] = behind;
   }
 }
@@ -136,7 +140,6 @@ VN_INLINE void backward(const RenderLossInputs& in, const RenderLossOutputs& out
     }
     sums.behind[ray] = behind;
   });
-  put(out.weights + first, chunk.weights, count);
   for (int64_t i = 0; i < count; i += kLanes) {
     store(chunk.own + i, load(chunk.own + i) * load(chunk.deltas + i) * load(chunk.slope + i));
   }
@@ -170,6 +173,10 @@ VN_INLINE void render_rays(const RenderLossInputs& in, const RenderLossOutputs& 
     hear(answers, from, to, sums);
   } else {
     compare(in, out, from, to, sums);
+  }
+  if (!has_target(in, from)) {
+    for (int64_t i = 4 * begin; i < 4 * end; ++i) out.gradient[i] = 0.0f;
+    return;
   }
   for (int64_t last = end; last > begin;) {
     const int64_t count = (last - begin - 1) % kChunk + 1;

@@ -8,6 +8,7 @@ namespace voronerf {
 
 constexpr int64_t kRenderLossRays = 64;  // of a call, at most
 
+// All rays [begin, end) have a colour to learn, or none of them has.
 VN_DECLARE_FOR_ISA(void render_loss_rays(const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin,
                                          int64_t end))
 VN_DECLARE_FOR_ISA(void run_sums_block(const RenderLossInputs& in, const float* depths, const int32_t* ray_index,

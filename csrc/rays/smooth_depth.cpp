@@ -26,16 +26,15 @@ float disparity_of(const SmoothDepth& in, int64_t ray) {
   return static_cast<float>(sum);
 }
 
-// The gradient of a ray's samples from that to its disparity; what is behind a sample adds up from the end.
+// Adds the gradient of a ray's samples from that to its disparity; what is behind a sample adds up from the end.
 void learn_ray(const SmoothDepth& in, int64_t ray, float to_disparity, float* gradient) {
   double through = light_left(in, ray), behind = through / static_cast<double>(in.far[ray]);
   for (int64_t i = in.offsets[ray + 1]; i-- > in.offsets[ray];) {
     const double own = 1.0 / static_cast<double>(in.depths[i]), weight = static_cast<double>(in.weights[i]);
     const float to_density = to_disparity * in.deltas[i] * static_cast<float>(through * own - behind);
-    for (int k = 0; k < 3; ++k) gradient[4 * i + k] = 0.0f;
-    gradient[4 * i + 3] = through + weight <= static_cast<double>(in.hidden)
-                              ? 0.0f
-                              : to_density * density_slope(in.density[i], in.density_scale, in.activated);
+    if (!(through + weight <= static_cast<double>(in.hidden))) {
+      gradient[4 * i + 3] += to_density * density_slope(in.density[i], in.density_scale, in.activated);
+    }
     through += weight;
     behind += weight * own;
   }
@@ -43,8 +42,7 @@ void learn_ray(const SmoothDepth& in, int64_t ray, float to_disparity, float* gr
 
 }  // namespace
 
-void smooth_depth_gradient_cpu(const SmoothDepth& in, float* loss, float* error, float* gradient, float* of_rays,
-                               int threads) {
+void smooth_depth_gradient_cpu(const SmoothDepth& in, float* loss, float* gradient, float* of_rays, int threads) {
   constexpr int64_t kTriples = 24;  // of a task
   check_ray_offsets("smooth_depth_gradient", in.offsets, in.r, in.m);
   const int64_t triples = in.triples, first = in.r - 3 * triples;
@@ -60,13 +58,9 @@ void smooth_depth_gradient_cpu(const SmoothDepth& in, float* loss, float* error,
     learn_ray(in, other, slope / beside, gradient);
     of_rays[triple] = ray_loss(bent * bent, in.edge);
   });
-  double sum = 0.0, colours = 0.0;
+  double sum = 0.0;
   for (int64_t triple = 0; triple < triples; ++triple) sum += static_cast<double>(of_rays[triple]);
-  for (int64_t ray = first; ray < in.r; ++ray) {
-    colours += static_cast<double>(ray_loss(error[ray], in.robust));
-    error[ray] = 0.0f;
-  }
-  *loss += static_cast<float>(share * sum - colours / (3.0 * static_cast<double>(in.r)));
+  *loss += static_cast<float>(share * sum);
 }
 
 }  // namespace voronerf

@@ -13,16 +13,15 @@ struct SmoothDepth {
   const float *density, *depths, *deltas, *weights;  // [m]
   const int32_t* offsets;                            // [r+1]
   const float* far;                                  // [r]
-  float factor, robust, hidden;                      // the last: samples that no more light reaches have no gradient
-  float edge;                                        // scale of the logarithms, as robust is that of colours
+  float factor, hidden;                              // the last: samples that no more light reaches have no gradient
+  float edge;                                        // scale of the logarithms, as `robust` of colours
   float density_scale;
   bool activated;  // the gradient is to the density itself, else to what comes before its softplus
   RowCount triples, r, m;
 };
 
-// Changes loss: [1], error: [r] and gradient: [m,4]. of_rays: [r], working memory. Throws std::invalid_argument for
-// offsets that fall or exceed m, and changes nothing then.
-void smooth_depth_gradient_cpu(const SmoothDepth& in, float* loss, float* error, float* gradient, float* of_rays,
-                               int threads);
+// Adds to loss: [1] and to the last column of gradient: [m,4]. of_rays: [r], working memory. Throws
+// std::invalid_argument for offsets that fall or exceed m, and adds nothing then.
+void smooth_depth_gradient_cpu(const SmoothDepth& in, float* loss, float* gradient, float* of_rays, int threads);
 
 }  // namespace voronerf

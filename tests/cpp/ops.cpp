@@ -249,9 +249,10 @@ void loss(Isa isa) {
   Array<float> deltas = uniform<float>(m);
   for (float& delta : deltas) delta = std::fabs(delta);
   const float robust = below(2) == 0 ? 0.0f : 0.05f;
+  const int64_t triples = below(2) * below(1 + r / 3);
   const voronerf::RenderLossInputs in{raw.data(), deltas.data(), offsets.data(), target.data(), or_null(background),
                                       per_ray,    10.0f,         activated,      1e-4f,         robust,
-                                      r,          m};
+                                      triples,    r,             m};
   const int64_t sizes[] = {1, 3 * r, m, m, r, 4 * m};
   Array<float> results[2][6];
   for (int i = 0; i < 2; ++i) {

@@ -159,6 +159,37 @@ def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend):
     assert leaf.grad[:4].isfinite().all() and leaf.grad[9:].isfinite().all()
 
 
+@pytest.mark.parametrize("counts", [[3, 0, 17, 1, 0, 40, 2], [300, 5, 200, 0, 1000], [0, 9, 0], [4] * 150])
+@pytest.mark.parametrize("robust", [0.0, 0.05])
+def test_unseen_rays_have_no_colour_to_learn(device, backend, counts, robust):
+    """Their loss, error and gradient are 0, even of targets and colours that are no numbers."""
+    raw, deltas, offsets, target, background = rays(counts, torch.float32, outside=(2, 3))
+    r, triples = len(counts), (len(counts) + 1) // 4
+    first, leaf = r - 3 * triples, raw.double().requires_grad_()
+    whole = step_by_step(leaf, deltas.double(), offsets, target.double(), background.double())
+    error = (whole.colour - target).square().sum(-1)[:first]
+    exact = (2 * robust * ((error + robust**2).sqrt() - robust) if robust else error).sum() / (3 * r)
+    exact.backward()
+    rest = {"density_scale": SCALE, "robust": robust, "backend": backend}
+    given = [tensor.to(device) for tensor in (deltas, offsets, target)]
+    expected = render_loss(raw.to(device), *given, background=background.to(device), **rest)
+    given[2][first:] = torch.nan
+    values = raw.to(device).requires_grad_()
+    found = render_loss(values, *given, background=background.to(device), triples=triples, **rest)
+    found.loss.backward()
+    torch.testing.assert_close(found.loss.double().cpu(), exact.detach(), rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(values.grad.double().cpu(), leaf.grad, rtol=1e-3, atol=1e-6)
+    begins = int(offsets[first])
+    assert not values.grad[begins:].any() and not found.error[first:].any()
+    assert torch.equal(found.error[:first], expected.error[:first])
+    assert all(torch.equal(part, other) for part, other in zip(found[1:4], expected[1:4]))
+    spoiled = values.detach().clone()
+    spoiled[begins:] = torch.nan
+    other = render_loss(spoiled.requires_grad_(), *given, background=background.to(device), triples=triples, **rest)
+    other.loss.backward()
+    assert torch.equal(other.loss, found.loss) and torch.equal(spoiled.grad, values.grad)
+
+
 @pytest.mark.parametrize("activated", [False, True])
 def test_infinite_density_is_opaque_and_has_no_gradient(device, backend, activated):
     raw, deltas, offsets, target, background = (t.to(device) for t in rays([4], torch.float32))
@@ -209,6 +240,8 @@ def test_bad_arguments():
         render_loss(raw, deltas, offsets, target, density_scale=0.0)
     with refused(ValueError, "render_loss: hidden must lie in [0, 1), got 1.0"):
         render_loss(raw, deltas, offsets, target, hidden=1.0, **rest)
+    with refused(ValueError, "render_loss: triples must be at most a third of the 2 rays, got 1"):
+        render_loss(raw, deltas, offsets, target, triples=1, **rest)
     with refused(ValueError, "render_loss: density_scale must be given unless the values are activated, got None"):
         render_loss(raw, deltas, offsets, target)
     with refused(ValueError, "render_loss: density_scale must not be given for activated values, got 1.0"):

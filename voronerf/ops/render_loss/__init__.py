@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -10,6 +10,12 @@ from torch import Tensor
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops._core.declare import declare
 from voronerf.ops.render_loss.reference import RenderLoss, scaled
+from voronerf.ops.unseen_rays import check_triples
+
+
+def _prepare(op: str, given: Any) -> Any:
+    check_triples(op, given)
+    return scaled(op, given)
 
 
 @declare(
@@ -17,7 +23,7 @@ from voronerf.ops.render_loss.reference import RenderLoss, scaled
     warp=Implementation(EVERYWHERE, FLOATS),
     smooth=["raw"],
     small=["raw"],
-    prepare=lambda given: scaled("render_loss", given),
+    prepare=lambda given: _prepare("render_loss", given),
 )
 def render_loss(
     raw: Annotated[Tensor, "floating [m, 4]"],
@@ -30,6 +36,7 @@ def render_loss(
     activated: bool = False,
     hidden: Annotated[float, "[0, 1)"] = 0.0,
     robust: Annotated[float, "[0, 1)"] = 0.0,
+    triples: Annotated[int, "0.."] = 0,
     backend: str = "auto",
 ) -> RenderLoss:
     """The mean squared or robust error of rendered rays, from what the networks put out for their samples.
@@ -54,6 +61,8 @@ def render_loss(
         hidden: share of the light, in [0, 1). Samples that no more than it reaches have no gradient; they count as all
             others in those of the samples in front of them.
         robust: s in [0, 1), the scale of the errors beyond which the loss is not squared; 0 for none.
+        triples: at most r / 3. The last ``3 triples`` rays are `unseen_rays`, which have no colour to learn: their
+            error and the gradients of their samples are 0, and the loss is still divided by the number of all rays.
 
     ``deltas``, ``target`` and ``background`` are float32, or float64 where ``raw`` is; so are the results. The loss is
     differentiable in ``raw``, any number of times. Nothing else has gradients.
@@ -62,7 +71,8 @@ def render_loss(
         RenderLoss(loss [], colour [r, 3], weights [m], density [m], error [r]).
 
     Raises:
-        ValueError: ``density_scale`` with ``activated``, or neither; on the CPU offsets that fall or exceed m.
+        ValueError: ``density_scale`` with ``activated``, or neither; more triples than a third of the rays; on the CPU
+            offsets that fall or exceed m.
 
     Examples:
         >>> import torch
@@ -86,7 +96,7 @@ def render_loss(
     warp=Implementation(EVERYWHERE, (torch.float32,), file="render_loss"),
     reference=Implementation(file="render_loss"),
     small=["raw"],
-    prepare=lambda given: scaled("render_loss_gradient", given),
+    prepare=lambda given: _prepare("render_loss_gradient", given),
 )
 def render_loss_gradient(
     raw: Annotated[Tensor, "floating [m, 4]"],
@@ -99,6 +109,7 @@ def render_loss_gradient(
     activated: bool = False,
     hidden: Annotated[float, "[0, 1)"] = 0.0,
     robust: Annotated[float, "[0, 1)"] = 0.0,
+    triples: Annotated[int, "0.."] = 0,
     backend: str = "auto",
 ) -> tuple[RenderLoss, Annotated[Tensor, "same [m, 4]"]]:
     """`render_loss` and the gradient of its loss to ``raw``, for `forward_with_tape`; nothing is differentiable.
@@ -113,6 +124,7 @@ def render_loss_gradient(
         activated: whether ``raw`` is the colour and the density themselves, as in `render_loss`. So is the gradient.
         hidden: share of the light, as in `render_loss`.
         robust: as in `render_loss`.
+        triples: of unseen rays, as in `render_loss`.
 
     Returns:
         (RenderLoss, gradient [m, 4]).

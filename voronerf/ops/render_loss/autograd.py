@@ -17,8 +17,8 @@ def register(forward: Op) -> None:
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    *tensors, density_scale, activated, hidden, robust = inputs
-    ctx.rule = density_scale, activated, hidden, robust
+    *tensors, density_scale, activated, hidden, robust, triples = inputs
+    ctx.rule = density_scale, activated, hidden, robust, triples
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(*output[1:])
     ctx.save_for_backward(*tensors, output[-1])
@@ -33,4 +33,4 @@ def _backward(ctx: Any, of_loss: Tensor | None, *_: Tensor | None) -> tuple[Tens
         (found,) = torch.autograd.grad(loss, raw, of_loss, create_graph=True)
     elif of_loss is not None:
         found = of_loss * gradient
-    return found, *[None] * 8
+    return found, *[None] * 9

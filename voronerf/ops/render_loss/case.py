@@ -21,24 +21,28 @@ def _make(draw: Draw, n: int) -> Arguments:
         call["raw"][:, 3].relu_()
     else:
         call["density_scale"] = 3.0
+    triples = min(draw.number("triples", 0, 0, r // 3), r // 3)
     of_all, of_rays = draw.uniform(3, dtype=wide), draw.uniform(r, 3, dtype=wide)
     return {
         **call,
         "background": draw.among("background", of_rays, of_all, None),
         "hidden": draw.among("hidden", 1e-3, 0.5),
         "robust": draw.among("robust", 0.0, 0.05),
+        "triples": triples,
     }
 
 
 def _make_plain(draw: Draw, n: int) -> Arguments:
-    return _make(Draw(n, dtype=torch.float32, activated=draw.among("activated", False, True)), n)
+    pinned = {"activated": draw.among("activated", False, True), "triples": draw.number("triples", 0, 0, 3)}
+    return _make(Draw(n, dtype=torch.float32, **pinned), n)
 
 
 _BOTH: dict[str, Any] = {
-    "kinds": {"": {}, "activated": {"activated": True}},
+    "kinds": {"": {}, "activated": {"activated": True}, "unseen": {"triples": 2}},
     "refused": {
         "density_scale must be given unless the values are activated, got None": {"density_scale": None},
         "density_scale must not be given for activated values, got 3.0": {"activated": True},
+        "triples must be at most a third of the 9 rays, got 4": {"triples": 4},
     },
 }
 CASE = Case(_make, differentiable=True, hostile="numbers", **_BOTH)

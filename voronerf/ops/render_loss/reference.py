@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from voronerf.ops.composite.reference import check_ray_offsets, composite, optical_depth, packed_light
+from voronerf.ops.composite.reference import check_ray_offsets, composite, kept, optical_depth, packed_light
 
 
 class RenderLoss(NamedTuple):
@@ -19,7 +19,7 @@ class RenderLoss(NamedTuple):
         colour: [r, 3], background included.
         weights: [m], the contribution of each sample.
         density: [m].
-        error: [r], the squared error of the colour of each ray, summed over the channels.
+        error: [r], the squared error of the colour of each ray, summed over the channels; 0 for unseen rays.
 
     Examples:
         >>> import torch
@@ -47,17 +47,24 @@ def render_loss(
     activated: bool,
     hidden: float,
     robust: float,
+    triples: int,
 ) -> RenderLoss:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
     raw = raw.to(torch.promote_types(raw.dtype, torch.float32))
     check_ray_offsets("render_loss", ray_offsets, raw.shape[0])
+    first = len(target) - 3 * triples
     if hidden and raw.requires_grad:
         _, density = activate(raw.detach(), density_scale, activated)
-        unseen = packed_light(optical_depth(density, deltas), ray_offsets)[0] <= hidden
+        dark = packed_light(optical_depth(density, deltas), ray_offsets)[0] <= hidden
+        raw = torch.where(dark[:, None], raw.detach(), raw)
+    if triples and raw.requires_grad:  # no host reads where the rays begin
+        unseen = torch.arange(len(raw), device=raw.device) >= ray_offsets[first]
         raw = torch.where(unseen[:, None], raw.detach(), raw)
     colours, density = activate(raw, density_scale, activated)
     seen = composite(density, colours, deltas, deltas, ray_offsets, background)
     error = (seen.colour - target).square().sum(-1)
+    if triples:
+        error = F.pad(error[:first], (0, 3 * triples))
     rest = (seen.colour, seen.weights, density, error)
     return RenderLoss(robust_error(error, robust).mean() / 3, *(part.detach() for part in rest))
 
@@ -84,11 +91,6 @@ def activate(raw: Tensor, density_scale: float = 1.0, activated: bool = False) -
     if activated:
         return raw[:, :3], raw[:, 3]
     return torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
-
-
-def kept(value: Any) -> Any:
-    """The same, or a copy of an inference tensor, which autograd can keep."""
-    return value.clone() if isinstance(value, Tensor) and value.is_inference() else value
 
 
 @torch.inference_mode(False)

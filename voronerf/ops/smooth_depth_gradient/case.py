@@ -10,19 +10,19 @@ from voronerf.ops.composite.reference import composite
 
 def _make(draw: Draw, n: int) -> Arguments:
     """n samples on seven rays, the last six of which are triples."""
-    call: Arguments = {"loss": torch.tensor(0.5), "error": draw.uniform(7).contiguous()}
-    call |= {"gradient": draw.normal(n, 4).contiguous(), "ray_offsets": draw.offsets(n, 7)}
+    call: Arguments = {"loss": torch.tensor(0.5), "gradient": draw.normal(n, 4).contiguous()}
+    call["ray_offsets"] = draw.offsets(n, 7)
     call |= {"density": draw.uniform(n), "depths": 0.5 + draw.uniform(n), "deltas": draw.uniform(n)}
     along = call["density"], call["density"][:, None], call["depths"], call["deltas"], call["ray_offsets"]
     rule = {"activated": True} if draw.among("activated", False, True) else {"density_scale": 3.0}
     triples = draw.number("triples", 2, 0, 2)
     call |= {"weights": composite(*along).weights, "far": 1.5 + draw.uniform(7), "triples": triples, "factor": 0.5}
-    return {**call, "robust": draw.among("robust", 0.05, 0.0), "hidden": draw.among("hidden", 0.0, 0.5), **rule}
+    return {**call, "hidden": draw.among("hidden", 0.0, 0.5), **rule}
 
 
 CASE = Case(
     _make,
-    {"": {}, "activated": {"activated": True}, "squared": {"robust": 0.0}, "hidden": {"hidden": 0.5}},
+    {"": {}, "activated": {"activated": True}, "hidden": {"hidden": 0.5}},
     refused={
         "ray_offsets must rise from 0 or more to at most the number of samples, 6, got 1 for ray 2": {
             "ray_offsets": torch.tensor([0, 2, 1, 5, 5, 5, 5, 5], dtype=torch.int32)

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.ops.composite.reference import check_ray_offsets, composite, optical_depth, packed_light
-from voronerf.ops.render_loss.reference import kept, robust_error
+from voronerf.ops.composite.reference import check_ray_offsets, composite, kept, optical_depth, packed_light
+from voronerf.ops.render_loss.reference import robust_error
 
 #: Scale of the logarithms beyond which the loss is not squared: at the edge of a surface.
 EDGE = 0.05
@@ -26,12 +26,11 @@ def smooth_depth_loss(disparity: Tensor, opacity: Tensor, far: Tensor, triples: 
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def smooth_depth_gradient(loss: Tensor, error: Tensor, gradient: Tensor, *given: Any) -> None:
-    """Smooth depths in the place of colours; see ``voronerf.ops.smooth_depth_gradient``."""
-    *tensors, triples, factor, robust, hidden, density_scale, activated = given
+def smooth_depth_gradient(loss: Tensor, gradient: Tensor, *given: Any) -> None:
+    """Adds the loss of bent depths; see ``voronerf.ops.smooth_depth_gradient``."""
+    *tensors, triples, factor, hidden, density_scale, activated = given
     density, depths, deltas, _, ray_offsets, far = (kept(tensor.detach()) for tensor in tensors)
     check_ray_offsets("smooth_depth_gradient", ray_offsets, len(density))
-    first = len(far) - 3 * triples
     density.requires_grad_()
     disparities = 1 / depths[:, None]
     light, _ = packed_light(optical_depth(density.detach(), deltas), ray_offsets)
@@ -42,10 +41,5 @@ def smooth_depth_gradient(loss: Tensor, error: Tensor, gradient: Tensor, *given:
     if not activated:
         slope = slope * -density_scale * torch.expm1(-density / density_scale)  # of a softplus
     with torch.no_grad():
-        loss += own - robust_error(error[first:], robust).sum() / (3 * max(len(far), 1))
-        error[first:] = 0
-        # Samples behind those of the rays belong to none; no host reads where the rays begin.
-        sample = torch.arange(len(density), device=density.device)
-        unseen = (sample >= ray_offsets[first]) & (sample < ray_offsets[-1])
-        gradient[:] = torch.where(unseen[:, None], 0, gradient)
+        loss += own
         gradient[:, 3] += slope
