@@ -49,27 +49,22 @@ std::map<std::string, PyObject*>& dtypes() {
   return known;
 }
 
-// A number of rows that lies in memory, and the most that it may be.
-struct Count {
-  const int64_t* memory;
-  int64_t most;
-};
-
 class Recording;
 Recording*& recorded() {  // the one that the calling thread's calls are added to, or null
   static thread_local Recording* recording = nullptr;
   return recording;
 }
-const Count* count_of(Recording& recording, int64_t rows);
-void add_tensor(Recording& recording, PyObject* tensor);
+void refuse(Recording& recording, const std::string& why);
+bool add_tensor(Recording& recording, PyObject* tensor);
 
 // What a call has taken from Python, given back when it ends.
 class Frame {
  public:
-  // A number of rows that a recorded call has taken, and where it lies.
+  // A number of rows that a recorded call has taken, where it lies, less so many, and the most that it may be.
   struct Counted {
     RowCount* rows;
-    const Count* count;
+    const int64_t* memory;
+    int64_t more, most;
   };
   Frame() = default;
   Frame(const Frame&) = delete;
@@ -79,6 +74,7 @@ class Frame {
   }
 
   const std::vector<Counted>& counted() const { return counted_; }
+  bool misses_rows() const { return has_rows_ && counted_.empty(); }
 
   // False: not of that type. `place` becomes that of an opaque object itself.
   bool load(const Type& type, PyObject* given, void*& place) {
@@ -100,8 +96,7 @@ class Frame {
         const int64_t rows = PyLong_AsLongLong(given);
         if (rows == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
         *static_cast<RowCount*>(place) = rows;
-        if (recorded() != nullptr && rows != 0)
-          counted_.push_back({static_cast<RowCount*>(place), count_of(*recorded(), rows)});
+        if (recorded() != nullptr && rows != 0) count(given, *static_cast<RowCount*>(place));
         return true;
       }
       case Type::Kind::floating: {
@@ -160,6 +155,17 @@ class Frame {
     kept_.push_back(given);
   }
 
+  // A RowCount of voronerf/ops/_core/rows.py, which is an int too.
+  void count(PyObject* given, RowCount& rows) {
+    if (PyLong_CheckExact(given)) {
+      return refuse(*recorded(), "a number of rows lies in no memory, " + std::to_string(rows.value));
+    }
+    const auto number = [given](const char* name) { return py::cast<int64_t>(py::handle(given).attr(name)); };
+    const auto* memory = reinterpret_cast<const int64_t*>(py::cast<std::uintptr_t>(py::handle(given).attr("address")));
+    counted_.push_back({&rows, memory, number("more"), number("most")});
+    keep(given);  // which holds the memory
+  }
+
   // Tensors: anything with a dtype, contiguous(), is_contiguous(), is_neg(), resolve_neg() and data_ptr().
   bool load_tensor(const Type& type, PyObject* given, void*& address) {
     address = nullptr;
@@ -200,7 +206,7 @@ class Frame {
     if (found == nullptr && holds_entries(kept_.back())) return false;  // memory that was freed, as by storage.resize_
     alignas(64) static char nothing[64];
     address = found == nullptr ? nothing : found;
-    if (recorded() != nullptr) add_tensor(*recorded(), kept_.back());
+    if (recorded() != nullptr && add_tensor(*recorded(), kept_.back())) has_rows_ = true;
     return true;
   }
 
@@ -258,6 +264,7 @@ class Frame {
   std::vector<PyObject*> kept_;
   std::deque<std::vector<void*>> arrays_;
   std::vector<Counted> counted_;
+  bool has_rows_ = false;  // a tensor whose rows are counted
 };
 
 // Values of parameters, made when they are loaded.
@@ -348,19 +355,21 @@ void call(const Loaded& loaded, Result& result) {
   }
 }
 
-// The address of a tensor's memory and, with its layout, size and stride; null without an answer.
+// Where a tensor's memory is and, with its layout, how it lies there; null without an answer. That it is contiguous
+// takes half the time to find that its size and stride take.
 struct Place {
   py::object answers[3];
 
-  Place(PyObject* tensor, bool layout) {
+  Place(PyObject* tensor, bool layout, bool contiguous) {
     static PyObject* const methods[] = {PyUnicode_InternFromString("data_ptr"), PyUnicode_InternFromString("size"),
-                                        PyUnicode_InternFromString("stride")};
+                                        PyUnicode_InternFromString("stride"), PyUnicode_InternFromString("numel"),
+                                        PyUnicode_InternFromString("is_contiguous")};
     for (int i = 0; i < (layout ? 3 : 1); ++i) {
-      answers[i] = py::reinterpret_steal<py::object>(PyObject_CallMethodNoArgs(tensor, methods[i]));
+      PyObject* const method = methods[i + (i > 0 && contiguous ? 2 : 0)];
+      answers[i] = py::reinterpret_steal<py::object>(PyObject_CallMethodNoArgs(tensor, method));
     }
     PyErr_Clear();
   }
-  const void* address() const { return answers[0] ? PyLong_AsVoidPtr(answers[0].ptr()) : nullptr; }
   bool operator==(const Place& other) const {
     for (int i = 0; i < 3; ++i) {
       PyObject *const one = answers[i].ptr(), *const two = other.answers[i].ptr();
@@ -372,21 +381,24 @@ struct Place {
   }
 };
 
-// Members of dictionaries that must stay the same objects, but for that of the key `skip`, and tensors that must stay
+// Members of dictionaries that must stay the same objects, but for those of the keys `free`, and tensors that must stay
 // where and as they are. Their storages are held too: memory that a tensor has left (`x.data = y`) is not freed.
 class Guards {
  public:
-  void add(const py::dict& members, const std::string& skip) {
+  void add(const py::dict& members, const std::vector<std::string>& free) {
     Guard guard{members, {}};
     for (const auto& [key, value] : members) {
-      const bool any = py::isinstance<py::str>(key) && py::cast<std::string>(key) == skip;
+      const bool any =
+          py::isinstance<py::str>(key) && std::count(free.begin(), free.end(), py::cast<std::string>(key)) != 0;
       guard.values.push_back(any ? py::object() : py::reinterpret_borrow<py::object>(value));
     }
     guards_.push_back(std::move(guard));
   }
   void add_tensor(const py::object& tensor, bool layout) {
     if (!known_.insert(tensor.ptr()).second) return;
-    tensors_.push_back({tensor, tensor.attr("untyped_storage")(), Place(tensor.ptr(), layout), layout});
+    const bool contiguous = py::cast<bool>(tensor.attr("is_contiguous")());
+    const Place place(tensor.ptr(), layout, contiguous);
+    tensors_.push_back({tensor, tensor.attr("untyped_storage")(), place, layout, contiguous});
   }
   // Compares as little as may be: between the kernels of a loop, whatever is looked at must come from memory.
   bool hold() const {
@@ -399,8 +411,9 @@ class Guards {
       }
       if (i != guard.values.size()) return false;
     }
-    return std::all_of(tensors_.begin(), tensors_.end(),
-                       [](const Held& held) { return Place(held.tensor.ptr(), held.layout) == held.place; });
+    return std::all_of(tensors_.begin(), tensors_.end(), [](const Held& held) {
+      return Place(held.tensor.ptr(), held.layout, held.contiguous) == held.place;
+    });
   }
 
  private:
@@ -411,7 +424,7 @@ class Guards {
   struct Held {
     py::object tensor, storage;
     Place place;
-    bool layout;
+    bool layout, contiguous;
   };
   std::vector<Guard> guards_;
   std::vector<Held> tensors_;
@@ -422,47 +435,34 @@ class Guards {
 // number of rows is read again from where it lies, so the memory must do for the most rows.
 class Recording {
  public:
-  // Calls of this thread are added from here to `end`, in the place of those from before.
-  void begin() {
-    calls_.clear();
-    counts_.clear();
-    obstacle_.clear();
-    tensors_ = {};
-    made_.clear();
-    recorded() = this;
-  }
+  // Calls of this thread are added from here to `end`.
+  void begin() { recorded() = this; }
   void end() { recorded() = nullptr; }
 
-  void count(const py::object& memory, int64_t most) {
-    add_tensor(memory);
-    counts_.push_back({static_cast<const int64_t*>(Place(memory.ptr(), false).address()), most});
+  // A tensor that a call takes, or of which such a tensor is a view. What is made for the calls stays where it is.
+  // Gives whether its rows are counted.
+  bool add_tensor(const py::object& tensor) {
+    const auto found = made_.find(py::cast<std::uintptr_t>(tensor.attr("untyped_storage")().attr("data_ptr")()));
+    if (found != made_.end()) return found->second;
+    tensors_.add_tensor(tensor, true);
+    return false;
   }
-  // A tensor that a call takes, or of which such a tensor is a view. Nobody lays out anew what is made for the calls.
-  void add_tensor(const py::object& tensor) {
-    const bool made = made_.count(py::cast<std::uintptr_t>(tensor.attr("untyped_storage")().attr("data_ptr")())) != 0;
-    tensors_.add_tensor(tensor, !made);
-  }
-  // The storage at an address is new memory for the calls.
-  void made(std::uintptr_t address) { made_.insert(address); }
-  const Count* count_of(int64_t rows) {
-    const Count* found = nullptr;
-    for (const Count& count : counts_) {
-      if (*count.memory != rows) continue;
-      if (found != nullptr) return refuse("two numbers of rows are the same, " + std::to_string(rows));
-      found = &count;
-    }
-    return found != nullptr ? found : refuse("a number of rows lies in no memory, " + std::to_string(rows));
-  }
+  // One that was made for the calls, and that others hold too.
+  void hold_tensor(const py::object& tensor) { tensors_.add_tensor(tensor, false); }
+  // The storage at an address is memory for these calls, or for others that are made before; of counted rows, or not.
+  void made(std::uintptr_t address, bool counted) { made_[address] = counted; }
+  bool hold() const { return tensors_.hold(); }
   void add(std::unique_ptr<Loaded> loaded) {
     if (loaded->bound->machine != &type_of<Cpu>()) refuse(loaded->function->name + " runs on a device");
+    if (loaded->frame.misses_rows()) refuse(loaded->function->name + " takes no number of rows that is counted");
     calls_.push_back(std::move(loaded));
   }
 
-  // Makes the calls again, so many times in a row. Before each time the next random numbers, `bytes` for each of
-  // `places`, are copied there. Gives how often they were made: it ends before a call that would exceed its memory, and
-  // does not begin where a tensor has moved. With a trace they have no team.
-  int replay(int threads, int times, std::uintptr_t drawn, const std::vector<std::uintptr_t>& places, size_t bytes) {
-    if (!tensors_.hold()) return 0;
+  // Makes the calls from `first` to `last` again, so many times in a row. Before each time the next random numbers,
+  // `bytes` for each of `places`, are copied there. Gives how often they were made: it ends before a call that would
+  // exceed its memory. With a trace they have no team.
+  int replay(int threads, int times, size_t first, size_t last, std::uintptr_t drawn,
+             const std::vector<std::uintptr_t>& places, size_t bytes) {
     const py::gil_scoped_release released;
     int made = 0;
     std::exception_ptr failure;
@@ -473,7 +473,9 @@ class Recording {
             std::memcpy(reinterpret_cast<void*>(place), reinterpret_cast<const void*>(drawn), bytes);
             drawn += bytes;
           }
-          if (!std::all_of(calls_.begin(), calls_.end(), [](const auto& each) { return again(*each); })) break;
+          for (size_t i = first; i < last; ++i) {
+            if (!again(*calls_.at(i))) return;
+          }
         }
       } catch (...) {
         failure = std::current_exception();
@@ -483,18 +485,17 @@ class Recording {
     return made;
   }
 
+  void refuse(const std::string& why) {
+    if (obstacle_.empty()) obstacle_ = why;
+  }
   size_t size() const { return calls_.size(); }
   const std::string& obstacle() const { return obstacle_; }
 
  private:
-  const Count* refuse(const std::string& why) {
-    if (obstacle_.empty()) obstacle_ = why;
-    return nullptr;
-  }
   static bool again(const Loaded& loaded) {
-    for (const auto& [rows, count] : loaded.frame.counted()) {
-      if (*count->memory > count->most) return false;
-      *rows = *count->memory;
+    for (const auto& [rows, memory, more, most] : loaded.frame.counted()) {
+      if (*memory > most) return false;
+      *rows = *memory + more;
     }
     Result result{};
     call(loaded, result);
@@ -506,15 +507,14 @@ class Recording {
   }
 
   std::vector<std::unique_ptr<Loaded>> calls_;
-  std::deque<Count> counts_;
   std::string obstacle_;
   Guards tensors_;
-  std::set<std::uintptr_t> made_;
+  std::map<std::uintptr_t, bool> made_;
 };
 
-const Count* count_of(Recording& recording, int64_t rows) { return recording.count_of(rows); }
-void add_tensor(Recording& recording, PyObject* tensor) {
-  recording.add_tensor(py::reinterpret_borrow<py::object>(tensor));
+void refuse(Recording& recording, const std::string& why) { recording.refuse(why); }
+bool add_tensor(Recording& recording, PyObject* tensor) {
+  return recording.add_tensor(py::reinterpret_borrow<py::object>(tensor));
 }
 
 py::object run(Loaded& loaded) {
@@ -604,7 +604,7 @@ constexpr const char* kStub =
     "most_sources: int\n"
     "\n"
     "class Guards:\n"
-    "    def add(self, members: Any, skip: str) -> None: ...\n"
+    "    def add(self, members: Any, free: Sequence[str]) -> None: ...\n"
     "    def add_tensor(self, tensor: Tensor, layout: bool) -> None: ...\n"
     "    def hold(self) -> bool: ...\n"
     "\n"
@@ -613,10 +613,12 @@ constexpr const char* kStub =
     "    def __len__(self) -> int: ...\n"
     "    def begin(self) -> None: ...\n"
     "    def end(self) -> None: ...\n"
-    "    def count(self, memory: Tensor, most: int) -> None: ...\n"
-    "    def add_tensor(self, tensor: Tensor) -> None: ...\n"
-    "    def made(self, address: int) -> None: ...\n"
-    "    def replay(self, threads: int, times: int, drawn: int, places: list[int], bytes: int) -> int: ...\n"
+    "    def add_tensor(self, tensor: Tensor) -> bool: ...\n"
+    "    def hold_tensor(self, tensor: Tensor) -> None: ...\n"
+    "    def made(self, address: int, counted: bool) -> None: ...\n"
+    "    def hold(self) -> bool: ...\n"
+    "    def replay(self, threads: int, times: int, first: int, last: int, drawn: int, places: Sequence[int],\n"
+    "               bytes: int) -> int: ...\n"
     "\n"
     "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n"
     "def trace(on: bool) -> list[tuple[str, float, int, float, list[float]]]: ...\n";
@@ -734,9 +736,10 @@ void bind_all(PyObject* python) {
       .def(py::init())
       .def("begin", &Recording::begin)
       .def("end", &Recording::end)
-      .def("count", &Recording::count)
       .def("add_tensor", &Recording::add_tensor)
+      .def("hold_tensor", &Recording::hold_tensor)
       .def("made", &Recording::made)
+      .def("hold", &Recording::hold)
       .def("replay", &Recording::replay)
       .def("__len__", &Recording::size)
       .def_property_readonly("obstacle", &Recording::obstacle);

@@ -5,6 +5,7 @@
 #include <cstdint>
 
 #include "common/isa.h"
+#include "common/row_count.h"
 
 namespace voronerf {
 
@@ -16,7 +17,10 @@ struct CompositeInputs {
   const int32_t* offsets;   // [r+1], or null
   const float* background;  // [r,c], or [c], or null
   bool background_per_ray;
-  int64_t r, s, m, c;
+  RowCount r;
+  int64_t s;
+  RowCount m;
+  int64_t c;
 };
 
 struct CompositeOutputs {

@@ -6,7 +6,7 @@
 
 namespace voronerf {
 
-void draw_points_cpu(const int32_t* seed, const float* box, int64_t n, float* points, int threads) {
+void draw_points_cpu(const int32_t* seed, const float* box, RowCount n, float* points, int threads) {
   constexpr int64_t kPoints = 1024;  // of a task
   const float extent[3] = {box[3] - box[0], box[4] - box[1], box[5] - box[2]};
   parallel_for(n, kPoints, threads, [&](int64_t i) {

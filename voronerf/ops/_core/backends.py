@@ -246,6 +246,9 @@ def torch_on_one_thread() -> Iterator[None]:
     the last elements of each one's part are computed by other instructions than the rest.
     """
     before, of_torch = _kept.threads, torch.get_num_threads()
+    if of_torch == 1:
+        yield
+        return
     _kept.threads = threads()
     torch.set_num_threads(1)
     try:

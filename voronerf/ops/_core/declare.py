@@ -47,6 +47,7 @@ from voronerf.ops._core.backends import Implementation
 from voronerf.ops._core.checks import FLOATING, LIKE_FIRST, MAX_COUNT
 from voronerf.ops._core.custom_op import Op, custom_op
 from voronerf.ops._core.derivatives import register_derivatives
+from voronerf.ops._core.rows import new_empty, rows_of
 
 F = TypeVar("F", bound=Callable[..., Any])
 Check = Callable[[checks.Checked, dict[str, Any]], None]
@@ -338,8 +339,11 @@ class Declaration:
         kind = _named("given", {**arriving, **typing.get_type_hints(self.Inputs), "wanted": Sequence[bool]})
 
         def memory(flat: Any) -> list[Tensor]:
-            empty, parts = flat[count].new_empty, zip(flat[-1], [flat[count + place] for place in places])
-            return [empty(part.shape if want and part is not None else 0) for want, part in parts]
+            like, parts = flat[count], zip(flat[-1], [flat[count + place] for place in places])
+            return [
+                new_empty(like, rows_of(part), *part.shape[1:]) if want and part is not None else like.new_empty(0)
+                for want, part in parts
+            ]
 
         memory.__annotations__["flat"] = kind
 
@@ -402,7 +406,7 @@ def _size_of(ways: Sequence[tuple[int, int, int, int]]) -> Callable[[Any], int]:
         for dimensions, place, dimension, less in ways:
             tensor = given[place]
             if tensor is not None and tensor.dim() == dimensions:
-                found: int = tensor.shape[dimension]
+                found = tensor.shape[dimension] if dimension else rows_of(tensor)
                 return found - less
         return 0
 
@@ -434,15 +438,16 @@ def _new(
 
     def memory(given: Any, sizes: Sequence[int]) -> Tensor:
         own = shape if told is None or given[told] is not None else otherwise
-        found: Tensor = given[like].new_empty(own(sizes), dtype=dtype)
-        return found
+        return new_empty(given[like], *own(sizes), dtype=dtype)
 
     return memory
 
 
 def _picker(places: Sequence[int]) -> Callable[[Any], Any]:
-    """What gives entries of a sequence at these places, a single one alone."""
-    return operator.itemgetter(*places) if places else lambda given: ()
+    """What gives entries of a sequence at these places."""
+    if len(places) > 1:
+        return operator.itemgetter(*places)
+    return lambda given: [given[place] for place in places]
 
 
 def _named(name: str, hints: dict[str, Any]) -> Any:

@@ -10,6 +10,7 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.checks import check_range
 from voronerf.ops._core.declare import declared
+from voronerf.ops._core.rows import rows_of
 
 WAYS = native.compiled.CellSortWay
 """Of sorting on CUDA; "automatic" is by the number of cells."""
@@ -32,7 +33,7 @@ def sort(cells: Tensor, order: Tensor, offsets: Tensor, caller: str, way: str = 
         way: of sorting on CUDA, one of ``WAYS``, for measurements.
     """
     compiled, machine = native.compiled, native.machine(cells)
-    n, k = cells.shape[0], offsets.shape[0] - 1
+    n, k = rows_of(cells), offsets.shape[0] - 1
     if isinstance(machine, compiled.Cuda):
         workspace = cells.new_empty(compiled.cell_sort_workspace(n, k, way, machine), dtype=torch.uint8)
         compiled.cell_sort(cells, order, offsets, workspace, n, k, way, machine)

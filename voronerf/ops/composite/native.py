@@ -11,10 +11,17 @@ from typing import Any
 from voronerf.ops._core import native
 from voronerf.ops._core.custom_op import in_float32
 from voronerf.ops._core.declare import declared
+from voronerf.ops._core.rows import new_empty, rows_of
 from voronerf.ops.composite import reference
 
 _OP = declared("composite")
-_inputs = _OP.inputs(native.compiled.CompositeInputs, offsets="ray_offsets", m=lambda given: given.sigma.numel())
+
+
+def _samples(given: Any) -> int:
+    return given.sigma.numel() if given.ray_offsets is None else rows_of(given.sigma)
+
+
+_inputs = _OP.inputs(native.compiled.CompositeInputs, offsets="ray_offsets", m=_samples)
 _outputs = _OP.outputs(native.compiled.CompositeOutputs)
 
 
@@ -27,8 +34,8 @@ def _forward(given: Any, found: Any) -> None:
 def _backward(given: Any, arriving: Any, gradients: Any) -> None:
     sigma = given.sigma
     if gradients.sigma is None:  # which kernels write in any case
-        gradients = gradients._replace(sigma=sigma.new_empty(sigma.shape))
-    left = None if given.background is None else sigma.new_empty(given.r)
+        gradients = gradients._replace(sigma=new_empty(sigma, rows_of(sigma), *sigma.shape[1:]))
+    left = None if given.background is None else new_empty(sigma, given.r)
     found = native.compiled.CompositeGradients(**arriving._asdict(), **gradients._asdict(), left=left)
     native.compiled.composite_backward(_inputs(given), found, native.machine(sigma))
 

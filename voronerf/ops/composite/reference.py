@@ -87,6 +87,11 @@ def composite(
     return Composite(colour.to(storage), opacity.to(storage), depth.to(storage), weights.to(storage))
 
 
+def kept(value: Any) -> Any:
+    """The same, or a copy of an inference tensor, which autograd can keep."""
+    return value.clone() if isinstance(value, Tensor) and value.is_inference() else value
+
+
 def optical_depth(sigma: Tensor, deltas: Tensor) -> Tensor:
     """Density times length, of infinite density too."""
     return sigma.clamp(max=_OPAQUE) * deltas

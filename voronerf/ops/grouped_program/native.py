@@ -20,6 +20,7 @@ from voronerf.ops._core.derivatives import asked_for
 from voronerf.ops._core.layers import MLP
 from voronerf.ops._core.memory import on_huge_pages
 from voronerf.ops._core.program import Program, gradient
+from voronerf.ops._core.rows import new_empty, rows_of
 from voronerf.ops.grouped_program.lowering import Lowered, compiled_runs, lower
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
 
@@ -116,20 +117,22 @@ class _Call(NamedTuple("_Call", [("rows", Rows), ("how", How)])):
         (inputs, _, _, _, index, _), how = self
         program = program_of(*self)
         lowered = lower(program.text, _layout(how.products, inputs[0])) if compiled_runs(program.text) else None
-        n = (inputs[0] if index is None else index).shape[0]
-        return program, lowered, n, inputs[program.rays[0]].shape[0] if program.rays else 0
+        n = rows_of(inputs[0] if index is None else index)
+        return program, lowered, n, rows_of(inputs[program.rays[0]]) if program.rays else 0
 
 
 def _memory(given: _Call) -> list[Tensor]:
     """For the outputs of a program, its sums, and what is kept."""
     (program, lowered, n, r), rows = given.plan, given.rows
-    new = rows.inputs[0].new_empty
-    found = [new((r if i in program.by_ray else n, columns.width)) for i, columns in enumerate(program.outputs)]
+    like = rows.inputs[0]
+    found = [
+        new_empty(like, r if i in program.by_ray else n, columns.width) for i, columns in enumerate(program.outputs)
+    ]
     if program.sums:
         counts = program.cells_of_sums(rows.parameters, rows.offsets.shape[0] - 1)
-        found += [new((count, *shape), dtype=torch.float32) for count, shape in zip(counts, program.sums)]
+        found += [new_empty(like, count, *shape, dtype=torch.float32) for count, shape in zip(counts, program.sums)]
     if given.how.keep and lowered:
-        found += [new((n, width), dtype=torch.float32) for width in lowered.widths]
+        found += [new_empty(like, n, width, dtype=torch.float32) for width in lowered.widths]
     return found
 
 

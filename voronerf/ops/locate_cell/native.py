@@ -9,6 +9,7 @@ from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
+from voronerf.ops._core.rows import rows_of
 
 
 @declared("locate_cell").custom_op()
@@ -30,7 +31,7 @@ def find(
     ``tree``: child_offsets, child and depth. ``caller``: whom errors name."""
     child_offsets, child, depth = tree
     compiled, machine = native.compiled, native.machine(points)
-    n, m, g = points.shape[0], centres.shape[0], child_offsets.shape[0] - 1
+    n, m, g = rows_of(points), centres.shape[0], child_offsets.shape[0] - 1
     given = points, centres, child_offsets, child
     if isinstance(machine, compiled.Cuda):
         compiled.locate_cell(*given, rows, leaves, n, m, g, depth, machine)

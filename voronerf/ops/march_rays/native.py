@@ -13,7 +13,7 @@ import torch
 from voronerf.ops._core import native
 from voronerf.ops._core.checks import MAX_COUNT
 from voronerf.ops._core.declare import declared
-from voronerf.ops._core.recording import read_count
+from voronerf.ops._core.rows import new_empty, read_count
 from voronerf.ops.march_rays.reference import March, fake, memory
 
 
@@ -42,8 +42,8 @@ inputs_of = _OP.inputs(native.compiled.MarchInputs, **INPUTS)
 def march_rays(given: Any) -> March:
     """Samples in occupied cells; see ``voronerf.ops.march_rays``."""
     near, capacity, inputs, machine = given.near, given.capacity, inputs_of(given), native.machine(given.near)
-    mask = near.new_empty(given.r, -(-given.samples // 32), dtype=torch.int32)
-    offsets = near.new_empty(given.r + 1, dtype=torch.int32)
+    mask = new_empty(near, given.r, -(-given.samples // 32), dtype=torch.int32)
+    offsets = new_empty(near, given.r + 1, dtype=torch.int32)
     most, total = MAX_COUNT if capacity is None else capacity, near.new_empty(1, dtype=torch.int64)
     if isinstance(machine, native.compiled.Cuda):
         native.compiled.march_rays_count(inputs, mask, offsets, most, machine)

@@ -11,6 +11,8 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from voronerf.ops._core.rows import new_empty, rows_of
+
 
 class March(NamedTuple):
     """Samples of rays in occupied cells, packed.
@@ -44,8 +46,8 @@ class March(NamedTuple):
 
 def memory(near: Tensor, offsets: Tensor, rows: Any) -> March:
     """Memory for so many samples, after the offsets of the rays."""
-    index, stop = (near.new_empty(count, dtype=torch.int32) for count in (rows, near.shape[0]))
-    return March(offsets, index, near.new_empty(rows), near.new_empty(rows), near.new_empty(rows, 3), stop)
+    index, stop = (new_empty(near, count, dtype=torch.int32) for count in (rows, rows_of(near)))
+    return March(offsets, index, new_empty(near, rows), new_empty(near, rows), new_empty(near, rows, 3), stop)
 
 
 def fake(given: Any) -> March:

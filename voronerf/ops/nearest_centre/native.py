@@ -8,6 +8,7 @@ from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
+from voronerf.ops._core.rows import rows_of
 
 
 @declared("nearest_centre").custom_op()
@@ -19,7 +20,7 @@ def nearest_centre(given: Any, cells: Tensor) -> None:
 def find(cells: Tensor, points: Tensor, centres: Tensor, rows: Tensor | None = None) -> None:
     """Fills ``cells``, int32 [n]; coordinates are of one dtype. On CUDA with -1 from ``rows`` on."""
     compiled, machine = native.compiled, native.machine(points)
-    n, k = points.shape[0], centres.shape[0]
+    n, k = rows_of(points), centres.shape[0]
     if isinstance(machine, compiled.Cuda):
         compiled.nearest_centre(points, centres, rows, cells, n, k, machine)
     else:

@@ -8,6 +8,7 @@ import torch
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
+from voronerf.ops._core.rows import new_empty
 from voronerf.ops.march_rays.native import space_of
 
 _OP = declared("observe_occupancy")
@@ -22,5 +23,5 @@ _samples = _OP.inputs(
 def observe_occupancy(given: Any, _: None) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
     density, occupied, m = given.density, given.occupied.view(torch.uint8), given.m
-    memory = density.new_empty(m, dtype=torch.int32), density.new_empty(m)  # cells, and the densities that these had
+    memory = new_empty(density, m, dtype=torch.int32), new_empty(density, m)  # cells, and the densities that these had
     native.compiled.observe_occupancy(_samples(given), density, occupied, *memory, native.machine(density))

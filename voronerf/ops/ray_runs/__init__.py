@@ -16,6 +16,7 @@ from torch import Tensor
 from voronerf.ops._core.backends import Implementation
 from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_range, check_shape
 from voronerf.ops._core.declare import declare
+from voronerf.ops._core.rows import rows_of
 from voronerf.ops.ray_runs.reference import OwnSamples
 
 _NATIVE = Implementation(("cpu",), (torch.float32,), file="ray_runs")
@@ -73,7 +74,7 @@ def own_samples(
 @declare(
     native=_NATIVE,
     reference=_REFERENCE,
-    sizes={"q": lambda given: len(given.samples.run_offsets) - 1},
+    sizes={"q": lambda given: rows_of(given.samples.run_offsets) - 1},
     prepare=lambda given: _check_samples("run_sums", given),
 )
 def run_sums(

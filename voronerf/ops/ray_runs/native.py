@@ -11,6 +11,7 @@ from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
+from voronerf.ops._core.rows import new_empty
 from voronerf.ops.ray_runs.reference import OwnSamples
 
 _OWN, _SUMS, _COMPOSE = declared("own_samples"), declared("run_sums"), declared("compose_runs")
@@ -18,7 +19,7 @@ _GRADIENTS = declared("run_gradients")
 _known = _OWN.inputs(native.compiled.KnownSamples)
 _own = _OWN.outputs(native.compiled.OwnSamples, offsets="run_offsets")
 _runs = _COMPOSE.inputs(native.compiled.RunsOfRays)
-_NO_RAYS: dict[str, Any] = {"deltas": "samples.deltas", "offsets": "samples.run_offsets", "r": "q"}
+_NO_RAYS: dict[str, Any] = {"deltas": "samples.deltas", "offsets": "samples.run_offsets", "r": "q", "triples": 0}
 _NO_RAYS |= {"target": None, "background": None, "background_per_ray": False, "activated": False, "robust": 0.0}
 _outputs_of_sums = _SUMS.inputs(native.compiled.RenderLossInputs, **_NO_RAYS, hidden=0.0)
 _outputs = _GRADIENTS.inputs(native.compiled.RenderLossInputs, **_NO_RAYS)
@@ -52,5 +53,5 @@ def compose_runs(given: Any, found: tuple[Tensor, Tensor]) -> None:
 def run_gradients(given: Any, found: tuple[Tensor, Tensor]) -> None:
     """Gradient of the loss to the outputs [m, 4], and weights [m]; see ``voronerf.ops.run_gradients``."""
     gradient, weights = found
-    importance = weights.new_empty(given.m)
+    importance = new_empty(weights, given.m)
     native.compiled.run_gradients(_outputs(given), given.answers, gradient, weights, importance, native.cpu())

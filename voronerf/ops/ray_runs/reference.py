@@ -14,8 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from voronerf.ops.composite.reference import Composite, composite
-from voronerf.ops.render_loss.reference import kept, robust_error
+from voronerf.ops.composite.reference import Composite, composite, kept
+from voronerf.ops.render_loss.reference import robust_error
 
 #: Stands for infinite density, as in `composite`.
 _OPAQUE = 1e30

@@ -19,6 +19,7 @@ from voronerf.ops._core.checks import check_same_device, of_one_dtype
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.layers import MLP
 from voronerf.ops._core.program import Program
+from voronerf.ops._core.rows import new_empty, rows_of
 from voronerf.ops.cell_sort import native as cell_sort
 from voronerf.ops.grouped_mlp.network import Given, Network, as_network, half_products
 from voronerf.ops.grouped_program.native import How, Rows, run_program
@@ -135,16 +136,17 @@ class _Samples(NamedTuple):
 def _memory(given: _Samples) -> tuple[Tensor, Tensor, Tensor]:
     """Cells (empty where they are given), the order (empty where there is one cell) and offsets."""
     positions, where, k = given
-    n, new, alone = positions.shape[0], positions.new_empty, where.cells is None and where.centres is None
-    cells, order = new(n if where.cells is None else 0, dtype=torch.int32), new(0 if alone else n, dtype=torch.int32)
-    return cells, order, new(k + 1, dtype=torch.int32)
+    n, alone = rows_of(positions), where.cells is None and where.centres is None
+    sizes = n if where.cells is None else 0, 0 if alone else n, k + 1
+    cells, order, offsets = (new_empty(positions, size, dtype=torch.int32) for size in sizes)
+    return cells, order, offsets
 
 
 @custom_op("routed_mlp_native", _memory)
 def locate_and_sort(given: _Samples, results: tuple[Tensor, Tensor, Tensor]) -> None:
     """Where samples are, and their order by cell."""
     positions, (centres, child_offsets, child, depth, cells, coords, rows), _ = given
-    n, (found, order, offsets) = positions.shape[0], results
+    n, (found, order, offsets) = rows_of(positions), results
     if cells is None and centres is None:  # one cell
         if not native.on_cuda(positions):
             native.compiled.one_cell(found, offsets, n, native.cpu())

@@ -7,8 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.ops.composite.reference import check_ray_offsets, composite
-from voronerf.ops.render_loss.reference import kept
+from voronerf.ops.composite.reference import check_ray_offsets, composite, kept
 
 #: How far from a surface a point of a sparse model may lie, as a share of its distance from the camera.
 NEARBY = 0.03
