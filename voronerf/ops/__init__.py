@@ -34,9 +34,9 @@ from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_
 from voronerf.ops.ray_runs.reference import OwnSamples
 from voronerf.ops.render_loss import RenderLoss, render_loss, render_loss_gradient
 from voronerf.ops.render_opaque import RaysSeen, render_opaque
+from voronerf.ops.rendered_gradient import rendered_gradient
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
-from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.ops.smooth_depth_gradient import smooth_depth_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.spherical_harmonics import spherical_harmonics
@@ -82,11 +82,11 @@ __all__ = [
     "render_loss",
     "render_loss_gradient",
     "render_opaque",
+    "rendered_gradient",
     "resample",
     "routed_mlp",
     "run_gradients",
     "run_sums",
-    "scale_gradient",
     "smooth_depth_gradient",
     "sparse_depth_gradient",
     "spherical_harmonics",

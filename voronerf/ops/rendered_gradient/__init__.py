@@ -1,0 +1,92 @@
+"""Gradients to what networks have put out, from those to what rays show. r rays, m samples of all rays (packed)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import torch
+from torch import Tensor
+
+from voronerf.ops._core.backends import PLAIN, Implementation
+from voronerf.ops._core.declare import declare
+from voronerf.ops.render_loss.reference import scaled
+
+
+def _prepare(given: Any) -> Any:
+    return scaled("rendered_gradient", given)
+
+
+@declare(
+    native=Implementation(("cpu",), (torch.float32,)),
+    warp=PLAIN,
+    small=["gradient"],
+    writes=["gradient"],
+    prepare=_prepare,
+)
+def rendered_gradient(
+    gradient: Annotated[Tensor, "float32|float64 [m, 4]"],
+    raw: Annotated[Tensor, "same [m, 4]"],
+    density: Annotated[Tensor, "same [m]"],
+    depths: Annotated[Tensor, "same [m]"],
+    deltas: Annotated[Tensor, "same [m]"],
+    weights: Annotated[Tensor, "same [m]"],
+    ray_offsets: Annotated[Tensor, "int32 [r+1]"],
+    *,
+    background: Annotated[Tensor | None, "same [3] or [r, 3]"] = None,
+    of_colour: Annotated[Tensor | None, "same [r, 3]"] = None,
+    of_opacity: Annotated[Tensor | None, "same [r]"] = None,
+    of_depth: Annotated[Tensor | None, "same [r]"] = None,
+    of_weights: Annotated[Tensor | None, "same [m]"] = None,
+    of_rgb: Annotated[Tensor | None, "same [m, 3]"] = None,
+    of_density: Annotated[Tensor | None, "same [m]"] = None,
+    hidden: Annotated[float, "[0, 1)"] = 0.0,
+    density_scale: Annotated[float | None, "positive"] = None,
+    activated: bool = False,
+    backend: str = "auto",
+) -> None:
+    """Adds the gradient of a loss to ``raw``, from its gradients to what rays and samples show, in place.
+
+    A ray shows what `composite` makes of its samples, with weights w, and transmittance T: the colour
+    ``sum w_i c_i + (1 - sum w_i) background``, the opacity ``sum w_i``, the depth ``sum w_i d_i``, which is not divided
+    by it, and the weights. Let v_i be the gradient of the loss to w_i through all of these, ``of_weights_i + of_opacity
+    + of_depth d_i + of_colour (c_i - background)``. Then the gradient to the density is ``of_density_i +
+    delta_i (T_{i+1} v_i - sum over j > i of w_j v_j)``, and to the colour of a sample ``of_rgb_i + w_i of_colour``: the
+    derivatives of Max 1995 and of Mildenhall et al. 2020, equation 3. Those of the activations take both to ``raw``.
+    Nothing is differentiable further.
+
+    Args:
+        gradient: contiguous, to the outputs of the networks.
+        raw: colour and density before their activations, or ``activated``, as for `render_loss`.
+        density: of the samples, as `render_loss` gives it for ``raw``.
+        depths: their distances along the rays.
+        deltas: their lengths.
+        weights: their contributions to the rays.
+        ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``, possibly none. Other samples have
+            no gradient.
+        background: seen with weight 1 - opacity.
+        of_colour: gradient of the loss to the colours of the rays. None is zero, here and below.
+        of_opacity: gradient of the loss to the opacities.
+        of_depth: gradient of the loss to the depths.
+        of_weights: gradient of the loss to the weights of the samples.
+        of_rgb: gradient of the loss to the colours of the samples.
+        of_density: gradient of the loss to their densities.
+        hidden: share of the light; samples that no more than it reaches have no gradient. 0 hides none.
+        density_scale: factor on the density behind its softplus, as for `render_loss`; None with ``activated``.
+        activated: whether ``raw`` is the colour and the density themselves. So is the gradient.
+
+    Raises:
+        ValueError: a gradient that is not contiguous; ``density_scale`` with ``activated``, or neither; on the CPU
+            offsets that fall or exceed m.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import rendered_gradient
+        >>> raw = torch.tensor([[1.0, 0, 0, 0.0], [0.0, 1, 0, 50.0]])  # red air before a green wall
+        >>> depths, deltas, offsets = torch.tensor([1.0, 2.0]), torch.ones(2), torch.tensor([0, 2]).int()
+        >>> along = raw[:, 3], depths, deltas, torch.tensor([0.0, 1.0]), offsets
+        >>> gradient, slope = torch.zeros(2, 4), torch.tensor([[1.0, 0, 0]])  # of a loss that grows with red
+        >>> rendered_gradient(gradient, raw, *along, of_colour=slope, activated=True)
+        >>> gradient  # denser red air would raise it, and so would a redder wall
+        tensor([[0., 0., 0., 1.],
+                [1., 0., 0., 0.]])
+    """
