@@ -11,6 +11,7 @@ from voronerf.app.scenes import load_scene
 from voronerf.nerf import Adam, Occupancy, PlannedSplit, RayBatches, RayLoss, Renderer, SplitStrategy, TrainingStep
 from voronerf.nerf.samplers import usual_samples
 from voronerf.nerf.schedule import GROUP, learning_rate, next_rays
+from voronerf.nerf.terms import SparseDepth
 
 torch.manual_seed(0)
 scene, seconds = load_scene(sys.argv[1]), float(sys.argv[2])
@@ -21,7 +22,7 @@ field = HashGridField(**HashGridField.scene_options(pixel, cube, contracted, sec
 router = VoronoiRouter(field, torch.zeros(1, 3), coords="first3", way="fused", share=["features"])  # one cell: coarse
 sampler = Occupancy(OccupancyGrid.for_training(scene.box, samples, contraction=space.contraction), samples, space=space)
 renderer = Renderer({"field": router}, sampler).train()
-loss = RayLoss(renderer, sparse_depth=0.003)
+loss = RayLoss(renderer, terms=[SparseDepth(0.003)])
 optimizer = Adam.of({"field": router}, lr=0.02, views=len(views), sparse=["features"])
 strategy = SplitStrategy({"field": router}, [PlannedSplit(at=0.2, children=16)], generator=generator)
 where = {"near": scene.near, "far": scene.far, "box": scene.box, "background": scene.background_colour()}

@@ -10,10 +10,13 @@ from voronerf.nerf import (
     RayBatches,
     RayLoss,
     Renderer,
+    SmoothDepth,
+    SparseDepth,
     TrainingStep,
     orbit_cameras,
 )
 from voronerf.ops import Guard
+from voronerf.ops._core.active import active
 
 BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
 
@@ -51,7 +54,8 @@ class Training:
         grid.density[:6] = grid.occupied[:6] = 0
         self.sampler = sampler(grid, 32)
         shown = self.router if own is None else DirectionPerSample(self.router)
-        self.loss = RayLoss(Renderer({"field": shown}, self.sampler), smooth_depth=0.1, sparse_depth=0.3)
+        terms = [SparseDepth(0.3), SmoothDepth(0.1)]
+        self.loss = RayLoss(Renderer({"field": shown}, self.sampler), terms=terms)
         self.optimizer = Adam.of({"field": self.router}, lr=0.01, sparse=["features"])
         for group in self.optimizer.param_groups:
             group["betas"] = list(group["betas"])  # which can be changed in place
@@ -60,8 +64,13 @@ class Training:
         self.step = TrainingStep(self.batches, self.loss, self.optimizer, **given)
         self.recorded = self.done = 0
         self.handles, self.other = [], None  # of hooks, and a second optimiser
-        record = self.step._record
-        self.step._record = lambda *of: (setattr(self, "recorded", self.recorded + 1), record(*of))[1]
+        run = self.step._run_stages
+
+        def counted(*of):
+            self.recorded += active.recording is not None
+            return run(*of)
+
+        self.step._run_stages = counted
 
     def run_as_it_is(self):
         """Records no step from here on."""

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from voronerf import OccupancyGrid
+from voronerf.nerf import Batch, PlannedSplit, RenderOutput, Seen, SplitStrategy
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))  # of the tests' helpers
 
@@ -31,14 +32,18 @@ def changed_steps(rng: random.Random, folder: Path, given: Path) -> str:
         options |= {"field": Scaled, "fuse": True, "way": "fused"}
     trainings = [Training(**options) for _ in range(2)]
     trainings[1].run_as_it_is()
-    average, threads, said = rng.choice((0.0, 0.9)), torch.get_num_threads(), list[str]()
+    hooks = rng.sample([*HOOKS], rng.choice((0, 0, 1, 2)))
+    for training in trainings:
+        for name in hooks:
+            HOOKS[name](training)
+    average, threads, said = rng.choice((0.0, 0.9)), torch.get_num_threads(), hooks[:]
     for training in trainings:
         training.optimizer.average = average
     try:
         for _ in range(2):
             _steps(rng, trainings, said)
-        if "replayed" not in trainings[0].step.explain():
-            raise Failed(f"the first steps are not replayed: {trainings[0].step.explain()}")
+        if "record" not in trainings[0].step.explain():
+            raise Failed(f"the first steps are not recorded: {trainings[0].step.explain()}")
         for _ in range(CHANGES):
             name = rng.choice([*EVENTS])
             said.append(name)
@@ -50,6 +55,40 @@ def changed_steps(rng: random.Random, folder: Path, given: Path) -> str:
     finally:
         torch.set_num_threads(threads)
     return RIGHT
+
+
+class Own(SplitStrategy):
+    """Counts, and calls its base."""
+
+    seen = 0
+
+    def step_post_backward(self, output: RenderOutput) -> None:
+        self.seen += len(output.weights)
+        super().step_post_backward(output)
+
+
+def _set_strategy(training: Training) -> None:
+    plan = [PlannedSplit(at=10_000, children=2)]
+    training.step.strategy = Own({"field": training.router}, plan, generator=torch.Generator().manual_seed(0))
+
+
+def _add_term(training: Training) -> None:
+    def clear(seen: Seen, batch: Batch) -> Tensor:
+        return 0.1 * (seen.opacity * (1 - seen.opacity)).mean() + 0.01 * (seen.colour * seen.weights.sum()).mean()
+
+    training.loss.terms = (*training.loss.terms, clear)
+
+
+def _fetch(training: Training) -> None:
+    training.batches.fetch = lambda pixels: None
+
+
+#: What runs in Python in each step of a sequence.
+HOOKS: dict[str, Callable[[Training], None]] = {
+    "a strategy": _set_strategy,
+    "a term": _add_term,
+    "pictures on disk": _fetch,
+}
 
 
 def _steps(rng: random.Random, trainings: list[Training], said: list[str]) -> None:

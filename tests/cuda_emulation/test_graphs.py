@@ -10,7 +10,7 @@ from graphs import graphs
 
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
-from voronerf.nerf import SplitStrategy
+from voronerf.nerf import SplitStrategy, replayed
 
 pytestmark = pytest.mark.native
 
@@ -101,9 +101,8 @@ def test_moved_memory_is_captured_anew(which):
         assert seen.calls.count("capture") == before + 1
 
 
+@replayed
 class Reading(SplitStrategy):
-    __module__ = "voronerf.tests"
-
     def step_post_backward(self, output):
         self.line = 1 + (lambda: None).__code__.co_firstlineno
         output.loss.item()

@@ -11,7 +11,7 @@ import pytest
 from helpers import script
 
 ROOT = Path(__file__).resolve().parents[2]
-RUNNABLE = ("README.md", "docs/quickstart.md", "docs/method.md")
+RUNNABLE = ("README.md", "docs/quickstart.md", "docs/method.md", "docs/extend.md")
 GENERATED = {"docs/scene.html"}  # by `make docs`, docs/scripts/scene.py
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 
@@ -24,8 +24,9 @@ def blocks(name: str) -> list[str]:
 def test_python_on_a_page_runs(name: str) -> None:
     found = [code for code in blocks(name) if "sys.argv" not in code]
     assert found, f"{name} has no Python"
+    names = {"__name__": "__main__"}
     for number, code in enumerate(found, 1):
-        exec(compile(code, f"{name}, block {number}", "exec"), {"__name__": "__main__"})
+        exec(compile(code, f"{name}, block {number}", "exec"), names)
 
 
 def test_the_readme_shows_the_example() -> None:

@@ -16,16 +16,17 @@ from voronerf.nerf import (
     Perspective,
     RayLoss,
     Rays,
+    SparseDepth,
     Stratified,
     intersect_box,
     orbit_cameras,
     render_rays,
     render_until_opaque,
 )
-from voronerf.nerf.loss import RenderOutput
 from voronerf.nerf.radiance import radiance_of
 from voronerf.nerf.samplers import SETTLING_PART
 from voronerf.nerf.schedule import GROUP
+from voronerf.nerf.volume import RenderOutput
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 WHITE = torch.ones(3)
@@ -417,7 +418,7 @@ def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse
 
     def compare(renderer):
         batch = Batch(rays, *ends(rays), target, background, seen)
-        loss = RayLoss(renderer, sparse_depth=sparse_depth, robust=robust)
+        loss = RayLoss(renderer, terms=[SparseDepth(sparse_depth)], robust=robust)
         found = loss(batch, torch.Generator().manual_seed(3))
         return found, torch.autograd.grad(found.loss, list(router.parameters()))
 

@@ -1,6 +1,8 @@
 """Fields whose program is known: the fast step and pictures give what separate operations give."""
 
 import math
+import re
+from dataclasses import replace
 from typing import ClassVar
 
 import pytest
@@ -10,11 +12,14 @@ from helpers import renderer_of, seeded
 from torch import nn
 
 from voronerf import MLP, HashGridField, Layer, NeRF, OccupancyGrid, VoronoiRouter
-from voronerf.nerf import Adam, Batch, DirectionPerSample, RayLoss, Rays
+from voronerf.nerf import Adam, Batch, DirectionPerSample, RayLoss, Rays, SmoothDepth, SparseDepth
 from voronerf.nerf.fields.nerf import MipNeRF
 from voronerf.nerf.fields.radiance import RadianceField
 from voronerf.nerf.occupancy import density_of
 from voronerf.nerf.radiance import Radiance, radiance_of
+from voronerf.ops.render_loss.reference import robust_error
+from voronerf.ops.smooth_depth_gradient.reference import smooth_depth_loss
+from voronerf.ops.sparse_depth_gradient.reference import sparse_depth_loss
 
 pytestmark = pytest.mark.native
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -141,29 +146,78 @@ def test_the_fast_step_is_the_separate_one(name, k, monkeypatch):
 @pytest.mark.parametrize("name", ["softplus", "relu", "hash", "own table"])
 def test_with_points_of_a_sparse_model(name, monkeypatch):
     router, field = make(name)
-    compare(router, *losses(field, monkeypatch, sparse_depth=0.3), batch_of(sparse=20))
+    compare(router, *losses(field, monkeypatch, terms=[SparseDepth(0.3)]), batch_of(sparse=20))
+
+
+def term_of_all(seen, batch):
+    """A term of all that a ray shows."""
+    near = (seen.colour - batch.target).abs().mean() + (seen.depth / batch.far).mean()
+    fog = (seen.density / (1 + seen.density) * seen.samples.deltas).mean() + (seen.rgb * seen.weights[:, None]).mean()
+    return near + fog + seen.opacity.square().mean() + seen.weights.square().sum() / len(batch.rays)
 
 
 @pytest.mark.parametrize("name", ["softplus", "relu", "table"])
 def test_with_a_term_in_torch(name, monkeypatch):
-    """Of all that a ray shows: the fast step carries it through the outputs of the networks."""
+    """The fast step and the separate one carry it through the outputs of the networks."""
     router, field = make(name)
-
-    def term(seen, batch):
-        near = (seen.colour - batch.target).abs().mean() + (seen.depth / batch.far).mean()
-        return near + seen.opacity.square().mean() + seen.weights.square().sum() / len(batch.rays)
-
-    fast, separate = losses(field, monkeypatch, term=term, sparse_depth=0.3)
+    fast, separate = losses(field, monkeypatch, terms=[SparseDepth(0.3), term_of_all])
     compare(router, fast, separate, batch_of(sparse=20))
-    without = losses(field, monkeypatch, sparse_depth=0.3)[0](batch_of(sparse=20), seeded(3))
-    assert fast(batch_of(sparse=20), seeded(3)).loss > without.loss + 0.1
+
+
+@pytest.mark.parametrize("name", ["relu", "hash"])
+def test_equals_a_rendering_that_torch_differentiates(name, monkeypatch):
+    """The error of the colours and all kinds of terms, each by the formula of its reference."""
+    router, field = make(name)
+    terms = [SparseDepth(0.3), term_of_all, SmoothDepth(0.2)]
+    fast, separate = losses(field, monkeypatch, terms=terms, robust=0.05)
+    batch, found = batch_of(sparse=20, unseen=12), []
+    for loss in (fast, separate):
+        router.zero_grad()
+        found.append([loss(batch, seeded(3), backward=True).loss, *(p.grad.clone() for p in router.parameters())])
+    router.zero_grad()
+    given = {"background": batch.background, "jitter": True, "generator": seeded(3)}
+    seen = separate.renderer.render(batch.rays, batch.near, batch.far, **given)[-1]
+    samples = seen.samples
+    along = seen.weights, samples.depths, samples.deltas, samples.ray_offsets
+    error = (seen.colour - batch.target).square().sum(-1)[:28]
+    disparity = torch.zeros(64).index_add(0, samples.ray_index.long(), seen.weights / samples.depths)
+    expected = robust_error(error, 0.05).sum() / 192 + 0.3 * sparse_depth_loss(*along, batch.sparse_depths).mean()
+    expected = expected + 0.2 * smooth_depth_loss(disparity, seen.opacity, batch.far, 12) + term_of_all(seen, batch)
+    expected.backward()
+    for own in found:
+        for part, other in zip(own, [expected.detach(), *(p.grad for p in router.parameters())], strict=True):
+            torch.testing.assert_close(part, other, rtol=2e-3, atol=1e-6 + 1e-4 * float(other.abs().max()))
+
+
+@pytest.mark.parametrize(("term", "came"), [(lambda seen, batch: 0.5, "0.5"), (lambda seen, batch: seen.depth, "[64]")])
+def test_a_term_that_gives_no_scalar_is_refused(term, came, monkeypatch):
+    _, field = make("relu")
+    for loss in losses(field, monkeypatch, terms=[term]):
+        with pytest.raises(ValueError, match=f"RayLoss: a term must give a scalar tensor, got {re.escape(came)}"):
+            loss(batch_of())
+
+
+def test_colours_that_would_learn_are_refused(monkeypatch):
+    _, field = make("relu")
+    for loss in losses(field, monkeypatch):
+        batch = replace(batch_of(), background=torch.ones(3, requires_grad=True))
+        with pytest.raises(ValueError, match="RayLoss: background must need no gradient"):
+            loss(batch)
+
+
+def test_a_term_that_reads_nothing_adds_to_the_loss_alone(monkeypatch):
+    _, field = make("relu")
+    with_it, without = (
+        losses(field, monkeypatch, terms=terms)[0](batch_of(), seeded(3)) for terms in ([lambda *_: torch.ones(())], [])
+    )
+    torch.testing.assert_close(with_it.loss, without.loss + 1)
 
 
 @pytest.mark.parametrize("name", ["relu", "hash"])
 def test_with_rays_from_where_no_camera_was(name, monkeypatch):
     """Their depths are learnt from, their colours are not."""
     router, field = make(name)
-    fast, separate = losses(field, monkeypatch, smooth_depth=0.3, sparse_depth=0.3, robust=0.05)
+    fast, separate = losses(field, monkeypatch, terms=[SmoothDepth(0.3), SparseDepth(0.3)], robust=0.05)
     batch = batch_of(sparse=20, unseen=12)
     compare(router, fast, separate, batch)
     found = fast(batch, seeded(3))

@@ -8,8 +8,8 @@ import torch
 from step_training import BOX, Scaled, Training, same
 
 from voronerf import OccupancyGrid
-from voronerf.nerf import Occupancy, PlannedSplit, SplitStrategy
-from voronerf.ops import cell_sort
+from voronerf.nerf import PlannedSplit, SplitStrategy, replayed
+from voronerf.ops import cell_sort, nearest_centre, spherical_harmonics
 from voronerf.ops._core.recording import Recording
 
 pytestmark = pytest.mark.native
@@ -86,7 +86,8 @@ def test_steps_in_one_call_are_the_same_bits(cells, threads):
             training.optimizer.set_learning_rate(0.01 / (1 + done // 16))
             made = training.step(40 + done // 16, steps, at=done)
             done += steps
-        assert "replayed" in training.step.explain() and set(training.step._parts) == {"before", "after"}
+        assert "replayed" in training.step.explain() and set(training.step._segments) == {"before", "step 0", "after"}
+        assert not any(segment.obstacle for segment in training.step._segments.values())
         with training.optimizer.averaged():
             shown = [p.detach().clone() for p in training.router.parameters()]
         found.append([made.loss, made.output.weights, *shown, *training.everything()])
@@ -112,26 +113,63 @@ def test_gradients_are_there_after_each_step():
     assert same(one.kept, other.kept) and same(one.everything(), other.everything())
 
 
-def test_numbers_of_rows_that_are_much_the_same():
-    """A tensor may have one row more than there are rays."""
+def test_numbers_of_rows_that_were_the_same():
+    """Two of them are told apart, though they were one number when the calls were recorded."""
+    centres = torch.rand(5, 3)
     with Recording() as recording:
-        recording.count(lambda: 8)
-        recording.count(lambda: 9)
-    assert recording.obstacle == "two numbers of rows are much the same, 9"
+        found = [nearest_centre(recording.take(torch.rand(6, 3)), centres) for _ in range(2)]
+    for rows in ((4, 7), (7, 6), (6, 6)):
+        points = [torch.rand(count, 3) for count in rows]
+        assert recording.replay(1, taken=points) == 1
+        for cells, given in zip(recording.now(found), points, strict=True):
+            assert torch.equal(cells, nearest_centre(given, centres))
+
+
+def test_a_number_of_rows_that_is_no_count_is_refused():
+    """A call would make the same rows again and again, or write to memory of fewer."""
+    points, centres = torch.rand(6, 3), torch.rand(5, 3)
+    with Recording() as recording:
+        nearest_centre(points, centres)
+    assert recording.obstacle == "a number of rows lies in no memory, 6"
+    with Recording() as recording:
+        taken = recording.take(points)
+        taken.new_empty(taken.shape)
+    assert recording.obstacle.startswith("new memory of 6 rows is not counted, in test_step.py:")
+    with Recording() as recording:
+        spherical_harmonics(recording.take(points), 2)
+    assert recording.obstacle == "spherical_harmonics takes no number of rows that is counted"
+
+
+def test_torch_entry_by_entry_is_computed_again():
+    """In place, in new memory, and of a column; what takes rows for columns, or draws, is refused."""
+    with Recording() as recording:
+        x = recording.take(torch.rand(6, 3))
+        y = torch.sigmoid(x[:, 1]) * 2
+        x[:, :2].addcmul_(y[:, None], y[:, None], value=3.0)
+    for rows in (5, 7, 6):
+        given = torch.rand(rows, 3)
+        assert recording.replay(1, taken=[given]) == 1
+        expected = given.clone()
+        own = torch.sigmoid(expected[:, 1]) * 2
+        expected[:, :2].addcmul_(own[:, None], own[:, None], value=3.0)
+        assert same(recording.now([x, y]), [expected, own])
+    for refused in (lambda x: x.t() + 1, lambda x: x[:, 0] + x.new_empty(2, 6), torch.bernoulli, torch.sum):
+        with Recording() as recording:
+            refused(recording.take(torch.rand(6, 3)))
+        assert recording.obstacle.startswith("torch "), refused
 
 
 def test_a_replay_refuses_what_a_call_finds_wrong():
     """Cells that came to lie out of range between replays are refused, as by the call itself."""
     cells = torch.tensor([0, 2, 1, 2, 0, 1], dtype=torch.int32)
     with Recording() as recording:
-        recording.count(lambda: 6)
-        order, _ = cell_sort(cells, 3)
-    assert recording.obstacle is None and recording.replay(threads=1) == 1
+        order, _ = cell_sort(recording.take(cells), 3)
+    assert recording.obstacle is None and recording.replay(1, taken=[cells]) == 1
     cells[3] = 5
     with pytest.raises(ValueError, match="cell_sort: indices out of range"):
-        recording.replay(threads=1)
+        recording.replay(1, taken=[cells])
     cells[3] = 0
-    assert recording.replay(threads=1) == 1 and order.tolist() == [0, 3, 4, 2, 5, 1]
+    assert recording.replay(1, taken=[cells]) == 1 and order.tolist() == [0, 3, 4, 2, 5, 1]
 
 
 @pytest.mark.parametrize(
@@ -354,28 +392,6 @@ def test_learning_rate_and_averages_follow_the_loop():
     assert same(one.shown, other.shown) and same(one.everything(), other.everything())
 
 
-class Counting(Occupancy):
-    """A user's own, which does something in Python."""
-
-    asked = 0
-
-    def sample(self, *given, **more):
-        self.asked += 1
-        return super().sample(*given, **more)
-
-
-def test_what_python_does_is_not_lost():
-    training = Training(sampler=Counting)
-    training.train(6)
-    assert training.sampler.asked == 6
-    assert "Counting may do in Python what is not seen" in training.step.explain()
-    training = Training()
-    training.train(2)
-    training.loss.term = lambda seen, batch: seen.opacity.mean()
-    training.train(1)
-    assert "function may do in Python what is not seen" in training.step.explain()
-
-
 class Torch(torch.nn.Module):
     """A field that is not fused, so its layers are torch's."""
 
@@ -408,26 +424,27 @@ def test_a_fused_field_is_replayed():
     assert same(*found)
 
 
+@replayed
+class Keeping(SplitStrategy):
+    """Says that its hook may be replayed, though torch sums in it."""
+
+    line = 0
+
+    def step_post_backward(self, output):
+        Keeping.line = 1 + (lambda: None).__code__.co_firstlineno
+        self.seen = output.weights.sum()
+
+
 def test_torch_in_a_step_is_named_and_tried_no_longer():
-    """Samples for a split that torch keeps: after it steps are replayed."""
     training = Training()
     given = {"field": training.router}, [PlannedSplit(at=8, children=2)]
     training.step.strategy = Keeping(*given, generator=torch.Generator().manual_seed(0))
     training.train(8)
     explained = training.step.explain()
-    assert explained == f"step: runs as it is, since torch computes sin, in {__file__.split('/')[-1]}:{Keeping.line}"
+    assert explained == f"step: runs as it is, since torch computes sum, in {__file__.split('/')[-1]}:{Keeping.line}"
     before = training.recorded
     training.train(100)
     assert training.recorded <= before + 7
-
-
-class Keeping(SplitStrategy):
-    __module__ = "voronerf.tests"
-    line = 0
-
-    def step_post_backward(self, output):
-        Keeping.line = 1 + (lambda: None).__code__.co_firstlineno
-        self.seen = output.weights.sin()
 
 
 def test_a_profiler_sees_the_operations():

@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import refuses, render_image, renderer_of, seeded
 
-from voronerf.nerf import Batch, OccupancyGrid, RayLoss, Space, Stratified, render_rays
+from voronerf.nerf import Batch, OccupancyGrid, RayLoss, Space, SparseDepth, Stratified, render_rays
 from voronerf.nerf.cameras import Rays, orbit_cameras
 
 BOX = torch.tensor([[-0.7, -0.7, -0.7], [0.7, 0.7, 0.7]])
@@ -135,7 +135,7 @@ def test_the_last_rays_end_at_points():
     renderer.sampler.sample = lambda *_, **__: rendered.samples  # without jitter
     expected = 0.1 * sum(-math.log(math.exp(-0.125 * before) * (1 - math.exp(-0.125 * many))) for before, many in ENDS)
     target, seen = rendered.colour, torch.tensor([2.0, 2.9])
-    loss = RayLoss(renderer, sparse_depth=0.1)
+    loss = RayLoss(renderer, terms=[SparseDepth(0.1)])
     assert float(loss(Batch(ahead, *ends, target, None, seen)).loss) == pytest.approx(expected / 2, rel=1e-5)
     assert float(loss(Batch(ahead, *ends, target)).loss) == 0
 

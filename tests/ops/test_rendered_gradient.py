@@ -43,7 +43,7 @@ def complete(given, rule):
 
 
 def learnt(given, backend, device="cpu", dtype=torch.float32, **rule):
-    """What is added to a gradient of ones."""
+    """The difference to a gradient of ones."""
     cast = {name: value.to(device, dtype if value.is_floating_point() else None) for name, value in given.items()}
     gradient = torch.ones_like(cast["raw"])
     rendered_gradient(gradient, **cast, **rule, backend=backend)

@@ -223,7 +223,7 @@ def test_parts_of_steps_are_replayed(tmp_path, monkeypatch):
     """With the same bits as steps that run as they are, beyond a split and looks at empty space."""
     found = []
     monkeypatch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 20)
-    for expected in ("parts of it are recorded", "a test"):
+    for expected in ("recorded and replayed", "a test"):
         if found:
             monkeypatch.setattr(TrainingStep, "_standing_obstacle", lambda *of, **how: "a test")
         town = build_some(tmp_path / expected, 60)
@@ -231,7 +231,8 @@ def test_parts_of_steps_are_replayed(tmp_path, monkeypatch):
         found.append([v for state in town.states.values() for v in snapshot(state).tensors.values()])
         for state in town.states.values():
             assert expected in state.training_step.explain()
-            replayed = {name for name, part in state.training_step._parts.items() if part.replayed}
+            assert "another segment" not in state.training_step.explain()
+            replayed = {name for name, each in state.training_step._segments.items() if each.replayed}
             assert replayed >= ({"own rays: networks", "own rays: gradients beside 0"} if len(found) == 1 else set())
     assert all(one.equal(other) for one, other in zip(*found, strict=True))
 
@@ -290,7 +291,7 @@ def test_one_territory_of_photographs_is_an_ordinary_training(tmp_path):
     more = {"rays": 32, "samples": (16,), "cells": (2,), "field_options": ("levels=4", "log2_entries=10")}
     config = TrainConfig(steps=30, out=tmp_path / "run", **more)
     town, alone = train.build_town(config, scene, 1, group.Group(torch.device("cpu"))), build(config, scene)
-    assert alone.batches.unseen > 0 and alone.ray_loss.sparse_depth > 0
+    assert alone.batches.unseen > 0 and [each.factor > 0 for each in alone.ray_loss.terms] == [True, True]
     train.train(town)
     train_alone(alone)
     found, expected = snapshot(town.first).tensors, snapshot(alone).tensors

@@ -1,20 +1,22 @@
 """The pieces of a radiance-field training, each usable alone: cameras, samplers, rendering, the loss, splits."""
 
 from voronerf.nerf.adam import Adam
-from voronerf.nerf.batches import RayBatches
+from voronerf.nerf.batches import RayBatches, RaySource
 from voronerf.nerf.cameras import Cameras, Rays, focus_point, orbit_cameras, turntable_cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import DirectionPerSample, Field
-from voronerf.nerf.loss import Batch, RayLoss, RenderOutput
+from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.marching import RayColours, render_until_opaque
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import RenderedImage, Renderer, render_rays
 from voronerf.nerf.samplers import SAMPLERS, Hierarchical, Occupancy, Sampler, Stratified
 from voronerf.nerf.sampling import stratified_depths
+from voronerf.nerf.segment import replayed
 from voronerf.nerf.split import PlannedSplit, SplitDone, SplitStrategy, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
-from voronerf.nerf.volume import Rendered, Samples, Space
+from voronerf.nerf.terms import LossAlongRays, Seen, SmoothDepth, SparseDepth, Term
+from voronerf.nerf.volume import Batch, Rendered, RenderOutput, Samples, Space
 
 __all__ = [
     "SAMPLERS",
@@ -25,6 +27,7 @@ __all__ = [
     "DirectionPerSample",
     "Field",
     "Hierarchical",
+    "LossAlongRays",
     "Occupancy",
     "OccupancyGrid",
     "Perspective",
@@ -32,6 +35,7 @@ __all__ = [
     "RayBatches",
     "RayColours",
     "RayLoss",
+    "RaySource",
     "Rays",
     "RenderOutput",
     "Rendered",
@@ -39,18 +43,23 @@ __all__ = [
     "Renderer",
     "Sampler",
     "Samples",
+    "Seen",
+    "SmoothDepth",
     "Space",
+    "SparseDepth",
     "SplitDone",
     "SplitStrategy",
     "StepOutput",
     "Strategy",
     "Stratified",
+    "Term",
     "TrainingStep",
     "focus_point",
     "intersect_box",
     "orbit_cameras",
     "render_rays",
     "render_until_opaque",
+    "replayed",
     "stratified_depths",
     "turntable_cameras",
 ]

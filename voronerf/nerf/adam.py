@@ -13,7 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.nerf import schedule
-from voronerf.ops._core.recording import varying
+from voronerf.nerf.segment import replayed
+from voronerf.ops._core.rows import varying
 from voronerf.ops.adam import Guard, Rule, adam, average
 from voronerf.router import VoronoiRouter
 from voronerf.router.optimizers import trained_parts
@@ -27,6 +28,7 @@ TABLE_DECAY, DECAY_VIEWS = 0.1, 300
 _AVERAGE = "average"
 
 
+@replayed
 class Adam(torch.optim.Adam):
     """``torch.optim.Adam``, with groups of parameters whose entries without a gradient stay as they are.
 

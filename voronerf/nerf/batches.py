@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from voronerf.nerf.cameras import Cameras, Rays
-from voronerf.nerf.loss import Batch
 from voronerf.nerf.occupancy import draw_seed
-from voronerf.ops._core.recording import following_count
+from voronerf.nerf.segment import replayed
+from voronerf.nerf.volume import Batch
+from voronerf.ops._core.rows import following_count
 from voronerf.ops.draw_pixels import Known, Runs, draw_pixels
 from voronerf.ops.unseen_rays import unseen_rays
 
@@ -21,6 +22,40 @@ SPARSE = 0.25
 UNSEEN, TILT = 1 / 12, 0.15
 
 
+class RaySource(Protocol):
+    """A source of rays for a `TrainingStep`, which asks it once in each step, before all else.
+
+    Attributes:
+        device: The one on which its rays lie.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import Batch, Rays
+        >>> class Sphere:  # looks from a sphere at what is white
+        ...     device = torch.device("cpu")
+        ...     def draw(self, count, generator):
+        ...         inwards = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+        ...         ends = torch.full((count,), 2.0), torch.full((count,), 6.0)
+        ...         return Batch(Rays(-4 * inwards, inwards), *ends, torch.ones(count, 3))
+        >>> len(Sphere().draw(5, torch.Generator()).rays)
+        5
+    """
+
+    device: torch.device
+
+    def draw(self, count: int, generator: torch.Generator) -> Batch:
+        """The rays of a step, and their colours.
+
+        Args:
+            count: How many, at least 1.
+            generator: Draws random numbers, on the device.
+
+        Returns:
+            As many rays or others; they may differ in number from step to step.
+        """
+
+
+@replayed
 class RayBatches:
     """Draws rays uniformly from those pixels of pictures whose ray meets the box of the scene.
 

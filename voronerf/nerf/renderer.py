@@ -17,6 +17,7 @@ from voronerf.nerf.field import Field
 from voronerf.nerf.marching import RayColours
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.samplers import Sampler, Stratified
+from voronerf.nerf.segment import replayed
 from voronerf.nerf.volume import Rendered, Samples, per_ray, render_samples
 
 
@@ -47,6 +48,7 @@ class RenderedImage(NamedTuple):
     heaviest: Tensor
 
 
+@replayed
 class Renderer:
     """Renders the rays of a scene: fields, asked where a sampler says.
 

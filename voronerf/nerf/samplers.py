@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -29,12 +29,10 @@ from voronerf.nerf.sampling import (
     union_depths,
 )
 from voronerf.nerf.schedule import WARMUP_STEPS
-from voronerf.nerf.volume import Rendered, Samples, Space
-from voronerf.ops._core.recording import fixed_count
+from voronerf.nerf.segment import replayed
+from voronerf.nerf.volume import Rendered, RenderOutput, Samples, Space
+from voronerf.ops._core.rows import fixed_count
 from voronerf.ops.resample import resample
-
-if TYPE_CHECKING:
-    from voronerf.nerf.loss import RenderOutput
 
 #: Share of the first pass in the loss if one network is evaluated in two passes (mip-NeRF, section 3.2).
 COARSE_SHARE = 0.1
@@ -59,12 +57,16 @@ LONG_IN_BOX, LONG_SAMPLES = 0.45, 256
 Look = Callable[[str, Samples], Rendered]
 
 
+@replayed
 class Sampler:
     """Where along rays a field is asked, and what becomes of that between the steps of a training.
 
     A subclass defines :meth:`sample`. One with several passes defines :meth:`draw` and :meth:`loss_before` too, one
     that learns from a training the two methods of steps, and one that skips empty space ``grid``. Nothing asks for the
-    class of a sampler.
+    class of a sampler. A step of a training calls :meth:`step_pre_backward`, :meth:`sample` after its rays are drawn,
+    and :meth:`step_post_backward` after the optimiser, once each. They may change the sampler and its grid; what they
+    change of other objects counts from the next step on. Their tensors are the step's own memory, to be read before
+    they return. A recorded step calls those that a subclass overrides, and makes the calls of the others again.
 
     Attributes:
         passes: How often a ray is sampled, each time with a number of samples of its own.
@@ -225,6 +227,7 @@ class Sampler:
         """
 
 
+@replayed
 class Stratified(Sampler):
     """One sample in each of s strata of a ray (NeRF, section 4).
 
@@ -259,6 +262,7 @@ class Stratified(Sampler):
         return space.samples(rays, depths, edges)
 
 
+@replayed
 class Occupancy(Sampler):
     """`Stratified` without the samples in empty voxels of a grid: rays have as many as are left.
 
@@ -437,6 +441,7 @@ class Occupancy(Sampler):
         return Samples(*parts, rows=rows), found.stop
 
 
+@replayed
 class Hierarchical(Stratified):
     """Two passes: the second samples where the first found something (NeRF, section 5.2; mip-NeRF, section 3.2).
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,10 +15,9 @@ from torch import Tensor
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.reservoir import SampleReservoir
 from voronerf.diagram.subdivision import Split, split_diagram
+from voronerf.nerf.segment import replayed
+from voronerf.nerf.volume import RenderOutput
 from voronerf.router import VoronoiRouter
-
-if TYPE_CHECKING:
-    from voronerf.nerf.loss import RenderOutput
 
 #: Default times as fractions of a run: of a single split, and of the first and last of several.
 ONLY, FIRST, LAST = 0.2, 0.15, 0.5
@@ -101,8 +100,15 @@ class SplitDone(NamedTuple):
     importance: Tensor
 
 
+@replayed
 class Strategy:
     """What a training asks of a rule when and where cells divide; this one never divides them.
+
+    Before each step the loop asks :meth:`is_due`, and :meth:`has_samples` where a split can wait, and calls
+    :meth:`step_pre_backward` where it is: networks and optimiser change there alone. After the optimiser each step
+    calls :meth:`step_post_backward`, which may change the strategy itself; tensors of the output are the step's own
+    memory, to be read before it returns. A recorded step calls what a subclass overrides, and makes the calls of the
+    others again.
 
     Attributes:
         inherit: Whether new cells start as copies of their parent.
@@ -168,6 +174,7 @@ class Strategy:
         """
 
 
+@replayed
 class SplitStrategy(Strategy):
     """Splits the cells of routers at planned times by the samples that are still wrong (Elsner et al. 2023, section 3).
 

@@ -1,10 +1,15 @@
-"""A step of a training, recorded once and replayed from then on. r rays, m samples of all rays."""
+"""A step of a training: stages, of which those that ops compute are recorded once and replayed from then on.
+
+r rays, m samples of all rays.
+"""
 
 from __future__ import annotations
 
 import functools
+import itertools
 import operator
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
 
@@ -13,11 +18,12 @@ from torch import Tensor, nn
 
 from voronerf.nerf import schedule
 from voronerf.nerf.adam import Adam
-from voronerf.nerf.batches import RayBatches
-from voronerf.nerf.loss import Batch, RayLoss, RenderOutput
-from voronerf.nerf.part import LONGEST_WAIT, Made, Part
+from voronerf.nerf.batches import RaySource
+from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.radiance import Radiance
+from voronerf.nerf.segment import LONGEST_WAIT, Made, Segment, Stage, free_names, in_python, run_stages
 from voronerf.nerf.split import Strategy
+from voronerf.nerf.volume import Batch, RenderOutput
 from voronerf.ops import Guard
 from voronerf.ops._core import backends
 from voronerf.ops._core.capture import Capture
@@ -52,15 +58,15 @@ class StepOutput:
     @property
     def rays(self) -> int:
         """How many there were."""
-        return len(self._batch.rays) if self._recording is None else self._recording.rows(0)
+        return len(self._batch.rays if self._recording is None else self._recording.now(self._batch.rays.origins))
 
     @property
     def samples(self) -> int:
         """How many the rays had; waits for the device."""
-        rows = self._output.samples.rows
+        rows, weights = self._output.samples.rows, self._output.weights
         if self._recording is not None:
-            return self._recording.rows_of(self._output.weights)
-        return len(self._output.weights) if rows is None else int(rows)
+            weights = self._recording.now(weights)
+        return len(weights) if rows is None else int(rows)
 
     @property
     def batch(self) -> Batch:
@@ -78,14 +84,16 @@ class TrainingStep:
 
     The calls of the compiled module that a step makes are recorded, and made again by the steps that follow, in one
     call for all of them that are asked for at once: no Python runs in between, and threads are woken once. Results are
-    the same bits. On CUDA, a step is captured in a CUDA graph, after one of its kind; another number of rays is
-    captured anew. What keeps a step from that (:meth:`explain`) lets it run as it is. What the objects are set to is
-    followed, by their attributes, and so is a tensor that moves to other memory (``x.data = y``); an object that is
-    changed inside needs :meth:`forget`. A parameter that needs a gradient and is not the optimiser's, such as that of
-    a second optimiser, keeps a step from being replayed.
+    the same bits. A hook that is one's own (`replayed` says which is not) is called in each step, between two segments
+    of such calls: of a `Sampler`, a `Strategy`, a source of rays, or a term of the loss. What it changes of other
+    objects counts from the next step on. On CUDA, a step without such hooks is captured in a CUDA graph, after one of
+    its kind; another number of rays is captured anew. What keeps a step from all that (:meth:`explain`) lets it run as
+    it is. What the objects are set to is followed, by their attributes, and so is a tensor that moves to other memory
+    (``x.data = y``); an object that is changed inside needs :meth:`forget`. A parameter that needs a gradient and is
+    not the optimiser's, such as that of a second optimiser, keeps a step from being replayed.
 
     Args:
-        batches: Where rays come from.
+        batches: Where rays come from: `RayBatches`, or another :class:`RaySource`.
         loss: From rays to gradients, with the sampler.
         optimizer: Of all networks. Learning rates may change from step to step.
         strategy: What keeps samples for the splits; None for none.
@@ -114,7 +122,7 @@ class TrainingStep:
 
     def __init__(
         self,
-        batches: RayBatches,
+        batches: RaySource,
         loss: RayLoss,
         optimizer: Adam,
         *,
@@ -127,34 +135,48 @@ class TrainingStep:
         self.batches, self.loss, self.optimizer, self.strategy, self.guard = batches, loss, optimizer, strategy, guard
         self.generator, self.autocast, self.scaler = generator, autocast, scaler
         self.as_it_is: Callable[[], AbstractContextManager[None]] = nullcontext  # around a step that is not replayed
-        self._rays = self._wait = self._left = 0  # steps that run as they are, the next time, and still this time
+        self._segments, self._same = dict[str, Segment](), False
+        self._asked = self._wait = self._left = 0  # of a capture: as of a segment
         self.forget()
 
     def forget(self) -> None:
         """Records the next step anew."""
-        self._recording: Recording | Capture | None = None
-        self._made: Any = None  # batch and output, when it was recorded
+        for segment in self._segments.values():
+            segment.forget()
+        self._capture: Capture | None = None
+        self._captured: Any = None  # batch and output of the capture
+        self._groups = list[tuple[bool, str, list[Stage]]]()  # of the stages: whether in Python, and a name
+        self._last = Made({})
+        self._spent = dict[str, tuple[float, int]]()  # seconds and calls of each hook in Python
         self._gradients = list[tuple[nn.Parameter, Tensor | None]]()  # the memory that replays write
         self._guards: Any = None
         self._cpu: Callable[[], Any]
         self._known: Radiance | None = None
         self._parameters = list[nn.Parameter]()  # of the field and the optimiser
-        self._parts = dict[str, Part]()
         self._objects, self._values = list[Any](), list[Any]()
-        self._obstacle, self._same = "", False
+        self._obstacle = ""
 
     def explain(self) -> str:
-        """Whether steps are replayed, and what keeps them from it."""
-        if isinstance(self._recording, Capture):
+        """Whether steps are replayed, what keeps them from it, and what runs in Python in between."""
+        if self._capture is not None:
             return "step: captured and replayed as a CUDA graph"
-        if self._recording is not None and self._left:
-            return f"step: runs as it is {self._left} times more, since the last recordings were not replayed"
-        if self._recording is not None:
-            return f"step: recorded and replayed, {len(self._recording)} calls"
-        if parts := sum(part.recorded for part in self._parts.values()):
-            return f"step: {parts} parts of it are recorded and replayed"
+        segments = [each for name, each in self._segments.items() if name not in ("before", "after")]
         obstacle = self._obstacle or self._standing_obstacle()
-        return "step: will be recorded" if obstacle is None else f"step: runs as it is, since {obstacle}"
+        obstacle = obstacle or next((each.obstacle for each in segments if each.obstacle), "")
+        recorded = [each.recording for each in segments if each.recording is not None]
+        if obstacle and not recorded:
+            return f"step: runs as it is, since {obstacle}"
+        if not obstacle and (left := max((self._left, *(each.left for each in segments)))):
+            return f"step: runs as it is {left} times more, since the last recordings were not replayed"
+        if not recorded:
+            return "step: will be recorded"
+        calls, several = sum(map(len, recorded)), f" in {len(recorded)} segments" if len(recorded) > 1 else ""
+        lines = [f"step: recorded and replayed, {calls} calls{several}"]
+        others = [each.obstacle for each in self._segments.values() if each.obstacle]
+        lines += [f"another segment runs as it is, since {each}" for each in others]
+        spent = self._spent.items()
+        lines += [f"in Python: {name}, {1e3 * seconds / calls:.3f} ms a call" for name, (seconds, calls) in spent]
+        return "\n".join(lines)
 
     def __call__(self, rays: int, steps: int = 1, *, at: int | None = None) -> StepOutput:
         """Makes steps in a row, with the same learning rate.
@@ -163,8 +185,9 @@ class TrainingStep:
             rays: Of each step.
             steps: How many, at least 1.
             at: Steps done before. With it, the sampler's ``step_pre_backward`` is called before every step that asks
-                for it (``steps_alike``), and the optimiser's ``after_step`` after every step whose number is a
-                multiple of `GROUP`; they are recorded, too. None where the loop calls them.
+                for it (``steps_alike``), before each where hooks are one's own, and the optimiser's ``after_step``
+                after every step whose number is a multiple of `GROUP`; they are recorded, too. None where the loop
+                calls them.
 
         Returns:
             What the last step has found.
@@ -174,21 +197,30 @@ class TrainingStep:
         """
         if steps < 1:
             raise ValueError(f"TrainingStep: steps must be >= 1, got {steps}")
-        self._rays = rays
         if at is None:
-            return self._make_all(steps, None)[0]
+            return self._make_all(rays, steps)
         sampler, end = self.loss.renderer.sampler, at + steps
         while at < end:
-            part = min(end - at, schedule.GROUP - at % schedule.GROUP, sampler.steps_alike(at))
-            output, same = self._make_all(part, self._before(at))
+            alike = 1 if self._calls_hooks() else sampler.steps_alike(at)
+            part = min(end - at, schedule.GROUP - at % schedule.GROUP, alike)
+            ask = self._asking(at)
+            if sampler.asks_at(at) and not in_python(sampler, "step_pre_backward"):
+                self._beside("before", ask)
+            else:
+                ask()
+            output = self._make_all(rays, part)
             at += part
-            self._after(at, same)
+            self.optimizer.steps_done = at
+            if at % schedule.GROUP == 0:
+                self._beside("after", functools.partial(self.optimizer.after_step, at))
         return output
 
-    def begin(self, at: int) -> None:
-        """Begins a step that another loop makes of parts, since the host computes something in between.
+    # Several segments of a step that another loop makes, since the host computes something in between -----------------
 
-        The sampler's ``step_pre_backward`` is called; then come parts (:meth:`part`), and :meth:`end`.
+    def begin(self, at: int) -> None:
+        """Begins a step that another loop makes of segments, since the host computes something in between.
+
+        The sampler's ``step_pre_backward`` is called; then come segments (:meth:`do`), and :meth:`end`.
 
         Args:
             at: Steps done before.
@@ -199,207 +231,231 @@ class TrainingStep:
         self._same = self._is_same()
         if not self._same:
             self.forget()
-            self._obstacle = self._standing_obstacle(draws=False) or ("it runs on a GPU" if self._on_gpu() else "")
+            self._obstacle = self._standing_obstacle() or ("it runs on a GPU" if self._on_gpu() else "")
+            if not self._obstacle:
+                self._guard()
         if asks:
-            self.part("before", ask)
+            self.do("before", ask)
         self.optimizer.zero_grad(set_to_none=True)
 
     def draw(self, rays: int) -> Batch:
-        """The part of a step that draws so many rays."""
-        draw = functools.partial(self.batches.draw, rays, self.generator)
-        if self.batches.fetch is not None:
-            return draw()
-        made = self.part("rays", draw, rows=(rays,))
+        """Draws so many rays."""
+        draw = functools.partial(self.batches.draw, generator=self.generator)
+        made = self.do("rays", draw, rays) if not self._draws_in_python() else Made(draw(rays))
         return cast(Batch, made.now(made.value))
 
-    def part(
-        self,
-        name: str,
-        function: Callable[..., Any],
-        *made: Made,
-        tensors: Sequence[Tensor] = (),
-        rows: Sequence[int] = (),
-    ) -> Made:
-        """A part of a step; it is recorded by itself, and replayed.
+    def do(self, name: str, function: Callable[..., Any], *given: Any) -> Made:
+        """A segment of a step, see :class:`Segment`.
 
         Args:
             name: The same in each step.
-            function: Of the values of other parts, and of tensors, as of these objects.
-            made: What it reads of other parts of this step.
-            tensors: What it reads else.
-            rows: Numbers of rows that these have, and that change from step to step.
+            function: The same in each step, but for what it is given.
+            given: As of a segment.
         """
         if self._obstacle:
-            return Made(function(*(each.now(each.value) for each in made), *tensors))
-        return self._parts.setdefault(name, Part())(function, made, tensors, rows)
+            return Made(function(*(each.now(each.value) if isinstance(each, Made) else each for each in given)))
+        return self._segments.setdefault(name, Segment())(function, *given)
 
     def end(self, at: int, output: RenderOutput, *gradients: Made) -> None:
-        """Ends a step of parts: optimiser, sampler and splits learn.
+        """Ends a step of segments: optimiser, sampler and splits learn.
 
         Args:
             at: Steps done, with this one.
             output: What was found, with the loss.
-            gradients: The parts that have left gradients at the parameters; without any there is nothing to learn.
+            gradients: The segments that have left gradients at the parameters; without any there is nothing to learn.
         """
         if gradients:
-            self.part(f"update of {len(gradients)}", self._update, *gradients, tensors=(output.loss,))
-        self._tell(output)
-        if not self._same and not self._obstacle:
-            self._guard()
+            self.do(f"update of {len(gradients)}", self._update, output.loss, *gradients)
+        for stage in self._telling():
+            stage.function(output)
         self.optimizer.steps_done = at
         if at % schedule.GROUP == 0:
-            self.part("after", functools.partial(self.optimizer.after_step, at))
+            self.do("after", functools.partial(self.optimizer.after_step, at))
 
-    def _update(self, *given: Any) -> None:
-        self.optimizer.update(self.guard, None if self.guard is None else given[-1])
+    # What a step does -------------------------------------------------------------------------------------------------
+
+    def _stages(self, field: Radiance) -> list[Stage]:
+        """A step whose networks, loss and gradients are one operation."""
+        draw = Stage(f"{type(self.batches).__name__}.draw", self._draw, ("rays",), self._draws_in_python())
+        clear = Stage("clear", functools.partial(self.optimizer.zero_grad, set_to_none=True))
+        update = Stage("update", lambda output: self._update(output.loss), ("output",))
+        *look, learn = self.loss.stages(field, self.generator, True, lambda held: self._last.now(held))
+        return [draw, *look, clear, learn, update, *self._telling()]
+
+    def _telling(self) -> Iterator[Stage]:
+        """What sampler and splits learn of a step."""
+        for part in (self.loss.renderer.sampler, self.strategy):
+            if part is not None:
+                own, name = in_python(part, "step_post_backward"), f"{type(part).__name__}.step_post_backward"
+                yield Stage(name, part.step_post_backward, ("output",), own)
+
+    def _draw(self, rays: int) -> dict[str, Any]:
+        return {"batch": self.batches.draw(rays, self.generator)}
+
+    def _draws_in_python(self) -> bool:
+        return in_python(self.batches, "draw") or getattr(self.batches, "fetch", None) is not None
+
+    def _update(self, loss: Tensor, *gradients: Any) -> None:
+        self.optimizer.update(self.guard, None if self.guard is None else loss)
 
     def _asking(self, step: int) -> Callable[[], None]:
         renderer = self.loss.renderer
         return functools.partial(renderer.sampler.step_pre_backward, renderer.field, step, self.generator)
 
-    def _tell(self, output: RenderOutput) -> None:
-        """What sampler and splits learn of a step."""
-        self.loss.renderer.sampler.step_post_backward(output)
-        if self.strategy is not None:
-            self.strategy.step_post_backward(output)
+    def _calls_hooks(self) -> bool:
+        """Whether Python runs in each step."""
+        sampler, strategy = self.loss.renderer.sampler, self.strategy
+        hooks = ("step_pre_backward", "sample", "step_post_backward")
+        told = strategy is not None and in_python(strategy, "step_post_backward")
+        own = any(not hasattr(term, "add") or in_python(term, "add") for term in self.loss.terms)
+        return told or own or self._draws_in_python() or any(in_python(sampler, hook) for hook in hooks)
 
-    def _make_all(self, steps: int, same: bool | None) -> tuple[StepOutput, bool | None]:
-        """Makes all of so many steps; ``same`` and the results are those of :meth:`_make`."""
+    # How it is made ---------------------------------------------------------------------------------------------------
+
+    def _make_all(self, rays: int, steps: int) -> StepOutput:
+        """Makes all of so many steps."""
         while True:
-            made, output, same = self._make(steps, same)
+            made, output = self._make(rays, steps)
             steps -= made
             if not steps:
-                return output, same
+                return output
 
-    def _make(self, steps: int, same: bool | None) -> tuple[int, StepOutput, bool | None]:
-        """Makes the next of so many steps, or more of them.
-
-        Args:
-            steps: At least 1.
-            same: Whether all is as it was noted; None where that is not known.
-
-        Returns:
-            How many, what the last has found, and whether all is still as it was.
-        """
-        recording = self._recording
-        same = self._is_same() if same is None else same
-        if recording is not None and same:
-            if times := recording.replay(backends.threads(), steps):
-                self._wait = self._left = 0
-                self._give_gradients()  # a step in between, or the loop, may have left others
-                batch, output = self._made
-                return times, StepOutput(batch, output, recording if isinstance(recording, Recording) else None), True
-        elif obstacle := self._standing_obstacle():
+    def _make(self, rays: int, steps: int) -> tuple[int, StepOutput]:
+        """Makes the next of so many steps, or more of them; gives how many, and what the last has found."""
+        same = self._is_same()
+        if not same and (obstacle := self._standing_obstacle()):
             self.forget()
             self._obstacle = obstacle
-            return 1, StepOutput(*self._run(self._rays)), None
-        if self._left:
-            self._left -= 1
-            return 1, StepOutput(*self._run(self._rays)), None
-        return 1, self._record(same), None
+            return 1, StepOutput(*self._run(rays))
+        if self._on_gpu():
+            return self._make_on_gpu(rays, steps, same)
+        if not same:
+            self.forget()
+            stages = self._stages(cast(Radiance, self.loss.radiance()))
+            groups = itertools.groupby(stages, operator.attrgetter("python"))
+            self._groups = [(own, f"step {place}", [*group]) for place, (own, group) in enumerate(groups)]
+            for name in self._segments.keys() - {"before", "after", *(name for _, name, _ in self._groups)}:
+                del self._segments[name]  # of other hooks
+            self._guard()  # before hooks, whose changes count from the next step on
+        self._last, fresh = Made({}), dict[str, Any]()
+        for own, name, stages in self._groups:
+            if own:
+                for stage in stages:
+                    fresh |= self._call(stage, {"rays": rays, **fresh})
+                continue
+            segment, before = self._segments.setdefault(name, Segment()), self._last if self._last.value else {}
+            run, times = functools.partial(self._run_stages, stages), steps if len(self._groups) == 1 else 1
+            self._last = segment(run, rays, before, fresh, times=times)
+            fresh = {}
+            if any(each.name == "update" for each in stages):
+                self._settle_gradients(segment)
+        value = self._last.value
+        return self._last.times, StepOutput(value["batch"], value["output"], self._last.recording)
 
-    def _before(self, step: int) -> bool | None:
-        """The sampler before a step, replayed where it asks the field; gives what :meth:`_beside` gives."""
-        ask = self._asking(step)
-        if self.loss.renderer.sampler.asks_at(step):
-            return self._beside("before", ask, self._is_same())
-        ask()
-        return None
+    def _call(self, stage: Stage, fresh: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A stage in Python, given what others there have made, or segments before."""
+        began, last = time.perf_counter(), self._last
+        with self.as_it_is():
+            values = [
+                fresh[name] if name in fresh else last.value[name] if stage.lazy else last.now(last.value[name])
+                for name in stage.reads
+            ]
+            found = stage.function(*values) or {}
+        seconds, calls = self._spent.get(stage.name, (0.0, 0))
+        self._spent[stage.name] = seconds + time.perf_counter() - began, calls + 1
+        return found
 
-    def _after(self, step: int, same: bool | None) -> None:
-        """The optimiser after so many steps; what it computes is replayed."""
-        self.optimizer.steps_done = step
-        if step % schedule.GROUP == 0:
-            learn = functools.partial(self.optimizer.after_step, step)
-            self._beside("after", learn, self._is_same() if same is None else same)
+    def _run_stages(self, stages: list[Stage], rays: int, before: Any, fresh: Any) -> dict[str, Any]:
+        with self.as_it_is():
+            return run_stages(stages, {**before, **fresh, "rays": rays})
 
-    def _beside(self, name: str, function: Callable[[], None], same: bool) -> bool | None:
-        """Calls a function of the same objects, or makes its calls again; whether all is as it was noted, if known."""
-        if not same or not isinstance(self._recording, Recording):
+    def _settle_gradients(self, segment: Segment) -> None:
+        """Gives parameters the gradients that replays write; a step in between, or the loop, may have left others."""
+        if segment.replayed:
+            for parameter, gradient in self._gradients:
+                if parameter.grad is not gradient:
+                    parameter.grad = gradient
+        elif (recording := self._last.recording) is not None:  # a new one
+            self._gradients = self._with_gradients()
+            for _, gradient in self._gradients:
+                if gradient is not None:
+                    recording.hold(gradient)
+
+    def _beside(self, name: str, function: Callable[[], None]) -> None:
+        """Calls a function of the same objects, or makes its calls again."""
+        if self._last.recording is not None and self._is_same():
+            self._segments.setdefault(name, Segment())(function)
+        else:
             function()
-            return None
-        part = self._parts.setdefault(name, Part())
-        part(function)
-        return True if part.replayed else None
 
     def _is_same(self) -> bool:
         """Whether all is as it was noted, and nothing of torch watches."""
         return not is_watched() and self._holds()
 
-    def _record(self, known: bool) -> StepOutput:
-        """A step as it is, recorded or captured if nothing keeps it from that.
-
-        Args:
-            known: Whether the step before was of this kind, so that what a first one prepares is there.
-        """
-        before, on_gpu = self._recording, self._on_gpu()
-        if not on_gpu or known:
-            self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
-        parts = self._parts if known else {}
-        self.forget()
-        self._parts = parts
-        if not on_gpu:
-            with Recording() as recording:
-                made = self._run(recording.count(lambda: self._rays))
-            self._keep(recording, made)
-        elif known:
-            made = self._capture(before if isinstance(before, Capture) else None)
-        else:
-            made, self._obstacle = self._run(self._rays), "no step of its kind was made before"
-        self._guard()
-        return StepOutput(*made)
-
     def _on_gpu(self) -> bool:
         return self.batches.device.type == "cuda"
 
-    def _capture(self, before: Capture | None) -> tuple[Batch, RenderOutput]:
+    def _make_on_gpu(self, rays: int, steps: int, same: bool) -> tuple[int, StepOutput]:
+        """As `_make`: by a CUDA graph, captured after a step of its kind."""
+        if self._calls_hooks():
+            self.forget()
+            self._obstacle = "Python runs in it, which a CUDA graph does not make"
+            return 1, StepOutput(*self._run(rays))
+        self._asked, capture = rays, self._capture
+        if capture is not None and same and (times := capture.replay(backends.threads(), steps)):
+            self._wait = self._left = 0
+            for parameter, gradient in self._gradients:
+                parameter.grad = gradient
+            return times, StepOutput(*self._captured)
+        if self._left:
+            self._left -= 1
+            return 1, StepOutput(*self._run(rays))
+        self.forget()
+        if not same:
+            made, self._obstacle = self._run(rays), "no step of its kind was made before"
+        else:
+            self._left, self._wait = self._wait, min(2 * self._wait or 1, LONGEST_WAIT)
+            made = self._capture_step(capture)
+        self._guard()
+        return 1, StepOutput(*made)
+
+    def _capture_step(self, before: Capture | None) -> tuple[Batch, RenderOutput]:
         """A step as it is, and the graph of those that follow."""
-        capture = Capture(self.batches.place, self.generator, before)
-        made = capture.warm_up(lambda: self._run(self._rays))
+        capture = Capture(getattr(self.batches, "place", self.batches.device), self.generator, before)
+        made = capture.warm_up(lambda: self._run(self._asked))
         gradients = self._with_gradients()
         if capture.obstacle is None:
-            self._keep(capture, capture.capture(lambda: self._run(capture.count(lambda: self._rays))))
+            self._captured = capture.capture(lambda: self._run(capture.count(lambda: self._asked)))
+            self._capture, self._gradients = capture, self._with_gradients()
         self._obstacle = capture.obstacle or ""
         for parameter, gradient in gradients:  # of the step that was made
             parameter.grad = gradient
         return made
 
-    def _keep(self, recording: Recording | Capture, made: tuple[Batch, RenderOutput]) -> None:
-        """Steps that follow are replayed, if nothing keeps them from it."""
-        self._obstacle = recording.obstacle or ""
-        if recording.obstacle is None:
-            self._recording, self._made, self._gradients = recording, made, self._with_gradients()
-
-    def _give_gradients(self) -> None:
-        for parameter, gradient in self._gradients:
-            if parameter.grad is not gradient:
-                parameter.grad = gradient
-
     def _with_gradients(self) -> list[tuple[nn.Parameter, Tensor | None]]:
         return [(p, p.grad) for group in self.optimizer.param_groups for p in group["params"]]
 
     def _run(self, rays: int) -> tuple[Batch, RenderOutput]:
+        """A step as it is."""
         with self.as_it_is():
-            return self._run_step(rays)
-
-    def _run_step(self, rays: int) -> tuple[Batch, RenderOutput]:
-        batch = self.batches.draw(rays, self.generator)
-        self.optimizer.zero_grad(set_to_none=True)
-        if self.autocast is None:
-            output = self.loss(batch, self.generator, backward=True)
-            self.optimizer.update(self.guard, None if self.guard is None else output.loss)
-        else:
-            with torch.autocast(self.batches.device.type, self.autocast, cache_enabled=False):
-                output = self.loss(batch, self.generator)
-            self._learn_scaled(output.loss)
-        self._tell(output)
-        return batch, output
+            batch = self.batches.draw(rays, self.generator)
+            self.optimizer.zero_grad(set_to_none=True)
+            if self.autocast is None:
+                output = self.loss(batch, self.generator, backward=True)
+                self._update(output.loss)
+            else:
+                with torch.autocast(self.batches.device.type, self.autocast, cache_enabled=False):
+                    output = self.loss(batch, self.generator)
+                self._learn_scaled(output.loss)
+            for stage in self._telling():
+                stage.function(output)
+            return batch, output
 
     def _learn_scaled(self, loss: Tensor) -> None:
         scaler = self.scaler
         if scaler is None or not scaler.is_enabled():
             loss.backward()
-            self.optimizer.update(self.guard, None if self.guard is None else loss.detach())
+            self._update(loss.detach())
             return
         scaler.scale(loss).backward()
         if self.guard is not None:
@@ -408,11 +464,12 @@ class TrainingStep:
         scaler.step(self.optimizer)
         scaler.update()
 
-    def _standing_obstacle(self, draws: bool = True) -> str | None:
-        """What keeps any step from being replayed, whatever it computes; one that draws its rays, or not."""
+    def _standing_obstacle(self) -> str | None:
+        """What keeps any step from being replayed, whatever it computes."""
         if is_watched():
             return "a mode, a transform or a profiler of torch watches"
-        renderer, device, place = self.loss.renderer, self.batches.device, self.batches.place
+        renderer, device = self.loss.renderer, self.batches.device
+        place = getattr(self.batches, "place", device)
         if device.type not in ("cpu", "cuda"):
             return f"it runs on {device.type}"
         if device.type != place.type or device.index not in (None, place.index):
@@ -423,10 +480,8 @@ class TrainingStep:
             return f"it runs on the {chosen} backend"
         if self.autocast is not None:
             return "it runs under autocast"
-        if draws and self.batches.fetch is not None:
-            return "its pictures are read from disk"
-        for part in (self.batches, self.loss, self.loss.term, renderer.sampler, self.optimizer, self.strategy):
-            if part is not None and not type(part).__module__.startswith("voronerf."):
+        for part in (self.loss, renderer, self.optimizer):
+            if in_python(part):
                 return f"{type(part).__name__} may do in Python what is not seen"
         if (reason := self.loss.why_not_fused()) is not None:
             return reason
@@ -445,19 +500,27 @@ class TrainingStep:
 
         self._known, self._guards, self._cpu = known, native.compiled.Guards(), native.cpu
         field, grid = cast(nn.Module, renderer.field), getattr(renderer.sampler, "grid", None)
-        parts = (self.batches, self.loss, renderer, renderer.sampler, grid, self.strategy)
-        dictionaries: list[dict[Any, Any]] = [vars(part) for part in parts if part is not None]
-        dictionaries.append(renderer.fields)
+        parts = [self.loss, renderer, renderer.sampler]  # those that segments read
+        parts += [each for each in self.loss.terms if hasattr(each, "add") and not in_python(each, "add")]
+        if not self._draws_in_python():
+            parts.append(self.batches)
+        if self.strategy is not None and not in_python(self.strategy, "step_post_backward"):
+            parts.append(self.strategy)
+        for part in parts:
+            self._guards.add(vars(part), free_names(part))
+        if grid is not None:
+            self._guards.add(vars(grid), [])
+        dictionaries: list[dict[Any, Any]] = [renderer.fields]
         for module in field.modules():  # the router, perhaps in a wrapper
             for name, members in vars(module).items():
                 if name in ("_parameters", "_buffers", "_modules") or name.endswith("_hooks"):
                     dictionaries.append(members)
         dictionaries += [*map(vars, known.router.module.modules()), optimizer.state, *optimizer.state.values()]
         for members in dictionaries:
-            self._guards.add(members, "")
-        self._guards.add(vars(optimizer), "steps_done")
+            self._guards.add(members, [])
+        self._guards.add(vars(optimizer), ["steps_done"])
         for group in optimizer.param_groups:
-            self._guards.add(group, "lr")
+            self._guards.add(group, ["lr"])
         if self._on_gpu():  # a capture does not see which tensors it takes, as a recording does
             owners = self.batches, renderer.sampler, self.strategy, self.guard, optimizer.state, self._gradients
             for tensor in (*tensors_of(owners), *field.parameters(), *field.buffers()):
@@ -486,8 +549,8 @@ class TrainingStep:
         objects = [self.batches, self.loss, optimizer, self.strategy, self.guard, self.generator, self.autocast]
         objects += [router.assignment, router.temperature, router.backend, router.coords]
         values: list[Any] = [backends.threads(), self._cpu().isa, torch.is_grad_enabled(), len(optimizer.state)]
-        values += [torch.are_deterministic_algorithms_enabled(), torch.backends.cuda.matmul.fp32_precision]
-        values.append(backends.cpu_precision())
+        values.append(torch.are_deterministic_algorithms_enabled())
+        values.append(torch.backends.cuda.matmul.fp32_precision if self._on_gpu() else backends.cpu_precision())
         for group in optimizer.param_groups:
             objects += group["params"]
             values += [len(group["params"]), tuple(group["betas"])]

@@ -18,7 +18,6 @@ from voronerf.nerf.cones import frustum_gaussians
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
 from voronerf.ops.composite import composite
-from voronerf.ops.scale_gradient.reference import shares_of
 
 
 class Samples(NamedTuple):
@@ -88,8 +87,9 @@ class Space:
         contraction: Of the space that the field works in; None for that of the world.
         spacing: Of the strata of a ray, "linear" or "disparity".
         cones: Whether the field is asked about Gaussians [m, 6], the frustums of cones, in place of points [m, 3].
-        full_gradient: Distance from which the gradients of samples are whole, see `voronerf.ops.scale_gradient`; None
-            for any.
+        full_gradient: Distance from which the gradients of samples are whole; nearer ones shrink with the square of
+            their distance. A camera sees the space before it with more rays, and more samples, than others do: fog
+            that only one view shows would be learnt there first. None: all gradients are whole.
 
     Examples:
         >>> from voronerf.nerf import Space, Stratified
@@ -148,6 +148,69 @@ class Rendered(NamedTuple):
     samples: Samples
 
 
+@dataclass(frozen=True)
+class Batch:
+    """Rays [r], where they enter and leave the scene, and the colours to learn.
+
+    Attributes:
+        rays: Origins and unit directions; radii for cones.
+        near: [r], the depth at which each ray enters the scene.
+        far: [r], the depth at which it leaves the scene.
+        target: [r, 3], the colour of each ray's pixel over the background.
+        background: [3], or [r, 3] where it was drawn; None for black.
+        sparse_depths: [s], the distances of the points of a sparse model that the first s rays end at, or None.
+        unseen: Triples at the end that are `voronerf.ops.unseen_rays`, whose colours are not known.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import Batch, Rays
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> batch = Batch(rays, torch.ones(5), torch.full((5,), 3.0), torch.rand(5, 3), background=torch.ones(3))
+    """
+
+    rays: Rays
+    near: Tensor
+    far: Tensor
+    target: Tensor
+    background: Tensor | None = None
+    sparse_depths: Tensor | None = None
+    unseen: int = 0
+
+
+class RenderOutput(NamedTuple):
+    """The result of :class:`RayLoss`. Only the loss has gradients.
+
+    Attributes:
+        loss: [].
+        error: [r], the squared error of the colour of each ray, summed over the channels.
+        weights: [m], contributions of the samples to their rays.
+        density: [m], per scene unit.
+        samples: Those of the last pass.
+        colour: [r, 3], as the field shows the rays.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf import NeRF
+        >>> from voronerf.nerf import Batch, RayLoss, Rays, Renderer, Stratified
+        >>> rays = Rays(torch.zeros(5, 3), torch.tensor([[0.0, 0, 1]]).expand(5, 3))
+        >>> batch = Batch(rays, torch.ones(5), torch.full((5,), 3.0), torch.rand(5, 3))
+        >>> output = RayLoss(Renderer({"field": NeRF(width=16, depth=2)}, Stratified(8)))(batch)
+        >>> output.loss.requires_grad, output.error.shape, output.importance().shape
+        (True, torch.Size([5]), torch.Size([40]))
+    """
+
+    loss: Tensor
+    error: Tensor
+    weights: Tensor
+    density: Tensor
+    samples: Samples
+    colour: Tensor
+
+    def importance(self) -> Tensor:
+        """[m]: the weight of each sample times the error of its ray (Elsner et al. 2023, section 3.1)."""
+        return self.weights * self.error.index_select(0, self.samples.ray_index)
+
+
 def ask(field: Field, rays: Rays, samples: Samples, space: Space) -> tuple[Tensor, Tensor]:
     """Colours [m, 3] and densities [m] of samples, in the dtype of their depths: a field under autocast gives others.
 
@@ -161,6 +224,19 @@ def ask(field: Field, rays: Rays, samples: Samples, space: Space) -> tuple[Tenso
             if values.requires_grad:
                 values.register_hook(functools.partial(torch.mul, scale))
     return rgb, density
+
+
+def shares_of(depths: Tensor, full: float) -> Tensor:
+    """Returns the factors [m] on the gradients of samples, the squares of their distances from the camera, up to 1.
+
+    Source: Philip and Deschaintre 2023, "Floaters No More: Radiance Field Gradient Scaling for Improved Near-Camera
+    Training".
+
+    Args:
+        depths: [m], the distances of the samples.
+        full: The distance from which gradients are whole, > 0.
+    """
+    return (depths / full).square().clamp(max=1)
 
 
 def render_samples(

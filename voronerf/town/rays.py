@@ -17,18 +17,16 @@ import torch
 from torch import Tensor
 
 from voronerf.nerf.cameras import Rays
-from voronerf.nerf.loss import Batch, RenderOutput
 from voronerf.nerf.occupancy import HIDDEN
-from voronerf.nerf.part import Made
 from voronerf.nerf.radiance import Radiance, radiance_of
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import Renderer
+from voronerf.nerf.segment import Made
 from voronerf.nerf.step import StepOutput, TrainingStep
-from voronerf.nerf.volume import Samples
+from voronerf.nerf.volume import Batch, RenderOutput, Samples, shares_of
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.ray_runs import OwnSamples, compose_runs, own_samples, run_gradients, run_sums
 from voronerf.ops.ray_runs.reference import along_rays, compose
-from voronerf.ops.scale_gradient import scale_gradient
 from voronerf.town.group import Group, Key
 from voronerf.town.territories import Place
 
@@ -72,10 +70,10 @@ class Pass:
 
     Attributes:
         sums: [q, 6] of its runs.
-        learnt: The part of the step that has left gradients at the parameters, if it had samples.
+        learnt: The segment that has left gradients at the parameters, if it had samples.
 
     Args:
-        name: Of its parts of the step.
+        name: Of its segments of the step.
         territory: Whose networks are asked.
         rays: r rays.
         near: [r].
@@ -94,15 +92,14 @@ class Pass:
         if not len(near):
             return
         given = rays.origins, rays.directions, near, far
-        drawn = step.part(f"{name}: samples", self._draw, tensors=given, rows=(len(near),))
+        drawn = step.do(f"{name}: samples", self._draw, *given)
         positions, ray_index, depths, deltas, cells = drawn.now(drawn.value)
         along = ray_index, depths, deltas, cells, place.own.to(near.device)
         bent = renderer.contraction is not None
         own: OwnSamples = own_samples(positions, *along, bent=bent, backend=renderer.backend)
         if not len(own.depths):
             return
-        rows = self.rays, len(own.depths), len(own.run_offsets) - 1
-        self.found = step.part(f"{name}: networks", self._look, tensors=(rays.directions, *own), rows=rows)
+        self.found = step.do(f"{name}: networks", self._look, rays.directions, *own)
         self.sums, self.own = self.found.now(self.found.value.sums), own
 
     def _draw(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, ...]:
@@ -142,13 +139,12 @@ class Pass:
         Args:
             answers: [q, 6], to the sums.
             loss: [], of the rays.
-            before: The parts that have left gradients before.
+            before: The segments that have left gradients before.
         """
         if self.found is None:
             return None
-        rows, given = (self.rays, len(self.own.depths), len(answers)), (answers, loss)
         name = f"{self.name}: gradients beside {len(before)}"
-        made = self.territory.step.part(name, self._learn, self.found, *before, tensors=given, rows=rows)
+        made = self.territory.step.do(name, self._learn, self.found, answers, loss, *before)
         for parameter, gradient in made.value.gradients:
             parameter.grad = gradient
         self.learnt = [made]
@@ -159,13 +155,12 @@ class Pass:
         density = self.found.now(self.found.value.density)
         return RenderOutput(loss, error, weights, density, samples, weights.new_empty(0, 3))
 
-    def _learn(self, found: Looked, *given: Any) -> Learnt:
-        *_, answers, loss = given
+    def _learn(self, found: Looked, answers: Tensor, loss: Tensor, *before: Learnt) -> Learnt:
         renderer, optimizer = self.territory.renderer, self.territory.step.optimizer
         rule: dict[str, Any] = {**self._field().rule, "hidden": HIDDEN, "backend": renderer.backend}
         gradient, weights = run_gradients(found.tape.raw, found.samples, answers, **rule)
         if (full := renderer.sampler.space.full_gradient) is not None:
-            scale_gradient(gradient, found.samples.depths, full, backend=renderer.backend)
+            gradient.mul_(shares_of(found.samples.depths, full)[:, None])
         found.tape.backward(loss, gradient)
         parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         return Learnt(weights, [(each, each.grad) for each in parameters if each.grad is not None])

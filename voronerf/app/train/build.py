@@ -27,6 +27,7 @@ from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import SAMPLERS, Occupancy, Sampler
 from voronerf.nerf.split import SplitStrategy
+from voronerf.nerf.terms import SmoothDepth, SparseDepth
 from voronerf.ops import Guard
 from voronerf.ops._core import backends
 from voronerf.ops._core.checks import physical_memory
@@ -123,9 +124,8 @@ def build(
         renderer=renderer,
         ray_loss=RayLoss(
             renderer,
-            sparse_depth=config.sparse_depth or 0.0,
+            terms=[*([SparseDepth(config.sparse_depth)] if config.sparse_depth else ()), SmoothDepth(SMOOTH_DEPTH)],
             robust=0.0 if scene.background is not None else ROBUST,
-            smooth_depth=SMOOTH_DEPTH,
         ),
         optimizer=optimizer,
         strategy=strategy,

@@ -11,9 +11,9 @@ import torch
 
 from voronerf.app.train.build import make_grid, make_routers
 from voronerf.app.train.state import State
-from voronerf.nerf.loss import Batch, RenderOutput
 from voronerf.nerf.schedule import GROUP
 from voronerf.nerf.step import StepOutput
+from voronerf.nerf.volume import Batch, RenderOutput
 
 #: Steps after the grid has settled after which a start is judged, and how often a training begins again at most.
 JUDGED, DRAWS = 100, 3

@@ -21,6 +21,7 @@ from voronerf.nerf.loss import RayLoss
 from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.samplers import Sampler
 from voronerf.nerf.schedule import learning_rate, next_rays
+from voronerf.nerf.segment import in_python
 from voronerf.nerf.split import SplitDone, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.ops import Guard
@@ -178,6 +179,8 @@ class State:
 
     def steps_alike(self) -> int:
         """How many of the next steps can be made in one call: nothing changes between them."""
+        if any(in_python(self.strategy, hook) for hook in ("is_due", "step_pre_backward")):
+            return 1
         age = self.step - self.began
         most = min(schedule.GROUP - age % schedule.GROUP, self.sampler.steps_alike(age))
         if self.config.steps is not None:

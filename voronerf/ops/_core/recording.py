@@ -277,6 +277,12 @@ class Recording(TorchDispatchMode):
             held = self._held[id(found)] = held._replace(rows=rows, value=mapped(self.now, found))
         return held.value
 
+    def counted_now(self, found: Any) -> Any:
+        """As :meth:`now`, for another recording, which reads numbers of rows again, too."""
+        if isinstance(found, RowCount):
+            return RowCount.of(found.count, found.more)
+        return self._tensor_now(found) if isinstance(found, Tensor) else mapped(self.counted_now, found)
+
     def _counts_of(self, found: Any) -> list[Count]:
         """The numbers of rows that tensors have, in whatever holds them."""
         if isinstance(found, (RowCount, Tensor)):
