@@ -30,7 +30,7 @@ class RayLoss:
 
     Args:
         renderer: Networks and sampler.
-        terms: Of the loss beside the error of the colours: a :class:`Term`, such as :class:`SparseDepth` and
+        terms: Further terms, beside the error of the colours: a :class:`Term`, such as :class:`SparseDepth` and
             :class:`SmoothDepth`, or a function of :class:`Seen` rays and their :class:`Batch` that gives a scalar, and
             that torch differentiates. The networks alone learn from it. It is given all rays: of the last
             ``3 * batch.unseen``, no picture shows the colour.
@@ -93,12 +93,12 @@ class RayLoss:
         backward: bool,
         now: Callable[[Any], Any] = lambda held: held,
     ) -> list[Stage]:
-        """What is computed of "batch", one after another, up to "output".
+        """The stages that lead from "batch" to "output".
 
         Args:
-            field: Of :meth:`radiance`.
-            generator: Of random samples.
-            backward: As of a call.
+            field: The result of :meth:`radiance`.
+            generator: Draws the random samples.
+            backward: Whether gradients are added at once, as in a call.
             now: Gives, in a stage in Python, what replays have filled.
         """
         sampler = self.renderer.sampler
@@ -132,7 +132,7 @@ class RayLoss:
         return {"samples": draw(batch.rays, batch.near, batch.far, jitter=True, generator=generator)}
 
     def _look(self, field: Radiance, batch: Batch, samples: Samples) -> dict[str, Any]:
-        """What the networks put out, its loss and the gradient of that."""
+        """Evaluates the networks, and computes the loss of the colours with its gradient."""
         renderer = self.renderer
         network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index, renderer.backend)
         tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
@@ -152,7 +152,7 @@ class RayLoss:
         return {"samples": samples, "before": before}
 
     def _look_apart(self, batch: Batch, samples: Samples, before: Sequence[Rendered]) -> dict[str, Any]:
-        """As `_look`, where torch differentiates the networks."""
+        """Does the same as `_look`, where torch differentiates the networks."""
         values = ask(self.renderer.field, batch.rays, samples, self.renderer.sampler.space)
         raw = torch.cat((values[0], values[1][:, None]), 1).detach()
         along = self._along(raw, {"activated": True}, batch, samples, 0.0)

@@ -97,9 +97,9 @@ class Stage(NamedTuple):
     """A part of a step.
 
     Attributes:
-        name: For people.
-        function: Of what stages before have made, by their names; gives what it makes, by names, or None.
-        reads: These names.
+        name: The one that people see.
+        function: Takes what stages before have made; gives what it makes, by names, or None.
+        reads: The names of what it takes.
         python: Whether it is called in each step, else it may be replayed.
         lazy: Whether it is given, in Python, what was recorded, and asks itself for what replays have filled.
     """
@@ -120,7 +120,7 @@ def run_stages(stages: Iterable[Stage], made: Mapping[str, Any]) -> dict[str, An
 
 
 class Made(NamedTuple):
-    """What a segment has given, until its next call.
+    """The result of a segment, until its next call.
 
     Attributes:
         value: Of the call that was recorded, or of this one.
