@@ -258,7 +258,8 @@ def _replay(settings: tuple[int, str, bool, int], device: str, n: int) -> None:
 
     step = _step(*settings, device, n)
     expected = [part.clone() for part in step()]
-    allowed = 1e-5 if settings[1] == "float32" else 8e-2  # rounding moves samples across kinks
+    # Rounding moves samples across kinks of ReLU: by up to 3e-4 in float32, on a CPU too.
+    allowed = 1e-3 if settings[1] == "float32" else 8e-2
     for part, exact in zip(expected, step("reference", torch.float64), strict=True):
         near(part, exact, allowed, 1e-7)
     captured = Capture(torch.device(device), torch.Generator(device))

@@ -182,7 +182,7 @@ def parts(call: str, out: Path, prebuilt: Path, cases: list[str], *, emulated: b
             "memcheck": sanitized("memcheck", 390, "@checked", PYTORCH_NO_CUDA_MEMORY_CACHING="1"),
         }
     return common | {
-        "cases": tried(110, "--parts", "small", "large", "captured", "rows", "--names", "rows", *cases),
+        "cases": tried(110, "--parts", "small", "large", "captured", "rows", "training", "--names", "rows", *cases),
         "tests": on_gpu(170, [*program, "tests", str(out)], out / "tests.json"),
         "racecheck": sanitized("racecheck", 210, "@racing"),
         "synccheck": sanitized("synccheck", 240, "@racing"),

@@ -1,8 +1,9 @@
 """CUDA graphs of the emulated device: ``with emulated(), graphs() as seen: ...``.
 
 In a capture nothing is computed: launches are kept, of this project's kernels and of torch's operations, and replays
-alone make them. A read of the host, which ends a capture on a GPU, is an error there, and a warning in torch's mode for
-it. Streams are in order by themselves.
+alone make them. Memory that is made in a capture is poisoned in each replay where it was made, since on a GPU it may
+have been other memory of the capture before. A read of the host, which ends a capture on a GPU, is an error there, and
+a warning in torch's mode for it. Streams are in order by themselves.
 """
 
 from __future__ import annotations
@@ -71,7 +72,10 @@ class Graph(TorchDispatchMode):
         name = function.overloadpacket.__name__
         if function.is_view or name in FREE:
             result = function(*args, **kwargs)
-            return result.zero_() if "empty" in name else result  # torch may look for shapes in it, as an index
+            if "empty" in name:
+                result.zero_()  # torch may look for shapes in it, as an index
+                self.add(result.fill_, float("nan") if result.is_floating_point() else 77)
+            return result
         generator = kwargs.get("generator")
         assert generator is None or generator._cdata in self._generators, "not registered"
         state = None if generator is None else generator.get_state()

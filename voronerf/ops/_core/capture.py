@@ -4,8 +4,9 @@ The counterpart of :mod:`voronerf.ops._core.recording`, of whatever the device c
 What the host does in Python is not made again, and the host cannot wait for the device: :attr:`Capture.obstacle` says
 where it did. **No GPU has run this yet.**
 
-What changes from run to run lies in memory, as numbers do (:func:`voronerf.ops._core.recording.varying`). The number of
-rows is that of the captured run.
+What changes from run to run lies in memory, as numbers do (:func:`voronerf.ops._core.rows.varying`). That memory is of
+the run before the capture: within a capture torch hands out the same memory again and again, and each replay writes all
+that was ever there. The number of rows is that of the captured run.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ class Capture:
         self._graph.register_generator_state(generator)
         self._device = device
         self._numbers = list[tuple[Tensor, Callable[[], float]]]()
+        self._taken = 0  # of the numbers, by the capture
         self._rows: list[tuple[int, Callable[[], int]]] = []
         self.obstacle: str | None = None
 
@@ -50,6 +52,7 @@ class Capture:
         """Calls the function, which runs as ever, and looks whether the host waits for the device in it."""
         here, mode = torch.cuda.current_stream(self._device), torch.cuda.get_sync_debug_mode()
         self._stream.wait_stream(here)
+        active.vary = self._make_number
         with warnings.catch_warnings(record=True) as told, torch.cuda.stream(self._stream):
             warnings.simplefilter("always")
             torch.cuda.set_sync_debug_mode("warn")
@@ -57,6 +60,7 @@ class Capture:
                 result = function()
             finally:
                 torch.cuda.set_sync_debug_mode(mode)
+                active.vary = None
         here.wait_stream(self._stream)
         for each in told:
             said = str(each.message)
@@ -67,8 +71,9 @@ class Capture:
         return result
 
     def capture(self, function: Callable[[], T]) -> T:
-        """Captures the function, which computes nothing until it is replayed; its result is memory of the replays."""
-        active.vary = self.vary
+        """Captures the function of the warm-up, which computes nothing until it is replayed; its result is memory of the
+        replays."""
+        active.vary = self._take_number
         try:
             # Other threads, such as a viewer's, may ask the device for memory meanwhile.
             with torch.cuda.graph(self._graph, self._pool, self._stream, capture_error_mode="thread_local"):
@@ -82,10 +87,17 @@ class Capture:
         self._rows.append((rows, given))
         return rows
 
-    def vary(self, value: Callable[[], float]) -> Tensor:
+    def _make_number(self, value: Callable[[], float]) -> Tensor:
         """A number that changes from run to run, float32 []."""
-        number = torch.empty((), dtype=torch.float32, device=self._device)  # replays fill it, the graph does not
+        number = torch.full((), value(), dtype=torch.float32, device=self._device)
         self._numbers.append((number, value))
+        return number
+
+    def _take_number(self, value: Callable[[], float]) -> Tensor:
+        """The number that the warm-up has made at this place."""
+        number, _ = self._numbers[self._taken]
+        self._numbers[self._taken] = number, value
+        self._taken += 1
         return number
 
     def replay(self, threads: int, times: int = 1) -> int:
