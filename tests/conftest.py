@@ -66,8 +66,10 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     names = backends.BACKENDS if mark is None else backends.implemented(mark.args[0])
     if wants_device:
         pairs = [(backend, device) for device in devices for backend in names]
+        if mark is not None:  # an implementation may be of one device alone
+            pairs = [pair for pair in pairs if mark.args[0] in backends.ops(*pair)]
         if NO_CUDA:  # one row stays to say so
-            pairs = pairs[: len(names) + 1]
+            pairs = pairs[: 1 + sum(device != "cuda" for _, device in pairs)]
         metafunc.parametrize(("backend", "device"), pairs, indirect=["device"], ids=["-".join(pair) for pair in pairs])
     else:
         metafunc.parametrize("backend", names)

@@ -218,6 +218,19 @@ def test_require_turns_skips_into_failures(pytester: pytest.Pytester, monkeypatc
     unknown.stderr.fnmatch_lines("*--require takes native,cuda,warp, got metal*")
 
 
+def test_an_op_is_tested_on_the_devices_of_each_implementation(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backends, "missing", lambda backend, device: None)
+    pytester.makeconftest(Path(__file__).with_name("conftest.py").read_text())
+    test = "@pytest.mark.op('{0}')\ndef test_{0}(device, backend):\n    pass\n"
+    pytester.makepyfile("import pytest\n" + "".join(map(test.format, ("adam", "balance_centres"))))
+    collected = [line.partition("::test_")[2] for line in pytester.runpytest_inprocess("--collect-only", "-q").outlines]
+    pairs = ("reference-cpu", "native-cpu", "reference-cuda")
+    expected = [*(f"adam[{pair}]" for pair in (*pairs, "native-cuda")), *(f"balance_centres[{pair}]" for pair in pairs)]
+    assert [line for line in collected if line] == expected
+
+
 def test_auto_runs_networks_natively_on_every_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backends, "missing", lambda backend, device: None)
     choose = backends._choose_once.__wrapped__
