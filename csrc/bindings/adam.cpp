@@ -10,6 +10,7 @@ VN_STRUCT(AdamGuard, loss, limit, found, skipped, in_a_row, scale);
 VN_BINDINGS(module) {
   module.cpu("adam", VN_CPU(adam_cpu));
   module.cuda("adam", VN_CUDA(adam_cuda));
+  module.cuda("adam_workspace", VN_CUDA(adam_workspace_cuda));
   module.cpu("average", VN_CPU(average_cpu));
   module.cpu("add", VN_CPU(add_cpu));
 }

@@ -38,9 +38,10 @@ void average_cpu(float* const* averages, const float* const* parameters, const f
 // Gradients are added to totals.
 void add_cpu(const float* const* gradients, float* const* totals, const std::vector<int64_t>& sizes, int threads);
 
-// A step on CUDA, in two launches. corrected: [2, number of parameters], working memory.
+// A step on CUDA, in two launches for 36 parameters. The floats of its workspace, for so many parameters.
+int64_t adam_workspace_cuda(int64_t count);
 void adam_cuda(const std::vector<AdamRule>& rules, float* const* parameters, const float* const* gradients,
                float* const* means, float* const* squares, const AdamGuard& guard, const std::vector<int64_t>& sizes,
-               float* corrected, void* stream);
+               float* workspace, void* stream);
 
 }  // namespace voronerf

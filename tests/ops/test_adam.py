@@ -27,6 +27,25 @@ def test_leaves_out_a_step_that_is_not_finite(device, backend, spoilt):
     assert_adam(3, device=device, backend=backend, spoilt=spoilt, limit=torch.inf if spoilt == "loss" else 1e3)
 
 
+def test_leaves_out_a_step_wherever_a_gradient_is_not_finite(device, backend):
+    """On CUDA, 127 blocks look at 4,096 entries each, and then at others."""
+    sizes, judged = [3, 90, 530_001, 0, 4097], [True, False, True, True, True]
+    tensors = [[torch.ones(n, device=device) for n in sizes] for _ in range(4)]
+    gradients, guard = tensors[1], Guard.on(device)
+    rules = [Rule(torch.zeros((), device=device), 0.1, every=every) for every in judged]
+    places = [(0, 2), (2, 0), (2, 4095), (2, 4096), (2, 127 * 4096), (2, 530_000), (4, 0), (4, 4096)]
+    for number, (which, place) in enumerate(places):
+        gradients[which][place] = torch.nan
+        adam(rules, *tensors, guard=guard, loss=guard.found + 1, backend=backend)
+        assert bool(guard.found) and float(guard.in_a_row) == float(guard.skipped) == number + 1
+        assert all(bool((parameter == 1).all()) for parameter in tensors[0]) and not any(rule.step for rule in rules)
+        gradients[which][place] = 1
+    gradients[1][89] = torch.nan  # of a table
+    adam(rules, *tensors, guard=guard, loss=guard.found + 1, backend=backend)
+    assert not guard.found and not guard.in_a_row and float(guard.skipped) == len(places)
+    assert all(bool((parameter != 1).all()) and rule.step for parameter, rule in zip(tensors[0], rules, strict=True))
+
+
 def test_a_table_may_have_any_gradient(device, backend):
     """Its entries are not read to judge a step: they are products of gradients that are."""
     table = [torch.ones(4, device=device) for _ in range(4)]

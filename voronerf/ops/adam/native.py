@@ -33,7 +33,7 @@ def adam(
     judged = compiled.AdamGuard(loss, limit, found, skipped, in_a_row, scale)
     taken = given, parameters, gradients, means, squares, judged, [parameter.numel() for parameter in parameters]
     if isinstance(machine, compiled.Cuda):
-        compiled.adam(*taken, parameters[0].new_empty(2 * len(rules)), machine)
+        compiled.adam(*taken, parameters[0].new_empty(compiled.adam_workspace(len(rules), machine)), machine)
     else:
         compiled.adam(*taken, machine)
 
