@@ -1,12 +1,16 @@
 """A training step as a CUDA graph, on the emulated device: what it captures, and that replays are the same steps."""
 
+import contextlib
+import gc
 import importlib
 import itertools
+import weakref
 
 import pytest
 import torch
 from emulated import emulated
 from graphs import graphs
+from step_training import Scaled, Training
 
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
@@ -48,13 +52,15 @@ def everything(state):
     return [*state.router.parameters(), *gradients, *moments, grid.density, grid.occupied, *kept, *state.guard[:3]]
 
 
-def test_replays_are_the_same_steps(monkeypatch):
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_replays_are_the_same_steps(precision, monkeypatch):
     """With splits, rates that change, and other numbers of rays."""
     found, calls, pools = [], [], []
     for as_it_is in (False, True):
         with emulated(), graphs() as seen:
-            state, losses = built(), []
+            state, losses = built(precision=precision), []
             step = state.training_step
+            assert step.autocast == (torch.bfloat16 if precision == "bf16" else None)
             if as_it_is:
                 monkeypatch.setattr(step, "_standing_obstacle", lambda: "a test")
             monkeypatch.setattr(state, "read_output", lambda made, to=losses: to.append(made.loss.clone()))
@@ -76,11 +82,16 @@ def captured(replays):
     return ["register", "capture", *["replay"] * replays]
 
 
-@pytest.mark.parametrize("which", ["parameter", "gradient", "moment", "grid", "pictures", "centres", "poses", "guard"])
-def test_moved_memory_is_captured_anew(which):
+PLACES = ("parameter", "gradient", "moment", "grid", "pictures", "centres", "poses", "guard")
+
+
+@pytest.mark.parametrize(
+    ("which", "precision"), [*((place, "fp32") for place in PLACES), ("parameter", "bf16"), ("gradient", "bf16")]
+)
+def test_moved_memory_is_captured_anew(which, precision):
     """The graph goes on with the addresses that it has, so what lies there is held, and no longer used."""
     with emulated(), graphs() as seen:
-        state = built()
+        state = built(precision=precision)
         steps(state, 7)
         parameter = state.router.module.colour.weight
         moved = {
@@ -118,9 +129,78 @@ def test_what_keeps_a_step_from_it():
         steps(state, 3)
         assert step.explain().endswith(f"since the host waits for the device, in test_graphs.py:{step.strategy.line}")
         step.strategy = None
-        step.autocast = torch.bfloat16
+        step.autocast, step.scaler = torch.float16, torch.amp.GradScaler("cpu")
         steps(state, 1)
-        assert step.explain().endswith("since it runs under autocast")
-        step.autocast, step.batches.place = None, torch.device("meta")
+        assert step.explain() == "step: runs as it is, since a GradScaler scales its loss"
+        step.autocast, step.scaler = None, None
+        handle = state.router.module.colour.weight.register_hook(lambda slope: None)
+        steps(state, 1)
+        assert step.explain().endswith(
+            "since a hook of module.colour.weight runs in Python, which a CUDA graph does not make"
+        )
+        handle.remove()
+        step.batches.place = torch.device("meta")
         assert step._standing_obstacle() == "its pictures are on meta"
     assert "capture" not in seen.calls
+
+
+def test_precision_of_a_traced_field():
+    """Autocast rounds between its layers, so that the operations are separate then."""
+    with emulated(), graphs():
+        training = Training(field=Scaled, cells=2, fuse=True)
+        training.train(4)
+        assert training.step.explain() == "step: captured and replayed as a CUDA graph"
+        training.step.autocast = torch.bfloat16
+        training.train(3)
+        assert training.step.explain() == "step: runs as it is, since Scaled.forward rounds as autocast does"
+
+
+def test_another_precision_is_captured_anew():
+    """That of the step, that of a scaler, and that of whoever calls the step."""
+    with emulated(), graphs() as seen:
+        training = Training(cells=2)
+
+        def train(*around):
+            before = seen.calls.count("capture")
+            with contextlib.ExitStack() as stack:
+                for context in around:
+                    stack.enter_context(context)
+                training.train(3)
+            assert seen.calls.count("capture") == before + 1 and "CUDA graph" in training.step.explain()
+
+        train()
+        training.step.autocast = torch.bfloat16
+        train()
+        training.step.autocast, training.step.scaler = torch.float16, torch.amp.GradScaler("cpu", enabled=False)
+        train()
+        training.step.autocast = None
+        train()
+        train(torch.autocast("cpu", torch.bfloat16))
+        train(torch.autocast("cpu", torch.float16))
+        training.step.autocast, training.step.scaler = torch.float16, torch.amp.GradScaler("cpu")
+        before = seen.calls.count("capture")
+        training.train(3)
+        assert seen.calls.count("capture") == before
+
+
+def test_no_graph_of_autograd_outlives_a_step():
+    """Its nodes would hand gradients to a capture on the stream of an earlier step."""
+    with emulated(), graphs() as seen:
+        training, alive = Training(cells=2), list[weakref.ref]()
+        training.step.autocast = torch.bfloat16
+        learn = training.step._learn_scaled
+
+        def marked(loss):
+            mark = contextlib.ExitStack()  # an object that can be referred to weakly
+            alive.append(weakref.ref(mark))
+            loss.grad_fn.metadata["mark"] = mark
+            learn(loss)
+
+        training.step._learn_scaled = marked
+        gc.disable()
+        try:
+            held = [training.step(64) for _ in range(4)]
+        finally:
+            gc.enable()
+        assert len(held) == 4 and "capture" in seen.calls
+        assert len(alive) == 3 and not any(each() is not None for each in alive[:2])  # an emulated graph holds tensors

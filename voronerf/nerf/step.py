@@ -99,8 +99,9 @@ class TrainingStep:
         strategy: What keeps samples for the splits; None for none.
         guard: Leaves out steps that are not finite; None for never.
         generator: Of random numbers.
-        autocast: The dtype that the networks run in under autocast; None for float32.
-        scaler: Of the loss in float16; None for none.
+        autocast: The dtype that the networks run in under autocast; None for float32. Such a step is captured on CUDA,
+            and runs as it is on the CPU.
+        scaler: Of the loss in float16, which keeps a step from being captured; None for none.
 
     Examples:
         >>> import torch
@@ -444,16 +445,29 @@ class TrainingStep:
                 output = self.loss(batch, self.generator, backward=True)
                 self._update(output.loss)
             else:
-                with torch.autocast(self.batches.device.type, self.autocast, cache_enabled=False):
+                with self._in_precision():
                     output = self.loss(batch, self.generator)
                 self._learn_scaled(output.loss)
+                # A graph of autograd that lives on gives the next step's gradients the stream of this one, and a
+                # capture may wait for no other stream than its own.
+                output = output._replace(loss=output.loss.detach())
             for stage in self._telling():
                 stage.function(output)
             return batch, output
 
+    def _in_precision(self) -> AbstractContextManager[Any]:
+        """Autocast to the dtype that the networks run in, without a cache of weights, which a capture would outlive."""
+        if self.autocast is None:
+            return nullcontext()
+        return torch.autocast(self.batches.device.type, self.autocast, cache_enabled=False)
+
+    def _scales(self) -> bool:
+        """Whether a scaler changes the loss."""
+        return self.autocast is not None and self.scaler is not None and self.scaler.is_enabled()
+
     def _learn_scaled(self, loss: Tensor) -> None:
         scaler = self.scaler
-        if scaler is None or not scaler.is_enabled():
+        if scaler is None or not self._scales():
             loss.backward()
             self._update(loss.detach())
             return
@@ -478,22 +492,30 @@ class TrainingStep:
             return f"its random numbers are drawn on {self.generator.device.type}"
         if (chosen := backends.chosen("adam", device, torch.float32, backend=renderer.backend)) != "native":
             return f"it runs on the {chosen} backend"
-        if self.autocast is not None:
+        if self.autocast is not None and not self._on_gpu():
             return "it runs under autocast"
+        if self._scales():
+            return "a GradScaler scales its loss"
         for part in (self.loss, renderer, self.optimizer):
             if in_python(part):
                 return f"{type(part).__name__} may do in Python what is not seen"
-        if (reason := self.loss.why_not_fused()) is not None:
+        with self._in_precision():  # in which a traced field is no program
+            reason = self.loss.why_not_fused()
+        if reason is not None:
             return reason
         learning = {id(p) for group in self.optimizer.param_groups for p in group["params"]}
         for name, parameter in cast(nn.Module, renderer.field).named_parameters():
             if parameter.requires_grad and id(parameter) not in learning:  # others read and drop its gradient
                 return f"{name} needs a gradient and is not the optimizer's"
+            if self._on_gpu() and (parameter._backward_hooks or parameter._post_accumulate_grad_hooks):
+                return f"a hook of {name} runs in Python, which a CUDA graph does not make"
         return None
 
     def _guard(self) -> None:
         """Notes what the step that was made depends on."""
-        renderer, optimizer, known = self.loss.renderer, self.optimizer, self.loss.radiance()
+        renderer, optimizer = self.loss.renderer, self.optimizer
+        with self._in_precision():
+            known = self.loss.radiance()
         if not isinstance(known, Radiance):
             return
         from voronerf.ops._core import native  # which is not everywhere
@@ -539,17 +561,20 @@ class TrainingStep:
         known = cast(Radiance, self._known)
         if known.cells.table is not None:  # of a field with a layer table, whose members are guarded
             return True
-        now = self.loss.radiance()
+        with self._in_precision():
+            now = self.loss.radiance()
         same = isinstance(now, Radiance) and now.networks is known.networks
         return same and all(map(operator.is_, cast(Radiance, now).cells.parameters, known.cells.parameters))
 
     def _current(self) -> tuple[list[Any], list[Any]]:
         """What is in no dictionary that is guarded: objects, and numbers."""
         router, optimizer = cast(Radiance, self._known).router, self.optimizer
-        objects = [self.batches, self.loss, optimizer, self.strategy, self.guard, self.generator, self.autocast]
-        objects += [router.assignment, router.temperature, router.backend, router.coords]
+        objects = [self.batches, self.loss, optimizer, self.strategy, self.guard, self.generator]
+        objects += [self.autocast, self.scaler, router.assignment, router.temperature, router.backend, router.coords]
         values: list[Any] = [backends.threads(), self._cpu().isa, torch.is_grad_enabled(), len(optimizer.state)]
         values.append(torch.are_deterministic_algorithms_enabled())
+        kind = self.batches.device.type  # autocast of the caller, around the step's own
+        values += [self._scales(), torch.is_autocast_enabled(kind) and torch.get_autocast_dtype(kind)]
         values.append(torch.backends.cuda.matmul.fp32_precision if self._on_gpu() else backends.cpu_precision())
         for group in optimizer.param_groups:
             objects += group["params"]
