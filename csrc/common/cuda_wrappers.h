@@ -38,11 +38,12 @@ namespace voronerf {
 constexpr unsigned kAllLanes = 0xffffffffu;
 
 // threadIdx.x, read where it is used: the compiler would otherwise keep values derived from it in scarce registers.
-__device__ __forceinline__ int thread_again() {
+// Unsigned, since a signed number cannot be divided by a shift alone.
+__device__ __forceinline__ unsigned thread_again() {
 #ifdef VN_EMULATE
-  return static_cast<int>(threadIdx.x);
+  return threadIdx.x;
 #else
-  int thread;
+  unsigned thread;
   asm volatile("mov.u32 %0, %%tid.x;" : "=r"(thread));
   return thread;
 #endif
@@ -80,6 +81,132 @@ __device__ __forceinline__ float unpack_half(uint16_t bits) {
     return __half2float(__ushort_as_half(bits));
   }
 #endif
+}
+
+// Two float16 in a word, infinities as the largest numbers; NaN stays.
+__device__ __forceinline__ uint32_t clamp_halves(uint32_t word) {
+#ifdef VN_EMULATE
+  for (int shift = 0; shift < 32; shift += 16) {
+    if ((word >> shift & 0x7fffu) == 0x7c00u) word -= 1u << shift;
+  }
+  return word;
+#else
+  __half2 pair;
+  memcpy(&pair, &word, sizeof pair);
+  const __half2 most = __half2half2(__ushort_as_half(0x7bff));
+  pair = __hmax2_nan(__hmin2_nan(pair, most), __hneg2(most));
+  memcpy(&word, &pair, sizeof word);
+  return word;
+#endif
+}
+
+// Two 16-bit numbers in a word, those below 0 as 0; NaN stays.
+template <bool kBfloat16>
+__device__ __forceinline__ uint32_t relu_halves(uint32_t word) {
+#ifdef VN_EMULATE
+  const uint32_t infinity = kBfloat16 ? 0x7f80u : 0x7c00u;
+  for (int shift = 0; shift < 32; shift += 16) {
+    const uint32_t bits = word >> shift & 0xffffu;
+    if ((bits & 0x8000u) != 0 && (bits & 0x7fffu) <= infinity) word &= ~(0xffffu << shift);
+  }
+  return word;
+#else
+  if constexpr (kBfloat16) {
+    __nv_bfloat162 pair;
+    memcpy(&pair, &word, sizeof pair);
+    pair = __hmax2_nan(pair, __nv_bfloat162(__ushort_as_bfloat16(0), __ushort_as_bfloat16(0)));
+    memcpy(&word, &pair, sizeof word);
+  } else {
+    __half2 pair;
+    memcpy(&pair, &word, sizeof pair);
+    pair = __hmax2_nan(pair, __half2half2(__ushort_as_half(0)));
+    memcpy(&word, &pair, sizeof word);
+  }
+  return word;
+#endif
+}
+
+// Whether the 16-bit number in the low half of a word is above 0.
+__device__ __forceinline__ bool positive_half(uint32_t word) { return (word & 0xffffu) - 1u < 0x7fffu; }
+
+// Adds to one, two or four numbers of global memory, by an operation that nobody waits for.
+template <int kCount>
+__device__ __forceinline__ void add_in_global(float* to, const float* values) {
+#ifdef VN_EMULATE
+  for (int i = 0; i < kCount; ++i) atomicAdd(to + i, values[i]);
+#else
+  const size_t at = __cvta_generic_to_global(to);
+#if __CUDA_ARCH__ >= 900
+  constexpr int kAtOnce = kCount;
+#else
+  constexpr int kAtOnce = 1;
+#endif
+  if constexpr (kAtOnce == 4) {
+    asm volatile("red.global.add.v4.f32 [%0], {%1, %2, %3, %4};" ::"l"(at), "f"(values[0]), "f"(values[1]),
+                 "f"(values[2]), "f"(values[3])
+                 : "memory");
+  } else if constexpr (kAtOnce == 2) {
+    asm volatile("red.global.add.v2.f32 [%0], {%1, %2};" ::"l"(at), "f"(values[0]), "f"(values[1]) : "memory");
+  } else {
+#pragma unroll
+    for (int i = 0; i < kCount; ++i) {
+      asm volatile("red.global.add.f32 [%0], %1;" ::"l"(at + 4 * i), "f"(values[i]) : "memory");
+    }
+  }
+#endif
+}
+
+// What no kernel writes while this one runs.
+template <typename T>
+__device__ __forceinline__ T load_constant(const T* from) {
+#ifdef VN_EMULATE
+  return *from;
+#else
+  return __ldg(from);
+#endif
+}
+
+// Four matrices [8][8] of 16-bit numbers as fragments, from rows of `stride` words, which begin at multiples of 16
+// bytes: those of a left operand [16][16] of mma.sync. kShared: in shared memory, by ldmatrix.
+template <bool kShared>
+__device__ __forceinline__ void load_matrices(uint32_t (&words)[4], const uint32_t* from, int stride, int lane) {
+#ifndef VN_EMULATE
+  if constexpr (kShared) {
+    const auto at = static_cast<uint32_t>(__cvta_generic_to_shared(from + lane % 16 * stride + lane / 16 * 4));
+    asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
+                 : "=r"(words[0]), "=r"(words[1]), "=r"(words[2]), "=r"(words[3])
+                 : "r"(at)
+                 : "memory");
+  } else
+#endif
+  {
+#pragma unroll
+    for (int j = 0; j < 4; ++j) words[j] = from[(lane / 4 + 8 * (j % 2)) * stride + 4 * (j / 2) + lane % 4];
+  }
+}
+
+// The same of 16 rows by 16 columns with rows as the depth: as a left operand [columns][rows], or as two right ones.
+template <bool kShared, bool kLeft>
+__device__ __forceinline__ void load_turned(uint32_t (&words)[4], const uint32_t* from, int stride, int lane) {
+#ifndef VN_EMULATE
+  if constexpr (kShared) {
+    const int down = kLeft ? lane / 16 : lane / 8 % 2, across = kLeft ? lane / 8 % 2 : lane / 16;
+    const auto at = static_cast<uint32_t>(__cvta_generic_to_shared(from + (lane % 8 + 8 * down) * stride + 4 * across));
+    asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
+                 : "=r"(words[0]), "=r"(words[1]), "=r"(words[2]), "=r"(words[3])
+                 : "r"(at)
+                 : "memory");
+  } else
+#endif
+  {
+#pragma unroll
+    for (int j = 0; j < 4; ++j) {
+      const int down = kLeft ? j / 2 : j % 2, across = kLeft ? j % 2 : j / 2;
+      const uint32_t* at = from + (8 * down + 2 * (lane % 4)) * stride + 4 * across + lane / 8;
+      const int shift = lane / 4 % 2 * 16;
+      words[j] = (at[0] >> shift & 0xffffu) | (at[stride] >> shift) << 16;
+    }
+  }
 }
 
 // x with the ten bits of fraction that tensor cores multiply, ties away from zero; as float32.

@@ -18,18 +18,17 @@ VN_HD constexpr MapPlace accumulator_place(unsigned lane, int i) {
   return {static_cast<int>(lane / 4) + 8 * (i / 2), static_cast<int>(2 * (lane % 4)) + i % 2};
 }
 
-// The last of `count` values, which do not fall, that is not above `value`; 0 where all are.
-VN_HD constexpr int64_t last_not_above(const int32_t* values, int64_t count, int64_t value) {
-  int64_t low = 0, high = count;
-  while (high - low > 1) {
-    const int64_t middle = (low + high) / 2;
-    if (values[middle] <= value) {
-      low = middle;
-    } else {
-      high = middle;
-    }
-  }
-  return low;
+// Where the last of some values is that do not fall and are not above another one: 32 probes at a time, of which as many
+// were not above it as there are votes. The first value is taken for one that is not.
+struct MapSpan {
+  int64_t first, last;
+};
+VN_HD constexpr int64_t probed(const MapSpan& span, int64_t lane) {
+  return span.first + lane * ((span.last - span.first + 31) / 32);
+}
+VN_HD constexpr MapSpan narrowed(const MapSpan& span, int votes) {
+  const int64_t first = probed(span, votes == 0 ? 0 : votes - 1), last = probed(span, votes == 0 ? 1 : votes);
+  return {first, last < span.last ? last : span.last};
 }
 
 // The first of n values, which do not fall, that is above `value`; n where none is.

@@ -30,8 +30,13 @@ VN_HD float sine_of_octave(float angle, float half) {
   return (parity & 1) != 0 ? -value : value;
 }
 
-// 2^octave; products with it are exact.
-VN_HD float octave_scale(int octave) { return ldexpf(1.0f, octave); }
+// 2^octave, for octaves below 128; products with it are exact.
+VN_HD float octave_scale(int octave) {
+  const int32_t bits = (octave + 127) << 23;
+  float scale;
+  memcpy(&scale, &bits, sizeof scale);
+  return scale;
+}
 
 // The factor on an octave for a Gaussian of this variance.
 VN_HD float octave_blur(float scale, float variance) { return expf(-0.5f * scale * scale * variance); }

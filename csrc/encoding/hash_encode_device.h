@@ -57,22 +57,9 @@ __device__ __forceinline__ void hash_store(float* to, const float (&values)[kFea
 // Adds to the gradient of an entry by atomic operations, which take several features from sm_90 on.
 template <int kFeatures>
 __device__ __forceinline__ void hash_add(float* to, const float (&values)[kFeatures]) {
-#if defined(VN_EMULATE) || __CUDA_ARCH__ >= 900
-  if constexpr (kFeatures == 2) {
-    atomicAdd(reinterpret_cast<float2*>(to), make_float2(values[0], values[1]));
-  } else if constexpr (kFeatures == 1) {
-    atomicAdd(to, values[0]);
-  } else {
+  constexpr int kCount = kFeatures < 4 ? kFeatures : 4;
 #pragma unroll
-    for (int f = 0; f < kFeatures; f += 4) {
-      const float4 four = make_float4(values[f], values[f + 1], values[f + 2], values[f + 3]);
-      atomicAdd(reinterpret_cast<float4*>(to + f), four);
-    }
-  }
-#else
-#pragma unroll
-  for (int f = 0; f < kFeatures; ++f) atomicAdd(to + f, values[f]);
-#endif
+  for (int f = 0; f < kFeatures; f += kCount) add_in_global<kCount>(to + f, values + f);
 }
 
 // run(number of the first feature, x, y, z) for each corner.

@@ -108,6 +108,9 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& in, const 
 // What products take on CUDA; sums are float32.
 enum class ProgramPrecision : int { float32, tf32, bfloat16, float16 };
 
+// Whether a device multiplies 16-bit numbers of this type: before sm_80 there is no bfloat16.
+bool multiplies_halves_cuda(ProgramPrecision precision, void* stream);
+
 // The records of a program for the device, and what is there of them: `code` has program_code_bytes(program) bytes, on
 // the host; the caller copies it to the device.
 int64_t program_code_bytes_cuda(const Program& program);

@@ -66,3 +66,4 @@ def _forget() -> None:
     """Programs are objects of the module that made them."""
     _programs.lower.cache_clear()
     _programs._code.cache_clear()
+    _programs._multiplies_halves.cache_clear()

@@ -35,19 +35,14 @@ struct alignas(8) float2 {
 struct alignas(16) float4 {
   float x, y, z, w;
 };
+struct alignas(16) uint4 {
+  unsigned x, y, z, w;
+};
 inline float2 make_float2(float x, float y) {
   return {x, y};
 }
 inline float4 make_float4(float x, float y, float z, float w) {
   return {x, y, z, w};
-}
-// Each component by itself, as on the device.
-inline float2 atomicAdd(float2* to, float2 value) {
-  return {atomicAdd(&to->x, value.x), atomicAdd(&to->y, value.y)};
-}
-inline float4 atomicAdd(float4* to, float4 value) {
-  return {atomicAdd(&to->x, value.x), atomicAdd(&to->y, value.y), atomicAdd(&to->z, value.z),
-          atomicAdd(&to->w, value.w)};
 }
 // The part of the runtime that launchers use.
 using cudaStream_t = void*;

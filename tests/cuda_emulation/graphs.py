@@ -25,6 +25,9 @@ from torch.utils._pytree import tree_leaves
 
 from voronerf.ops._core import native as _native
 
+ASKED = "_workspace", "multiplies_halves"
+"""Ends of the names of functions that launch nothing."""
+
 
 def reads(function: Any, args: Any) -> bool:
     """Whether the host waits for the device."""
@@ -111,7 +114,7 @@ class Kernels:
 
     def __getattr__(self, name: str) -> Any:
         found, graph = getattr(self._compiled, name), self._seen.capturing
-        if graph is None or isinstance(found, type) or not callable(found) or name.endswith("_workspace"):
+        if graph is None or isinstance(found, type) or not callable(found) or name.endswith(ASKED):
             return found
 
         def call(*arguments: Any) -> Any:

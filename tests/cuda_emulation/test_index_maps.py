@@ -25,6 +25,11 @@ def test_a_tile_is_of_the_cell_that_counts_it():
             owners = [cell for cell, count in enumerate(tiles) for _ in range(count)]
             found = [module().last_not_above(first, cells, tile) for tile in range(first[-1])]
             assert found == owners
+    for cells in (31, 32, 33, 70, 1024, 1025, 2100):  # a probe for each, and several for some
+        tiles = [cell * 7 % 3 for cell in range(cells)]
+        first = [0, *itertools.accumulate(tiles)]
+        owners = [cell for cell, count in enumerate(tiles) for _ in range(count)]
+        assert [module().last_not_above(first, cells, tile) for tile in range(first[-1])] == owners
 
 
 def test_the_first_row_of_a_cell():

@@ -11,7 +11,7 @@ import voronerf
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
 
-LAUNCHES, READS = 26, 0
+LAUNCHES, READS = 23, 0
 """Of a default step. The launches go down only."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import random
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from helpers import refuses
 from programs import ByPrograms
 from programs import derivatives as of_every_order
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from voronerf import HashGrid
 from voronerf.ops import frequency_encode, grouped_program, hash_encode, integrated_encode, spherical_harmonics
@@ -18,6 +20,8 @@ from voronerf.ops._core import native
 from voronerf.ops._core.program import FUNCTIONS, PARAMETER, VALUE, Builder, Columns, Program, Step, gradient
 from voronerf.ops.grouped_mlp.reference import cells_of
 from voronerf.ops.grouped_program.case import GRID, encoded, every_step
+
+plans = importlib.import_module("voronerf.ops.grouped_program.native")
 
 NUMBERS = {"softplus": (3.0, 20.0), "sine": (1.7, 0.3), "clamp": (-0.5, 0.6), "power": (1.5, 0.0), "affine": (2.0, 1.0)}
 SIZES = ([0], [1], [5, 0, 24], [96, 1], [97, 0, 3], [0, 95, 200, 23])
@@ -689,3 +693,15 @@ def test_second_derivatives_where_rows_have_no_gradient() -> None:
         found.append(torch.autograd.grad(sum((slope**2).sum() for slope in first), leaves))
     for ours, exact in zip(*found, strict=True):
         torch.testing.assert_close(ours, exact, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("products", ["float32", "bfloat16"])
+def test_shapes_of_a_gpu_that_is_not_there(products):
+    """Tensors without memory have shapes and a device, of which nothing is asked."""
+    b = Builder()
+    program = b.program([b.linear(b.input(5), b.parameter(7, 5), 7)])
+    with FakeTensorMode():
+        x, weight = torch.empty(9, 5, device="cuda"), torch.empty(2, 7, 5, device="cuda")
+        offsets = torch.zeros(3, dtype=torch.int32, device="cuda")
+        found = plans.run(plans.Rows([x], [weight], offsets, None, None), plans.How(program.text, products=products))
+        assert [tuple(t.shape) for t in found] == [(9, 7)]

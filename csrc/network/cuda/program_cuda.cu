@@ -1,26 +1,26 @@
 // Programs on CUDA: an interpreter. A block takes tasks, rows of one cell, and all of its threads do one step after
 // another for a tile of rows.
 //
-// Values lie in shared memory as float32, each [rows][stride] at its slot, 64 rows where two blocks of that fit into a
-// multiprocessor, else 32; what does not fit with 32 lies in the workspace instead, a part for each of two blocks a
-// multiprocessor, which the second-level cache holds. Rows are 4 floats longer than a multiple of 16, so that the lanes
-// of a product are in different banks (program_cuda_product.h).
+// Values lie in shared memory, [rows][stride] each at its slot: as float32, and with products of 16 bits as words of
+// two such numbers wherever only products read them. A tile has 128 rows with 16 bits, else 64, and fewer where two
+// blocks would not fit into a multiprocessor; what does not fit with 32 lies in the workspace instead, a part for each
+// of two blocks a multiprocessor.
 //
-// Layers: weights come from where they lie, through a strip of shared memory, 32 inputs of 64 outputs at a time; those
-// of the next strip are on their way in registers while one is multiplied. Sums over rows: a thread has the same
-// entries in every tile and adds to them in the task's partial in global memory; a second kernel adds up the partials
-// of a cell in their order, so results are the same every time. Gradients of tables alone are added up by atomic
-// operations, in any order.
+// Layers: weights are packed once for a call, in the order and the type that products take them in
+// (program_cuda_product.h). Sums over rows: a thread has the same entries in every tile and adds to them in the task's
+// partial in global memory; a second kernel adds up the partials of a cell in their order, so results are the same
+// every time. Gradients of tables alone are added up by atomic operations, in any order.
 //
-// Budget: 256 threads of up to 128 registers, 16 of which are sums of a product, so that two blocks are resident. What
-// is not a product is not inlined, so that it is compiled once for all kernels. With 32 rows one register is spilled on
-// sm_86 and sm_89, once written and once read.
+// Budget: 256 threads of 128 registers, so that two blocks are resident; or of 80 for three, in float32 and in bfloat16
+// with tiles of 64 rows, at the price of 4 to 12 registers that are spilled from step to step. What is not a product is
+// not inlined.
 #include <algorithm>
 #include <cstring>
 #include <stdexcept>
 #include <string>
 
 #include "network/cuda/program_cuda_encoding.h"
+#include "network/cuda/program_cuda_product.h"
 #include "network/program.h"
 
 #define VN_ISA_NAMESPACE device
@@ -56,10 +56,11 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = kProgramThreads;
-constexpr int64_t kTaskRows = 128, kTasksPerMultiprocessor = 4, kPartialBytes = int64_t{1} << 28;
+constexpr int64_t kTaskRows = 128, kPartialBytes = int64_t{1} << 28;
 constexpr int64_t kBlocksPerMultiprocessor = 8;  // of kernels other than the interpreter
-constexpr int kResident = 2;                     // blocks of the interpreter on a multiprocessor
-constexpr int kStripBytes = 4 * kProgramStrip;
+constexpr int kPackPart = 1024;                  // words of what is packed that a block takes at a time
+constexpr int kResident = 2, kMostResident = 3;  // blocks of the interpreter on a multiprocessor, at least and at most
+constexpr int64_t kReservedBytes = 1024;         // of shared memory, for each block
 // The memory of a step, in the device's records: the number of a look-up, none, or below that the number of a scatter.
 constexpr int kNoMemory = -1;
 
@@ -79,19 +80,19 @@ __device__ __forceinline__ float derivative(int order, float x, float a, float b
   }
 }
 
-__device__ __noinline__ void function_step(const ProgramTile& tile, const ProgramStep& step,
-                                           const ProgramOperand* operands) {
+template <typename Tile>
+__device__ __noinline__ void function_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
   const Rows x = tile.operand(operands[0]), times = tile.operand(operands[step.taken - 1]);
   const float a = step.a, b = step.b;
-  const int order = step.order, stride = step.stride;
+  const int order = step.order;
   const bool alone = step.taken == 1;
-  float* const to = tile.slot(step.slot);
+  const Target to = tile.target(step);
   switch (step.function) {
-#define VN_CASE(NAME, ...)                                                                                  \
-  case ProgramFunction::NAME:                                                                               \
-    return for_each_entry(tile.rows, step.width, [&](int row, int column) {                                 \
-      const float by = alone ? 1.0f : times.at(row, column);                                                \
-      to[row * stride + column] = by * derivative<device::NAME##_function>(order, x.at(row, column), a, b); \
+#define VN_CASE(NAME, ...)                                                                           \
+  case ProgramFunction::NAME:                                                                        \
+    return for_each_entry(tile.rows, step.width, [&](int row, int column) {                          \
+      const float by = alone ? 1.0f : times.at(row, column);                                         \
+      to.put(row, column, by * derivative<device::NAME##_function>(order, x.at(row, column), a, b)); \
     });
     VN_FUNCTIONS(VN_CASE)
 #undef VN_CASE
@@ -113,16 +114,15 @@ __device__ __forceinline__ float binary(ProgramBinary name, float a, float b) {
   }
 }
 
-__device__ __forceinline__ void move_step(const ProgramTile& tile, const ProgramStep& step,
-                                          const ProgramOperand* operands) {
-  float* const to = tile.slot(step.slot);
-  const int stride = step.stride;
+template <typename Tile>
+__device__ __forceinline__ void move_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
+  const Target to = tile.target(step);
   if (step.order == 1) {  // every column has one part
     for (int i = 0; i < step.taken; ++i) {
       const Rows x = tile.operand(operands[i]);
       const int place = operands[i].place;
       for_each_entry(tile.rows, operands[i].width,
-                     [&](int row, int column) { to[row * stride + place + column] = x.at(row, column); });
+                     [&](int row, int column) { to.put(row, place + column, x.at(row, column)); });
     }
     return;
   }
@@ -132,23 +132,24 @@ __device__ __forceinline__ void move_step(const ProgramTile& tile, const Program
       const int within = column - operands[i].place;
       if (within >= 0 && within < operands[i].width) sum += tile.operand(operands[i]).at(row, within);
     }
-    to[row * stride + column] = sum;
+    to.put(row, column, sum);
   });
 }
 
-__device__ __forceinline__ void input_step(const ProgramTile& tile, const ProgramStep& step) {
+template <typename Tile>
+__device__ __forceinline__ void input_step(const Tile& tile, const ProgramStep& step) {
   const CudaProgram& call = tile.call;
-  float* const to = tile.slot(step.slot);
-  const int input = step.number, width = step.width, stride = step.stride;
+  const Target to = tile.target(step);
+  const int input = step.number, width = step.width;
   const bool turned = call.turned[input];  // neighbouring lanes read neighbouring rows, else columns
   for_each_entry(turned ? width : tile.rows, turned ? tile.rows : width, [&](int i, int j) {
     const int row = turned ? j : i, column = turned ? i : j;
-    to[row * stride + column] = load_input(call, input, width, source_row(call.rows, tile.begin + row), column);
+    to.put(row, column, load_input(call, input, width, source_row(call.rows, tile.begin + row), column));
   });
 }
 
-__device__ __forceinline__ void output_step(const ProgramTile& tile, const ProgramStep& step,
-                                            const ProgramOperand* operands) {
+template <typename Tile>
+__device__ __forceinline__ void output_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
   const CudaProgram& call = tile.call;
   const Rows x = tile.operand(operands[0]);
   const int output = step.number, type = call.output_types[output];
@@ -159,10 +160,12 @@ __device__ __forceinline__ void output_step(const ProgramTile& tile, const Progr
 }
 
 // Steps that multiply nothing.
-__device__ __noinline__ void plain_step(const ProgramTile& tile, const ProgramStep& given) {
+template <typename Tile>
+__device__ __noinline__ void plain_step(const Tile& tile, const ProgramStep& given) {
   const ProgramStep step = given;
   const ProgramOperand* operands = tile.call.code.operands + step.first;
-  float* const to = tile.slot(step.slot);
+  const Target to = tile.target(step);
+  if (step.op != ProgramOp::output) clear_rest(tile, step);
   switch (step.op) {
     case ProgramOp::input:
       return input_step(tile, step);
@@ -173,7 +176,7 @@ __device__ __noinline__ void plain_step(const ProgramTile& tile, const ProgramSt
     case ProgramOp::binary: {
       const Rows x = tile.operand(operands[0]), y = tile.operand(operands[1]);
       return for_each_entry(tile.rows, step.width, [&](int row, int column) {
-        to[row * step.stride + column] = binary(step.binary, x.at(row, column), y.at(row, column));
+        to.put(row, column, binary(step.binary, x.at(row, column), y.at(row, column)));
       });
     }
     case ProgramOp::total: {
@@ -181,33 +184,26 @@ __device__ __noinline__ void plain_step(const ProgramTile& tile, const ProgramSt
       return for_each_entry(tile.rows, step.width, [&](int row, int column) {
         float sum = 0.0f;
         for (int i = 0; i < step.number; ++i) sum += x.at(row, column * step.number + i);
-        to[row * step.stride + column] = sum;
+        to.put(row, column, sum);
       });
     }
     case ProgramOp::move:
       return move_step(tile, step, operands);
-    case ProgramOp::encode: {
+    default: {  // encode
       const bool there = tile.call.ready && step.memory >= 0 && tile.call.kept[step.memory] != nullptr;
       if (!there) return encode_step(tile, given, operands);
       const int64_t stride = tile.call.kept_strides[step.memory];
       const float* from = tile.call.kept[step.memory] + tile.begin * stride;
       return for_each_entry(tile.rows, step.width,
-                            [&](int row, int column) { to[row * step.stride + column] = from[row * stride + column]; });
-    }
-    default: {  // columns
-      const Rows x = tile.operand(operands[0]);
-      for (int column = threadIdx.x; column < step.width; column += kThreads) {
-        float sum = tile.fill ? 0.0f : tile.partial[step.number + column];
-        for (int row = 0; row < tile.rows; ++row) sum += x.at(row, column);
-        tile.partial[step.number + column] = sum;
-      }
+                            [&](int row, int column) { to.put(row, column, from[row * stride + column]); });
     }
   }
 }
 
 // What becomes of a value beside its slot: what was looked up is kept, and the gradient of that is added to that of the
 // table.
-__device__ __noinline__ void keep(const ProgramTile& tile, const ProgramStep& step) {
+template <typename Tile>
+__device__ __noinline__ void keep(const Tile& tile, const ProgramStep& step) {
   const CudaProgram& call = tile.call;
   if (step.memory < kNoMemory) return scatter_rows(tile, step, call.scatters[kNoMemory - 1 - step.memory]);
   if (call.kept[step.memory] == nullptr || call.ready) return;
@@ -219,134 +215,53 @@ __device__ __noinline__ void keep(const ProgramTile& tile, const ProgramStep& st
   });
 }
 
-// A product. Rows without a sample get what lies in the slots, and are not stored.
-//
-// What enters a product of float16 is cut off at its largest number, since infinities in a network soon become NaN,
-// except for gradients: whoever scales a loss looks for the infinite ones. What a turned matrix multiplies is taken for
-// one.
-template <typename Products>
-__device__ __forceinline__ void linear_step(const ProgramTile& tile, float* slots, float* strip,
-                                            const ProgramStep& step) {
-  const ProgramOperand* operands = tile.call.code.operands + step.first;
-  const ProgramPack pack = tile.call.code.packs[step.number];
-  const bool turned = pack.kind == ProgramPackKind::turned || pack.kind == ProgramPackKind::few_turned;
-  const bool sloped = step.finish == ProgramFinish::relu_slope, added = step.taken > 1 + sloped;
-  const float* weights = tile.parameter(pack);
-  const Rows add = added ? tile.operand(operands[1]) : Rows{};
-  const Rows slope = sloped ? tile.operand(operands[step.taken - 1]) : Rows{};
-  const float largest = turned ? __builtin_inff() : kLargestHalf;
-  ByRows x{slots + operands[0].slot * tile.height + operands[0].start, operands[0].stride, largest};
-  float* const to = slots + step.slot * tile.height;
-  constexpr int kTurns = kProgramDepth * kProgramWide / kThreads;
-  for (int first = 0; first < step.width; first += kProgramWide) {
-    const int columns = step.width - first < kProgramWide ? step.width - first : kProgramWide;
-    typename Products::Sums sums;
-#pragma unroll
-    for (int i = 0; i < Products::kSums; ++i) {
-      const MapPlace at = Products::place(i);
-      const bool there = added && at.row < tile.rows && at.column < columns;
-      Products::sum(sums, i) = there ? add.at(at.row, first + at.column) : 0.0f;
-    }
-    // The part of the strip that a thread loads in its turns, along the rows of memory.
-    const auto place = [&](int turn) {
-      const int entry = thread_again() + turn * kThreads;
-      return turned ? MapPlace{entry / kProgramWide, entry % kProgramWide}
-                    : MapPlace{entry % kProgramDepth, entry / kProgramDepth};
-    };
-    float ahead[kTurns];
-    const auto fetch = [&](int start) {
-#pragma unroll
-      for (int turn = 0; turn < kTurns; ++turn) {
-        const MapPlace at = place(turn);
-        const int input = start + at.row, output = first + at.column;
-        const bool there = input < step.depth && at.column < columns;
-        ahead[turn] = there ? weights[turned ? input * pack.i + output : output * pack.i + input] : 0.0f;
-      }
-    };
-    fetch(0);
-    for (int start = 0; start < step.depth; start += kProgramDepth) {
-      const int deep = step.depth - start < kProgramDepth ? step.depth - start : kProgramDepth;
-#pragma unroll
-      for (int turn = 0; turn < kTurns; ++turn) {
-        const MapPlace at = place(turn);
-        Products::store(strip, at.column, at.row, ahead[turn]);
-      }
-      __syncthreads();
-      if (start + kProgramDepth < step.depth) fetch(start + kProgramDepth);
-      const ByRows part{x.data + start, x.stride, x.largest};
-      Products::multiply(sums, part, Products::strip(strip), deep, columns);
-      __syncthreads();  // the strip has been read
-    }
-#pragma unroll
-    for (int i = 0; i < Products::kSums; ++i) {
-      const MapPlace at = Products::place(i);
-      if (at.row >= tile.rows || at.column >= columns) continue;
-      float value = Products::sum(sums, i);  // comparisons keep NaN
-      if (step.finish == ProgramFinish::relu) value = value < 0.0f ? 0.0f : value;
-      if (sloped) value = slope.at(at.row, first + at.column) <= 0.0f ? 0.0f : value;
-      to[at.row * step.stride + first + at.column] = value;
-    }
-  }
-}
-
-// partial[i][j] += sum over rows of a[row][i] b[row][j].
-template <typename Products, int kHeight>
-__device__ __forceinline__ void outer_step(const ProgramTile& tile, const float* slots, const ProgramStep& step) {
-  const ProgramOperand* operands = tile.call.code.operands + step.first;
-  const auto columns = [&](int number) {
-    const ProgramOperand& o = operands[number];
-    return ByColumns{slots + o.slot * tile.height + o.start, o.stride, number == 0 ? __builtin_inff() : kLargestHalf,
-                     o.width};
-  };
-  const ByColumns all_a = columns(step.order == 1 ? 0 : 1), all_b = columns(step.order == 1 ? 1 : 0);
-  for (int i0 = 0; i0 < all_a.count; i0 += kHeight) {
-    for (int j0 = 0; j0 < all_b.count; j0 += kProgramWide) {
-      const ByColumns a{all_a.data + i0, all_a.stride, all_a.largest, all_a.count - i0};
-      const ByColumns b{all_b.data + j0, all_b.stride, all_b.largest, all_b.count - j0};
-      typename Products::Sums sums = {};
-      Products::multiply(sums, a, b, tile.rows, b.count);
-#pragma unroll
-      for (int i = 0; i < Products::kSums; ++i) {
-        const MapPlace at = Products::place(i);
-        if (at.row >= a.count || at.column >= b.count) continue;
-        float& entry = tile.partial[step.number + (i0 + at.row) * step.stride + j0 + at.column];
-        entry = (tile.fill ? 0.0f : entry) + Products::sum(sums, i);
-      }
-    }
-  }
-}
-
 // Kernels --------------------------------------------------------------------------------------------------------
 
-// kSpilled: values lie in the workspace.
-template <typename Products, int kHeight, bool kSpilled>
-__global__ void __launch_bounds__(kThreads, kResident)
+// The last of the cells whose first task is not above one, by all lanes of a warp.
+__device__ __forceinline__ int cell_of_task(const CudaRows& rows, int task) {
+  const int lane = static_cast<int>(threadIdx.x % 32);
+  MapSpan cells{0, rows.k};
+  while (cells.last - cells.first > 1) {
+    const int64_t at = probed(cells, lane);
+    const unsigned votes = __ballot_sync(kAllLanes, at < cells.last && rows.first_task[at] <= task);
+    cells = narrowed(cells, __popc(votes));
+  }
+  return static_cast<int>(cells.first);
+}
+
+// kHalves and kBfloat16: as of a tile.
+template <typename Steps, bool kHalves, bool kBfloat16>
+__global__ void __launch_bounds__(kThreads, Steps::kResident)
     program_kernel(const VN_GRID_CONSTANT CudaProgram call, int64_t partial) {
-  VN_DYN_SHARED(float, shared);
-  float* slots = shared + kProgramStrip;
-  if constexpr (kSpilled) slots = call.spilled + int64_t{blockIdx.x} * call.code.columns * kHeight;
+  constexpr int kHeight = Steps::kHeight;
+  float* const slots = call.spilled + int64_t{blockIdx.x} * call.code.columns * kHeight;
   const CudaRows& rows = call.rows;
   const int tasks = rows.first_task[rows.k];
   for (int task = blockIdx.x; task < tasks; task += gridDim.x) {
-    const int cell = static_cast<int>(last_not_above(rows.first_task, rows.k, task));
+    const int cell = cell_of_task(rows, task);
     const int64_t first = cell_begin(rows, cell), last = first + cell_rows(rows, cell);
     const int64_t begin = first + (task - rows.first_task[cell]) * call.task_rows;
     const int count = static_cast<int>(last - begin < call.task_rows ? last - begin : call.task_rows);
+    const float* const weights = call.packed + cell * call.packed_stride;
     for (int done = 0; done < count; done += kHeight) {
       const int left = count - done < kHeight ? count - done : kHeight, row = static_cast<int>(begin) + done;
-      const ProgramTile tile{call, slots, call.partials + task * partial, cell, row, kHeight, left, done == 0};
+      const ProgramTile<Steps::kInShared> tile{
+          call,    slots,    call.partials + task * partial, weights, cell, row, kHeight, left, done == 0,
+          kHalves, kBfloat16};
       for (int i = 0; i < call.code.step_count; ++i) {
-        const ProgramStep& step = call.code.steps[i];
+        const CudaStep& step = call.steps[i];
         if (step.op == ProgramOp::linear) {
-          linear_step<Products>(tile, slots, shared, step);
+          Steps::linear(tile, step);
         } else if (step.op == ProgramOp::outer) {
-          outer_step<Products, kHeight>(tile, slots, step);
+          Steps::outer(tile, step);
+        } else if (step.op == ProgramOp::columns) {
+          Steps::columns(tile, step);
         } else {
-          plain_step(tile, step);
+          plain_step(tile, call.code.steps[i]);
         }
         __syncthreads();
-        if (step.memory != kNoMemory) {
-          keep(tile, step);
+        if (step.keeps) {
+          keep(tile, call.code.steps[i]);
           __syncthreads();
         }
       }
@@ -383,25 +298,78 @@ __device__ void number_tasks(const CudaRows& rows, int64_t task_rows, int64_t mo
   if (threadIdx.x == 0) rows.first_task[rows.k] = inside(carry);
 }
 
-// The first block numbers the tasks, and all clear what rows of no cell have: outputs, and what is kept of them.
-__global__ void __launch_bounds__(kThreads)
-    program_prepare_kernel(const VN_GRID_CONSTANT CudaProgram call, int64_t most) {
-  const CudaRows& rows = call.rows;
-  if (blockIdx.x == 0) number_tasks(rows, call.task_rows, most);
-  const int64_t low = cell_begin(rows, 0), last = cell_begin(rows, rows.k), high = last < low ? low : last;
-  const int64_t step = static_cast<int64_t>(gridDim.x) * kThreads;
-  for (int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; i < rows.n - (high - low); i += step) {
-    const int64_t stray = i < low ? i : i + high - low, row = source_row(rows, stray);
-    for (int o = 0; o < call.output_count; ++o) {
-      const int width = call.output_widths[o];
-      for (int c = 0; c < width; ++c) store_number(call.outputs[o], call.output_types[o], row * width + c, 0.0f);
-    }
-    for (int l = 0; l < call.lookup_count; ++l) {
-      const int64_t stride = call.kept_strides[l];
-      if (call.kept[l] == nullptr || call.ready) continue;
-      for (int c = 0; c < stride; ++c) call.kept[l][stray * stride + c] = 0.0f;
+// Word `word` of a matrix as products take it: in the order of fragments, or [depth][outputs].
+__device__ __forceinline__ uint32_t any_packed_word(const PackedMatrix& matrix, ProgramPrecision precision, int outputs,
+                                                    int word) {
+  switch (precision) {
+    case ProgramPrecision::tf32:
+      return packed_word<Tf32Numbers>(matrix, word);
+    case ProgramPrecision::bfloat16:
+      return packed_word<HalfNumbers<true>>(matrix, word);
+    case ProgramPrecision::float16:
+      return packed_word<HalfNumbers<false>>(matrix, word);
+    default: {
+      const float value = matrix.at(word / outputs, word % outputs);
+      uint32_t bits;
+      memcpy(&bits, &value, sizeof bits);
+      return bits;
     }
   }
+}
+
+// Of each cell's matrices and biases, as products take them. A block takes a part of one at a time.
+__device__ void pack_weights(const CudaProgram& call, ProgramPrecision precision) {
+  const bool halves = precision == ProgramPrecision::bfloat16 || precision == ProgramPrecision::float16;
+  const int deep = halves ? HalfNumbers<true>::kChunk : Tf32Numbers::kChunk, packs = call.code.pack_count;
+  for (int64_t unit = blockIdx.x; unit < call.rows.k * packs * call.pack_parts; unit += gridDim.x) {
+    const int part = static_cast<int>(unit % call.pack_parts);
+    const int64_t rest = unit / call.pack_parts, cell = rest / packs;
+    const ProgramPack pack = call.code.packs[rest % packs];
+    const bool turned = pack.kind == ProgramPackKind::turned, vector = pack.kind == ProgramPackKind::vector;
+    if (!turned && !vector && pack.kind != ProgramPackKind::matrix) continue;
+    const float* from =
+        static_cast<const float*>(call.parameters[pack.parameter]) + cell * call.strides[pack.parameter] + pack.start;
+    PackedMatrix matrix{from, turned ? pack.i : 1, turned ? 1 : pack.i, turned ? pack.o : pack.width,
+                        turned ? pack.width : pack.o};
+    if (vector) matrix = {from, 0, 1, 1, pack.width};
+    const int outputs = padded(matrix.outputs, kProgramOutputs);
+    const int words = vector ? outputs : padded(matrix.depth, deep) * outputs / (halves ? 2 : 1);
+    auto* const to = reinterpret_cast<uint32_t*>(call.packed) + cell * call.packed_stride + pack.at;
+    const int last = words < (part + 1) * kPackPart ? words : (part + 1) * kPackPart;
+    for (int word = part * kPackPart + static_cast<int>(threadIdx.x); word < last; word += kThreads) {
+      to[word] = any_packed_word(matrix, vector ? ProgramPrecision::float32 : precision, outputs, word);
+    }
+  }
+}
+
+// What rows of no cell have: 0 in outputs, and in what is kept.
+__device__ void clear_strays(const CudaProgram& call) {
+  const CudaRows& rows = call.rows;
+  const int64_t low = cell_begin(rows, 0), last = cell_begin(rows, rows.k), high = last < low ? low : last;
+  const int64_t begin = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t step = static_cast<int64_t>(gridDim.x) * kThreads, strays = rows.n - (high - low);
+  for (int o = 0; o < call.output_count; ++o) {
+    const int width = call.output_widths[o];
+    for (int64_t i = begin; i < strays * width; i += step) {
+      const int64_t stray = i / width, row = source_row(rows, stray < low ? stray : stray + high - low);
+      store_number(call.outputs[o], call.output_types[o], row * width + i - stray * width, 0.0f);
+    }
+  }
+  for (int l = 0; l < call.lookup_count; ++l) {
+    const int64_t stride = call.kept_strides[l];
+    if (call.kept[l] == nullptr || call.ready) continue;
+    for (int64_t i = begin; i < strays * stride; i += step) {
+      call.kept[l][i < low * stride ? i : i + (high - low) * stride] = 0.0f;
+    }
+  }
+}
+
+// The first block numbers the tasks.
+__global__ void __launch_bounds__(kThreads)
+    program_prepare_kernel(const VN_GRID_CONSTANT CudaProgram call, int64_t most, ProgramPrecision precision) {
+  if (blockIdx.x == 0) number_tasks(call.rows, call.task_rows, most);
+  pack_weights(call, precision);
+  clear_strays(call);
 }
 
 // Grid (k, blocks of a cell).
@@ -421,7 +389,16 @@ __global__ void __launch_bounds__(kThreads)
         const int o = vector ? 0 : i / sum.i, column = i - o * sum.i * !vector - sum.start;
         if (column < 0 || column >= sum.width) continue;
         const int at = sum.partial + (turned ? column * sum.stride + o : o * sum.stride + column);
-        for (int64_t task = first; task < last; ++task) total += call.partials[task * partial + at];
+        const float* from = call.partials + at;
+        int64_t task = first;
+        for (; task + 8 <= last; task += 8) {  // several loads on their way at a time
+          float parts[8];
+#pragma unroll
+          for (int p = 0; p < 8; ++p) parts[p] = from[(task + p) * partial];
+#pragma unroll
+          for (int p = 0; p < 8; ++p) total += parts[p];
+        }
+        for (; task < last; ++task) total += from[task * partial];
       }
       call.sums[code.sums[s].sum][cell * size + i] = total;
     }
@@ -432,6 +409,7 @@ __global__ void __launch_bounds__(kThreads)
 
 struct Device {
   int multiprocessors, shared_bytes;
+  int64_t multiprocessor_bytes;
   int capability;  // 86 for 8.6; of the architecture that the kernels are compiled for, where that is lower
 };
 
@@ -446,6 +424,7 @@ const Device& current_device() {
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&minor, cudaDevAttrComputeCapabilityMinor, device));
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
+  found.multiprocessor_bytes = found.shared_bytes + kReservedBytes;
   VN_CUDA_CHECK(cudaDeviceGetAttribute(&found.multiprocessors, cudaDevAttrMultiProcessorCount, device));
   // Code for a lower architecture than the device's chooses its instructions by that.
   cudaFuncAttributes compiled{};
@@ -462,7 +441,9 @@ class Slots {
  public:
   explicit Slots(const ProgramTable& table) : own_(table.memories.size(), -1) {
     for (const ProgramStep& step : table.steps) {
-      if (makes_value(step)) starts_.push_back(step.slot);
+      if (!makes_value(step)) continue;
+      if (step.floats) starts_.push_back(step.slot);
+      if (step.pairs >= 0) starts_.push_back(step.pairs);
     }
     std::sort(starts_.begin(), starts_.end());
     starts_.erase(std::unique(starts_.begin(), starts_.end()), starts_.end());
@@ -489,7 +470,7 @@ class Slots {
 
 // Bytes of the parts of a code, one after another.
 struct CodePlaces {
-  int64_t packs, steps, operands, sums, scatters, grids, bytes;
+  int64_t packs, steps, operands, sums, scatters, grids, own_steps, bytes;
 };
 int64_t aligned(int64_t bytes) { return ceil_div<int64_t>(bytes, 256) * 256; }
 CodePlaces code_places(const ProgramTable& table) {
@@ -502,8 +483,62 @@ CodePlaces code_places(const ProgramTable& table) {
   at.sums = behind(at.operands, table.operands);
   at.scatters = behind(at.sums, table.sums);
   at.grids = behind(at.scatters, table.scatters);
-  at.bytes = at.grids + aligned(static_cast<int64_t>(table.grids.size() * sizeof(HashEncoding)));
+  at.own_steps = at.grids + aligned(static_cast<int64_t>(table.grids.size() * sizeof(HashEncoding)));
+  at.bytes = at.own_steps + aligned(static_cast<int64_t>(table.steps.size() * sizeof(CudaStep)));
   return at;
+}
+
+// Words that the largest of what is packed takes, at most: up to where the next one begins.
+int32_t largest_pack(const ProgramTable& table) {
+  int32_t largest = 1;
+  for (size_t i = 0; i < table.packs.size(); ++i) {
+    const int32_t end = i + 1 < table.packs.size() ? table.packs[i + 1].at : table.packed;
+    largest = std::max(largest, end - table.packs[i].at);
+  }
+  return largest;
+}
+
+// A step for the interpreter, of records whose slots are those of the device.
+CudaStep cuda_step(const ProgramStep& step, const ProgramOperand* operands, const std::vector<ProgramPack>& packs) {
+  CudaStep made{};
+  const auto value = [](const ProgramOperand& o, bool& words) -> CudaValue {
+    words = o.pairs >= 0;
+    if (words) return {o.pairs, 0, pair_stride(o.width), o.width};
+    return {o.slot, o.start, o.stride, o.width};
+  };
+  made.op = step.op;
+  made.keeps = step.memory != kNoMemory;
+  made.slot = step.floats ? step.slot : -1, made.stride = step.stride, made.pairs = step.pairs;
+  made.width = step.width, made.depth = step.depth;
+  made.bias = made.added = -1;
+  made.partial = step.number;
+  if (step.op == ProgramOp::linear) {
+    const ProgramPack& pack = packs[static_cast<size_t>(step.number)];
+    made.weights = pack.at;
+    made.turned = pack.kind == ProgramPackKind::turned;
+    made.relu = step.finish == ProgramFinish::relu;
+    made.sloped = step.finish == ProgramFinish::relu_slope;
+    made.x = value(operands[0], made.x_words);
+    if (made.sloped) made.y = value(operands[step.taken - 1], made.y_words);
+    if (step.taken > 1 + made.sloped) {
+      const ProgramOperand& added = operands[1];
+      const bool bias = added.parameter && !added.spread;
+      if (bias) made.bias = packs[static_cast<size_t>(added.slot)].at;
+      if (!bias) made.added = step.first + 1;
+    }
+  } else if (step.op == ProgramOp::outer) {
+    made.swapped = step.order != 1;
+    made.x = value(operands[made.swapped ? 1 : 0], made.x_words);
+    made.y = value(operands[made.swapped ? 0 : 1], made.y_words);
+  } else if (step.op == ProgramOp::columns) {
+    made.x = value(operands[0], made.x_words);
+  }
+  return made;
+}
+
+// Whether three blocks of the interpreter are resident where a tile has fewer than 128 rows.
+bool three_resident(ProgramPrecision precision) {
+  return precision == ProgramPrecision::float32 || precision == ProgramPrecision::bfloat16;
 }
 
 // How a call is cut: rows of a tile and of a task, blocks, at most so many tasks, and where what is in the workspace.
@@ -512,10 +547,10 @@ struct Cut {
   bool spilled;
   int shared;
   int64_t task_rows, tasks, blocks;
-  int64_t partials, slots, bytes;
+  int64_t packed, partials, slots, bytes;
 };
 
-Cut cut(const Program& program, int64_t n, int64_t k) {
+Cut cut(const Program& program, int64_t n, int64_t k, bool three_resident) {
   const ProgramTable& table = program.table;
   const Device& device = current_device();
   const size_t most = std::max({table.inputs.size(), static_cast<size_t>(table.parameters), table.outputs.size(),
@@ -532,46 +567,65 @@ Cut cut(const Program& program, int64_t n, int64_t k) {
   }
   Cut found{};
   const int64_t columns = Slots(table).columns();
-  const auto shared = [&](int rows) { return kStripBytes + 4 * rows * columns; };
-  found.height = 2 * shared(64) <= device.shared_bytes ? 64 : 32;
+  const auto shared = [&](int rows) { return 4 * rows * columns; };
+  found.height = table.layout == ProgramLayout::tiles ? 128 : 64;
+  while (found.height > 32 && kResident * (shared(found.height) + kReservedBytes) > device.multiprocessor_bytes) {
+    found.height /= 2;
+  }
   found.spilled = shared(found.height) > device.shared_bytes;
   if (found.spilled) found.height = 64;
-  found.shared = static_cast<int>(found.spilled ? kStripBytes : shared(found.height));
+  found.shared = static_cast<int>(found.spilled ? 0 : shared(found.height));
   found.task_rows = kTaskRows;
   if (table.partial > 0) {
-    found.task_rows = std::max(found.task_rows, n / (kTasksPerMultiprocessor * device.multiprocessors));
+    // As many tasks as there are blocks at a time, of which each cell's last one is smaller, and few enough partials.
+    const int64_t fitting = device.multiprocessor_bytes / (found.shared + kReservedBytes);
+    const int most = three_resident && !found.spilled && found.height < 128 ? kMostResident : kResident;
+    const int64_t wave = std::clamp<int64_t>(fitting, 1, most) * device.multiprocessors;
+    found.task_rows = std::max<int64_t>(found.height, ceil_div<int64_t>(n, wave > 2 * k ? wave - k : wave));
     found.task_rows = std::max(found.task_rows, ceil_div<int64_t>(n * table.partial, kPartialBytes / 4));
   }
-  found.task_rows = ceil_div<int64_t>(found.task_rows, kTaskRows) * kTaskRows;
+  found.task_rows = ceil_div<int64_t>(found.task_rows, found.height) * found.height;
   found.tasks = n / found.task_rows + k;
   found.blocks = found.spilled ? std::min<int64_t>(found.tasks, kResident * device.multiprocessors) : found.tasks;
-  found.partials = aligned(4 * (k + 1));
+  found.packed = aligned(4 * (k + 1));
+  found.partials = found.packed + aligned(4 * k * table.packed);
   found.slots = found.partials + aligned(4 * found.tasks * table.partial);
   found.bytes = found.slots + (found.spilled ? aligned(4 * found.blocks * found.height * columns) : 0);
   return found;
 }
 
-template <typename Products, int kHeight, bool kSpilled>
+template <typename Steps, bool kHalves = false, bool kBfloat16 = false>
 void launch(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
-  const auto kernel = program_kernel<Products, kHeight, kSpilled>;
+  const auto kernel = program_kernel<Steps, kHalves, kBfloat16>;
   // Always the same, since what one host thread sets must do for the launch of another.
   VN_CUDA_CHECK(
       cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, current_device().shared_bytes));
   VN_LAUNCH(kernel, static_cast<unsigned>(found.blocks), kThreads, found.shared, stream, call, partial);
 }
 
-template <template <int> typename Products>
-void launch_cut(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
-  if (found.spilled) return launch<Products<4>, 64, true>(call, found, partial, stream);
-  if (found.height == 64) return launch<Products<4>, 64, false>(call, found, partial, stream);
-  launch<Products<2>, 32, false>(call, found, partial, stream);
+void launch_floats(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
+  if (found.spilled) return launch<FloatSteps<4, false>>(call, found, partial, stream);
+  if (found.height == 64) return launch<FloatSteps<4, true>>(call, found, partial, stream);
+  launch<FloatSteps<2, true>>(call, found, partial, stream);
 }
-template <int kDown>
-using Bfloat16Products = TensorProducts<HalfFragments<true>, kDown>;
-template <int kDown>
-using Float16Products = TensorProducts<HalfFragments<false>, kDown>;
-template <int kDown>
-using Tf32Products = TensorProducts<Tf32Fragments, kDown>;
+void launch_tf32(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
+  if (found.spilled) return launch<TensorSteps<Tf32Numbers, 4, 1, false>>(call, found, partial, stream);
+  if (found.height == 64) return launch<TensorSteps<Tf32Numbers, 4, 1, true>>(call, found, partial, stream);
+  launch<TensorSteps<Tf32Numbers, 2, 1, true>>(call, found, partial, stream);
+}
+template <bool kBfloat16>
+void launch_halves(const CudaProgram& call, const Cut& found, int64_t partial, void* stream) {
+  using Numbers = HalfNumbers<kBfloat16>;
+  if (found.spilled) return launch<TensorSteps<Numbers, 4, 1, false>, true, kBfloat16>(call, found, partial, stream);
+  switch (found.height) {
+    case 128:
+      return launch<TensorSteps<Numbers, 4, 2, true>, true, kBfloat16>(call, found, partial, stream);
+    case 64:
+      return launch<TensorSteps<Numbers, 4, 1, true>, true, kBfloat16>(call, found, partial, stream);
+    default:
+      return launch<TensorSteps<Numbers, 2, 1, true>, true, kBfloat16>(call, found, partial, stream);
+  }
+}
 
 // Blocks that fill the device, if there is as much to do.
 unsigned blocks_for(int64_t entries) {
@@ -580,6 +634,11 @@ unsigned blocks_for(int64_t entries) {
 }
 
 }  // namespace
+
+bool multiplies_halves_cuda(ProgramPrecision precision, void*) {
+  return precision == ProgramPrecision::float16 ||
+         (precision == ProgramPrecision::bfloat16 && current_device().capability >= 80);
+}
 
 int64_t program_code_bytes_cuda(const Program& program) {
   return std::max<int64_t>(1, code_places(program.table).bytes);
@@ -603,6 +662,7 @@ void program_code_cuda(const Program& program, unsigned char* code) {
     const bool made = Slots::makes_value(step);
     if (made) {
       step.slot = slots.at(step.slot, step.memory);
+      step.pairs = step.pairs < 0 ? step.pairs : slots.at(step.pairs, kNoMemory);
       step.stride += kProgramSkew;
     }
     step.memory = made && step.memory >= 0 ? memories[static_cast<size_t>(step.memory)] : kNoMemory;
@@ -610,8 +670,11 @@ void program_code_cuda(const Program& program, unsigned char* code) {
   for (ProgramOperand& operand : operands) {
     if (operand.parameter) continue;
     operand.slot = slots.at(operand.slot, operand.memory);
+    operand.pairs = operand.pairs < 0 ? operand.pairs : slots.at(operand.pairs, kNoMemory);
     operand.stride += kProgramSkew;
   }
+  std::vector<CudaStep> own_steps;
+  for (const ProgramStep& step : steps) own_steps.push_back(cuda_step(step, operands.data() + step.first, table.packs));
   std::vector<HashEncoding> grids;
   for (const HashGrid& grid : table.grids) grids.push_back(hash_encoding(HashInputs{}, grid));
   const auto write = [code](int64_t place, const auto& records) {
@@ -623,29 +686,38 @@ void program_code_cuda(const Program& program, unsigned char* code) {
   write(at.sums, table.sums);
   write(at.scatters, table.scatters);
   write(at.grids, grids);
+  write(at.own_steps, own_steps);
 }
 
 int64_t grouped_program_workspace_cuda(const Program& program, int64_t n, int64_t, int64_t k) {
-  return cut(program, n, k).bytes;
+  return std::max(cut(program, n, k, false).bytes, cut(program, n, k, true).bytes);
 }
 
 void grouped_program_cuda(const Program& program, const unsigned char* code, const ProgramInputs& in,
                           const ProgramResults& results, ProgramPrecision precision, unsigned char* workspace,
                           void* stream) {
   const ProgramTable& table = program.table;
-  const Cut found = cut(program, in.n, in.k);
+  if (current_device().capability < 80 && precision == ProgramPrecision::tf32) {
+    precision = ProgramPrecision::float32;  // there are no such products
+  }
+  const Cut found = cut(program, in.n, in.k, three_resident(precision));
   const CodePlaces at = code_places(table);
   CudaProgram call{};
   call.code.packs = reinterpret_cast<const ProgramPack*>(code + at.packs);
   call.code.steps = reinterpret_cast<const ProgramStep*>(code + at.steps);
   call.code.operands = reinterpret_cast<const ProgramOperand*>(code + at.operands);
   call.code.sums = reinterpret_cast<const ProgramSum*>(code + at.sums);
+  call.code.pack_count = static_cast<int32_t>(table.packs.size());
   call.code.step_count = static_cast<int32_t>(table.steps.size());
   call.code.sum_count = static_cast<int32_t>(table.sums.size());
   call.code.columns = Slots(table).columns();
+  call.steps = reinterpret_cast<const CudaStep*>(code + at.own_steps);
   call.scatters = reinterpret_cast<const ProgramScatter*>(code + at.scatters);
   call.grids = reinterpret_cast<const HashEncoding*>(code + at.grids);
   call.rows = {in.offsets, in.order, in.ray_index, reinterpret_cast<int32_t*>(workspace), in.n, in.r, in.k};
+  call.packed = reinterpret_cast<float*>(workspace + found.packed);
+  call.packed_stride = table.packed;
+  call.pack_parts = ceil_div(largest_pack(table), kPackPart);
   call.partials = reinterpret_cast<float*>(workspace + found.partials);
   call.spilled = reinterpret_cast<float*>(workspace + found.slots);
   call.task_rows = found.task_rows;
@@ -682,23 +754,22 @@ void grouped_program_cuda(const Program& program, const unsigned char* code, con
     VN_CUDA_CHECK(cudaMemsetAsync(results.sums[scatter.sum], 0, 4 * static_cast<size_t>(size),
                                   static_cast<cudaStream_t>(stream)));
   }
-  VN_LAUNCH(program_prepare_kernel, blocks_for(in.n), kThreads, 0, stream, call, found.tasks);
+  const int64_t packed = in.k * table.packed;
+  VN_LAUNCH(program_prepare_kernel, blocks_for(std::max<int64_t>(in.n, packed)), kThreads, 0, stream, call, found.tasks,
+            precision);
   if (in.n > 0 && in.k > 0) {
-    if (current_device().capability < 80 && precision != ProgramPrecision::float16) {
-      precision = ProgramPrecision::float32;  // there are no such products
-    }
     switch (precision) {
       case ProgramPrecision::float32:
-        launch_cut<FloatProducts>(call, found, table.partial, stream);
+        launch_floats(call, found, table.partial, stream);
         break;
       case ProgramPrecision::tf32:
-        launch_cut<Tf32Products>(call, found, table.partial, stream);
+        launch_tf32(call, found, table.partial, stream);
         break;
       case ProgramPrecision::bfloat16:
-        launch_cut<Bfloat16Products>(call, found, table.partial, stream);
+        launch_halves<true>(call, found, table.partial, stream);
         break;
       case ProgramPrecision::float16:
-        launch_cut<Float16Products>(call, found, table.partial, stream);
+        launch_halves<false>(call, found, table.partial, stream);
         break;
     }
   }

@@ -56,22 +56,25 @@ __device__ __forceinline__ HashAxes hash_axes(const HashEncoding& grid, const Gr
 }
 
 // The table of a cell.
-template <TableType kType>
-__device__ __forceinline__ const typename HashElement<kType>::Type* hash_table(const ProgramTile& tile, int parameter) {
+template <TableType kType, typename Tile>
+__device__ __forceinline__ const typename HashElement<kType>::Type* hash_table(const Tile& tile, int parameter) {
   return static_cast<const typename HashElement<kType>::Type*>(tile.call.parameters[parameter]) +
          tile.cell * tile.call.strides[parameter];
 }
 
-static __device__ __noinline__ void look_up(const ProgramTile& tile, const ProgramStep& step, const Rows& x,
-                                            float* to) {
+template <typename Tile>
+__device__ __noinline__ void look_up(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
+  const Rows x = tile.value(operands[0]);
+  const Target to = tile.target(step);
   const HashEncoding& grid = tile.call.grids[step.number];
+  const int shift = 31 - __clz(tile.height);
   hash_with_table(grid.features, tile.call.parameter_types[step.parameter], [&](auto features, auto type) {
     constexpr int kFeatures = decltype(features)::value;
     constexpr TableType kType = decltype(type)::value;
     const auto* table = hash_table<kType>(tile, step.parameter);
 #pragma unroll 1
     for (int i = threadIdx.x; i < tile.height * grid.count; i += kProgramThreads) {
-      const int number = i / tile.height, row = i % tile.height;
+      const int number = i >> shift, row = i & (tile.height - 1);
       if (row >= tile.rows) continue;
       const GridLevel& level = grid.levels[number];
       const HashAxes at = hash_axes(grid, level, [&](int axis) { return x.at(row, axis); });
@@ -84,22 +87,23 @@ static __device__ __noinline__ void look_up(const ProgramTile& tile, const Progr
         for (int f = 0; f < kFeatures; ++f) sums[f] += weight * found[f];
       });
 #pragma unroll
-      for (int f = 0; f < kFeatures; ++f) to[row * step.stride + number * kFeatures + f] = sums[f];
+      for (int f = 0; f < kFeatures; ++f) to.put(row, number * kFeatures + f, sums[f]);
     }
   });
 }
 
 // Adds to the gradient of a table that of what was looked up, a value of a step, by atomic operations.
-static __device__ __noinline__ void scatter_rows(const ProgramTile& tile, const ProgramStep& step,
-                                                 const ProgramScatter& scatter) {
+template <typename Tile>
+__device__ __noinline__ void scatter_rows(const Tile& tile, const ProgramStep& step, const ProgramScatter& scatter) {
   const CudaProgram& call = tile.call;
   const HashEncoding& grid = call.grids[scatter.grid];
   float* const to = call.sums[scatter.sum] + tile.cell * call.strides[scatter.parameter];
+  const int shift = 31 - __clz(tile.height);
   hash_with_features(grid.features, [&](auto features) {
     constexpr int kFeatures = decltype(features)::value;
 #pragma unroll 1
     for (int i = threadIdx.x; i < tile.height * grid.count; i += kProgramThreads) {
-      const int number = i / tile.height, row = i % tile.height;
+      const int number = i >> shift, row = i & (tile.height - 1);
       if (row >= tile.rows) continue;
       const int64_t source = source_row(call.rows, tile.begin + row);
       const GridLevel& level = grid.levels[number];
@@ -118,8 +122,11 @@ static __device__ __noinline__ void scatter_rows(const ProgramTile& tile, const 
 }
 
 // Eight lanes share a row and its levels.
-static __device__ __noinline__ void look_up_gradient(const ProgramTile& tile, const ProgramStep& step, const Rows& x,
-                                                     const Rows& g, float* to) {
+template <typename Tile>
+__device__ __noinline__ void look_up_gradient(const Tile& tile, const ProgramStep& step,
+                                              const ProgramOperand* operands) {
+  const Rows x = tile.value(operands[0]), g = tile.value(operands[1]);
+  const Target to = tile.target(step);
   const HashEncoding& grid = tile.call.grids[step.number];
   const int part = threadIdx.x % 8;
   hash_with_table(grid.features, tile.call.parameter_types[step.parameter], [&](auto features, auto type) {
@@ -152,84 +159,126 @@ static __device__ __noinline__ void look_up_gradient(const ProgramTile& tile, co
         for (int other = 4; other > 0; other /= 2) sums[axis] += __shfl_xor_sync(kAllLanes, sums[axis], other);
         if (part != axis || row >= tile.rows) continue;
         const float slope = hash_place(x.at(row, axis), grid.low[axis], grid.inverse[axis]).slope;
-        to[row * step.stride + axis] = slope == 0.0f ? 0.0f : slope * sums[axis];
+        to.put(row, axis, slope == 0.0f ? 0.0f : slope * sums[axis]);
       }
     }
   });
 }
 
 // A row a thread: the polynomials share their terms.
-static __device__ __noinline__ void harmonics(const ProgramTile& tile, const ProgramStep& step, const Rows& x,
-                                              const Rows* g, float* to) {
+template <typename Tile>
+__device__ __noinline__ void harmonics(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
+  const Rows x = tile.value(operands[0]);
+  const Target to = tile.target(step);
   const int row = threadIdx.x, degree = step.number;
   if (row >= tile.rows) return;
   float values[kMostHarmonics] = {}, found[3];
-  if (g == nullptr) {
+  if (step.order == 0) {
     spherical_harmonics_of(x.at(row, 0), x.at(row, 1), x.at(row, 2), degree, values);
 #pragma unroll
     for (int c = 0; c < kMostHarmonics; ++c) {
-      if (c < step.width) to[row * step.stride + c] = values[c];
+      if (c < step.width) to.put(row, c, values[c]);
     }
     return;
   }
+  const Rows g = tile.value(operands[1]);
 #pragma unroll
   for (int c = 0; c < kMostHarmonics; ++c) {
-    if (c < degree * degree) values[c] = g->at(row, c);
+    if (c < degree * degree) values[c] = g.at(row, c);
   }
   spherical_harmonics_gradient(x.at(row, 0), x.at(row, 1), x.at(row, 2), degree, values, found);
 #pragma unroll
-  for (int c = 0; c < 3; ++c) to[row * step.stride + c] = found[c];
+  for (int c = 0; c < 3; ++c) to.put(row, c, found[c]);
 }
 
-// Sines and cosines of `features` columns of x in octaves; after x itself, or blurred by the variances beside it.
-static __device__ __noinline__ void octaves(const ProgramTile& tile, const ProgramStep& step, int features,
-                                            const Rows& x, float* to) {
-  const bool blurred = step.encoding == ProgramEncoding::integrated;
+// By the hardware's own functions, whose error is 2^-21 near 0.
+__device__ __forceinline__ void fast_sine_and_cosine(float angle, float& sine, float& cosine) {
+#ifndef VN_EMULATE
+  if (fabsf(angle) <= kLargestDeviceAngle) {
+    const float turns = rintf(angle * 0.159154943f);
+    const float r = fmaf(turns, 1.74845553e-7f, fmaf(turns, -6.28318548f, angle));
+    sine = __sinf(r), cosine = __cosf(r);
+    return;
+  }
+#endif
+  sine = sine_of_octave(angle, 0.0f), cosine = sine_of_octave(angle, 0.5f);
+}
+
+// Sines and cosines of `features` columns of x in octaves; after x itself, or blurred by the variances beside it. A
+// thread has a sine and its cosine. For 16-bit products the hardware's do.
+template <bool kFast, typename Tile>
+__device__ __forceinline__ void octave_pairs(const Tile& tile, int octaves, int features, Rows x, Target to,
+                                             bool blurred) {
   const int before = blurred ? 0 : features;
-  for_each_entry(tile.rows, step.width, [&](int row, int column) {
-    float value = x.at(row, column % features);
-    if (column >= before) {
-      const int part = (column - before) / features, feature = (column - before) % features;
-      const float scale = octave_scale(part / 2);
-      value = sine_of_octave(x.at(row, feature) * scale, part % 2 == 0 ? 0.0f : 0.5f);
-      if (blurred) value *= octave_blur(scale, x.at(row, features + feature));
+  // A product in place of a division, which is right for what is below 2^32 / features.
+  const uint32_t inverse = 0xffffffffu / static_cast<uint32_t>(features) + 1u;
+  for_each_entry(tile.rows, features * octaves, [&](int row, int i) {
+    const int octave = features == 1 ? i : static_cast<int>(uint64_t{static_cast<uint32_t>(i)} * inverse >> 32);
+    const int feature = i - octave * features, column = before + i + octave * features;
+    const float scale = octave_scale(octave), angle = x.at(row, feature) * scale;
+    float sine, cosine;
+    if constexpr (kFast) {
+      fast_sine_and_cosine(angle, sine, cosine);
+    } else {
+      sine = sine_of_octave(angle, 0.0f), cosine = sine_of_octave(angle, 0.5f);
     }
-    to[row * step.stride + column] = value;
+    if (blurred) {
+      const float blur = octave_blur(scale, x.at(row, features + feature));
+      sine *= blur, cosine *= blur;
+    }
+    to.put(row, column, sine);
+    to.put(row, column + features, cosine);
   });
+}
+template <typename Tile>
+__device__ __noinline__ void octaves(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands,
+                                     int features) {
+  const Rows x = tile.value(operands[0]);
+  const Target to = tile.target(step);
+  const bool blurred = step.encoding == ProgramEncoding::integrated;
+  if (!blurred) {
+    for_each_entry(tile.rows, features, [&](int row, int column) { to.put(row, column, x.at(row, column)); });
+  }
+  if (tile.halves) {
+    octave_pairs<true>(tile, step.depth, features, x, to, blurred);
+  } else {
+    octave_pairs<false>(tile, step.depth, features, x, to, blurred);
+  }
 }
 
 // The gradient to them from g, with what was encoded: the derivative of a sine is the cosine beside it.
-static __device__ __noinline__ void octaves_gradient(const ProgramTile& tile, const ProgramStep& step, int features,
-                                                     const Rows& g, const Rows& encoded, float* to) {
+template <typename Tile>
+__device__ __noinline__ void octaves_gradient(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands,
+                                              int features) {
+  const Rows g = tile.value(operands[1]), encoded = tile.value(operands[2]);
+  const Target to = tile.target(step);
+  const int octaves = step.depth;
   const bool blurred = step.encoding == ProgramEncoding::integrated;
   const int before = blurred ? 0 : features;
   for_each_entry(tile.rows, features, [&](int row, int feature) {
     float sum = blurred ? 0.0f : g.at(row, feature), of_variance = 0.0f;
-    for (int octave = 0; octave < step.depth; ++octave) {
+    for (int octave = 0; octave < octaves; ++octave) {
       const int sine = before + 2 * octave * features + feature, cosine = sine + features;
       const float scale = octave_scale(octave);
       sum += scale * (g.at(row, sine) * encoded.at(row, cosine) - g.at(row, cosine) * encoded.at(row, sine));
       of_variance -= 0.5f * scale * scale *
                      (g.at(row, sine) * encoded.at(row, sine) + g.at(row, cosine) * encoded.at(row, cosine));
     }
-    to[row * step.stride + feature] = sum;
-    if (blurred) to[row * step.stride + features + feature] = of_variance;
+    to.put(row, feature, sum);
+    if (blurred) to.put(row, features + feature, of_variance);
   });
 }
 
 // A step that encodes. Operands are x or, for the gradient, x, g and what was encoded.
-__device__ inline void encode_step(const ProgramTile& tile, const ProgramStep& step, const ProgramOperand* operands) {
-  const Rows x = tile.operand(operands[0]), g = step.order > 0 ? tile.operand(operands[1]) : Rows{};
-  float* const to = tile.slot(step.slot);
+template <typename Tile>
+__device__ __forceinline__ void encode_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
   if (step.encoding == ProgramEncoding::hash) {
-    return step.order > 0 ? look_up_gradient(tile, step, x, g, to) : look_up(tile, step, x, to);
+    return step.order > 0 ? look_up_gradient(tile, step, operands) : look_up(tile, step, operands);
   }
-  if (step.encoding == ProgramEncoding::spherical) {
-    return harmonics(tile, step, x, step.order > 0 ? &g : nullptr, to);
-  }
+  if (step.encoding == ProgramEncoding::spherical) return harmonics(tile, step, operands);
   const int features = operands[0].width / (step.encoding == ProgramEncoding::integrated ? 2 : 1);
-  if (step.order == 0) return octaves(tile, step, features, x, to);
-  octaves_gradient(tile, step, features, g, tile.operand(operands[2]), to);
+  if (step.order == 0) return octaves(tile, step, operands, features);
+  octaves_gradient(tile, step, operands, features);
 }
 
 }  // namespace voronerf

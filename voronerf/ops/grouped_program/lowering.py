@@ -77,9 +77,9 @@ def lower(text: str, layout: str = "floats", cuda: bool = False) -> Lowered:
         text: of the program.
         layout: what products take: "floats", "pairs" of bfloat16, pairs in "tiles" (tile registers), or there floats
             in two "parts" each.
-        cuda: for CUDA, whose products have one source.
+        cuda: for CUDA, whose products have one source: of "floats", or of "tiles", which are any 16-bit numbers there.
     """
-    return _Lowering(merged(Program.parse(text)), layout, joins=layout == "floats" and not cuda).lowered()
+    return _Lowering(merged(Program.parse(text)), layout, cuda).lowered()
 
 
 def _padded(width: int, to: int = _GRANULE) -> int:
@@ -123,8 +123,8 @@ class _Value:
 class _Lowering:
     """Records on their way."""
 
-    def __init__(self, program: Program, layout: str, joins: bool) -> None:
-        self.program, self.layout = program, layout
+    def __init__(self, program: Program, layout: str, cuda: bool) -> None:
+        self.program, self.layout, self.cuda = program, layout, cuda
         self.half, self.tiles, self.parts = layout != "floats", layout in ("tiles", "parts"), layout == "parts"
         self.compiled = native.compiled
         self.slots, self.values = _Slots(), dict[int, _Value]()
@@ -137,7 +137,7 @@ class _Lowering:
         self.lookups: list[tuple[Lookup, int]] = []
         self.scatters: list[tuple[Lookup, int, int]] = []
         self.own: dict[int, int] = {}  # the memory of outputs that values may be made in
-        self.work = _joined(self._in_order()) if joins else self._in_order()
+        self.work = self._in_order() if self.half or cuda else _joined(self._in_order())
         self.readers: dict[int, list[tuple[Step, int]]] = {}
         for step in self.work:
             for place, c in enumerate(step.operands):
@@ -186,7 +186,7 @@ class _Lowering:
     def _scratch(self) -> int:
         """Columns of each part of the memory that a step may use."""
         widths = [0]
-        for step in self.work:
+        for step in [] if self.cuda else self.work:
             if step.op == "encode" and step.name in ("spherical", "hash"):
                 widths.append(_GRANULE)
             if self.half and step.op == "linear":
@@ -198,6 +198,10 @@ class _Lowering:
     def pairs_of(self, width: int) -> int:
         """Floats of a row of pairs, and in parts of what rounding has left of them."""
         return _padded(width, 2 * _GRANULE) // 2 * (2 if self.parts else 1)
+
+    def padded_outputs(self, width: int) -> int:
+        """Floats of a row of packed weights, of one for each output."""
+        return _padded(width, 2 * _GRANULE if self.cuda else _GRANULE)
 
     # Records ----------------------------------------------------------------------------------------------------------
 
@@ -221,7 +225,7 @@ class _Lowering:
         given |= {"start": c.start, "width": c.width, "place": place, "spread": c.spread}
         if c.of == PARAMETER:
             width = 1 if c.spread else c.width
-            number = self.pack("vector", c.index, c.start, width, width, self.shape(c.index))
+            number = self.pack("vector", c.index, c.start, width, self.padded_outputs(width), self.shape(c.index))
             return self.compiled.ProgramOperand(parameter=True, slot=number, stride=0, **(given | {"start": 0}))
         value = self.values[c.index]
         given |= {"memory": value.memory, "input": value.input}
@@ -290,6 +294,11 @@ class _Lowering:
         scattered = [reader for reader, place in self.readers.get(step.out, []) if reader.op == "scatter" and place]
         if scattered:
             value.memory = self.memory(value.stride)
+        if self.cuda and self.half and any(as_pairs := self._as_pairs(step)):  # which any step makes there
+            looked_up = step.op == "encode" and step.name == "hash"  # and may be kept
+            value.pairs = self.slots.take(self.pairs_of(step.width))
+            value.floats = value.memory != _NONE or looked_up or not all(as_pairs)
+        if scattered or not value.floats:
             return value
         for c in entrywise:
             known = self.values[c.index] if c.of == VALUE else None
@@ -323,7 +332,7 @@ class _Lowering:
             value.input = number
         hashed = [reader.op == "scatter" or (reader.name == "hash" and not reader.numbers[2]) for reader, _ in readers]
         points = bool(readers) and all(hashed)
-        if self.tiles and any(as_pairs := self._as_pairs(step)):
+        if self.tiles and not self.cuda and any(as_pairs := self._as_pairs(step)):
             value.pairs, value.floats = self.slots.take(self.pairs_of(step.width)), not all(as_pairs)
         self.emit("input", value=value, number=number, points=points, in_place=value.input != _NONE)
 
@@ -345,18 +354,20 @@ class _Lowering:
         sources, added = step.operands[:count], step.operands[count : len(step.operands) - relu_slope]
         depth, unit = sum(c.width for c in sources), 2 * _GRANULE if self.half else _GRANULE
         few = step.width <= _FEW and not relu_slope and all(c.width % unit == 0 for c in sources) and not self.tiles
+        few = few and not self.cuda
         few = few and all(c.of == PARAMETER for c in added)
         order = 0 if not few else 1 if step.width == 1 else _FEW
         kind, width = ("turned", step.width) if transposed else ("matrix", depth)
         kind = f"few{'_turned' * transposed}" if few else kind
         deep = self.pairs_of(depth) if self.tiles else -(-depth // 2) if self.half else depth
-        number = self.pack(kind, matrix, start, width, deep * (order or _padded(step.width)), (o, i))
+        deep = _padded(depth) if self.cuda and not self.half else deep
+        number = self.pack(kind, matrix, start, width, deep * (order or self.padded_outputs(step.width)), (o, i))
         slope = len(step.operands) - 1 if relu_slope and self.tiles else _NONE
         records = [self.operand(c, product=at < count or at == slope) for at, c in enumerate(step.operands)]
         entrywise = [c for c in step.operands[count:] if all(c[:2] != x[:2] for x in sources)]
         value = self.make(step, dying, entrywise)
         as_pairs = self._as_pairs(step)
-        narrow = self.half and any(as_pairs) and not few and (self.tiles or not relu_slope)
+        narrow = self.half and not self.cuda and any(as_pairs) and not few and (self.tiles or not relu_slope)
         filled = value.stride % (2 * _GRANULE) == 0 and step.width % 2 == 0 and value.memory == _NONE
         if self.tiles:  # what is added fills up rows with what may be infinite
             filled = step.width % _GRANULE == 0 or all(c.of == PARAMETER for c in added)
@@ -412,7 +423,8 @@ class _Lowering:
             features = raw if first else raw // 2
             given["number"] = self.pack("waves", 0, int(first), width, 3 * width, (size, features))
             given["depth"] = size
-        if self.tiles and not order and step.name == "frequency" and any(as_pairs := self._as_pairs(step)):
+        by_waves = self.tiles and not self.cuda and not order and step.name == "frequency"
+        if by_waves and any(as_pairs := self._as_pairs(step)):
             value.pairs = self.slots.take(self.pairs_of(step.width))
             value.floats = value.memory != _NONE or not all(as_pairs)
         self.emit("encode", records, value, **given)

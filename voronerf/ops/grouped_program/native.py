@@ -112,18 +112,24 @@ class _Call(NamedTuple("_Call", [("rows", Rows), ("how", How)])):
     """What a program runs on, and how. Unlike a named tuple of its own it keeps what was found once."""
 
     @functools.cached_property
-    def plan(self) -> tuple[Program, Lowered | None, int, int]:
-        """The program, for the compiled module if that runs it, rows and rays."""
-        (inputs, _, _, _, index, _), how = self
-        program = program_of(*self)
-        lowered = lower(program.text, _layout(how.products, inputs[0])) if compiled_runs(program.text) else None
+    def plan(self) -> tuple[Program, int, int]:
+        """The program, rows and rays."""
+        inputs, index, program = self.rows.inputs, self.rows.ray_index, program_of(*self)
         n = rows_of(inputs[0] if index is None else index)
-        return program, lowered, n, rows_of(inputs[program.rays[0]]) if program.rays else 0
+        return program, n, rows_of(inputs[program.rays[0]]) if program.rays else 0
+
+    @functools.cached_property
+    def lowered(self) -> Lowered | None:
+        """The program for the compiled module, if that runs it."""
+        (program, _, _), x = self.plan, self.rows.inputs[0]
+        if not compiled_runs(program.text):
+            return None
+        return lower(program.text, _layout(self.how.products, x), native.on_cuda(x))
 
 
 def _memory(given: _Call) -> list[Tensor]:
     """For the outputs of a program, its sums, and what is kept."""
-    (program, lowered, n, r), rows = given.plan, given.rows
+    (program, n, r), rows = given.plan, given.rows
     like = rows.inputs[0]
     found = [
         new_empty(like, r if i in program.by_ray else n, columns.width) for i, columns in enumerate(program.outputs)
@@ -131,15 +137,16 @@ def _memory(given: _Call) -> list[Tensor]:
     if program.sums:
         counts = program.cells_of_sums(rows.parameters, rows.offsets.shape[0] - 1)
         found += [new_empty(like, count, *shape, dtype=torch.float32) for count, shape in zip(counts, program.sums)]
-    if given.how.keep and lowered:
-        found += [new_empty(like, n, width, dtype=torch.float32) for width in lowered.widths]
+    if given.how.keep and program.grids and compiled_runs(program.text):
+        widths = lower(program.text).widths  # of every layout: tensors without memory have no device to ask
+        found += [new_empty(like, n, width, dtype=torch.float32) for width in widths]
     return found
 
 
 @custom_op("grouped_program_native", _memory)
 def run(given: _Call, found: list[Tensor]) -> None:
     """A program."""
-    (program, lowered, n, r), (rows, how) = given.plan, given
+    (program, n, r), lowered, (rows, how) = given.plan, given.lowered, given
     inputs, parameters, offsets, order, ray_index, kept = rows
     if lowered is None:
         made = in_torch([x.float() for x in inputs], parameters, offsets, order, ray_index, program.text)
@@ -152,7 +159,7 @@ def run(given: _Call, found: list[Tensor]) -> None:
     looked = keeps or kept or None
     taken = program_inputs(lowered, rows, n, r, kept=looked, ready=not keeps, gradients=gradients, caller=how.caller)
     if native.on_cuda(offsets):
-        _run_on_cuda(program, rows, how, taken, outputs, sums)
+        _run_on_cuda(program, lowered, rows, how, taken, outputs, sums)
         return
     made = [to.float() if i in program.by_ray else to for i, to in enumerate(outputs)]  # sums of rays are float32
     results = native.compiled.ProgramResults(outputs=made, output_types=[_NAMES[to.dtype] for to in made], sums=sums)
@@ -166,6 +173,7 @@ def run(given: _Call, found: list[Tensor]) -> None:
 
 def _run_on_cuda(
     program: Program,
+    lowered: Lowered,
     rows: Rows,
     how: How,
     given: native.compiled.ProgramInputs,
@@ -183,12 +191,13 @@ def _run_on_cuda(
     results = native.compiled.ProgramResults(
         outputs=made, output_types=[_NAMES[result.dtype] for result in made], sums=sums
     )
-    lowered, code = lower(program.text, cuda=True).program, _code(program.text, offsets.device)
     machine = native.compiled.Cuda(*native.stream(offsets))
-    size = native.compiled.grouped_program_workspace(lowered, given.n, given.r, given.k, machine)
+    size = native.compiled.grouped_program_workspace(lowered.program, given.n, given.r, given.k, machine)
     workspace = torch.empty(size, dtype=torch.uint8, device=offsets.device)
-    products = "tf32" if tf32 else how.products
-    native.compiled.grouped_program(lowered, code, given, results, products, workspace, machine)
+    layout = _layout(how.products, offsets)
+    products = "tf32" if tf32 else how.products if layout == "tiles" else "float32"
+    code = _code(program.text, layout, offsets.device)
+    native.compiled.grouped_program(lowered.program, code, given, results, products, workspace, machine)
     for i in program.by_ray:
         total = torch.zeros(given.r, outputs[i].shape[1], device=offsets.device)
         if index is not None and given.n and given.r:
@@ -197,9 +206,9 @@ def _run_on_cuda(
 
 
 @functools.lru_cache(maxsize=1024)
-def _code(text: str, device: torch.device) -> Tensor:
+def _code(text: str, layout: str, device: torch.device) -> Tensor:
     """The records of a program on a device, copied there once."""
-    program = lower(text, cuda=True).program
+    program = lower(text, layout, True).program
     code = torch.empty(native.compiled.program_code_bytes(program), dtype=torch.uint8)
     native.compiled.program_code(program, code)
     return code.to(device)
@@ -276,12 +285,19 @@ _LAYOUTS = {
 
 
 def _layout(products: str, tensor: Tensor) -> str:
-    """What values are laid out for: bfloat16 products where they are asked for, and the processor has them; for float32
-    as ``torch.set_float32_matmul_precision`` says, of which "high" are products in parts."""
+    """What values are laid out for: products of 16 bits where they are asked for, and the device has them; for float32
+    on the CPU as ``torch.set_float32_matmul_precision`` says, of which "high" are products in parts."""
     if native.on_cuda(tensor):
-        return "floats"
+        return "tiles" if products != "float32" and _multiplies_halves(products, tensor.device) else "floats"
     asked = backends.cpu_precision() if products == "float32" else products
     return _LAYOUTS.get((native.cpu().isa, asked), "floats")
+
+
+@functools.lru_cache(maxsize=64)
+def _multiplies_halves(products: str, device: torch.device) -> bool:
+    """Whether a GPU has products of this 16-bit type."""
+    there = native.compiled.Cuda(*native.stream(torch.empty(0, device=device)))
+    return native.compiled.multiplies_halves(products, there)
 
 
 def _keep(ctx: Any, inputs: tuple[Rows, How], output: list[Tensor]) -> None:
