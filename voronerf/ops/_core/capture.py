@@ -2,7 +2,7 @@
 
 The counterpart of :mod:`voronerf.ops._core.recording`, of whatever the device computes, torch's operations included.
 What the host does in Python is not made again, and the host cannot wait for the device: :attr:`Capture.obstacle` says
-where it did. **No GPU has run this yet.**
+where it did.
 
 What changes from run to run lies in memory, as numbers do (:func:`voronerf.ops._core.rows.varying`). That memory is of
 the run before the capture: within a capture torch hands out the same memory again and again, and each replay writes all
@@ -71,8 +71,7 @@ class Capture:
         return result
 
     def capture(self, function: Callable[[], T]) -> T:
-        """Captures the function of the warm-up, which computes nothing until it is replayed; its result is memory of the
-        replays."""
+        """Captures the warm-up's function, which computes nothing until it is replayed; its result is the replays'."""
         active.vary = self._take_number
         try:
             # Other threads, such as a viewer's, may ask the device for memory meanwhile.
@@ -93,12 +92,10 @@ class Capture:
         self._numbers.append((number, value))
         return number
 
-    def _take_number(self, value: Callable[[], float]) -> Tensor:
+    def _take_number(self, _: Callable[[], float]) -> Tensor:
         """The number that the warm-up has made at this place."""
-        number, _ = self._numbers[self._taken]
-        self._numbers[self._taken] = number, value
         self._taken += 1
-        return number
+        return self._numbers[self._taken - 1][0]
 
     def replay(self, threads: int, times: int = 1) -> int:
         """Makes the work again so many times, and gives how often: not at all where the rows are other ones.
