@@ -314,6 +314,7 @@ def captured_trainings(device: str, count: int = 20, **small: Any) -> list[tuple
     """Names and trainings: steps that are replayed as a graph find what steps as they are do."""
     whole: dict[str, Any] = {"cells": (), "split_at": ()}
     kinds = {"training": whole, "training of a nerf": {**whole, "field": "nerf"}, "training before a split": {}}
+    kinds["training in bfloat16"] = {"precision": "bf16"}
     return [(name, functools.partial(_train_both, {**own, **small}, device, count)) for name, own in kinds.items()]
 
 

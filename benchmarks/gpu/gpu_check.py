@@ -79,6 +79,8 @@ COUNTED = {
 """Metrics of ncu that are told, by their names there, and factors."""
 STALLED = "smsp__average_warps_issue_stalled_", "_per_issue_active.ratio"
 """Name of a stall's metric, before and after its reason."""
+KEPT = (STALLED[0], "launch__", "l1tex__t_sector_hit", "lts__t_sector_hit", "dram__bytes.sum")
+"""Beginnings of the names of other metrics that are kept: there are 700 of a launch."""
 SECTIONS = (
     *("SpeedOfLight", "WarpStateStats", "SchedulerStats", "MemoryWorkloadAnalysis", "ComputeWorkloadAnalysis"),
     *("InstructionStats", "Occupancy", "LaunchStats"),
@@ -265,12 +267,13 @@ def read(path: Path | None) -> Any:
 def counters(text: str) -> dict[str, Any] | None:
     """Parse ncu's raw page: a line of names, one of units, and one of values for each launch. None without launches."""
     rows = [row for row in csv.reader(text.splitlines()) if len(row) > 20]  # lines of ncu's own are among them
-    found = []
+    found, told = [], {name for name, _ in COUNTED.values()}
     for row in rows[2:]:
         values = {}
         for name, value in zip(rows[0], row, strict=False):
-            with contextlib.suppress(ValueError):
-                values[name] = float(value.replace(",", ""))
+            if name.startswith(KEPT) or name in told:
+                with contextlib.suppress(ValueError):
+                    values[name] = float(value.replace(",", ""))
         kernel = dict(zip(rows[0], row, strict=False)).get("Kernel Name", "")
         found.append({"kernel": kernel, "values": values})
     return {"launches": found} if found else None
