@@ -95,8 +95,8 @@ def case(layers: MLP, counts: list[int], d: int, dtype: torch.dtype = torch.floa
     return given
 
 
-def run(given: dict, layers: MLP, dtype: torch.dtype, backend: str) -> list[Tensor]:
-    """Output and gradients of everything."""
+def run(given: dict, layers: MLP, dtype: torch.dtype, backend: str, gradient: Tensor | None = None) -> list[Tensor]:
+    """Output and gradients of everything, from the gradient to the output or from a sine."""
     leaves: list[Tensor] = []
 
     def leaf(value):
@@ -111,8 +111,9 @@ def run(given: dict, layers: MLP, dtype: torch.dtype, backend: str) -> list[Tens
     options = {"layers": layers, "directions": named["directions"], "direction_index": given["direction_index"]}
     parameters = named["weights"], named["biases"]
     out = voronerf.grouped_mlp(named["positions"], given["offsets"], *parameters, **options, backend=backend)
-    gradient = torch.linspace(-1, 1, out.numel()).reshape(out.shape).sin().to(dtype)
-    return [out, *torch.autograd.grad(out, leaves, gradient, allow_unused=True, materialize_grads=True)]
+    if gradient is None:
+        gradient = torch.linspace(-1, 1, out.numel()).reshape(out.shape).sin()
+    return [out, *torch.autograd.grad(out, leaves, gradient.to(dtype), allow_unused=True, materialize_grads=True)]
 
 
 def check(layers: MLP, counts: list[int], d: int, precision: str) -> None:

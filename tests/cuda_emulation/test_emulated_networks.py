@@ -20,6 +20,7 @@ from emulated_networks import (
     case,
     check,
     check_forward,
+    run,
 )
 from helpers import same
 
@@ -111,3 +112,32 @@ def test_rows_are_gathered_and_scattered_and_every_order_of_threads_gives_the_sa
     exact = routed(torch.float64, torch.float64, "reference")
     assert torch.equal(results[0][1], exact[1])
     assert (results[0][0].double() - exact[0]).norm() <= 1.2e-2 * exact[0].norm()
+
+
+@pytest.mark.parametrize("kib", TILES)
+@pytest.mark.parametrize("precision", ["bfloat16", "float16", "tf32"])
+def test_gradients_of_relu_are_exact_in_whole_numbers(precision: str, kib: int) -> None:
+    """Small whole numbers and weights of which few are not 0: no rounding moves a sample across a kink."""
+    layers = MLP((Layer((POSITIONS,), 40, "relu"), Layer((0,), 70, "relu"), Layer((1, 0), 5)), (2,))
+    dtype, draw = torch.float32 if precision == "tf32" else getattr(torch, precision), torch.Generator().manual_seed(1)
+
+    def whole(*shape: int, few: bool = False) -> torch.Tensor:
+        numbers = torch.randint(-2, 3, shape, generator=draw).double()
+        return numbers * (torch.rand(shape, generator=draw) < 2 / shape[-1]) if few else numbers
+
+    counts = [150, 0, 70]
+    given = case(layers, counts, 3)
+    given |= {
+        "positions": whole(sum(counts), 3),
+        "weights": [whole(len(counts), *shape, few=True) for shape in layers.weight_shapes(3)],
+        "biases": [whole(len(counts), o) for o, _ in layers.weight_shapes(3)],
+    }
+    gradient, before = whole(sum(counts), 5), torch.backends.cuda.matmul.fp32_precision
+    with emulated(shared_bytes=kib * KIB):
+        try:
+            torch.backends.cuda.matmul.fp32_precision = "tf32" if precision == "tf32" else "ieee"
+            found = run(given, layers, dtype, "native", gradient)
+        finally:
+            torch.backends.cuda.matmul.fp32_precision = before
+    for part, exact in zip(found, run(given, layers, torch.float64, "reference", gradient), strict=True):
+        assert exact.abs().max() > 3 and torch.equal(part, exact.to(dtype))

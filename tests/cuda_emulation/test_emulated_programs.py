@@ -154,6 +154,18 @@ def test_encodings_rays_and_tables(products: str, shared: bool, ordered: bool) -
         close(found, exact, ALLOWED[products])
 
 
+def test_rows_of_no_cell_keep_nothing() -> None:
+    """What was looked up for them is 0, before the first cell and behind the last."""
+    b = Builder()
+    e = b.encode("hash", b.input(3), b.grid(GRID.text), b.parameter(*GRID.table_shape))
+    program = b.program([e])
+    x, table = torch.rand(200, 3), torch.randn(2, *GRID.table_shape)
+    rows = plans.Rows([x], [table], torch.tensor([30, 90, 150], dtype=torch.int32), None, None)
+    with emulated():
+        out, kept = plans.run(rows, plans.How(program.text, keep=True))
+    assert not (kept[:30].any() or kept[150:].any()) and torch.equal(kept[30:150, : e.width], out[30:150])
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("features", [1, 2, 4, 8])
 def test_tables_of_every_kind(features: int, dtype: torch.dtype) -> None:
