@@ -18,8 +18,8 @@ VN_HD constexpr MapPlace accumulator_place(unsigned lane, int i) {
   return {static_cast<int>(lane / 4) + 8 * (i / 2), static_cast<int>(2 * (lane % 4)) + i % 2};
 }
 
-// Where the last of some values is that do not fall and are not above another one: 32 probes at a time, of which as many
-// were not above it as there are votes. The first value is taken for one that is not.
+// Where the last of some values is that do not fall and are not above another one: 32 probes at a time, of which as
+// many were not above it as there are votes. The first value is taken for one that is not.
 struct MapSpan {
   int64_t first, last;
 };
