@@ -155,7 +155,7 @@ def test_encodings_rays_and_tables(products: str, shared: bool, ordered: bool) -
 
 
 def test_rows_of_no_cell_keep_nothing() -> None:
-    """What was looked up for them is 0, before the first cell and behind the last."""
+    """Their looked-up values are 0, before the first cell and behind the last."""
     b = Builder()
     e = b.encode("hash", b.input(3), b.grid(GRID.text), b.parameter(*GRID.table_shape))
     program = b.program([e])
