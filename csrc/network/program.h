@@ -43,7 +43,8 @@ struct ProgramScatter {
 };
 
 // What packs and slots are laid out for: products of floats, of pairs of bfloat16, of pairs in tile registers, whose
-// tiles are multiples of 32 rows; or there of floats in two parts each, as high x high + high x low + low x high.
+// tiles are multiples of 32 rows, and on CUDA of any 16-bit numbers; or in tile registers of floats in two parts each,
+// as high x high + high x low + low x high.
 enum class ProgramLayout : int { floats, pairs, tiles, parts };
 
 // As Python describes a program.

@@ -32,7 +32,7 @@ struct CudaValue {
 // steps have `op` and `keeps` alone.
 struct alignas(16) CudaStep {
   CudaValue x, y;               // linear: y is where ReLU was. outer: x by y. columns: x
-  int32_t slot, stride, pairs;  // of what it makes; floats: -1 where there are none; pairs: -1
+  int32_t slot, stride, pairs;  // of what it makes: as floats, or -1; and where it is as 16-bit words, or -1
   int32_t width, depth;
   int32_t weights, bias, added;  // places in what is packed, and an operand; -1: none
   int32_t partial;               // outer, columns: the place; outer: its rows are `stride` floats
