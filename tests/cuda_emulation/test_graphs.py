@@ -156,7 +156,7 @@ def test_precision_of_a_traced_field():
 
 
 def test_another_precision_is_captured_anew():
-    """That of the step, that of a scaler, and that of whoever calls the step."""
+    """The step is captured anew where its dtype, its scaler or the caller's autocast changes."""
     with emulated(), graphs() as seen:
         training = Training(cells=2)
 

@@ -123,8 +123,8 @@ class Made(NamedTuple):
     """The result of a segment, until its next call.
 
     Attributes:
-        value: Of the call that was recorded, or of this one.
-        recording: Of that call; None where this one ran as it is.
+        value: The result of the recorded call, or of this one.
+        recording: The recording that made it; None where this call ran as it is.
         times: How often its calls were made.
     """
 
@@ -141,10 +141,10 @@ class Segment:
     """A function that is recorded when it is first called; later calls make its compiled calls again.
 
     Attributes:
-        recording: Of its calls; None without.
+        recording: The recorded calls; None before there is one.
         replayed: Whether the last call was.
-        obstacle: What kept the last recording from being replayed; "" for nothing.
-        left: How many calls will run as they are, since the last recordings were not replayed.
+        obstacle: The reason why the last recording was not replayed; "" for none.
+        left: The number of calls that run as they are, since the last recordings were not replayed.
 
     Examples:
         >>> import torch
@@ -174,7 +174,7 @@ class Segment:
 
         Args:
             function: Does the same in each call, but for what it is given.
-            given: What other segments have `Made`, whose memory stays; numbers of rows; or tensors in tuples,
+            given: Results of other segments (`Made`), whose memory stays; numbers of rows; or tensors in tuples,
                 dictionaries and dataclasses, which are copied. All of them may have other rows in each call.
             times: How often to make its calls in a row; it is called once where they cannot be made.
         """
@@ -203,7 +203,7 @@ class Segment:
         return Made(value, recording)
 
     def _placed(self, recording: Recording, given: Iterable[Any]) -> Iterator[Any]:
-        """What is given, where replays find it."""
+        """The arguments, in memory where replays find them."""
 
         def take(each: Any) -> Any:
             if type(each) is int and each:

@@ -93,7 +93,7 @@ class TrainingStep:
     not the optimiser's, such as that of a second optimiser, keeps a step from being replayed.
 
     Args:
-        batches: Where rays come from: `RayBatches`, or another :class:`RaySource`.
+        batches: The source of rays: `RayBatches`, or another :class:`RaySource`.
         loss: From rays to gradients, with the sampler.
         optimizer: Of all networks. Learning rates may change from step to step.
         strategy: What keeps samples for the splits; None for none.
@@ -101,7 +101,7 @@ class TrainingStep:
         generator: Of random numbers.
         autocast: The dtype that the networks run in under autocast; None for float32. Such a step is captured on CUDA,
             and runs as it is on the CPU.
-        scaler: Of the loss in float16, which keeps a step from being captured; None for none.
+        scaler: Scales the loss in float16, which keeps a step from being captured; None for none.
 
     Examples:
         >>> import torch
