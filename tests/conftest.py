@@ -92,19 +92,22 @@ def isa(request: pytest.FixtureRequest) -> Iterator[str]:
 
 @pytest.fixture
 def poisoned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[torch.Tensor]]:
-    """Whatever ``Tensor.new_empty`` gives in the test holds NaN or a large number, and lies between guards of the same,
-    which must survive. The guards there are so far."""
+    """Whatever ``Tensor.new_empty`` and ``torch.empty`` give in the test holds NaN or a large number, and lies between
+    guards of the same, which must survive. The guards there are so far."""
     guards: list[torch.Tensor] = []
 
-    def new_empty(like: torch.Tensor, *shape: Any, dtype: torch.dtype | None = None) -> torch.Tensor:
+    def empty(*shape: Any, dtype: torch.dtype = torch.float32, device: Any = "cpu") -> torch.Tensor:
         size = torch.Size(shape if not shape or isinstance(shape[0], int) else shape[0])
-        kind = dtype or like.dtype
-        poison = float("nan") if kind.is_floating_point else False if kind == torch.bool else 121
-        memory = torch.full((size.numel() + 64,), poison, dtype=kind, device=like.device)
+        poison = float("nan") if dtype.is_floating_point else False if dtype == torch.bool else 121
+        memory = torch.full((size.numel() + 64,), poison, dtype=dtype, device=device)
         guards.extend((memory[:32], memory[size.numel() + 32 :]))
         return memory[32 : size.numel() + 32].view(size)
 
+    def new_empty(like: torch.Tensor, *shape: Any, dtype: torch.dtype | None = None) -> torch.Tensor:
+        return empty(*shape, dtype=dtype or like.dtype, device=like.device)
+
     monkeypatch.setattr(torch.Tensor, "new_empty", new_empty)
+    monkeypatch.setattr(torch, "empty", empty)
     yield guards
     for guard in guards:
         whole = guard.isnan() if guard.is_floating_point() else guard == (0 if guard.dtype == torch.bool else 121)

@@ -1,301 +1,21 @@
-// Calls from Python of what the binding files list: the only file that reads pybind11.
+// Calls from Python of what the binding files list.
 #include "bindings/bind.h"
 
-#include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
 #include <algorithm>
-#include <cstring>
-#include <deque>
-#include <map>
 #include <optional>
 #include <set>
-#include <stdexcept>
 
+#include "bindings/frame.h"
+#include "bindings/signature.h"
 #include "common/cuda_device.h"
 #include "common/parallel.h"
 #include "common/trace.h"
 
 namespace voronerf {
 
-namespace py = pybind11;
-
 namespace {
-
-constexpr size_t kMostParameters = 24;
-constexpr size_t kMostBytes = 2048;  // of all parameters of a call
-
-struct Bound {
-  Module::AnyFunction function;
-  Module::Call call;
-  std::vector<const Type*> given;       // by Python
-  std::vector<const Type*> parameters;  // of the function
-  const Type *result, *machine;         // null: none
-};
-
-struct Function {
-  std::string name;
-  std::vector<Bound> overloads;
-};
-
-std::map<std::string, Function>& functions() {
-  static std::map<std::string, Function> all;
-  return all;
-}
-
-// Objects that Python has for dtypes, by the names of load.h.
-std::map<std::string, PyObject*>& dtypes() {
-  static std::map<std::string, PyObject*> known;
-  return known;
-}
-
-class Recording;
-Recording*& recorded() {  // the one that the calling thread's calls are added to, or null
-  static thread_local Recording* recording = nullptr;
-  return recording;
-}
-void refuse(Recording& recording, const std::string& why);
-bool add_tensor(Recording& recording, PyObject* tensor);
-
-// What a call has taken from Python, given back when it ends.
-class Frame {
- public:
-  // A number of rows that a recorded call has taken, where it lies, less so many, and the most that it may be.
-  struct Counted {
-    RowCount* rows;
-    const int64_t* memory;
-    int64_t more, most;
-  };
-  Frame() = default;
-  Frame(const Frame&) = delete;
-  Frame& operator=(const Frame&) = delete;
-  ~Frame() {
-    for (PyObject* each : kept_) Py_DECREF(each);
-  }
-
-  const std::vector<Counted>& counted() const { return counted_; }
-  bool misses_rows() const { return has_rows_ && counted_.empty(); }
-
-  // False: not of that type. `place` becomes that of an opaque object itself.
-  bool load(const Type& type, PyObject* given, void*& place) {
-    switch (type.kind) {
-      case Type::Kind::boolean:
-        if (!PyBool_Check(given)) return false;
-        *static_cast<bool*>(place) = given == Py_True;
-        return true;
-      case Type::Kind::integer: {
-        if (!PyLong_Check(given)) return false;
-        const auto value =
-            type.is_signed ? PyLong_AsLongLong(given) : static_cast<long long>(PyLong_AsUnsignedLongLong(given));
-        if (value == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
-        store(place, value, type.size);
-        return true;
-      }
-      case Type::Kind::rows: {
-        if (!PyLong_Check(given)) return false;
-        const int64_t rows = PyLong_AsLongLong(given);
-        if (rows == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
-        *static_cast<RowCount*>(place) = rows;
-        if (recorded() != nullptr && rows != 0) count(given, *static_cast<RowCount*>(place));
-        return true;
-      }
-      case Type::Kind::floating: {
-        if (!PyFloat_Check(given) && !PyLong_Check(given)) return false;
-        const double value = PyFloat_AsDouble(given);
-        if (type.size == sizeof(float)) {
-          *static_cast<float*>(place) = static_cast<float>(value);
-        } else {
-          *static_cast<double*>(place) = value;
-        }
-        return true;
-      }
-      case Type::Kind::enumeration:
-        if (!PyUnicode_Check(given)) return false;
-        for (size_t i = 0; i < type.values.size(); ++i) {
-          if (PyUnicode_CompareWithASCIIString(given, type.values[i].c_str()) != 0) continue;
-          store(place, static_cast<long long>(i), type.size);
-          return true;
-        }
-        return false;
-      case Type::Kind::text:
-        if (!PyUnicode_Check(given)) return false;
-        *static_cast<const char**>(place) = PyUnicode_AsUTF8(given);
-        keep(given);  // which owns the characters
-        return *static_cast<const char**>(place) != nullptr;
-      case Type::Kind::tensor:
-        return load_tensor(type, given, *static_cast<void**>(place));
-      case Type::Kind::tensors:
-        *static_cast<void***>(place) = nullptr;
-        if (given == Py_None) return true;
-        arrays_.emplace_back();
-        return load_sequence(*type.of, given, [&](size_t count) {
-          arrays_.back().resize(count + 1);
-          *static_cast<void***>(place) = arrays_.back().data();
-          return arrays_.back().data();
-        });
-      case Type::Kind::sequence:
-        return load_sequence(*type.of, given, [&](size_t count) { return type.resize(place, count); });
-      case Type::Kind::structure:
-        return load_structure(type, given, static_cast<char*>(place));
-      case Type::Kind::opaque:
-        if (!PyCapsule_IsValid(given, type.exact.c_str())) return false;
-        place = PyCapsule_GetPointer(given, type.exact.c_str());
-        keep(given);
-        return true;
-      default:
-        return false;
-    }
-  }
-
- private:
-  static void store(void* place, long long value, size_t size) { std::memcpy(place, &value, size); }
-
-  void keep(PyObject* given) {
-    Py_INCREF(given);
-    kept_.push_back(given);
-  }
-
-  // A RowCount of voronerf/ops/_core/rows.py, which is an int too.
-  void count(PyObject* given, RowCount& rows) {
-    if (PyLong_CheckExact(given)) {
-      return refuse(*recorded(), "a number of rows lies in no memory, " + std::to_string(rows.value));
-    }
-    const auto number = [given](const char* name) { return py::cast<int64_t>(py::handle(given).attr(name)); };
-    const auto* memory = reinterpret_cast<const int64_t*>(py::cast<std::uintptr_t>(py::handle(given).attr("address")));
-    counted_.push_back({&rows, memory, number("more"), number("most")});
-    keep(given);  // which holds the memory
-  }
-
-  // Tensors: anything with a dtype, contiguous(), is_contiguous(), is_neg(), resolve_neg() and data_ptr().
-  bool load_tensor(const Type& type, PyObject* given, void*& address) {
-    address = nullptr;
-    if (given == Py_None) return true;
-    static PyObject *const dtype_word = PyUnicode_InternFromString("dtype"),
-                           *const address_word = PyUnicode_InternFromString("data_ptr"),
-                           *const negative_word = PyUnicode_InternFromString("is_neg"),
-                           *const resolve_word = PyUnicode_InternFromString("resolve_neg"),
-                           *const contiguous_word = PyUnicode_InternFromString("contiguous"),
-                           *const is_contiguous_word = PyUnicode_InternFromString("is_contiguous");
-    if (type.dtype != "any") {
-      if (type.known_dtype == nullptr) type.known_dtype = dtypes().at(type.dtype);
-      PyObject* const dtype = PyObject_GetAttr(given, dtype_word);
-      Py_XDECREF(dtype);  // a dtype lives as long as Python
-      if (dtype != type.known_dtype) return PyErr_Clear(), false;
-    }
-    PyObject* const answer = PyObject_CallMethodNoArgs(given, type.constant ? contiguous_word : is_contiguous_word);
-    if (answer == nullptr) throw py::error_already_set();  // no memory
-    if (type.constant) {
-      kept_.push_back(answer);
-    } else {
-      Py_DECREF(answer);  // True or False
-      if (answer != Py_True) return false;
-      keep(given);
-    }
-    PyObject* const negative = PyObject_CallMethodNoArgs(kept_.back(), negative_word);
-    if (negative == nullptr) return PyErr_Clear(), false;
-    Py_DECREF(negative);        // True or False
-    if (negative == Py_True) {  // memory holds the values negated, as of x.conj().imag
-      PyObject* const resolved = type.constant ? PyObject_CallMethodNoArgs(kept_.back(), resolve_word) : nullptr;
-      if (resolved == nullptr) return PyErr_Clear(), false;
-      Py_DECREF(std::exchange(kept_.back(), resolved));
-    }
-    PyObject* const number = PyObject_CallMethodNoArgs(kept_.back(), address_word);
-    if (number == nullptr) return PyErr_Clear(), false;
-    void* const found = PyLong_AsVoidPtr(number);
-    Py_DECREF(number);
-    if (found == nullptr && holds_entries(kept_.back())) return false;  // memory that was freed, as by storage.resize_
-    alignas(64) static char nothing[64];
-    address = found == nullptr ? nothing : found;
-    if (recorded() != nullptr && add_tensor(*recorded(), kept_.back())) has_rows_ = true;
-    return true;
-  }
-
-  static bool holds_entries(PyObject* tensor) {
-    PyObject* const count = PyObject_CallMethod(tensor, "numel", nullptr);
-    const bool holds = count == nullptr || PyLong_AsLongLong(count) != 0;
-    PyErr_Clear();
-    Py_XDECREF(count);
-    return holds;
-  }
-
-  template <typename Resize>
-  bool load_sequence(const Type& type, PyObject* given, const Resize& resize) {
-    PyObject* const items = PySequence_Fast(given, "");
-    if (items == nullptr) return PyErr_Clear(), false;
-    kept_.push_back(items);
-    const Py_ssize_t count = PySequence_Fast_GET_SIZE(items);
-    char* const data = static_cast<char*>(static_cast<void*>(resize(static_cast<size_t>(count))));
-    for (Py_ssize_t i = 0; i < count; ++i) {
-      void* place = data + i * static_cast<Py_ssize_t>(type.size);
-      if (!load(type, PySequence_Fast_GET_ITEM(items, i), place)) return false;
-    }
-    return true;
-  }
-
-  bool load_structure(const Type& type, PyObject* given, char* place) {
-    if (!is_one(type, given)) return false;
-    for (size_t i = 0; i < type.members.size(); ++i) {
-      const Member& member = type.members[i];
-      void* at = place + member.offset;
-      if (load(*member.type, PyTuple_GET_ITEM(given, static_cast<Py_ssize_t>(i)), at)) continue;
-      throw py::type_error(type.exact + ": " + member.name + " is no " + member.type->exact);
-    }
-    return true;
-  }
-
-  // A named tuple of these members.
-  static bool is_one(const Type& type, PyObject* given) {
-    if (Py_TYPE(given) == type.known_class) return true;
-    if (!PyTuple_Check(given)) return false;
-    PyObject* const names = PyObject_GetAttrString(given, "_fields");
-    if (names == nullptr) return PyErr_Clear(), false;
-    bool same = PyTuple_Check(names) && PyTuple_GET_SIZE(names) == static_cast<Py_ssize_t>(type.members.size());
-    for (size_t i = 0; same && i < type.members.size(); ++i) {
-      PyObject* const name = PyTuple_GET_ITEM(names, static_cast<Py_ssize_t>(i));
-      same = PyUnicode_Check(name) && PyUnicode_CompareWithASCIIString(name, type.members[i].name.c_str()) == 0;
-    }
-    Py_DECREF(names);
-    if (!same) return false;
-    Py_INCREF(Py_TYPE(given));
-    type.known_class = Py_TYPE(given);
-    return true;
-  }
-
-  std::vector<PyObject*> kept_;
-  std::deque<std::vector<void*>> arrays_;
-  std::vector<Counted> counted_;
-  bool has_rows_ = false;  // a tensor whose rows are counted
-};
-
-// Values of parameters, made when they are loaded.
-class Values {
- public:
-  Values() = default;
-  Values(const Values&) = delete;
-  Values& operator=(const Values&) = delete;
-  ~Values() {
-    for (size_t i = 0; i < count_; ++i) {
-      if (types_[i]->construct != nullptr) types_[i]->destroy(begins_[i]);
-    }
-  }
-  bool load(Frame& frame, const Type& type, PyObject* given) {
-    void*& begin = begins_[count_];
-    begin = memory_ + used_;
-    used_ += (type.size + alignof(std::max_align_t) - 1) / alignof(std::max_align_t) * alignof(std::max_align_t);
-    if (type.construct != nullptr) type.construct(begin);
-    types_[count_] = &type;
-    places_[count_] = begin;
-    return frame.load(type, given, places_[count_++]);
-  }
-  void* const* places() const { return places_; }
-  void replace(size_t i, void* place) { places_[i] = place; }
-
- private:
-  alignas(std::max_align_t) char memory_[kMostBytes];
-  void *begins_[kMostParameters], *places_[kMostParameters];
-  const Type* types_[kMostParameters];
-  size_t count_ = 0, used_ = 0;
-};
 
 union Result {
   bool boolean;
@@ -326,14 +46,6 @@ py::object to_python(const Type* type, const Result& result) {
   }
 }
 
-// A call with what it has taken.
-struct Loaded {
-  const Function* function;
-  const Bound* bound;
-  Frame frame;
-  Values values;
-};
-
 // A call that was traced (common/trace.h).
 struct Traced {
   const std::string* name;
@@ -354,6 +66,8 @@ void call(const Loaded& loaded, Result& result) {
     traced_calls.push_back({&loaded.function->name, Trace::now() - began, regions});
   }
 }
+
+}  // namespace
 
 // Where a tensor's memory is and, with its layout, how it lies there; null without an answer. That it is contiguous
 // takes half the time to find that its size and stride take.
@@ -546,6 +260,8 @@ py::object run(Loaded& loaded) {
   return to_python(bound.result, result);
 }
 
+namespace {
+
 // Whether all arguments are of the types that a function takes.
 bool load(Loaded& loaded, const py::args& given) {
   for (size_t i = 0; i < given.size(); ++i) {
@@ -620,7 +336,15 @@ constexpr const char* kStub =
     "    def replay(self, threads: int, times: int, first: int, last: int, drawn: int, places: Sequence[int],\n"
     "               bytes: int) -> int: ...\n"
     "\n"
-    "def name_dtypes(names: dict[str, torch.dtype]) -> None: ...\n"
+    "class Rules:\n"
+    "    def __init__(self, rows: Sequence[Any], names: Sequence[str]) -> None: ...\n"
+    "    def __call__(self, tensors: list[Tensor]) -> tuple[int, ...] | None: ...\n"
+    "\n"
+    "def signature(op: str, rows: Sequence[Any], positional: int, more: dict[str, Any]) -> Any: ...\n"
+    "def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool: ...\n"
+    "def way_of(arguments: tuple[Any, ...]) -> int: ...\n"
+    "def know_calls(objects: dict[str, Any]) -> None: ...\n"
+    "def know_torch(dtypes: dict[str, torch.dtype], classes: tuple[type, ...], exchange: Any) -> None: ...\n"
     "def trace(on: bool) -> list[tuple[str, float, int, float, list[float]]]: ...\n";
 
 // What is bound, as a stub for type checkers (voronerf/ops/_core/_C.pyi), and the classes that it needs.
@@ -727,12 +451,13 @@ void bind_all(PyObject* python) {
     if (!there) continue;
     bound.def(name.c_str(), [one = &function](const py::args& given) { return call_any(*one, given); });
   }
-  py::class_<Guards>(bound, "Guards")
+  // Local: the emulated module of the tests has them too.
+  py::class_<Guards>(bound, "Guards", py::module_local())
       .def(py::init())
       .def("add", &Guards::add)
       .def("add_tensor", &Guards::add_tensor)
       .def("hold", &Guards::hold);
-  py::class_<Recording>(bound, "Recording")
+  py::class_<Recording>(bound, "Recording", py::module_local())
       .def(py::init())
       .def("begin", &Recording::begin)
       .def("end", &Recording::end)
@@ -743,11 +468,14 @@ void bind_all(PyObject* python) {
       .def("replay", &Recording::replay)
       .def("__len__", &Recording::size)
       .def_property_readonly("obstacle", &Recording::obstacle);
-  // The dtypes of tensors, objects of Python that this module knows by name alone.
-  bound.def("name_dtypes", [](const py::dict& names) {
+  bind_signatures(bound);
+  // The dtypes and the plain classes of tensors, objects of Python that this module knows by name alone, and the
+  // exchange of tensor_view.h or None.
+  bound.def("know_torch", [](const py::dict& names, const py::tuple& classes, const py::object& exchange) {
     for (const auto& entry : names) {
       dtypes()[py::cast<std::string>(entry.first)] = py::reinterpret_borrow<py::object>(entry.second).release().ptr();
     }
+    know_tensors(classes.ptr(), exchange.ptr());
   });
   // Whether calls are traced from now on; of those before, name, seconds, regions, the seconds in these, and what they
   // would take on each number of Trace::kTeams.

@@ -1,5 +1,5 @@
 // What Python passes as what C++ takes: a Type for each kind of parameter. Templates only describe; loading is compiled
-// once (bind.cpp), since pybind11's templates for each function took the compiler a fifth of the whole extension's
+// once (frame.h), since pybind11's templates for each function took the compiler a fifth of the whole extension's
 // time.
 //
 //   T*            a tensor of that dtype (or None, which is null); a const one is made contiguous for the call, and has
@@ -9,7 +9,7 @@
 //   enumeration   the name of a value (VN_NAMES)
 //   struct        a named tuple with its members (VN_STRUCT), of a class that the module makes
 //   numbers       int, float and bool
-//   RowCount          an int, which a recording reads again (bind.cpp)
+//   RowCount          an int, which a recording reads again (frame.h, bind.cpp)
 #pragma once
 
 #include <cstddef>
@@ -54,6 +54,7 @@ struct Type {
   size_t size = 0;
   std::string python, exact;        // in Python's words and in C++'s, for the stub; of what has a name, that
   std::string dtype;                // of a tensor, "any" for all
+  unsigned dtypes = 0;              // that it may have; 0 for any. A bool is read as an uint8
   bool constant = false;            // a tensor
   bool is_signed = false;           // an integer
   const Type* of = nullptr;         // what a sequence consists of
@@ -129,25 +130,35 @@ struct ElementOf<std::unique_ptr<T>> {
   using Type = T;
 };
 
+// A set of dtypes of tensors, by their bits; 0 is any of them.
+constexpr unsigned kFloat16 = 1, kBfloat16 = 2, kFloat32 = 4, kFloat64 = 8, kInt32 = 16, kInt64 = 32, kUint8 = 64,
+                   kBool = 128, kOther = 256;
+constexpr unsigned kFloating = kFloat16 | kBfloat16 | kFloat32 | kFloat64;
+
+struct Dtype {
+  const char* name;
+  unsigned dtypes;
+};
 template <typename T>
-constexpr const char* dtype_name() {
+constexpr Dtype dtype_of() {
   using V = std::remove_cv_t<T>;
-  if constexpr (std::is_same_v<V, float>) return "float32";
-  if constexpr (std::is_same_v<V, double>) return "float64";
-  if constexpr (std::is_same_v<V, int32_t> || std::is_same_v<V, uint32_t>) return "int32";
-  if constexpr (std::is_same_v<V, int64_t>) return "int64";
-  if constexpr (std::is_same_v<V, bool>) return "bool";
-  if constexpr (std::is_same_v<V, uint8_t>) return "uint8";
-  return "any";
+  if constexpr (std::is_same_v<V, float>) return {"float32", kFloat32};
+  if constexpr (std::is_same_v<V, double>) return {"float64", kFloat64};
+  if constexpr (std::is_same_v<V, int32_t> || std::is_same_v<V, uint32_t>) return {"int32", kInt32};
+  if constexpr (std::is_same_v<V, int64_t>) return {"int64", kInt64};
+  if constexpr (std::is_same_v<V, bool>) return {"bool", kBool};
+  if constexpr (std::is_same_v<V, uint8_t>) return {"uint8", kUint8 | kBool};
+  return {"any", 0};
 }
 
-inline Type tensor_type(const char* dtype, bool constant) {
+inline Type tensor_type(Dtype dtype, bool constant) {
   Type type;
   type.kind = Type::Kind::tensor;
   type.size = sizeof(void*);
   type.python = "Tensor | None";
-  type.exact = std::string(constant ? "const " : "") + dtype + "*";
-  type.dtype = dtype;
+  type.exact = std::string(constant ? "const " : "") + dtype.name + "*";
+  type.dtype = dtype.name;
+  type.dtypes = dtype.dtypes;
   type.constant = constant;
   return type;
 }
@@ -189,7 +200,7 @@ Type describe() {
       type.of = &tensor;
       return type;
     } else {
-      return tensor_type(dtype_name<Pointed>(), std::is_const_v<Pointed>);
+      return tensor_type(dtype_of<Pointed>(), std::is_const_v<Pointed>);
     }
   } else if constexpr (IsStruct<T>::value) {
     Type type = named_type(Kind::structure, sizeof(T), Fields<T>::vn_type, Fields<T>::vn_type);

@@ -341,7 +341,7 @@ FAULTS = (
     ),
     Fault(
         "A recorded step: a call that takes rows may have a number of rows that stays",
-        "csrc/bindings/bind.cpp",
+        "csrc/bindings/frame.h",
         "return has_rows_ && counted_.empty();",
         "return false;",
         ("tests/nerf/test_step.py",),

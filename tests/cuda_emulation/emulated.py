@@ -25,7 +25,7 @@ _programs = importlib.import_module("voronerf.ops.grouped_program.native")
 def module() -> ModuleType:
     """The emulated module, built if need be."""
     loaded = load(build())
-    loaded.name_dtypes(_native.DTYPES)
+    _native.know_torch(loaded)
     return loaded
 
 

@@ -171,7 +171,7 @@ def graphs() -> Iterator[Seen]:
     with (
         mock.patch.multiple(torch.cuda, **doubles),
         mock.patch("voronerf.nerf.TrainingStep._on_gpu", lambda step: True),
-        mock.patch("voronerf.ops._core.custom_op._LISTENERS", []),
+        mock.patch("voronerf.ops._core.custom_op.LISTENERS", []),
         mock.patch.object(_native, "compiled", Kernels(_native.compiled, seen)),
     ):
         yield seen

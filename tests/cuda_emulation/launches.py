@@ -92,7 +92,7 @@ class Watched:
 @contextmanager
 def asked() -> Iterator[Asked]:
     """Counts what is asked of the emulated GPU; custom ops run as without a mode, so that what is in them counts."""
-    with emulated() as module, mock.patch("voronerf.ops._core.custom_op._LISTENERS", []):
+    with emulated() as module, mock.patch("voronerf.ops._core.custom_op.LISTENERS", []):
         counted = Asked()
         with mock.patch.object(_native, "compiled", Watched(_native.compiled, module, counted)), counted:
             yield counted

@@ -7,6 +7,7 @@ its own file.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import re
 from collections import Counter
@@ -24,6 +25,7 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 from voronerf import ops
 from voronerf.ops._core import backends, checks
 from voronerf.ops._core.cases import Draw, cases
+from voronerf.ops._core.declare import declared
 
 CASES = cases()
 KINDS = [
@@ -38,8 +40,8 @@ RUNS = [
     for backend in backends.implemented(op)
     for device in ("cpu", "cuda")
 ]
-NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "adam")
-"""Ops that check their tensors in ways of their own."""
+NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "adam", "average", "hash_encode")
+"""Ops whose arguments tell how many tensors there are, and of which shapes."""
 SINGLE = ("balance_centres", "cell_sort", "march_rays", "pixel_rays")
 """Ops without floating-point numbers, or with those of one size alone."""
 
@@ -357,9 +359,30 @@ def shapes_of(name, call, given):
             known.update(self.sizes)
 
     known, whole = set(), checks.Checked.tensor
-    with mock.patch.object(checks.Checked, "tensor", tensor):
+    with mock.patch.object(checks.Checked, "tensor", tensor), in_python(name):
         call(**given)
     return shapes, letters
+
+
+@contextlib.contextmanager
+def in_python(name):
+    """The arguments of an op are checked in Python, not in the compiled module."""
+    if name in NETWORKS:
+        yield
+        return
+    with mock.patch.object(declared(name), "_calls", lambda args, options: NotImplemented):
+        yield
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("op", [op for op in CASES if op not in NETWORKS])
+def test_the_compiled_module_checks_what_python_checks(op):
+    """It takes all valid arguments; what it does not take Python refuses, in `test_refuses_tensors_that_do_not_fit`."""
+    case = CASES[op]
+    call, name = getattr(ops, case.call or op), case.call or op
+    for kind in case.kinds.values():
+        with mock.patch.object(declared(name), "_call", side_effect=AssertionError):
+            call(**case.make(Draw(**kind), 6))
 
 
 @pytest.mark.parametrize("op", CASES)

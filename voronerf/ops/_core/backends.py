@@ -136,9 +136,13 @@ def resolve_composed(op: str, *, backend: str, device: torch.device, dtype: torc
     With "auto" it calls them where no other implementation runs, each on the backend that "auto" gives it; and where
     the implementation is plain, on the backend that was named.
     """
-    name = _choose(op, backend, device.type, device.index, dtype)
+    return function(op, _choose(op, backend, device.type, device.index, dtype), backend, composed=True)
+
+
+def function(op: str, name: str, backend: str, composed: bool) -> Callable[..., Any]:
+    """The implementation that was chosen for ``backend`` by its name; ``composed``: see `resolve_composed`."""
     run = _FUNCTIONS[op, name]
-    passed = _TABLE[op, name].plain or (name == "reference" and backend == "auto")
+    passed = composed and (_TABLE[op, name].plain or (name == "reference" and backend == "auto"))
     return functools.partial(run, backend=backend) if passed else run
 
 

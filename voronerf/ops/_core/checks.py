@@ -12,14 +12,18 @@ checks makes a letter mean the same number in all of them.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from voronerf.ops._core import backends
 
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 INDEX = (torch.int32,)
@@ -186,6 +190,117 @@ class Checked:
             for tensor in self.tensors.values():
                 if tensor.is_inference():
                     check_no_inference(self.op, **self.tensors)
+
+
+class Row(NamedTuple):
+    """What a tensor must be, as `Checked.tensor` has it.
+
+    Attributes:
+        name: in errors.
+        dtypes: that it may have.
+        shape: of numbers and letters; "1|k" is 1 or the letter.
+        like: the tensor whose dtype it must have, where an error is to name that.
+        empty: what an error says where the letter of its rows is 0; without it that may be.
+    """
+
+    name: str
+    dtypes: Sequence[torch.dtype]
+    shape: tuple[int | str, ...]
+    like: str = ""
+    empty: str = ""
+
+
+class Default(NamedTuple):
+    """What a letter is that no tensor before has bound."""
+
+    letter: str
+    number: int
+
+
+Rows = Sequence[Row | Default]
+Others = tuple[Sequence[Row], Sequence[Any]]
+"""Rows, and as many tensors."""
+
+
+def check_rows(op: str, make: Callable[..., Rows], tensors: list[Any], *given: Any) -> dict[str, int]:
+    """Checks tensors by the rows of a table: those of a network, which tells how many there are.
+
+    The compiled module reads the rows once, and checks all later tensors of the network by itself. Where one breaks a
+    rule, Python says which.
+
+    Args:
+        op: operation named in errors.
+        make: gives the rows of the tensors.
+        tensors: one for each row.
+        given: the arguments of ``make``, which are hashed.
+
+    Returns:
+        What the letters stand for; 0 for one that no tensor has bound.
+
+    Raises:
+        TypeError: not a tensor, another dtype.
+        ValueError: another shape or device, too many rows.
+    """
+    if not torch.compiler.is_dynamo_compiling():
+        letters, compiled = _compiled(make, *given)
+        found = compiled(tensors)
+        if found is not None:
+            return dict(zip(letters, found))
+    checked, by_name, there, rows = Checked(op), {}, iter(tensors), make(*given)
+    for row in rows:
+        if isinstance(row, Default):
+            checked.sizes.setdefault(row.letter, row.number)
+            continue
+        tensor = by_name[row.name] = next(there)
+        shape = row.shape
+        if shape and isinstance(shape[0], str) and shape[0].startswith("1|"):
+            check_tensor(op, row.name, tensor)
+            shape = (1 if tensor.shape[:1] == (1,) else shape[0].removeprefix("1|"), *shape[1:])
+        if row.like:
+            check_shape(op, row.name, tensor, shape, checked.sizes)
+            check_same_dtype(op, **{row.like: by_name[row.like], row.name: tensor})
+        checked.tensor(row.name, tensor, row.dtypes, *shape)
+        if row.empty and checked.sizes[str(shape[0]).removesuffix("+1")] < 1:
+            raise ValueError(f"{op}: {row.name} {row.empty}, got {list(tensor.shape)}")
+    checked.no_inference()
+    return {**dict.fromkeys(_letters(rows), 0), **checked.sizes}
+
+
+@functools.lru_cache(maxsize=4096)
+def _compiled(make: Callable[..., Rows], *given: Any) -> tuple[list[str], Callable[[list[Any]], Any]]:
+    """The letters of rows, and what checks tensors by them in the compiled module, or gives None."""
+    rows = make(*given)
+    letters = _letters(rows)
+    try:
+        from voronerf.ops._core import native
+    except backends.BackendUnavailable:
+        return letters, lambda tensors: None
+    told: list[Any] = []
+    for row in rows:
+        told.append(
+            row
+            if isinstance(row, Default)
+            else ([_short(dtype) for dtype in row.dtypes], "filled" if row.empty else "", row.shape, None)
+        )
+    return letters, native.Rules([tuple(row) for row in told], letters)
+
+
+def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool:
+    """Whether tensors at one place of several lists have one shape, all are float32 and on one device, those of lists
+    that are written lie in order, and scalars are tensors [] like them. False also where only Python can tell."""
+    if torch.compiler.is_dynamo_compiling():
+        return False
+    try:
+        from voronerf.ops._core import native
+    except backends.BackendUnavailable:
+        return False
+    return native.alike(lists, written, scalars)
+
+
+def _letters(rows: Rows) -> list[str]:
+    shapes = [[row.letter] if isinstance(row, Default) else row.shape for row in rows]
+    entries = [entry for shape in shapes for entry in shape if isinstance(entry, str)]
+    return [*dict.fromkeys(entry.removesuffix("+1").removeprefix("1|") for entry in entries)]
 
 
 def check_writable(op: str, name: str, tensor: Tensor) -> None:

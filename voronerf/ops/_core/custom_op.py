@@ -15,7 +15,7 @@ from torch.autograd import forward_ad
 from voronerf.ops._core.active import active
 
 # torch has no public names for these questions; without an answer the custom op is called.
-_LISTENERS = [
+LISTENERS = [
     getattr(torch._C, "_len_torch_function_stack", lambda: True),
     getattr(torch._C, "_len_torch_dispatch_stack", lambda: True),
     getattr(torch._C, "_are_functorch_transforms_active", lambda: True),
@@ -27,7 +27,7 @@ _is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor
 
 def is_watched() -> bool:
     """Whether modes, transforms, tracers or profilers of torch are to see what is called."""
-    for listens in _LISTENERS:  # noqa: SIM110  # a generator takes twice the time
+    for listens in LISTENERS:  # noqa: SIM110  # a generator takes twice the time
         if listens():
             return True
     return False
@@ -121,7 +121,13 @@ class Op:
 
     Attributes:
         tensors: places of the arguments of the custom op that are tensors, or None.
+        plan: how the compiled module calls it by itself (`Declaration.compiled_op`); None where it does not.
     """
+
+    plan: Any = None
+    way: Callable[[tuple[Any, ...]], int] = staticmethod(lambda flat: 2)
+    """The compiled module's answer, once that is there (csrc/bindings/signature.cpp): 0 for plain tensors of the CPU
+    past the dispatcher, 1 for those with gradients, 2 where only what follows in Python knows."""
 
     def __init__(
         self,
@@ -171,6 +177,11 @@ class Op:
         flat = self._flat(arguments) if self._nested else arguments
         if torch.compiler.is_dynamo_compiling():
             return self._op(*flat)
+        way = self.way(tuple(flat))
+        if way == 0:
+            return self._run(arguments)
+        if way == 1 and self._backward is not None:
+            return self._learning(flat, arguments)
         if forward_ad._current_level >= 0:
             self._refuse_tangents(flat)
         if active.recording is None and is_watched():
@@ -190,6 +201,10 @@ class Op:
             return self._op(*flat)
         if any(map(_is_wrapped, tensors)):  # by a transform that has ended, such as the arguments that vjp keeps
             return self._transformed(flat)
+        return self._learning(flat, arguments)
+
+    def _learning(self, flat: Sequence[Any], arguments: Sequence[Any]) -> Any:
+        """The op with its node of autograd."""
         entries, lengths = _flattened(flat) if self._lists else (flat, None)
         return self._given(_apply_directly(*entries, lengths, self, arguments))
 
@@ -314,4 +329,5 @@ def in_float32(op: Op) -> Callable[..., Any]:
         found = op(*wide)
         return found.to(narrow) if isinstance(found, Tensor) else tuple(part.to(narrow) for part in found)
 
+    run.op = op  # type: ignore[attr-defined]
     return run

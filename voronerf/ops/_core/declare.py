@@ -43,7 +43,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import backends, checks
-from voronerf.ops._core.backends import Implementation
+from voronerf.ops._core.backends import BackendUnavailable, Implementation
 from voronerf.ops._core.checks import FLOATING, LIKE_FIRST, MAX_COUNT
 from voronerf.ops._core.custom_op import Op, custom_op
 from voronerf.ops._core.derivatives import register_derivatives
@@ -86,6 +86,13 @@ class Shaped(NamedTuple):
         """Whether it may have the one shape or the other."""
         return bool(self.otherwise) and not self.condition
 
+    @property
+    def row(self) -> tuple[Any, ...]:
+        """What the compiled module is told."""
+        names = [str(dtype).removeprefix("torch.") for dtype in self.dtypes]
+        kind = "wide" if self.wide else "" if names else "same"
+        return names, kind, self.shape, self.otherwise or None
+
     @staticmethod
     def parse(text: str) -> Shaped:
         """Of what a signature says."""
@@ -123,6 +130,7 @@ class Argument(NamedTuple):
     kind: Any
     optional: bool
     rule: Any
+    text: str = ""
 
     def check(self, op: str, detach: bool, bind: bool) -> Check:
         """What checks its value in a call, and puts it right.
@@ -164,6 +172,37 @@ class Argument(NamedTuple):
         return check
 
 
+@dataclass(frozen=True)
+class Struct:
+    """What makes a struct of the compiled module: of the arguments of an op, or of the memory for its results.
+
+    Attributes:
+        make: it does.
+        of_results: whether of these.
+        source: what the compiled module is told.
+    """
+
+    make: Callable[[Any], Any]
+    of_results: bool
+    source: tuple[Any, ...]
+
+    def __call__(self, given: Any) -> Any:
+        """The struct."""
+        return self.make(given)
+
+
+class Memory:
+    """Memory that a compiled function writes for itself.
+
+    Args:
+        dtype: of its entries.
+        shape: letters.
+    """
+
+    def __init__(self, dtype: torch.dtype, *shape: str) -> None:
+        self.dtype, self.shape = dtype, shape
+
+
 @dataclass(eq=False)
 class Declaration:
     """What the signature of an op says.
@@ -177,6 +216,8 @@ class Declaration:
         small: the arguments whose elements an int32 must number.
         writes: the arguments that it writes into.
         sizes: letters of the results that are no argument's, as functions of the arguments.
+        filled: letters that are at least 1, and what an error says where they are not.
+        compared: two arguments that are compared, for which they are given one type (`checks.of_one_dtype`).
         prepare: takes the checked arguments, as a named tuple, and gives those of the implementations; it checks what
             the signature cannot say.
         composed: whether the reference takes the ``backend`` of other ops that it calls (`resolve_composed`).
@@ -197,6 +238,8 @@ class Declaration:
     small: Sequence[str] = ()
     writes: Sequence[str] = ()
     sizes: Mapping[str, Callable[[Any], int]] = field(default_factory=dict)
+    filled: Mapping[str, str] = field(default_factory=dict)
+    compared: Sequence[str] = ()
     prepare: Callable[[Any], Any] | None = None
     composed: bool = False
 
@@ -213,6 +256,7 @@ class Declaration:
         for letter, size in {**self._letters(), **self.sizes}.items():
             setattr(self.Inputs, letter, property(size))
         self._pack, self.results = _results(of_result)
+        self._results_class = of_result if hasattr(of_result, "_fields") else None
         self._Results = _named("results", dict.fromkeys(self.results, Tensor))
         self.allocate = self._memory()
         hint: Any = Tensor if len(self.results) == 1 else tuple[(Tensor,) * len(self.results)]  # type: ignore[misc]
@@ -225,7 +269,7 @@ class Declaration:
     def _letters(self) -> dict[str, Callable[[Any], Any]]:
         """What gives each letter that shapes speak of, and of a tensor of either form whether it has one per ray."""
         ways, found = dict[str, list[tuple[int, int, int, int]]](), dict[str, Callable[[Any], Any]]()
-        for name, _, _, rule in self._tensors():
+        for name, _, _, rule, _ in self._tensors():
             if rule.either:
                 found[f"{name}_per_ray"] = _is_per_ray(self._places[name])
                 continue
@@ -236,9 +280,17 @@ class Declaration:
                         ways.setdefault(letter, []).append((len(shape), self._places[name], dimension, len(one)))
         return {**found, **{letter: _size_of(sorted(each)) for letter, each in ways.items()}}
 
+    def _likes(self) -> list[tuple[str, torch.dtype | None]]:
+        """For each result the argument beside which its memory lies, and its dtype where that is another one."""
+        tensors, found = [each for each in self._tensors() if not each.optional], list[tuple[str, torch.dtype | None]]()
+        for result in self.results.values():
+            same = [each for each in tensors if {*each.rule.dtypes} <= {*(result.dtypes or FLOATING)}]
+            found.append((same[0].name, None) if same else (tensors[0].name, result.dtypes[0]))
+        return found
+
     def _memory(self) -> Callable[[Any], Any]:
         """What gives new memory for the results: a named tuple where they have names."""
-        tensors, parts = [each for each in self._tensors() if not each.optional], []
+        parts = []
         sizes = dict.fromkeys(entry for each in self.results.values() for entry in (*each.shape, *each.otherwise))
         names = [entry for entry in sizes if isinstance(entry, str)]
         numbers = [entry for entry in sizes if isinstance(entry, int)]
@@ -246,11 +298,9 @@ class Declaration:
             if name.endswith("+1"):
                 setattr(self.Inputs, name, property(_one_more(name[:-2])))
         places, known = {entry: place for place, entry in enumerate([*names, *numbers])}, _getter(names)
-        for result in self.results.values():
-            same = [each for each in tensors if {*each.rule.dtypes} <= {*(result.dtypes or FLOATING)}]
-            like, dtype = (same[0], None) if same else (tensors[0], result.dtypes[0])
+        for result, (like, dtype) in zip(self.results.values(), self._likes()):
             shapes = [_picker([places[entry] for entry in shape]) for shape in (result.shape, result.otherwise)]
-            parts.append(_new(self._places[like.name], dtype, self._places.get(result.condition), *shapes))
+            parts.append(_new(self._places[like], dtype, self._places.get(result.condition), *shapes))
         if len(parts) < 2:
             return (lambda given: parts[0](given, (*known(given), *numbers))) if parts else lambda given: None
         new, kind = tuple.__new__, tuple if "result0" in self.results else self._Results
@@ -262,45 +312,120 @@ class Declaration:
         return allocate
 
     def public(self) -> Any:
-        """The public function: it checks its arguments, chooses a backend and calls its implementation."""
-        function, op, parameters = self.function, self.name, inspect.signature(self.function).parameters
-        defaults = {name: each.default for name, each in parameters.items() if each.default is not each.empty}
-        ordered, sizes = dict.fromkeys(parameters), {e for each in self._tensors() for e in each.rule.shape}
-        positional = sum(each.kind is not each.KEYWORD_ONLY for each in parameters.values())
-        names = [*self._places]
-        every = [(e.name, e.optional, e.check(op, e.name not in self.smooth, e.name in sizes)) for e in self.arguments]
-        prepare, pack, smooth, small, writes = self.prepare, self._pack, bool(self.smooth), self.small, self.writes
-        resolve = backends.resolve_composed if self.composed else backends.resolve
+        """The public function: it checks its arguments, chooses a backend and calls its implementation.
+
+        The compiled module does so where it can (csrc/bindings/signature.cpp). Where it is not there, where an argument
+        breaks a rule, or is no plain tensor, `_call` does.
+        """
+        function, self._calls, traces = self.function, self._first_call, torch.compiler.is_dynamo_compiling
 
         @functools.wraps(function)
         def public(*args: Any, **options: Any) -> Any:
-            named = {**dict(zip(ordered, args)), **options}
-            values, twice = {**defaults, **named}, len(named) < len(args) + len(options)
-            if twice or len(args) > positional or values.keys() != ordered.keys():
-                function(*args, **options)  # which has no body, and says what is wrong
-            given = checks.Checked(op)
-            for name, optional, check in every:
-                if not optional or values[name] is not None:
-                    check(given, values)
-            if smooth:
-                given.no_inference()
-            for name in writes:
-                checks.check_writable(op, name, values[name])
-            for name in small:
-                checks.check_count(op, name, values[name].numel())
-            flat = [values[name] for name in names]
-            if prepare is not None:
-                flat = prepare(self.Inputs(*flat))
-            run = resolve(op, backend=values["backend"], device=flat[0].device, dtype=flat[0].dtype)
-            return run(*flat) if pack is None else pack(run(*flat))
+            if not traces():
+                found = self._calls(args, options)
+                if found is not NotImplemented:
+                    return found
+            return self._call(args, options)
 
+        parameters = inspect.signature(function).parameters
+        self._defaults = {name: each.default for name, each in parameters.items() if each.default is not each.empty}
+        self._ordered = dict.fromkeys(parameters)
+        self._positional = sum(each.kind is not each.KEYWORD_ONLY for each in parameters.values())
+        shapes = [each.rule.shape for each in self._tensors()] + [each.shape for each in self.results.values()]
+        self._bound = {str(entry).removesuffix("+1") for shape in shapes for entry in shape}
+        self._checks = [
+            (each.name, each.optional, each.check(self.name, each.name not in self.smooth, each.name in self._bound))
+            for each in self.arguments
+        ]
         public.__doc__ = self._described()
         return public
+
+    def _call(self, args: tuple[Any, ...], options: dict[str, Any]) -> Any:
+        """A call in Python, which says what is wrong with its arguments."""
+        named = {**dict(zip(self._ordered, args)), **options}
+        values, twice = {**self._defaults, **named}, len(named) < len(args) + len(options)
+        if twice or len(args) > self._positional or values.keys() != self._ordered.keys():
+            self.function(*args, **options)  # which has no body, and says what is wrong
+        given = checks.Checked(self.name)
+        for name, optional, check in self._checks:
+            if not optional or values[name] is not None:
+                check(given, values)
+        if self.smooth:
+            given.no_inference()
+        for name in self.writes:
+            checks.check_writable(self.name, name, values[name])
+        for name in self.small:
+            checks.check_count(self.name, name, values[name].numel())
+        for letter, rule in self.filled.items():
+            if given.sizes[letter] < 1:
+                raise ValueError(f"{self.name}: {rule}")
+        if self.compared:
+            one, two = self.compared
+            values[one], values[two] = checks.of_one_dtype(values[one], values[two])
+        flat = [values[name] for name in self._places]
+        if self.prepare is not None:
+            flat = self.prepare(self.Inputs(*flat))
+        resolve = backends.resolve_composed if self.composed else backends.resolve
+        run = resolve(self.name, backend=values["backend"], device=flat[0].device, dtype=flat[0].dtype)
+        return run(*flat) if self._pack is None else self._pack(run(*flat))
+
+    def _first_call(self, args: tuple[Any, ...], options: dict[str, Any]) -> Any:
+        """Makes what the compiled module calls the op with, and calls it."""
+        try:
+            from voronerf.ops._core import native
+        except BackendUnavailable:
+            self._calls = lambda args, options: NotImplemented
+        else:
+            rows = [{**self._row(each), **self._default(each.name)} for each in self.arguments]
+            rows.append({"name": "backend", "kind": "any", "optional": False, "rule": None, **self._default("backend")})
+            more = {
+                "filled": list(self.filled),
+                "compared": [self._places[name] for name in self.compared],
+                "smooth": bool(self.smooth),
+                "inputs": self.Inputs,
+                "prepare": self.prepare,
+                "found": self._found,
+                "pack": self._pack,
+            }
+            self._calls = native.signature(self.name, rows, self._positional, more)
+        return self._calls(args, options)
+
+    def _default(self, name: str) -> dict[str, Any]:
+        return {"default": self._defaults[name]} if name in self._defaults else {}
+
+    def _row(self, argument: Argument) -> dict[str, Any]:
+        """What the compiled module is told of an argument."""
+        name, kind, optional, rule, text = argument
+        row = {"name": name, "optional": optional, "bound": name in self._bound, "rule": rule, "kind": "any"}
+        if kind is Tensor:
+            floating = not rule.dtypes or bool({*rule.dtypes} & {*FLOATING})
+            return {
+                **row,
+                "kind": "tensor",
+                "rule": rule.row,
+                "either": rule.either,
+                "condition": self._places.get(rule.condition, -1),
+                "detached": name not in self.smooth and floating,
+                "small": name in self.small,
+                "written": name in self.writes,
+            }
+        if kind is float:
+            ends = [float(end) for end in re.findall(r"[\d.]+", text)] or [0.0, 0.0]
+            return {**row, "kind": "float", "rule": text, "ends": tuple(ends)}
+        if kind in (int, bool, str):
+            return {**row, "kind": kind.__name__}
+        return {**row, "kind": "instance"} if isinstance(rule, type) else row
+
+    def _found(self, name: str, backend: str) -> tuple[Any, Any, bool]:
+        """An implementation, how the compiled module calls it by itself (`Op.plan`), and whether in float32 alone."""
+        run = backends.function(self.name, name, backend, self.composed)
+        op = getattr(run, "op", run)
+        return run, getattr(op, "plan", None), op is not run
 
     def _described(self) -> str:
         """The docstring, with the dtypes and the shape of each tensor, which the signature has, and the backends."""
         text = self.function.__doc__ or ""
-        for name, _, optional, rule in self._tensors():
+        for name, _, optional, rule, _ in self._tensors():
             form = f"{rule.text} or None" if optional else rule.text
             text = re.sub(rf"^( +{name}: )", rf"\g<1>{form}, ", text, count=1, flags=re.MULTILINE)
         known = {"auto": True, "reference": True, "native": self.native, "warp": self.warp}
@@ -360,7 +485,7 @@ class Declaration:
 
         return of
 
-    def inputs(self, kind: Any, **others: Any) -> Callable[[Any], Any]:
+    def inputs(self, kind: Any, **others: Any) -> Struct:
         """What makes a struct of the compiled module of the arguments.
 
         Args:
@@ -373,7 +498,7 @@ class Declaration:
         """
         return self._struct(kind, {name: others.get(name, name) for name in kind._fields}, self.Inputs)
 
-    def outputs(self, kind: Any, **others: str) -> Callable[[Any], Any]:
+    def outputs(self, kind: Any, **others: str) -> Struct:
         """What makes a struct of the compiled module, whose members are the results, of memory for these.
 
         Args:
@@ -382,12 +507,12 @@ class Declaration:
         """
         return self._struct(kind, {name: others.get(name, name) for name in kind._fields}, self._Results)
 
-    def _struct(self, kind: Any, members: dict[str, Any], source: Any) -> Callable[[Any], Any]:
+    def _struct(self, kind: Any, members: dict[str, Any], source: Any) -> Struct:
         names = [value for value in members.values() if isinstance(value, str)]
         if unknown := [name for name in names if not hasattr(source, name.partition(".")[0])]:
             raise NameError(f"{self.name}: {kind.__name__} must have members of its declaration, got {unknown}")
         others = [(place, value) for place, value in enumerate(members.values()) if not isinstance(value, str)]
-        known, new = _getter(names), tuple.__new__
+        known, new, of_results = _getter(names), tuple.__new__, source is self._Results
 
         def made(given: Any) -> Any:
             values = [*known(given)]
@@ -395,7 +520,100 @@ class Declaration:
                 values.insert(place, value(given) if callable(value) else value)
             return new(kind, values)
 
-        return made if others else lambda given: new(kind, known(given))
+        sources = [self._source(value, of_results) for value in members.values()]
+        return Struct(made if others else lambda given: new(kind, known(given)), of_results, ("structure", sources))
+
+    def _source(self, value: Any, of_results: bool = False) -> tuple[Any, ...]:
+        """What the compiled module is told of where a parameter or a member comes from."""
+        if isinstance(value, Struct):
+            return value.source
+        if isinstance(value, Memory):
+            return "memory", value.dtype.itemsize, value.shape
+        if not isinstance(value, str):
+            return ("function", value) if callable(value) else ("constant", value)
+        if not of_results and value in self._places:
+            return "argument", self._places[value]
+        if value in self.results:
+            return "result", [*self.results].index(value)
+        if value.endswith("_per_ray"):
+            return "rays", self._places[value.removesuffix("_per_ray")]
+        return ("letter", value) if value in self._letters() else ("function", operator.attrgetter(value))
+
+    def _result_rows(self) -> list[tuple[Any, ...]]:
+        """What the compiled module is told of the results."""
+
+        def size(entry: int | str) -> Any:
+            name = str(entry).removesuffix("+1")
+            known = isinstance(entry, int) or name in self._places or name in self._letters()
+            return entry if known else operator.attrgetter(name)
+
+        return [
+            (
+                self._places[like],
+                dtype,
+                self._places.get(each.condition, -1),
+                [size(entry) for entry in each.shape],
+                [size(entry) for entry in each.otherwise],
+            )
+            for each, (like, dtype) in zip(self.results.values(), self._likes())
+        ]
+
+    def compiled_op(
+        self,
+        name: str,
+        function: str,
+        *parameters: Any,
+        on_cuda: Callable[[Any, Any, Any], None] | None = None,
+        fault: Callable[[Any], Any] | None = None,
+        **options: Any,
+    ) -> Op:
+        """The custom op that is a function of the compiled module.
+
+        A plain call of it, on the CPU, is made without Python (csrc/bindings/signature.cpp).
+
+        Args:
+            name: of the custom op; without it that of the op.
+            function: its name.
+            parameters: of the function, without the machine: names of arguments, results and letters, a `Struct`, a
+                `Memory`, a function of the arguments, or what is the same in every call.
+            on_cuda: what fills the results there, of the arguments, the results and the machine, where that function
+                has other parameters.
+            fault: what is called with the arguments where the function gives False: it raises the error.
+            options: of `custom_op`.
+        """
+        from voronerf.ops._core import native
+
+        known, on_devices = [self._value(value) for value in parameters], "cuda" in options.get("devices", ("cuda",))
+
+        def fill(given: Any, found: Any) -> None:
+            machine = native.machine(given[0]) if on_devices else native.cpu()
+            if on_cuda is not None and isinstance(machine, native.compiled.Cuda):
+                on_cuda(given, found, machine)
+                return
+            said = getattr(native.compiled, function)(*[value(given, found) for value in known], machine)
+            if said is False and fault is not None:
+                fault(given)
+
+        op = self.custom_op(name, **options)(functools.wraps(self.function)(fill))
+        op.__module__ = f"voronerf.ops.{backends.folder(self.name)}.native"
+        pack = self._results_class or self._pack
+        op.plan = function, [self._source(value) for value in parameters], self._result_rows(), pack, fault
+        return op
+
+    def _value(self, value: Any) -> Callable[[Any, Any], Any]:
+        """What gives a parameter, from the arguments and the results."""
+        if isinstance(value, Struct):
+            return lambda given, found: value(found if value.of_results else given)
+        if isinstance(value, Memory):
+            sizes = _getter([entry for entry in value.shape if isinstance(entry, str)])
+            return lambda given, found: new_empty(given[0], *sizes(given), dtype=value.dtype)
+        if not isinstance(value, str):
+            return (lambda given, found: value(given)) if callable(value) else lambda given, found: value
+        if value in self._places or value not in self.results:
+            known = operator.attrgetter(value)
+            return lambda given, found: known(given)
+        place = [*self.results].index(value)
+        return (lambda given, found: found) if len(self.results) == 1 else lambda given, found: found[place]
 
 
 def _size_of(ways: Sequence[tuple[int, int, int, int]]) -> Callable[[Any], int]:
@@ -473,7 +691,7 @@ def _argument(name: str, hint: Any) -> Argument:
         made = _of_floats(rule)
     elif kind is str:
         made = rule.split("|")
-    return Argument(name, kind, hint is not kind, made)
+    return Argument(name, kind, hint is not kind, made, rule)
 
 
 def _of_floats(rule: str) -> Callable[[str, str, float], None]:

@@ -146,6 +146,9 @@ class MLP:
         elif octaves is not None:
             raise ValueError(f"MLP: direction_octaves must be None with spherical harmonics, got {octaves}")
 
+    def __hash__(self) -> int:
+        return hash(self.text)  # which is kept
+
     @staticmethod
     @functools.lru_cache(maxsize=256)
     def parse(text: str) -> MLP:

@@ -196,6 +196,9 @@ class Program:
         of_sums = {step.out: int(step.numbers[1]) for step in self.steps if step.op == "scatter"}
         object.__setattr__(self, "sum_tables", tuple(of_sums.get(index) for index in range(len(self.sums))))
 
+    def __hash__(self) -> int:
+        return hash(self.text)  # which is kept
+
     @staticmethod
     @functools.lru_cache(maxsize=1024)
     def parse(text: str) -> Program:

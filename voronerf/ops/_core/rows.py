@@ -84,7 +84,9 @@ def new_empty(like: Tensor, *shape: int, dtype: torch.dtype | None = None) -> Te
     """New memory beside a tensor; with a `RowCount` of rows there can be more of them in later runs."""
     recording = active.recording
     if recording is None or not (shape and isinstance(shape[0], RowCount)):
-        return like.new_empty(shape, dtype=dtype)
+        # Of a tuple, and of a dtype, torch takes longer.
+        sizes: Any = shape or ((),)
+        return like.new_empty(*sizes) if dtype is None else like.new_empty(*sizes, dtype=dtype)
     memory: Tensor = recording.new_rows(like, shape, dtype)
     return memory
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
 from voronerf.ops._core.checks import (
+    alike,
     check_dtype,
     check_flag,
     check_interval,
@@ -141,23 +142,18 @@ def _check_all(
         if before is None or any(part is not known for part, known in zip(rule[1:], before[1:])):
             _check_rule(rule, parameters[0])  # a training has the same rule many times
         before = rule
-    _check_lists(_OP, lists, read="gradient")
-    device = parameters[0].device
-    for step in [rule.step for rule in rules]:
-        plain = isinstance(step, Tensor) and step.layout is torch.strided and step.dtype is torch.float32
-        if not plain or step.dim() or step.device != device:
-            _check_scalar(_OP, "step", step, parameters[0])
     if guard is not None:
         if not isinstance(guard, Guard):
             raise TypeError(f"{_OP}: guard must be a Guard, got {type(guard).__name__}")
         check_number(_OP, "limit", guard.limit)
-        for name, scalar in zip(guard._fields, guard[:4]):
-            if scalar is not None or name != "scale":
-                _check_scalar(_OP, name, scalar, parameters[0])
+    if loss is not None and guard is None:
+        raise ValueError(f"{_OP}: loss must come with a guard, got none")
+    scalars: list[tuple[str, Any]] = [("step", rule.step) for rule in rules]
+    if guard is not None:
+        scalars += [(name, each) for name, each in zip(guard._fields, guard[:4]) if each is not None or name != "scale"]
     if loss is not None:
-        if guard is None:
-            raise ValueError(f"{_OP}: loss must come with a guard, got none")
-        _check_scalar(_OP, "loss", loss, parameters[0])
+        scalars.append(("loss", loss))
+    _check_lists(_OP, lists, read="gradient", scalars=scalars)
 
 
 def _are_lists(op: str, lists: dict[str, Sequence[Tensor]], name: str, first: Sequence[Any]) -> bool:
@@ -170,32 +166,18 @@ def _are_lists(op: str, lists: dict[str, Sequence[Tensor]], name: str, first: Se
     return bool(first)
 
 
-def _check_lists(op: str, lists: dict[str, Sequence[Tensor]], read: str) -> None:
-    """Checks the tensors of all parameters, of which those that are ``read`` alone may have any strides."""
-    if _are_plain(*lists.values()):
+def _check_lists(
+    op: str, lists: dict[str, Sequence[Tensor]], read: str, scalars: Sequence[tuple[str, Any]] = ()
+) -> None:
+    """Checks tensors of all parameters, of which those that are ``read`` alone may have any strides, and those []."""
+    if alike([*lists.values()], [name[:-1] != read for name in lists], [each for _, each in scalars]):
         return
     for own in zip(*lists.values(), strict=True):
         _check(op, {name[:-1]: tensor for name, tensor in zip(lists, own, strict=True)}, read)
     name, first = next(iter(lists.items()))
     check_same_device(op, **{f"{name}[{index}]": tensor for index, tensor in enumerate(first)})
-
-
-def _are_plain(*lists: Sequence[Any]) -> bool:
-    """Whether the tensors of all parameters keep all rules, found in one pass without names for messages."""
-    if not isinstance(lists[0][0], Tensor):
-        return False
-    device = lists[0][0].device
-    for own in zip(*lists, strict=True):
-        shape: torch.Size | None = None
-        for tensor in own:
-            if not isinstance(tensor, Tensor) or tensor.layout is not torch.strided or tensor.is_nested:
-                return False
-            shape = tensor.shape if shape is None else shape
-            if tensor.dtype is not torch.float32 or tensor.shape != shape or tensor.device != device:
-                return False
-            if not tensor.is_contiguous() or tensor.is_neg():
-                return False
-    return True
+    for key, scalar in scalars:
+        _check_scalar(op, key, scalar, first[0])
 
 
 def _check(op: str, tensors: dict[str, Tensor], read: str) -> None:

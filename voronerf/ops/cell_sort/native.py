@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -14,12 +12,6 @@ from voronerf.ops._core.rows import rows_of
 
 WAYS = native.compiled.CellSortWay
 """Of sorting on CUDA; "automatic" is by the number of cells."""
-
-
-@declared("cell_sort").custom_op()
-def cell_sort(given: Any, found: tuple[Tensor, Tensor]) -> None:
-    """Stable order and cell offsets; see ``voronerf.ops.cell_sort``."""
-    sort(given.cells, *found, "cell_sort")
 
 
 def sort(cells: Tensor, order: Tensor, offsets: Tensor, caller: str, way: str = "automatic") -> None:
@@ -40,3 +32,12 @@ def sort(cells: Tensor, order: Tensor, offsets: Tensor, caller: str, way: str = 
         return
     if not compiled.cell_sort(cells, order, offsets, n, k, machine):
         check_range(caller, "cells", cells, k)
+
+
+cell_sort = declared("cell_sort").compiled_op(
+    "",
+    "cell_sort",
+    *("cells", "result0", "result1", "n", "k"),
+    on_cuda=lambda given, found, _: sort(given.cells, found[0], found[1], "cell_sort"),
+    fault=lambda given: check_range("cell_sort", "cells", given.cells, given.k),
+)

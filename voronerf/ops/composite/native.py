@@ -23,11 +23,7 @@ def _samples(given: Any) -> int:
 
 _inputs = _OP.inputs(native.compiled.CompositeInputs, offsets="ray_offsets", m=_samples)
 _outputs = _OP.outputs(native.compiled.CompositeOutputs)
-
-
-@_OP.custom_op("composite_native")
-def _forward(given: Any, found: Any) -> None:
-    native.compiled.composite(_inputs(given), _outputs(found), native.machine(given.sigma))
+_forward = _OP.compiled_op("composite_native", "composite", _inputs, _outputs)
 
 
 @_OP.backward_op("composite_native_backward", _forward, reference.composite)

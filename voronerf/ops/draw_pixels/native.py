@@ -4,20 +4,31 @@ from __future__ import annotations
 
 from typing import Any
 
-from torch import Tensor
-
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 
+_OP = declared("draw_pixels")
 
-@declared("draw_pixels").custom_op("draw_pixels_native")
-def draw_pixels(given: Any, found: tuple[Tensor, Tensor, Tensor]) -> None:
-    """Pixels, and three uniform numbers for each; see ``voronerf.ops.draw_pixels.reference``."""
-    seed, count, below, runs, known = given
-    ends, shift, first, bits, _ = runs or (None, None, None, 0, below)
-    n, places = (0, 0) if ends is None or first is None else (len(ends), len(first))
-    of_runs = seed, ends, shift, first, n, places, bits, below, count
-    pixels, distances, several = known or (None, None, 0)
-    p = 0 if pixels is None else len(pixels)
-    inputs = native.compiled.DrawPixelsInputs(*of_runs, pixels, distances, p, several)
-    native.compiled.draw_pixels(inputs, *found, native.machine(seed))
+
+def _of_runs(name: str) -> Any:
+    return lambda given: None if given.runs is None else getattr(given.runs, name)
+
+
+def _of_known(name: str) -> Any:
+    return lambda given: None if given.known is None else getattr(given.known, name)
+
+
+_inputs = _OP.inputs(
+    native.compiled.DrawPixelsInputs,
+    ends=_of_runs("ends"),
+    shift=_of_runs("shift"),
+    first=_of_runs("first"),
+    n=lambda given: 0 if given.runs is None else len(given.runs.ends),
+    places=lambda given: 0 if given.runs is None else len(given.runs.first),
+    bits=lambda given: 0 if given.runs is None else given.runs.bits,
+    b="count",
+    known=_of_known("pixels"),
+    distances=_of_known("distances"),
+    p=lambda given: 0 if given.known is None else len(given.known.pixels),
+)
+draw_pixels = _OP.compiled_op("draw_pixels_native", "draw_pixels", _inputs, "result0", "result1", "result2")

@@ -8,18 +8,14 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import (
-    INDEX,
-    check_count,
-    check_dtype,
-    check_shape,
-)
+from voronerf.ops._core.checks import INDEX, Row
 from voronerf.ops._core.layers import MLP
-from voronerf.ops.grouped_mlp.checks import check_network, check_together
+from voronerf.ops.grouped_mlp.checks import check_network
 
 _OP = backends.declare(
     "grouped_mlp", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
 )
+_OFFSETS = Row("offsets", INDEX, ("k+1",), empty="must have at least two entries")
 
 
 def grouped_mlp(
@@ -76,17 +72,9 @@ def grouped_mlp(
         >>> out.shape
         torch.Size([5, 4])
     """
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "positions", positions, ("n", "p"), sizes)
-    check_dtype(_OP, "positions", positions)
-    check_shape(_OP, "offsets", offsets, ("k+1",), sizes)
-    check_dtype(_OP, "offsets", offsets, INDEX)
-    if sizes["k"] < 1:
-        raise ValueError(f"{_OP}: offsets must have at least two entries, got [{sizes['k'] + 1}]")
-    check_network(_OP, weights, biases, layers, directions, direction_index, features, sizes)
     read = {"directions": directions, "direction_index": direction_index, "features": features}
-    check_together(_OP, weights, biases, {"positions": positions, "offsets": offsets, **read})
-    check_count(_OP, "positions", sizes["n"])
+    network = {"positions": positions, "weights": weights, "biases": biases, "layers": layers, **read}
+    check_network(_OP, network, ([_OFFSETS], [offsets]))
     run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=weights[0].dtype)
     out: Tensor = run(positions, offsets, weights, biases, layers=layers, **read)
     return out

@@ -4,23 +4,13 @@ entries and f features of a table."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import (
-    INDEX,
-    check_count,
-    check_dtype,
-    check_no_inference,
-    check_same_device,
-    check_shape,
-    check_tensor,
-)
+from voronerf.ops._core.checks import INDEX, Default, Others, Row, Rows, check_rows, check_tensor
 from voronerf.ops._core.program import Program
 
 _OP = backends.declare("grouped_program", native=Implementation(EVERYWHERE, FLOATS))
@@ -82,12 +72,9 @@ def grouped_program(
         >>> out.flatten()
         tensor([1., 1.])
     """
-    given = ([] if tensor is None else [tensor] for tensor in (offsets, order, ray_index))
-    alike = _alike(program, inputs, parameters, *given)
-    if alike not in _PASSED:
-        _check(inputs, parameters, offsets, program, order, ray_index)
-        if alike is not None and len(_PASSED) < 4096:
-            _PASSED.add(alike)
+    cells: Others = ([_OFFSETS], [offsets])
+    sorting: Others = ((), ()) if order is None else ([_ORDER], [order])
+    check_program(_OP, program, inputs, parameters, ray_index, cells, sorting)
     dtype = inputs[0].dtype
     run = backends.resolve(_OP, backend=backend, device=inputs[0].device, dtype=dtype)
     if dtype in _HALF:
@@ -97,53 +84,26 @@ def grouped_program(
     return [tensor.to(dtype) for tensor in results] if dtype in _HALF else results
 
 
-_PASSED: set[Any] = set()  # what arguments that have passed the checks are like: those of a program take 60 us
-
-
-def _alike(program: Any, *lists: Sequence[Any]) -> Any:
-    """What the checks ask of arguments; None where it cannot be said for all calls with arguments like these."""
-    if torch.compiler.is_compiling() or not all(type(tensors) in (list, tuple) for tensors in lists):
-        return None
-    if not isinstance(program, Program):
-        return None
-    known = (Tensor, Parameter)
-    if any(type(t) not in known or t.is_nested or t.is_inference() for tensors in lists for t in tensors):
-        return None
-    return program.text, *[tuple([(t.shape, t.dtype, t.device, t.layout) for t in tensors]) for tensors in lists]
-
-
-def _check(
-    inputs: Sequence[Tensor],
-    parameters: Sequence[Tensor],
-    offsets: Tensor,
-    program: Program,
-    order: Tensor | None,
-    ray_index: Tensor | None,
-) -> None:
-    """Raises ValueError and TypeError as :func:`grouped_program` says."""
-    sizes: dict[str, int] = {}
-    check_shape(_OP, "offsets", offsets, ("k+1",), sizes)
-    check_dtype(_OP, "offsets", offsets, INDEX)
-    if sizes["k"] < 1:
-        raise ValueError(f"{_OP}: offsets must be of at least one cell, got {list(offsets.shape)}")
-    named = check_tensors(_OP, inputs, parameters, program, ray_index, sizes)
-    if order is not None:
-        check_shape(_OP, "order", order, ("n",), sizes)
-        check_dtype(_OP, "order", order, INDEX)
-    named.update(offsets=offsets, order=order)
-    check_same_device(_OP, **named)
-    check_no_inference(_OP, **named)
-
-
-def check_tensors(
+def check_program(
     op: str,
+    program: Program,
     inputs: Sequence[Tensor],
     parameters: Sequence[Tensor],
-    program: Program,
     ray_index: Tensor | None,
-    sizes: dict[str, int],
-) -> dict[str, Tensor | None]:
-    """Checks the tensors of a program but for devices, and gives them by name; ``sizes`` holds k where it is known."""
+    first: Others = ((), ()),
+    last: Others = ((), ()),
+) -> dict[str, int]:
+    """Checks a program and its tensors, and gives what the letters of their shapes stand for.
+
+    Args:
+        op: operation named in errors.
+        program: which tells how many tensors there are.
+        inputs: its own.
+        parameters: its own.
+        ray_index: int32 [n], or None.
+        first: rows of others that are checked before, and these.
+        last: of others that are checked behind.
+    """
     if not isinstance(program, Program):
         raise TypeError(f"{op}: program must be a Program, got {type(program).__name__}")
     for name, given, wanted in (("inputs", inputs, program.inputs), ("parameters", parameters, program.parameters)):
@@ -151,30 +111,37 @@ def check_tensors(
             raise TypeError(f"{op}: {name} must be a list, got {type(given).__name__}")
         if len(given) != len(wanted) or not (wanted or name == "parameters"):
             raise ValueError(f"{op}: {name} must be {len(wanted)} tensors (inputs at least one), got {len(given)}")
-    for i, (x, width) in enumerate(zip(inputs, program.inputs)):
-        check_shape(op, f"inputs[{i}]", x, ("r" if _among(i, program.rays) else "n", width), sizes)
-        check_dtype(op, f"inputs[{i}]", x, backends.COORDINATES if i == 0 else (inputs[0].dtype,))
-    for i, (p, shape) in enumerate(zip(parameters, program.parameters)):
-        check_tensor(op, f"parameters[{i}]", p)
-        check_shape(op, f"parameters[{i}]", p, (1 if p.shape[:1] == (1,) else "k", *shape), sizes)
-        known = (inputs[0].dtype, *(_TABLES if _among(i, program.tables) else ()))
-        check_dtype(op, f"parameters[{i}]", p, tuple(dict.fromkeys(known)))
     if (ray_index is not None) != (len(program.rays) > 0):
         rule = "given for a program with" if program.rays else "None for a program without"
         came = "None" if ray_index is None else "an index"
         raise ValueError(f"{op}: ray_index must be {rule} inputs of rays, got {came}")
-    if ray_index is not None:
-        check_shape(op, "ray_index", ray_index, ("n",), sizes)
-        check_dtype(op, "ray_index", ray_index, INDEX)
-        first = next(i for i in range(len(inputs)) if _among(i, program.rays))
-        if not sizes["r"] and sizes["n"]:
-            found = list(inputs[first].shape)
-            raise ValueError(f"{op}: inputs[{first}] must hold a row for the ray_index, got {found}")
-        check_count(op, f"inputs[{first}]", sizes["r"])
-    check_count(op, "inputs[0]", sizes["n"])
-    named: dict[str, Tensor | None] = {f"inputs[{i}]": x for i, x in enumerate(inputs)}
-    named.update({f"parameters[{i}]": p for i, p in enumerate(parameters)}, ray_index=ray_index)
-    return named
+    check_tensor(op, "inputs[0]", inputs[0])
+    rays = () if ray_index is None else (ray_index,)
+    tensors = [*first[1], *inputs, *parameters, *rays, *last[1]]
+    sizes = check_rows(op, _rows, tensors, program, inputs[0].dtype, tuple(first[0]), tuple(last[0]))
+    if ray_index is not None and not sizes["r"] and sizes["n"]:
+        at = next(i for i in range(len(inputs)) if _among(i, program.rays))
+        found = list(inputs[at].shape)
+        raise ValueError(f"{op}: inputs[{at}] must hold a row for the ray_index, got {found}")
+    return sizes
+
+
+_OFFSETS = Row("offsets", INDEX, ("k+1",), empty="must be of at least one cell")
+_ORDER = Row("order", INDEX, ("n",))
+
+
+def _rows(program: Program, dtype: torch.dtype, first: Sequence[Row], last: Sequence[Row]) -> Rows:
+    """What the tensors of a program must be: inputs, parameters and the index of rays, between others."""
+    rows: list[Row | Default] = [*first]
+    for i, width in enumerate(program.inputs):
+        letter = "r" if _among(i, program.rays) else "n"
+        rows.append(Row(f"inputs[{i}]", backends.COORDINATES if i == 0 else (dtype,), (letter, width)))
+    for i, shape in enumerate(program.parameters):
+        known = (dtype, *(_TABLES if _among(i, program.tables) else ()))
+        rows.append(Row(f"parameters[{i}]", tuple(dict.fromkeys(known)), ("1|k", *shape)))
+    if program.rays:
+        rows.append(Row("ray_index", INDEX, ("n",)))
+    return [*rows, Default("k", 1), *last]
 
 
 def _among(i: int, numbers: Sequence[int]) -> bool:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import FLOATING, INDEX, Checked
+from voronerf.ops._core.checks import FLOATING, INDEX, Row, check_rows
 from voronerf.ops._core.grids import HashGrid
 
 _OP = backends.declare(
@@ -54,13 +54,14 @@ def hash_encode(
     """
     if not isinstance(grid, HashGrid):
         raise TypeError(f"{_OP}: grid must be a HashGrid, got {type(grid).__name__}")
-    given = Checked(_OP)
-    given.tensor("positions", positions, FLOATING, "n", 3)
-    given.tensor("table", table, FLOATING, *(() if cells is None else ("k",)), *grid.table_shape)
-    if cells is not None:
-        given.tensor("cells", cells, INDEX, "n")
-    given.no_inference()
+    check_rows(_OP, _rows, [positions, table] if cells is None else [positions, table, cells], grid, cells is not None)
     dtype = torch.promote_types(positions.dtype, table.dtype)
     run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=dtype)
     encoded: Tensor = run(positions, table, grid, cells)
     return encoded
+
+
+def _rows(grid: HashGrid, several: bool) -> list[Row]:
+    shape: tuple[int | str, ...] = ("k", *grid.table_shape) if several else grid.table_shape
+    rows = [Row("positions", FLOATING, ("n", 3)), Row("table", FLOATING, shape)]
+    return [*rows, Row("cells", INDEX, ("n",))] if several else rows

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from torch import Tensor
+
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 
@@ -12,8 +14,9 @@ _samples = _OP.inputs(native.compiled.WeighedSamples)
 _kept = _OP.inputs(native.compiled.KeptSamples, points="kept_points", importance="kept_importance")
 
 
-@_OP.custom_op("keep_heaviest_native", devices=("cpu",))
-def keep_heaviest(given: Any, _: None) -> None:
-    """Keeps the heaviest samples of a batch; see ``voronerf.ops.keep_heaviest``."""
-    workspace = given.added.new_empty(native.compiled.keep_heaviest_workspace(given.q))
-    native.compiled.keep_heaviest(_samples(given), _kept(given), workspace, native.cpu())
+def _workspace(given: Any) -> Tensor:
+    workspace: Tensor = given.added.new_empty(native.compiled.keep_heaviest_workspace(given.q))
+    return workspace
+
+
+keep_heaviest = _OP.compiled_op("keep_heaviest_native", "keep_heaviest", _samples, _kept, _workspace, devices=("cpu",))

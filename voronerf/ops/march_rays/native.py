@@ -28,7 +28,6 @@ def space_of(given: Any) -> native.compiled.MarchSpace:
 
 _OP = declared("march_rays")
 INPUTS: dict[str, Any] = {
-    "occupied": lambda given: given.occupied.view(torch.uint8),
     "s": "samples",
     "disparity": lambda given: given.spacing == "disparity",
     "most": lambda given: given.samples if given.most is None else given.most,

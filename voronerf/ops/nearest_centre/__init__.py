@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from torch import Tensor
 
 from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
-from voronerf.ops._core.checks import of_one_dtype
 from voronerf.ops._core.declare import declare
-
-
-def _prepare(given: Any) -> tuple[Tensor, Tensor]:
-    if given.centres.shape[0] < 1:
-        raise ValueError("nearest_centre: centres must hold at least one centre, got none")
-    return of_one_dtype(*given)
 
 
 @declare(
     native=Implementation(EVERYWHERE, COORDINATES),
     warp=Implementation(EVERYWHERE, COORDINATES),
-    prepare=_prepare,
+    filled={"k": "centres must hold at least one centre, got none"},
+    compared=["points", "centres"],
 )
 def nearest_centre(
     points: Annotated[Tensor, "floating [n, 3]"],

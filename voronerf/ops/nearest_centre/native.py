@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 from voronerf.ops._core.rows import rows_of
 
-
-@declared("nearest_centre").custom_op()
-def nearest_centre(given: Any, cells: Tensor) -> None:
-    """Index of the nearest centre of every point; see ``voronerf.ops.nearest_centre``."""
-    find(cells, given.points, given.centres)
+nearest_centre = declared("nearest_centre").compiled_op(
+    "",
+    "nearest_centre",
+    *("points", "centres", "result", "n", "k"),
+    on_cuda=lambda given, cells, _: find(cells, given.points, given.centres),
+)
 
 
 def find(cells: Tensor, points: Tensor, centres: Tensor, rows: Tensor | None = None) -> None:

@@ -15,10 +15,8 @@ _inputs, _outputs = (
 )
 
 
-@_OP.custom_op("pixel_rays_native")
-def pixel_rays(given: Any, found: Any) -> None:
-    """Rays, where they meet the box, and colours; see ``voronerf.ops.pixel_rays``."""
-    inputs, machine = _inputs(given), native.machine(given.poses)
-    # Only on the CPU the compiled function says whether all pixels are in range.
-    if native.compiled.pixel_rays(inputs, _outputs(found), machine) is False:
-        check_range("pixel_rays", "index", given.index, inputs.c * inputs.h * inputs.w)
+def _fault(given: Any) -> None:
+    check_range("pixel_rays", "index", given.index, given.c * given.h * given.w)
+
+
+pixel_rays = _OP.compiled_op("pixel_rays_native", "pixel_rays", _inputs, _outputs, fault=_fault)

@@ -16,18 +16,11 @@ from voronerf.ops.render_loss.autograd import register
 _OP = declared("render_loss_gradient")
 _inputs = _OP.inputs(native.compiled.RenderLossInputs, offsets="ray_offsets")
 _outputs = _OP.outputs(native.compiled.RenderLossOutputs)
-
-
-@_OP.custom_op("render_loss_native")
-def _forward(given: Any, found: Any) -> None:
-    native.compiled.render_loss(_inputs(given), _outputs(found), native.machine(given.raw))
-
-
-register(_forward)
-render_loss_gradient = _forward
+render_loss_gradient = _OP.compiled_op("render_loss_native", "render_loss", _inputs, _outputs)
+register(render_loss_gradient)
 
 
 def render_loss(raw: Tensor, *others: Any) -> list[Tensor]:
     """Activations, compositing and squared error; see ``voronerf.ops.render_loss``."""
-    *parts, _ = _forward(raw.float(), *others)
+    *parts, _ = render_loss_gradient(raw.float(), *others)
     return parts

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 
 _OP = declared("rendered_gradient")
 _inputs = _OP.inputs(native.compiled.RenderedGradient, offsets="ray_offsets")
-
-
-@_OP.custom_op("rendered_gradient_native", devices=("cpu",))
-def rendered_gradient(given: Any, _: None) -> None:
-    """Adds the gradient; see ``voronerf.ops.rendered_gradient``."""
-    native.compiled.rendered_gradient(_inputs(given), given.gradient, native.cpu())
+rendered_gradient = _OP.compiled_op(
+    "rendered_gradient_native", "rendered_gradient", _inputs, "gradient", devices=("cpu",)
+)

@@ -12,14 +12,14 @@ from voronerf.ops._core.custom_op import in_float32
 from voronerf.ops._core.declare import declared
 
 
-@declared("resample").custom_op("resample_native")
-def _resample(given: Any, depths: Tensor) -> None:
-    compiled, machine = native.compiled, native.machine(depths)
-    tensors, sizes = (given.weights, given.edges, given.uniforms, depths), (given.r, given.s, given.count)
-    if isinstance(machine, compiled.Cuda):
-        compiled.resample(*tensors, depths.new_empty(given.r, given.s, dtype=torch.float64), *sizes, machine)
-    else:
-        compiled.resample(*tensors, *sizes, machine)
+def _on_cuda(given: Any, depths: Tensor, machine: native.compiled.Cuda) -> None:
+    sums = depths.new_empty(given.r, given.s, dtype=torch.float64)
+    tensors = given.weights, given.edges, given.uniforms, depths, sums
+    native.compiled.resample(*tensors, given.r, given.s, given.count, machine)
 
 
-resample = in_float32(_resample)
+resample = in_float32(
+    declared("resample").compiled_op(
+        "resample_native", "resample", *("weights", "edges", "uniforms", "result", "r", "s", "count"), on_cuda=_on_cuda
+    )
+)

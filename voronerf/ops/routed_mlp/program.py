@@ -10,27 +10,25 @@ from torch import Tensor
 
 from voronerf.ops._core.program import Program
 from voronerf.ops.cell_sort import cell_sort
-from voronerf.ops.grouped_mlp.checks import PLACES, check_places, with_coords
-from voronerf.ops.grouped_program import check_tensors, grouped_program
+from voronerf.ops.grouped_mlp.checks import PLACES, check_places, rows_of_places, with_coords
+from voronerf.ops.grouped_program import check_program, grouped_program
 from voronerf.ops.routed_mlp.reference import Where, find_cells, first_rows
 
 
-def check_program(
+def check_routed_program(
     op: str, /, program: Program, inputs: Sequence[Tensor], parameters: Sequence[Tensor], **given: Any
 ) -> dict[str, Any]:
     """Arguments of `routed_program` but for the backend, and ``frozen``, checked; what is compared has one dtype."""
     network = {**PLACES, "ray_index": None, **given}
     if unknown := network.keys() - PLACES.keys() - {"ray_index"}:
         raise TypeError(f"{op}: unknown arguments {', '.join(unknown)}")
-    sizes: dict[str, int] = {}
     known = isinstance(program, Program) and isinstance(parameters, Sequence)
     known = known and all(isinstance(p, Tensor) for p in parameters)
     shaped = with_cells(program, parameters) if known else parameters  # the others are refused
-    tensors = check_tensors(op, inputs, shaped, program, network["ray_index"], sizes)
+    sizes = check_program(op, program, inputs, shaped, network["ray_index"], last=rows_of_places(op, network))
     if len(program.outputs) != 1 or program.sums or program.by_ray or 0 in program.rays:
         raise ValueError(f"{op}: program must have one output [n, w] and inputs[0] [n, w], got others")
-    sizes.update(k=sizes.get("k", 1), p=program.inputs[0])
-    check_places(op, network, tensors, sizes)
+    check_places(op, network, sizes, program.inputs[0])
     return {"program": program, "inputs": inputs, "parameters": parameters, **with_coords(inputs[0], network)}
 
 

@@ -24,9 +24,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import BackendUnavailable
+from voronerf.ops._core.custom_op import LISTENERS, Op
 
 
 def _bind_openmp() -> None:
@@ -71,6 +73,8 @@ if getattr(compiled, "interface", "none") != _interface():
     )
 
 DTYPES = {
+    "float16": torch.float16,
+    "bfloat16": torch.bfloat16,
     "float32": torch.float32,
     "float64": torch.float64,
     "int32": torch.int32,
@@ -79,7 +83,18 @@ DTYPES = {
     "bool": torch.bool,
 }
 """By the names that the compiled module has for them."""
-compiled.name_dtypes(DTYPES)
+
+
+def know_torch(module: Any) -> None:
+    """Hands a compiled module the objects of torch that it knows by name alone."""
+    exchange = getattr(Tensor, "__dlpack_c_exchange_api__", None)  # from torch 2.10 on
+    module.know_torch(DTYPES, (Tensor, torch.nn.Parameter), exchange)
+
+
+know_torch(compiled)
+
+signature, Rules, alike = compiled.signature, compiled.Rules, compiled.alike
+"""What checks arguments and makes calls (csrc/bindings/signature.h), of this module where another one stands in."""
 
 ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
@@ -165,6 +180,22 @@ def refuse_where_deterministic(op: str, tensor: Tensor) -> None:
     if not torch.is_deterministic_algorithms_warn_only_enabled():
         raise RuntimeError(said)
     warnings.warn(said, stacklevel=2)
+
+
+compiled.know_calls(
+    {
+        "grad_enabled": torch.is_grad_enabled,
+        "tangents": vars(forward_ad),
+        "listeners": LISTENERS,
+        "torch": vars(torch),
+        "threads": torch.get_num_threads,
+        "kept": backends._kept,
+        "native": globals(),
+        "choose": backends._choose_once,
+        "dtypes": DTYPES,
+    }
+)
+Op.way = compiled.way_of
 
 
 @functools.lru_cache(maxsize=64)

@@ -1,0 +1,844 @@
+#include "bindings/signature.h"
+
+#include <pybind11/stl.h>
+
+#include <algorithm>
+#include <memory>
+#include <optional>
+
+#include "bindings/frame.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int kMostLetters = 32, kMostArguments = 32, kMostDimensions = 8;
+constexpr int64_t kMostRows = (int64_t{1} << 31) - 1, kMostGroups = int64_t{1} << 27;  // checks.MAX_COUNT, MAX_GROUPS
+
+unsigned dtypes_of(const py::handle& names) {
+  static const std::map<std::string, unsigned> known = {
+      {"float16", kFloat16}, {"bfloat16", kBfloat16}, {"float32", kFloat32}, {"float64", kFloat64},
+      {"int32", kInt32},     {"int64", kInt64},       {"uint8", kUint8},     {"bool", kBool}};
+  unsigned found = 0;
+  for (const auto& name : names) found |= known.at(py::cast<std::string>(name));
+  return found;
+}
+
+// The numbers that letters of shapes stand for.
+class Letters {
+ public:
+  // A size of a shape: a number, that of a letter and some more, or 1 in its place.
+  struct Size {
+    int letter = -1;
+    int64_t more = 0;
+    bool or_one = false;
+  };
+
+  int number(const std::string& name) {
+    const auto [entry, is_new] = names_.emplace(name, static_cast<int>(names_.size()));
+    if (is_new && entry->second >= kMostLetters) throw std::invalid_argument("too many letters of shapes");
+    return entry->second;
+  }
+  std::vector<Size> sizes(const py::handle& shape) {
+    std::vector<Size> found;
+    for (const auto& entry : shape) {
+      if (py::isinstance<py::int_>(entry)) {
+        found.push_back({-1, py::cast<int64_t>(entry)});
+        continue;
+      }
+      auto text = py::cast<std::string>(entry);
+      const bool or_one = text.compare(0, 2, "1|") == 0;
+      if (or_one) text.erase(0, 2);
+      const size_t end = text.find("+1");
+      found.push_back({number(text.substr(0, end)), end == std::string::npos ? 0 : 1, or_one});
+    }
+    return found;
+  }
+  size_t count() const { return names_.size(); }
+
+ private:
+  std::map<std::string, int> names_;
+};
+
+// What the tensors of a call have in common so far.
+struct Common {
+  int64_t letters[kMostLetters] = {};
+  uint32_t bound = 0;
+  unsigned first_float = 0;
+  int32_t device_type = -1, device_index = 0;
+  bool learns = false;  // whether one requires a gradient
+
+  bool bind(int letter, int64_t value) {
+    if ((bound >> letter & 1) != 0) return letters[letter] == value;
+    bound |= 1u << letter;
+    letters[letter] = value;
+    return true;
+  }
+  int64_t size(const Letters::Size& size) const {
+    return size.letter < 0 ? size.more : letters[size.letter] + size.more;
+  }
+};
+
+// What a tensor must be: as Checked.tensor of checks.py asks it.
+struct TensorRule {
+  unsigned dtypes = 0;
+  bool same = false, wide = false;  // as the first floating-point tensor; at least float32
+  bool either = false;              // of two shapes
+  bool filled = false;              // the letter of the first size is at least 1
+  std::vector<Letters::Size> shape, otherwise;
+
+  // From (dtypes, "same", "wide", "filled" or "", shape, otherwise or None).
+  static TensorRule of(const py::handle& row, Letters& letters) {
+    const auto parts = py::cast<py::tuple>(row);
+    const auto kind = py::cast<std::string>(parts[1]);
+    TensorRule rule;
+    rule.dtypes = dtypes_of(parts[0]);
+    rule.same = kind == "same";
+    rule.wide = kind == "wide";
+    rule.filled = kind == "filled";
+    rule.shape = letters.sizes(parts[2]);
+    if (!parts[3].is_none()) rule.otherwise = letters.sizes(parts[3]);
+    return rule;
+  }
+  bool fits(const TensorView& view, bool other, Common& common) const {
+    const auto& sizes = other || (either && view.dimensions != static_cast<int>(shape.size())) ? otherwise : shape;
+    if (view.dimensions != static_cast<int>(sizes.size())) return false;
+    for (int i = 0; i < view.dimensions; ++i) {
+      const Letters::Size& size = sizes[static_cast<size_t>(i)];
+      const int64_t there = view.shape[i];
+      if (size.or_one && there == 1) continue;
+      if (size.letter < 0 ? there != size.more : !common.bind(size.letter, there - size.more)) return false;
+      if (size.letter >= 0 && size.more == 1 && (there < 1 || there > kMostGroups + 1)) return false;
+    }
+    if (view.dimensions > 0 && view.shape[0] > kMostRows) return false;
+    if (filled && view.shape[0] <= sizes[0].more) return false;
+    const unsigned dtype = view.dtype(), first = common.first_float;
+    if (same || wide) {
+      if (first == 0 || dtype != (wide && first != kFloat64 ? kFloat32 : first)) return false;
+    } else if ((dtype & dtypes) == 0) {
+      return false;
+    }
+    if (first == 0 && (dtype & kFloating) != 0) common.first_float = dtype;
+    if (common.device_type < 0) {
+      common.device_type = view.device_type;
+      common.device_index = view.device_index;
+    }
+    return common.device_type == view.device_type && common.device_index == view.device_index;
+  }
+};
+
+bool is_true(PyObject* answer) {
+  PyErr_Clear();
+  Py_XDECREF(answer);
+  return answer == Py_True;
+}
+bool requires_gradient(PyObject* tensor) {
+  static PyObject* const word = PyUnicode_InternFromString("requires_grad");
+  return is_true(PyObject_GetAttr(tensor, word));
+}
+bool is_inference(PyObject* tensor) {
+  static PyObject* const word = PyUnicode_InternFromString("is_inference");
+  return is_true(PyObject_CallMethodNoArgs(tensor, word));
+}
+
+// What torch and voronerf answer to questions of every call; objects live as long as Python.
+struct Questions {
+  PyObject *own, *torch, *grad_enabled, *tangents, *threads, *kept, *native, *choose;
+  std::vector<PyObject*> listeners;
+  std::map<unsigned, PyObject*> dtypes;
+
+  bool grad() const { return is_true(PyObject_CallNoArgs(grad_enabled)); }
+  // Whether modes, transforms, tracers or profilers of torch are to see what is called, or tangents have to.
+  bool is_watched() const {
+    for (PyObject* listener : listeners) {
+      PyObject* const answer = PyObject_CallNoArgs(listener);
+      const bool listens = answer == nullptr || PyObject_IsTrue(answer) != 0;
+      PyErr_Clear();
+      Py_XDECREF(answer);
+      if (listens) return true;
+    }
+    static PyObject* const word = PyUnicode_InternFromString("_current_level");
+    PyObject* const level = PyDict_GetItemWithError(tangents, word);
+    return level == nullptr || PyLong_AsLong(level) >= 0;
+  }
+  // torch.empty: beside a tensor of the CPU it gives what Tensor.new_empty gives, in half the time.
+  PyObject* empty() const {
+    static PyObject* const word = PyUnicode_InternFromString("empty");
+    return PyDict_GetItemWithError(torch, word);
+  }
+  // native.cpu()
+  Cpu cpu() const {
+    static PyObject *const isa_word = PyUnicode_InternFromString("_isa"), *const threads_word =
+                                                                              PyUnicode_InternFromString("threads");
+    static PyObject* known = nullptr;  // a name stays, and almost always the one that was looked at last
+    static Isa isa;
+    PyObject* const name = PyDict_GetItemWithError(native, isa_word);
+    if (name != known) {
+      Frame frame;
+      void* place = &isa;
+      if (!frame.load(type_of<Isa>(), name, place)) throw py::type_error("_isa");
+      Py_INCREF(name);
+      known = name;
+    }
+    PyObject* count = PyObject_GetAttr(kept, threads_word);
+    if (count == Py_None) {
+      Py_DECREF(count);
+      count = PyObject_CallNoArgs(threads);
+    }
+    const auto many = static_cast<int>(PyLong_AsLong(count));
+    Py_XDECREF(count);
+    return {isa, many};
+  }
+  // Whether the compiled module is this one, and no other one stands in.
+  bool compiled_here() const {
+    static PyObject* const word = PyUnicode_InternFromString("compiled");
+    return PyDict_GetItemWithError(native, word) == own;
+  }
+};
+Questions questions;
+
+// The rules of tensors whose number is not that of arguments, such as those of a network.
+class Rules {
+ public:
+  // Of rows of checks.py: (dtypes, kind, shape, otherwise) of a tensor, or (letter, number) that it is if it is not
+  // bound. A call gives `names`, which are letters.
+  Rules(const py::sequence& rows, const std::vector<std::string>& names) {
+    for (const auto& row : rows) {
+      const auto parts = py::cast<py::tuple>(row);
+      if (parts.size() == 2) {
+        rules_.emplace_back();
+        defaults_.push_back({letters_.number(py::cast<std::string>(parts[0])), py::cast<int64_t>(parts[1])});
+      } else {
+        rules_.push_back(TensorRule::of(row, letters_));
+        defaults_.emplace_back();
+      }
+    }
+    for (const std::string& name : names) asked_.push_back(letters_.number(name));
+  }
+  // The letters, or None where a tensor breaks a rule, or torch does not say whether it does; 0 for what is not bound.
+  py::object check(const py::list& tensors) const {
+    Common common;
+    Py_ssize_t i = 0;
+    for (size_t row = 0; row < rules_.size(); ++row) {
+      const Letters::Size& own = defaults_[row];
+      if (own.letter >= 0) {
+        if ((common.bound >> own.letter & 1) == 0) common.bind(own.letter, own.more);
+        continue;
+      }
+      if (i == PyList_GET_SIZE(tensors.ptr())) return py::none();
+      PyObject* const tensor = PyList_GET_ITEM(tensors.ptr(), i++);
+      TensorView view;
+      if (!view.look(tensor) || !rules_[row].fits(view, false, common)) return py::none();
+      common.learns = common.learns || ((view.dtype() & kFloating) != 0 && requires_gradient(tensor));
+    }
+    if (i != PyList_GET_SIZE(tensors.ptr())) return py::none();
+    if (common.learns && questions.grad()) {
+      for (const auto& tensor : tensors) {
+        if (is_inference(tensor.ptr())) return py::none();
+      }
+    }
+    py::tuple found(asked_.size());
+    for (size_t each = 0; each < asked_.size(); ++each) found[each] = py::int_(common.letters[asked_[each]]);
+    return std::move(found);
+  }
+
+ private:
+  Letters letters_;
+  std::vector<TensorRule> rules_;
+  std::vector<Letters::Size> defaults_;  // of a row that is one
+  std::vector<int> asked_;
+};
+
+// Whether lists have as many tensors, those at one place have one shape, all are float32 and on one device, those of
+// the lists that are written lie in order, and the scalars are tensors [] like them.
+bool alike(const py::sequence& lists, const std::vector<bool>& written, const py::list& scalars) {
+  std::vector<TensorView> first;
+  for (size_t i = 0; i < lists.size(); ++i) {
+    const py::object list = lists[i];
+    if (!PyList_Check(list.ptr()) && !PyTuple_Check(list.ptr())) return false;
+    const auto count = static_cast<size_t>(PySequence_Fast_GET_SIZE(list.ptr()));
+    if (i == 0) first.resize(count);
+    if (count != first.size()) return false;
+    for (size_t j = 0; j < count; ++j) {
+      PyObject* const tensor = PySequence_Fast_GET_ITEM(list.ptr(), static_cast<Py_ssize_t>(j));
+      TensorView view;
+      if (!view.look(tensor) || view.dtype() != kFloat32) return false;
+      if (i == 0) first[j] = view;
+      const TensorView& own = first[j];
+      if (view.dimensions != own.dimensions || !std::equal(view.shape, view.shape + view.dimensions, own.shape)) {
+        return false;
+      }
+      if (view.device_type != first[0].device_type || view.device_index != first[0].device_index) return false;
+      if (written.at(i) && (!view.is_contiguous() || is_negative(tensor))) return false;
+    }
+  }
+  return !first.empty() && std::all_of(scalars.begin(), scalars.end(), [&first](const py::handle& scalar) {
+    TensorView view;
+    return view.look(scalar.ptr()) && view.dimensions == 0 && view.dtype() == kFloat32 &&
+           view.device_type == first[0].device_type && view.device_index == first[0].device_index;
+  });
+}
+
+// How a custom op may be called with these arguments: 0 past torch's dispatcher, which has nothing to do there, 1 with
+// gradients that are recorded, 2 as a custom op, or as Python says.
+int way_of(PyObject* arguments, bool top = true) {
+  if (top && questions.is_watched()) return 2;
+  bool learns = false;
+  for (Py_ssize_t i = 0; i < PySequence_Fast_GET_SIZE(arguments); ++i) {
+    PyObject* const each = PySequence_Fast_GET_ITEM(arguments, i);
+    if (each == Py_None || PyUnicode_CheckExact(each) || PyLong_CheckExact(each) || PyBool_Check(each)) continue;
+    TensorView view;
+    if (view.look(each)) {
+      if (!view.on_cpu()) return 2;
+      learns = learns || ((view.dtype() & kFloating) != 0 && requires_gradient(each));
+    } else if (PyList_CheckExact(each) || PyTuple_CheckExact(each)) {
+      const int inner = way_of(each, false);
+      if (inner == 2) return 2;
+      learns = learns || inner == 1;
+    } else if (!PyFloat_CheckExact(each)) {
+      return 2;
+    }
+  }
+  return top && learns && !questions.grad() ? 0 : static_cast<int>(learns);
+}
+
+struct Argument {
+  enum class Kind { tensor, integer, flag, number, text, instance, any };
+  Kind kind = Kind::any;
+  py::str name;
+  bool optional = false, bound = false, detached = false, small = false, written = false;
+  py::object otherwise;  // the default, null for none
+  TensorRule rule;
+  int condition = -1;  // the argument with which the shape is the first of two
+  int letter = -1;     // that shapes have for it
+  int64_t low = 0, high = 0;
+  double from = 0, to = 0;
+  bool positive = false, interval = false, open = false;
+  py::tuple choices;
+  py::object kind_of;
+};
+
+// A call whose arguments are checked.
+struct Call {
+  PyObject* values[kMostArguments] = {};
+  TensorView views[kMostArguments];
+  Common common;
+  std::vector<py::object> own;  // what was made for it
+  py::object given;             // the values as a named tuple, once somebody asks for it
+};
+
+// How a compiled function is called with the arguments of an op: where each of its parameters comes from.
+class Plan {
+ public:
+  struct Source {
+    enum class Kind { argument, form, rays, letter, result, memory, constant, function, structure };
+    Kind kind = Kind::constant;
+    int place = 0, dimensions = 0;
+    int64_t bytes = 0;
+    std::vector<Letters::Size> sizes;
+    py::object object;
+    std::vector<Source> members;
+  };
+  struct Size {
+    Letters::Size size;
+    py::object function;  // null for a letter or a number
+  };
+  struct Result {
+    int like, condition;
+    py::object dtype;
+    std::vector<Size> shape, otherwise;
+  };
+
+  // From (name of the function, sources, results, class of the results or None, what is called where it gives False).
+  Plan(const py::tuple& parts, Letters& letters) : function_(&functions().at(py::cast<std::string>(parts[0]))) {
+    for (const auto& source : parts[1]) sources_.push_back(source_of(source, letters));
+    for (const auto& row : parts[2]) {
+      const auto result = py::cast<py::tuple>(row);
+      results_.push_back({py::cast<int>(result[0]), py::cast<int>(result[2]), result[1], sizes_of(result[3], letters),
+                          sizes_of(result[4], letters)});
+    }
+    kind_ = parts[3];
+    fault_ = parts[4];
+  }
+
+  // Null where the function does not take these arguments.
+  py::object run(Call& call, const py::object& inputs, size_t count) const {
+    std::vector<py::object> found;
+    std::vector<TensorView> views(results_.size());
+    for (size_t i = 0; i < results_.size(); ++i) {
+      found.push_back(memory(results_[i], call, inputs, count));
+      if (!found.back() || !views[i].look(found.back().ptr())) return {};
+    }
+    for (const Bound& bound : function_->overloads) {
+      if (bound.function == nullptr || bound.machine != &type_of<Cpu>()) continue;
+      if (bound.given.size() != sources_.size() + 1) continue;
+      Loaded loaded{function_, &bound, {}, {}};
+      std::vector<std::unique_ptr<char[]>> memories;
+      const Loading loading{call, found, views, loaded.frame, memories, inputs, count};
+      bool fits = true;
+      for (size_t i = 0; fits && i < sources_.size(); ++i) {
+        void*& place = loaded.values.place(*bound.given[i]);
+        fits = loading.load(sources_[i], *bound.given[i], place);
+      }
+      if (!fits) continue;
+      *static_cast<Cpu*>(loaded.values.place(type_of<Cpu>())) = questions.cpu();
+      const py::object said = voronerf::run(loaded);
+      if (said.ptr() == Py_False && !fault_.is_none()) fault_(given(call, inputs, count));
+      if (found.size() == 1) return found[0];
+      if (found.empty()) return py::none();
+      py::tuple all(found.size());
+      for (size_t i = 0; i < found.size(); ++i) all[i] = found[i];
+      if (kind_.is_none()) return std::move(all);
+      return PyType_Check(kind_.ptr()) ? named(kind_, all) : kind_(all);
+    }
+    return {};
+  }
+
+  // An instance of a class of named tuples.
+  static py::object named(const py::object& kind, const py::tuple& values) {
+    const py::tuple arguments = py::make_tuple(values);
+    return py::reinterpret_steal<py::object>(
+        PyTuple_Type.tp_new(reinterpret_cast<PyTypeObject*>(kind.ptr()), arguments.ptr(), nullptr));
+  }
+  static const py::object& given(Call& call, const py::object& inputs, size_t count) {
+    if (!call.given) {
+      py::tuple values(count);
+      for (size_t i = 0; i < count; ++i) values[i] = py::reinterpret_borrow<py::object>(call.values[i]);
+      call.given = named(inputs, values);
+    }
+    return call.given;
+  }
+
+ private:
+  static std::vector<Size> sizes_of(const py::handle& entries, Letters& letters) {
+    std::vector<Size> found;
+    for (const auto& entry : entries) {
+      if (PyCallable_Check(entry.ptr()) != 0) {
+        found.push_back({{}, py::reinterpret_borrow<py::object>(entry)});
+      } else {
+        found.push_back({letters.sizes(py::make_tuple(entry))[0], {}});
+      }
+    }
+    return found;
+  }
+  static Source source_of(const py::handle& given, Letters& letters) {
+    const auto parts = py::cast<py::tuple>(given);
+    const auto kind = py::cast<std::string>(parts[0]);
+    Source source;
+    if (kind == "argument" || kind == "result" || kind == "rays") {
+      source.kind = kind == "result" ? Source::Kind::result
+                    : kind == "rays" ? Source::Kind::rays
+                                     : Source::Kind::argument;
+      source.place = py::cast<int>(parts[1]);
+    } else if (kind == "form") {
+      source.kind = Source::Kind::form;
+      source.place = py::cast<int>(parts[1]);
+      source.dimensions = py::cast<int>(parts[2]);
+    } else if (kind == "letter") {
+      source.kind = Source::Kind::letter;
+      source.sizes = letters.sizes(py::make_tuple(parts[1]));
+    } else if (kind == "memory") {
+      source.kind = Source::Kind::memory;
+      source.bytes = py::cast<int64_t>(parts[1]);
+      source.sizes = letters.sizes(parts[2]);
+    } else if (kind == "structure") {
+      source.kind = Source::Kind::structure;
+      for (const auto& member : parts[1]) source.members.push_back(source_of(member, letters));
+    } else {
+      source.kind = kind == "function" ? Source::Kind::function : Source::Kind::constant;
+      source.object = parts[1];
+    }
+    return source;
+  }
+
+  py::object memory(const Result& result, Call& call, const py::object& inputs, size_t count) const {
+    static PyObject* const names = PyTuple_Pack(1, PyUnicode_InternFromString("dtype"));
+    const bool other = result.condition >= 0 && call.values[result.condition] == Py_None;
+    const auto& sizes = other ? result.otherwise : result.shape;
+    py::object shape[kMostDimensions];
+    PyObject* arguments[kMostDimensions + 1];
+    for (size_t i = 0; i < sizes.size(); ++i) {
+      if (sizes[i].function) {
+        shape[i] = sizes[i].function(given(call, inputs, count));
+      } else {
+        shape[i] = py::int_(call.common.size(sizes[i].size));
+      }
+      arguments[i] = shape[i].ptr();
+    }
+    if (sizes.empty()) arguments[0] = (shape[0] = py::tuple()).ptr();
+    const size_t given_count = std::max<size_t>(sizes.size(), 1);
+    arguments[given_count] =
+        result.dtype.is_none() ? questions.dtypes.at(call.views[result.like].dtype()) : result.dtype.ptr();
+    PyObject* const made = PyObject_Vectorcall(questions.empty(), arguments, given_count, names);
+    if (made == nullptr) throw py::error_already_set();
+    return py::reinterpret_steal<py::object>(made);
+  }
+
+  // What a call of the function is loaded from.
+  struct Loading {
+    Call& call;
+    const std::vector<py::object>& found;
+    const std::vector<TensorView>& views;
+    Frame& frame;
+    std::vector<std::unique_ptr<char[]>>& memories;
+    const py::object& inputs;
+    size_t count;
+
+    bool load(const Source& source, const Type& type, void*& place) const {
+      switch (source.kind) {
+        case Source::Kind::argument:
+        case Source::Kind::form: {
+          PyObject* const value = call.values[source.place];
+          const TensorView& view = call.views[source.place];
+          if (source.kind == Source::Kind::form && value != Py_None && view.dimensions != source.dimensions) {
+            return frame.load(type, Py_None, place);
+          }
+          if (type.kind != Type::Kind::tensor || value == Py_None) return frame.load(type, value, place);
+          return frame.load_view(type, value, view, *static_cast<void**>(place));
+        }
+        case Source::Kind::rays:  // whether there is a row for each of them
+          if (type.kind != Type::Kind::boolean) return false;
+          *static_cast<bool*>(place) = call.views[source.place].dimensions > 1;
+          return true;
+        case Source::Kind::letter: {
+          const int64_t size = call.common.size(source.sizes[0]);
+          if (type.kind == Type::Kind::rows) {
+            *static_cast<RowCount*>(place) = size;
+          } else if (type.kind == Type::Kind::integer) {
+            std::memcpy(place, &size, type.size);
+          } else {
+            return false;
+          }
+          return true;
+        }
+        case Source::Kind::result: {
+          const TensorView& view = views[static_cast<size_t>(source.place)];
+          *static_cast<void**>(place) = view.address();
+          return type.dtypes == 0 || (view.dtype() & type.dtypes) != 0;
+        }
+        case Source::Kind::memory: {
+          int64_t bytes = source.bytes;
+          for (const auto& size : source.sizes) bytes *= call.common.size(size);
+          memories.emplace_back(new char[static_cast<size_t>(bytes) + 64]);
+          const auto begin = reinterpret_cast<std::uintptr_t>(memories.back().get());
+          *static_cast<void**>(place) = reinterpret_cast<void*>((begin + 63) / 64 * 64);
+          return true;
+        }
+        case Source::Kind::constant:
+          return frame.load(type, source.object.ptr(), place);
+        case Source::Kind::function: {
+          const py::object value = source.object(Plan::given(call, inputs, count));
+          frame.keep(value.ptr());
+          return frame.load(type, value.ptr(), place);
+        }
+        default: {
+          if (type.kind != Type::Kind::structure || type.members.size() != source.members.size()) return false;
+          char* const begin = static_cast<char*>(place);
+          for (size_t i = 0; i < type.members.size(); ++i) {
+            void* at = begin + type.members[i].offset;
+            if (!load(source.members[i], *type.members[i].type, at)) return false;
+          }
+          return true;
+        }
+      }
+    }
+  };
+
+  const Function* function_;
+  std::vector<Source> sources_;
+  std::vector<Result> results_;
+  py::object kind_, fault_;
+};
+
+class Signature {
+ public:
+  // From the op's name, rows of its arguments, and what Declaration.signature (declare.py) says.
+  Signature(const py::str& op, const py::sequence& rows, int positional, const py::dict& more)
+      : op_(op), positional_(positional) {
+    for (const auto& row : rows) arguments_.push_back(argument_of(py::cast<py::dict>(row)));
+    if (arguments_.size() > kMostArguments) throw std::invalid_argument("too many arguments");
+    for (const auto& letter : more["filled"]) filled_.push_back(letters_.number(py::cast<std::string>(letter)));
+    for (const auto& place : more["compared"]) compared_.push_back(py::cast<size_t>(place));
+    smooth_ = py::cast<bool>(more["smooth"]);
+    inputs_ = more["inputs"];
+    prepare_ = more["prepare"];
+    found_ = more["found"];
+    pack_ = more["pack"];
+  }
+
+  // The results of a call; NotImplemented where its arguments break a rule, or torch does not say whether they do.
+  py::object call(PyObject* args, PyObject* options) {
+    Call call;
+    const size_t count = arguments_.size() - 1;  // without the backend
+    if (!bind(args, options, call) || !check(call)) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
+    bool learns = false;
+    for (size_t i = 0; i < count; ++i) learns = detach(i, call) || learns;
+    learns = learns && questions.grad();
+    if (learns && !no_inference_of(call)) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
+    if (!prepare_.is_none()) prepare(call);
+    const Implementation* const chosen = choose(call);
+    if (chosen == nullptr) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
+    if (chosen->plan && !learns && call.views[0].on_cpu() && questions.compiled_here() &&
+        (!chosen->narrow || call.common.first_float == kFloat32) && !questions.is_watched()) {
+      if (py::object result = chosen->plan->run(call, inputs_, count)) return result;
+    }
+    PyObject* const found = PyObject_Vectorcall(chosen->run.ptr(), call.values, count, nullptr);
+    if (found == nullptr) throw py::error_already_set();
+    const py::object result = py::reinterpret_steal<py::object>(found);
+    return pack_.is_none() ? result : pack_(result);
+  }
+
+ private:
+  struct Implementation {
+    py::object name, backend, run;
+    std::unique_ptr<Plan> plan;
+    bool narrow;
+  };
+
+  Argument argument_of(const py::dict& row) {
+    Argument argument;
+    argument.name = row["name"];
+    PyObject* name = argument.name.release().ptr();
+    PyUnicode_InternInPlace(&name);
+    argument.name = py::reinterpret_steal<py::str>(name);
+    argument.optional = py::cast<bool>(row["optional"]);
+    if (row.contains("default")) argument.otherwise = row["default"];
+    const auto kind = py::cast<std::string>(row["kind"]);
+    const py::object rule = row["rule"];
+    using Kind = Argument::Kind;
+    if (kind == "tensor") {
+      argument.kind = Kind::tensor;
+      argument.rule = TensorRule::of(rule, letters_);
+      argument.rule.either = py::cast<bool>(row["either"]);
+      argument.condition = py::cast<int>(row["condition"]);
+      argument.detached = py::cast<bool>(row["detached"]);
+      argument.small = py::cast<bool>(row["small"]);
+      argument.written = py::cast<bool>(row["written"]);
+    } else if (kind == "int") {
+      argument.kind = Kind::integer;
+      std::tie(argument.low, argument.high) = py::cast<std::pair<int64_t, int64_t>>(rule);
+      if (py::cast<bool>(row["bound"])) argument.letter = letters_.number(py::cast<std::string>(row["name"]));
+    } else if (kind == "float") {
+      argument.kind = Kind::number;
+      const auto text = py::cast<std::string>(rule);
+      argument.positive = text == "positive";
+      argument.interval = !text.empty() && !argument.positive;
+      argument.open = argument.interval && text.back() == ')';
+      std::tie(argument.from, argument.to) = py::cast<std::pair<double, double>>(row["ends"]);
+    } else if (kind == "bool") {
+      argument.kind = Kind::flag;
+    } else if (kind == "str") {
+      argument.kind = Kind::text;
+      argument.choices = py::tuple(rule);
+    } else if (kind == "instance") {
+      argument.kind = Kind::instance;
+      argument.kind_of = rule;
+    }
+    return argument;
+  }
+
+  bool bind(PyObject* args, PyObject* options, Call& call) const {
+    const auto given = static_cast<size_t>(PyTuple_GET_SIZE(args));
+    if (given > static_cast<size_t>(positional_)) return false;
+    for (size_t i = 0; i < given; ++i) call.values[i] = PyTuple_GET_ITEM(args, static_cast<Py_ssize_t>(i));
+    PyObject *key, *value;
+    for (Py_ssize_t at = 0; PyDict_Next(options, &at, &key, &value) != 0;) {
+      size_t i = given;
+      while (i < arguments_.size() && arguments_[i].name.ptr() != key) ++i;
+      if (i == arguments_.size()) {  // a name that is not interned, or of an argument that was given already
+        for (i = given; i < arguments_.size() && PyUnicode_Compare(arguments_[i].name.ptr(), key) != 0;) ++i;
+        if (i == arguments_.size()) return false;
+      }
+      call.values[i] = value;
+    }
+    for (size_t i = given; i < arguments_.size(); ++i) {
+      if (call.values[i] == nullptr) call.values[i] = arguments_[i].otherwise.ptr();
+      if (call.values[i] == nullptr) return false;
+    }
+    return true;
+  }
+
+  bool check(Call& call) const {
+    for (size_t i = 0; i < arguments_.size(); ++i) {
+      const Argument& argument = arguments_[i];
+      if (argument.optional && call.values[i] == Py_None) continue;
+      if (!check(argument, call.values[i], call.views[i], call)) return false;
+    }
+    for (const int letter : filled_) {
+      if (call.common.letters[letter] < 1) return false;
+    }
+    if (!PyUnicode_CheckExact(call.values[arguments_.size() - 1])) return false;  // the backend
+    if (!compared_.empty()) {
+      const unsigned one = call.views[compared_[0]].dtype(), two = call.views[compared_[1]].dtype();
+      if (one != two || (one & (kFloat32 | kFloat64)) == 0) return false;
+    }
+    return true;
+  }
+  bool check(const Argument& argument, PyObject*& value, TensorView& view, Call& call) const {
+    switch (argument.kind) {
+      case Argument::Kind::tensor: {
+        const bool other = argument.condition >= 0 && call.values[argument.condition] == Py_None;
+        if (!view.look(value) || !argument.rule.fits(view, other, call.common)) return false;
+        if (argument.written && (!view.is_contiguous() || is_negative(value))) return false;
+        return !argument.small || view.entries() <= kMostRows;
+      }
+      case Argument::Kind::integer: {
+        if (!PyLong_CheckExact(value)) return false;
+        int overflow = 0;
+        const int64_t number = PyLong_AsLongLongAndOverflow(value, &overflow);
+        if (overflow != 0 || number < argument.low || number > argument.high) return false;
+        return argument.letter < 0 || call.common.bind(argument.letter, number);
+      }
+      case Argument::Kind::number: {
+        if (!PyFloat_CheckExact(value) && !PyLong_CheckExact(value)) return false;
+        const double number = PyFloat_AsDouble(value);
+        if (number == -1 && PyErr_Occurred() != nullptr) return PyErr_Clear(), false;
+        if (argument.positive && !(number > 0)) return false;
+        if (argument.interval &&
+            !((argument.from <= number && number < argument.to) || (number == argument.to && !argument.open))) {
+          return false;
+        }
+        if (PyLong_CheckExact(value)) {
+          call.own.push_back(py::float_(number));
+          value = call.own.back().ptr();
+        }
+        return true;
+      }
+      case Argument::Kind::flag:
+        return PyBool_Check(value);
+      case Argument::Kind::text:
+        if (!PyUnicode_CheckExact(value)) return false;
+        return std::any_of(argument.choices.begin(), argument.choices.end(), [value](const py::handle& choice) {
+          return choice.ptr() == value || PyUnicode_Compare(choice.ptr(), value) == 0;
+        });
+      case Argument::Kind::instance:
+        return reinterpret_cast<PyObject*>(Py_TYPE(value)) == argument.kind_of.ptr();
+      default:
+        return true;
+    }
+  }
+  // Whether the value requires a gradient after all.
+  bool detach(size_t i, Call& call) const {
+    if (!call.views[i].is_there() || (call.views[i].dtype() & kFloating) == 0) return false;
+    if (!requires_gradient(call.values[i])) return false;
+    if (!arguments_[i].detached) return true;
+    static PyObject* const word = PyUnicode_InternFromString("detach");
+    call.own.push_back(py::reinterpret_steal<py::object>(PyObject_CallMethodNoArgs(call.values[i], word)));
+    if (!call.own.back()) throw py::error_already_set();
+    call.values[i] = call.own.back().ptr();
+    return false;
+  }
+  bool no_inference_of(const Call& call) const {
+    if (!smooth_) return true;
+    for (size_t i = 0; i + 1 < arguments_.size(); ++i) {
+      if (call.views[i].is_there() && is_inference(call.values[i])) return false;
+    }
+    return true;
+  }
+  void prepare(Call& call) const {
+    const size_t count = arguments_.size() - 1;
+    py::object found = prepare_(Plan::given(call, inputs_, count));
+    if (found.is(call.given)) return;
+    const py::tuple values(found);
+    for (size_t i = 0; i < count; ++i) {
+      PyObject* const value = PyTuple_GET_ITEM(values.ptr(), static_cast<Py_ssize_t>(i));
+      if (value == call.values[i]) continue;
+      call.values[i] = value;
+      call.views[i] = {};
+      if (arguments_[i].kind == Argument::Kind::tensor) call.views[i].look(value);
+    }
+    call.own.push_back(values);
+    call.given = {};
+  }
+  // The implementation for the backend, and for device and dtype of the first argument; null where these are unknown.
+  const Implementation* choose(const Call& call) {
+    static PyObject *const cpu = PyUnicode_InternFromString("cpu"), *const cuda = PyUnicode_InternFromString("cuda");
+    const TensorView& first = call.views[0];
+    const auto dtype = questions.dtypes.find(first.dtype());
+    if ((!first.on_cpu() && !first.on_cuda()) || dtype == questions.dtypes.end()) return nullptr;
+    const py::handle backend = call.values[arguments_.size() - 1];
+    const py::object index = first.on_cpu() ? py::object(py::none()) : py::object(py::int_(first.device_index));
+    PyObject* const asked[] = {op_.ptr(), backend.ptr(), first.on_cpu() ? cpu : cuda, index.ptr(), dtype->second};
+    const auto name = py::reinterpret_steal<py::object>(PyObject_Vectorcall(questions.choose, asked, 5, nullptr));
+    if (!name) throw py::error_already_set();
+    for (const auto& each : implementations_) {
+      if (each->name.equal(name) && each->backend.equal(backend)) return each.get();
+    }
+    const py::tuple found = found_(name, backend);
+    auto made = std::make_unique<Implementation>();
+    made->name = name;
+    made->backend = py::reinterpret_borrow<py::object>(backend);
+    made->run = found[0];
+    if (!found[1].is_none()) made->plan = std::make_unique<Plan>(py::cast<py::tuple>(found[1]), letters_);
+    made->narrow = py::cast<bool>(found[2]);
+    implementations_.push_back(std::move(made));
+    return implementations_.back().get();
+  }
+
+  py::str op_;
+  int positional_;
+  Letters letters_;
+  std::vector<Argument> arguments_;
+  std::vector<int> filled_;
+  std::vector<size_t> compared_;
+  bool smooth_ = false;
+  py::object inputs_, prepare_, found_, pack_;
+  std::vector<std::unique_ptr<Implementation>> implementations_;
+};
+
+// Signature.call as a function of Python that takes a tuple and a dict, which pybind11 would call in four times the
+// time.
+PyObject* call_signature(PyObject* self, PyObject* const* given, Py_ssize_t) {
+  auto* const signature = static_cast<Signature*>(PyCapsule_GetPointer(self, nullptr));
+  try {
+    return signature->call(given[0], given[1]).release().ptr();
+  } catch (py::error_already_set& error) {
+    error.restore();
+  } catch (const py::builtin_exception& error) {
+    error.set_error();
+  } catch (const std::bad_alloc& error) {
+    PyErr_SetString(PyExc_MemoryError, error.what());
+  } catch (const std::invalid_argument& error) {
+    PyErr_SetString(PyExc_ValueError, error.what());
+  } catch (const std::exception& error) {
+    PyErr_SetString(PyExc_RuntimeError, error.what());
+  }
+  return nullptr;
+}
+
+}  // namespace
+
+void bind_signatures(py::module_& module) {
+  questions.own = module.ptr();
+  py::class_<Rules>(module, "Rules")
+      .def(py::init<const py::sequence&, const std::vector<std::string>&>())
+      .def("__call__", &Rules::check);
+  module.def("alike", &alike);
+  module.def("way_of", [](const py::tuple& arguments) { return way_of(arguments.ptr()); });
+  module.def("signature", [](const py::str& op, const py::sequence& rows, int positional, const py::dict& more) {
+    static PyMethodDef definition = {
+        "call", reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(&call_signature)), METH_FASTCALL, nullptr};
+    const py::capsule owner(new Signature(op, rows, positional, more),
+                            [](void* object) { delete static_cast<Signature*>(object); });
+    return py::reinterpret_steal<py::object>(PyCFunction_NewEx(&definition, owner.ptr(), nullptr));
+  });
+  module.def("know_calls", [](const py::dict& objects) {
+    const auto held = [&objects](const char* name) { return py::object(objects[name]).release().ptr(); };
+    questions.grad_enabled = held("grad_enabled");
+    questions.tangents = held("tangents");
+    questions.torch = held("torch");
+    questions.threads = held("threads");
+    questions.kept = held("kept");
+    questions.native = held("native");
+    questions.choose = held("choose");
+    for (const auto& listener : objects["listeners"]) {
+      questions.listeners.push_back(py::reinterpret_borrow<py::object>(listener).release().ptr());
+    }
+    for (const auto& entry : py::cast<py::dict>(objects["dtypes"])) {
+      questions.dtypes[dtypes_of(py::make_tuple(entry.first))] =
+          py::reinterpret_borrow<py::object>(entry.second).release().ptr();
+    }
+  });
+}
+
+}  // namespace voronerf
