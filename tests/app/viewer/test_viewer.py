@@ -36,7 +36,7 @@ from voronerf.app.scenes.record import read_scene
 from voronerf.app.train import Callback, ConfigError, Scores, TrainConfig, build, train
 from voronerf.app.train import run as run_training
 from voronerf.app.viewer import view_run, watch
-from voronerf.app.viewer.cameras import scene_bounds
+from voronerf.app.viewer.cameras import angle_of_view, scene_bounds
 from voronerf.nerf import Renderer, Stratified, orbit_cameras
 
 
@@ -114,6 +114,21 @@ def test_a_narrow_canvas_opens_at_all_of_the_first_view(viewer, scene, tab) -> N
         again.rest()  # of a browser that has lost its connection and comes back
         assert abs(viewer.clients[2].handle.camera.fov - 2 * np.arctan(np.tan(viewer.clients[0].fov / 2) / 2)) < 1e-3
         again.close()
+
+
+def test_a_slow_page_opens_at_all_of_the_first_view(viewer, scene) -> None:
+    """It tells viser's own angle of view, which is wider here, before it takes the viewer's."""
+    before = replace(scene.test.cameras, intrinsics=scene.test.cameras.intrinsics / 2)
+    with closing(Tab(viewer, before, size=(39, 84))) as phone:
+        client = phone.until(lambda: viewer.clients.get(0))
+        assert client.handle.camera.fov == client.fov > 1.1 * viewer.server.initial_camera.fov
+        phone.look(scene.test.cameras)
+        opened = angle_of_view(scene.test.cameras, 0, 39 / 84)
+        phone.until(lambda: np.isclose(client.handle.camera.fov, opened))
+        phone.until(lambda: phone.gui["Field of view"]["value"] == round(np.degrees(opened)))
+        phone.look(scene.test.cameras)  # it may go back later
+        phone.until(lambda: np.isclose(client.fov, viewer.server.initial_camera.fov))
+        assert np.isclose(client.handle.camera.fov, client.fov)
 
 
 @pytest.mark.slow

@@ -42,6 +42,11 @@ OWN_GPU = "[Draw it in this browser](/scene.html), by WebGPU: a movement then wa
 PADDING = (14, 14, 0, 0)
 
 
+def shown_angle(fov: float) -> int:
+    """The angle of view in degrees that the panel shows for one in radians."""
+    return min(max(round(math.degrees(fov)), NARROWEST), WIDEST)
+
+
 class Client:
     """A browser that has connected.
 
@@ -52,6 +57,8 @@ class Client:
         look: What it shows.
         longest: Pixels along the longer side of its sharp picture.
         follows: Whether these are still those of the window.
+        opened: Whether an angle of view has been chosen for its canvas.
+        degrees: The angle of view that the panel shows.
         version: Counts what changes its picture.
         moved_at: When that was last.
         wants_coarse: Whether it needs a coarse picture now.
@@ -63,7 +70,7 @@ class Client:
 
     def __init__(self, handle: viser.ClientHandle, viewer: Viewer) -> None:
         self.handle, self.viewer = handle, viewer
-        self.longest, self.follows = SHARP, True
+        self.longest, self.follows, self.opened = SHARP, True, False
         self.times: deque[float] = deque(maxlen=20)  # when the last coarse pictures were drawn
         self.said_at = 0.0
         self.version, self.moved_at, self.drawn_at, self.cost = 0, 0.0, 0.0, 0.0
@@ -73,9 +80,8 @@ class Client:
         self.camera: Callable[[int], Cameras] = partial(make_camera, np.eye(3), start.position, start.fov, 1.0)
         self._look_around()
         self._start()
-        new = math.isclose(self.fov, start.fov, rel_tol=1e-3)  # else it has been connected before
-        self._open(angle_of_view(viewer.subject.scene.test.cameras, 0, self.aspect) if new else self.fov)
         handle.camera.on_update(self._moved)
+        self._follow()  # the camera may have moved before the line above
         handle.scene.on_click()(self._clicked)
 
     def _start(self) -> None:
@@ -107,19 +113,31 @@ class Client:
         return any(self.nodes.values())
 
     async def _moved(self, _: object) -> None:
-        self.viewer.serve_client(self, self._look_around)
+        self.viewer.serve_client(self, self._follow)
         self.change()
 
-    def _look_around(self) -> None:
-        """Takes the browser's camera, unless its canvas is empty or its numbers are not finite."""
+    def _follow(self) -> None:
+        """Takes the browser's camera, and opens a new browser at all of the first view.
+
+        A slow page tells viser's own angle of view first and takes the server's later. A page that has been connected
+        before keeps its angle.
+        """
+        there = self._look_around()
+        if there and not self.opened and math.isclose(self.fov, self.viewer.server.initial_camera.fov, rel_tol=1e-3):
+            self._open(angle_of_view(self.viewer.subject.scene.test.cameras, 0, self.aspect))
+
+    def _look_around(self) -> bool:
+        """Takes the browser's camera unless its canvas is empty or a number not finite; returns whether it did."""
         now = self.handle.camera
         numbers = (*now.wxyz, *now.position, now.fov)
         there = min(now.image_width, now.image_height) > 0 and np.any(now.wxyz)
-        if there and np.isfinite(numbers).all() and 0 < now.fov < math.pi:
-            self.aspect, self.fov = now.aspect, now.fov
-            if self.follows:
-                self.longest = int(min(max(SHARP, now.image_width, now.image_height), FULL))
-            self.camera = partial(make_camera, SO3(now.wxyz).as_matrix(), now.position, now.fov, now.aspect)
+        if not there or not np.isfinite(numbers).all() or not 0 < now.fov < math.pi:
+            return False
+        self.aspect, self.fov = now.aspect, now.fov
+        if self.follows:
+            self.longest = int(min(max(SHARP, now.image_width, now.image_height), FULL))
+        self.camera = partial(make_camera, SO3(now.wxyz).as_matrix(), now.position, now.fov, now.aspect)
+        return True
 
     def change(self, **look: Any) -> None:
         """Asks for new pictures, with other values of its `Look`."""
@@ -152,11 +170,14 @@ class Client:
 
     def _open(self, fov: float) -> None:
         """Takes another vertical angle of view, in radians, and shows it in the panel."""
+        self.opened = True
         self.handle.camera.fov = fov
-        self.angle.value = min(max(round(math.degrees(fov)), NARROWEST), WIDEST)  # type: ignore[misc]
+        self.degrees = shown_angle(fov)
+        self.angle.value = self.degrees  # type: ignore[misc]
 
     def _choose_angle(self, degrees: int) -> None:
-        if abs(math.degrees(self.handle.camera.fov) - degrees) > 0.5:  # else `_open` has set both
+        if degrees != self.degrees:  # else `_open` has set both
+            self.opened, self.degrees = True, degrees
             self.handle.camera.fov = math.radians(degrees)
         self._look_around()
         self.change()
@@ -183,7 +204,8 @@ class Client:
         hint = "Along the longer side of a picture at rest; at first those of the window."
         size = gui.add_slider("Pixels", 128, LARGEST, 1, self.longest, hint=hint)
         self.on(size.on_update, lambda: self._resize(chosen(size)))
-        self.angle = gui.add_slider("Field of view", NARROWEST, WIDEST, 1, NARROWEST, hint="Top to bottom, in degrees.")
+        self.degrees, hint = shown_angle(self.fov), "Top to bottom, in degrees."
+        self.angle = gui.add_slider("Field of view", NARROWEST, WIDEST, 1, self.degrees, hint=hint)
         self.on(self.angle.on_update, lambda: self._choose_angle(chosen(self.angle)))
         behind = gui.add_dropdown("Background", tuple(BACKGROUNDS), initial_value=self.look.background)
         self.on(behind.on_update, lambda: self.change(background=chosen(behind)))
