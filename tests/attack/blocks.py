@@ -10,6 +10,8 @@ CSRC = Path(__file__).resolve().parents[2] / "csrc"
 DECLARED = re.compile(r"constexpr (?:int|int32_t|int64_t) (k[A-Z][^;]*);")
 VALUE = re.compile(r"k\w+ = (?:int64_t\{(\d+)\}|(\d+))(?: << (\d+))?(?=,|$)")
 SMALL, MOST = 5, 1 << 20
+#: Rows of a block from which on three have one row more only: whole blocks in the middle, and a short last one.
+LARGE = 1 << 14
 
 
 @functools.cache
@@ -26,4 +28,5 @@ def blocks() -> tuple[int, ...]:
 def sizes(most: int) -> tuple[int, ...]:
     """At most so many rows: one and three blocks of each size, one row less and one more."""
     about = {count * block + more for block in blocks() for count in (1, 3) for more in (-1, 0, 1)}
+    about -= {3 * block - less for block in blocks() if block >= LARGE for less in (0, 1)}
     return tuple(sorted(size for size in about if size <= most))
