@@ -26,6 +26,8 @@ PYTHON = {"module.cpp", "index_maps.cpp"}
 """Files for Python, which are compiled with the bindings of csrc/."""
 PLAIN = {"emulation.cpp", "emulated_products.cpp", "python.cpp"}
 """Files with nothing to watch."""
+FAST = {"emulation.cpp", "emulated_products.cpp"}
+"""Of these, the scheduler and the products, where a launch spends most of its time."""
 SHARED = ("cell_sort_plan.cpp",)
 """What the launchers need of the C++ beside them."""
 REPLACED = {"radix_sort.cu"}
@@ -78,6 +80,7 @@ def _build(out, sanitizer):
         objects.append(f"{'plain' if plain else sanitizer}/{source.parent.name}/{source.name}.o")
         lines.append(f"build {objects[-1]}: cxx {source}{f' | {header}.gch' if kernels else ''}")
         own = [*([] if plain else watched), *(["-include", header] if kernels else [])]
+        own += ["-O2"] if source.name in FAST else []
         lines.append(f"  flags = {shlex.join(own)}")
     lines += [f"build {sanitizer}/{module.name}: link {' '.join(objects)}", ""]
     (out / f"{sanitizer}.ninja").write_text("\n".join(lines))
