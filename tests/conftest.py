@@ -20,6 +20,7 @@ is a skip with its reason; ``--require native,cuda,warp`` turns those skips into
 from __future__ import annotations
 
 import contextlib
+import gc
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -145,6 +146,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             seen.add(name)
     items[:] = rows[0]
     config.hook.pytest_deselected(items=rows[1])
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Leaves torch, and thousands of collected tests, out of what the collector looks through again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)
