@@ -76,6 +76,9 @@ class CallPlan:
     skip: int = 0
     wait: int = 0
 
+    def __post_init__(self) -> None:
+        self._most = measured_samples(self.ways)
+
     @property
     def fused(self) -> Fused | None:
         """The way that a call takes as it was traced."""
@@ -91,7 +94,7 @@ class CallPlan:
 
     def size(self, n: int, k: int) -> tuple[int, int]:
         """The key of ``chosen``: batches of up to four times as many samples."""
-        return min(n, measured_samples(self.ways)).bit_length() // 2, k
+        return min(n, self._most).bit_length() // 2, k
 
     def changed(self, constants: dict[str, Any]) -> list[Source]:
         """The arguments, attributes and buffers that have changed since the module was traced."""

@@ -94,20 +94,23 @@ class KnownCall:
         """The results of a call of a router, None where it is unlike the others after all; coords [..., d] are those
         that it was given."""
         arguments = (*args, *kwargs.values()) if kwargs else args
+        compiles = torch.compiler.is_compiling()
         if coords is None and type(router.coords) is str:  # as when the kind was found
             positions, d = arguments[self._tensors[0]], router._d
-            positions = positions if positions.shape[-1] == d else positions[..., :d]
-            if router._unseen and not torch.compiler.is_compiling():
+            shape = positions.shape
+            positions = positions if shape[-1] == d else positions[..., :d]
+            if router._unseen and not compiles:
                 router._look_at(positions, args, kwargs, coords)
         else:
             positions = router._positions(args, kwargs, coords)
-        lead = positions.shape[:-1]
-        n, k = lead[0] if len(lead) == 1 else math.prod(lead), router.num_cells
+            shape = positions.shape
+        lead, k = shape[:-1], router.num_cells
+        n = lead[0] if len(lead) == 1 else math.prod(lead)
         if len(lead) != self._leading or not 0 < n <= MAX_COUNT or router._modules["module"] is not self._module:
             return None
         if self._learns and router.frozen_cells is not None:  # whose samples take no part in the backward pass
             return None
-        if compiles := torch.compiler.is_compiling():
+        if compiles:
             drawn = router.assignment == "stochastic" and router.training
             if drawn or router.methods or not self._in_graphs:
                 return None
@@ -120,12 +123,12 @@ class KnownCall:
         rows = []
         for i in self._reads:
             x = arguments[i] if arguments[i].dim() == 2 else arguments[i].reshape(n, -1)
-            rows.append(x if x.dtype is torch.float32 else x.float())
+            x = x if x.dtype is torch.float32 else x.float()
+            # Of views the engine knows whether their gradients are asked for, of leaves it does not.
+            rows.append(x.view_as(x) if x.requires_grad and self._learns else x)
         parameters = self._parameters(k, rows[0].device, router.backend)
         if self._shares:
             parameters = [p[None] if p.dim() == len(size) else p for p, size in zip(parameters, self._shapes)]
-        if self._learns:  # of views the engine knows whether their gradients are asked for, of leaves it does not
-            rows, parameters = [x.view_as(x) for x in rows], [p.view_as(p) for p in parameters]
         results = self._run(self._how, rows, parameters, k, **router._places_of(self._method, positions))
         if not self._as_they_are:
             results = [rows.reshape(*lead, *tail).to(dtype) for rows, (tail, dtype) in zip(results, self._results)]

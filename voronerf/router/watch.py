@@ -102,11 +102,11 @@ class Watch:
 
     def changed(self) -> list[Source]:
         """The sources whose values have changed."""
-        now = [registry.get(name, _MISSING) for registry, name in self._dicts]
         changed = list[Source]()
+        now = [registry.get(name, _MISSING) for registry, name in self._dicts]
         if not all(map(operator.is_, now, self._values)):
             changed += [s for s, a, b in zip(self.sources, now, self._values, strict=True) if not same(a, b)]
-        if [tensor._version for tensor in self._tensors] != self._versions:
+        if self._tensors and [tensor._version for tensor in self._tensors] != self._versions:
             pairs = zip(self._of_tensors, self._tensors, self._versions, strict=True)
             changed += [source for source, tensor, version in pairs if tensor._version != version]
         for source, value, held in self._holders:

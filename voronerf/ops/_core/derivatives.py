@@ -19,22 +19,26 @@ def asked_for(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
     the products of an eikonal loss. torch's own layers ask the engine, and so does this.
     """
     edges = iter(ctx.next_functions)
-    return [tensor is not None and _runs(next(edges)[0]) for tensor in inputs]
+    nodes = [None if tensor is None else next(edges)[0] for tensor in inputs]
+    if _ask is None:
+        return [node is not None for node in nodes]
+    answers, refused = list[bool](), False
+    # The engine refuses to answer for a leaf that torch.autograd.grad was asked for, which takes 10 us. Parameters are
+    # the last inputs, and mostly leaves: after the first refusal, the leaves before it count as asked for.
+    for node in reversed(nodes):
+        if node is None or (refused and type(node).__name__ == "AccumulateGrad"):
+            answers.append(node is not None)
+            continue
+        try:
+            answers.append(bool(_ask(node)))
+        except RuntimeError:
+            answers.append(True)
+            refused = True
+    return answers[::-1]
 
 
-def _runs(node: Any) -> bool:
-    # torch has no public name for this question; without the answer every gradient is computed.
-    ask = getattr(torch._C, "_will_engine_execute_node", None)
-    if node is None or ask is None:
-        return node is not None
-    # For leaves that torch.autograd.grad was asked for the engine refuses to answer, which takes 30 us: too long to ask
-    # unless a whole graph is being made.
-    if type(node).__name__ == "AccumulateGrad" and not torch.is_grad_enabled():
-        return True
-    try:
-        return bool(ask(node))
-    except RuntimeError:
-        return True
+# torch has no public name for this question; without the answer every gradient is computed.
+_ask = getattr(torch._C, "_will_engine_execute_node", None)
 
 
 def aliases(tensors: Sequence[Tensor | None]) -> tuple[list[Tensor | None], bool]:

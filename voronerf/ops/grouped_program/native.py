@@ -81,9 +81,10 @@ def grouped_program(
 
 def run_program(rows: Rows, how: How) -> list[Tensor]:
     """The outputs and sums of a program, with gradients of every order."""
-    learning = torch.is_grad_enabled() and any(t.requires_grad for t in (*rows.inputs, *rows.parameters))
-    found: list[Tensor] = run(rows, how._replace(keep=True) if learning else how)
-    return found[: _results(how)]
+    if (how.biased or _looks_up(how.text)) and torch.is_grad_enabled():
+        how = how._replace(keep=any(t.requires_grad for t in (*rows.inputs, *rows.parameters)))
+    found: list[Tensor] = run(rows, how)
+    return found[: _results(how)] if how.keep else found
 
 
 def _results(how: How) -> int:
@@ -97,6 +98,12 @@ def _results_of(text: str) -> int:
     return len(program.outputs) + len(program.sums)
 
 
+@constant_result
+def _looks_up(text: str) -> bool:
+    """Whether a program has hash grids."""
+    return bool(Program.parse(text).grids)
+
+
 def program_of(rows: Rows, how: How) -> Program:
     """The program for tensors of these shapes."""
     if not how.biased:
@@ -108,36 +115,32 @@ def program_of(rows: Rows, how: How) -> Program:
     )
 
 
-class _Call(NamedTuple("_Call", [("rows", Rows), ("how", How)])):
-    """What a program runs on, and how. Unlike a named tuple of its own it keeps what was found once."""
+class _Call(NamedTuple):
+    """What a program runs on, and how."""
 
-    @functools.cached_property
-    def plan(self) -> tuple[Program, int, int]:
-        """The program, rows and rays."""
-        inputs, index, program = self.rows.inputs, self.rows.ray_index, program_of(*self)
-        n = rows_of(inputs[0] if index is None else index)
-        return program, n, rows_of(inputs[program.rays[0]]) if program.rays else 0
+    rows: Rows
+    how: How
 
-    @functools.cached_property
-    def lowered(self) -> Lowered | None:
-        """The program for the compiled module, if that runs it."""
-        (program, _, _), x = self.plan, self.rows.inputs[0]
-        if not compiled_runs(program.text):
-            return None
-        return lower(program.text, _layout(self.how.products, x), native.on_cuda(x))
+
+def _sizes(program: Program, rows: Rows) -> tuple[int, int]:
+    """The numbers of rows and rays."""
+    n = rows_of(rows.inputs[0] if rows.ray_index is None else rows.ray_index)
+    return n, rows_of(rows.inputs[program.rays[0]]) if program.rays else 0
 
 
 def _memory(given: _Call) -> list[Tensor]:
     """For the outputs of a program, its sums, and what is kept."""
-    (program, n, r), rows = given.plan, given.rows
-    like = rows.inputs[0]
+    rows, how = given
+    program, like = program_of(rows, how), rows.inputs[0]
+    n, r = _sizes(program, rows)
     found = [
         new_empty(like, r if i in program.by_ray else n, columns.width) for i, columns in enumerate(program.outputs)
     ]
     if program.sums:
         counts = program.cells_of_sums(rows.parameters, rows.offsets.shape[0] - 1)
-        found += [new_empty(like, count, *shape, dtype=torch.float32) for count, shape in zip(counts, program.sums)]
-    if given.how.keep and program.grids and compiled_runs(program.text):
+        dtype = None if like.dtype is torch.float32 else torch.float32
+        found += [new_empty(like, count, *shape, dtype=dtype) for count, shape in zip(counts, program.sums)]
+    if how.keep and program.grids and compiled_runs(program.text):
         widths = lower(program.text).widths  # of every layout: tensors without memory have no device to ask
         found += [new_empty(like, n, width, dtype=torch.float32) for width in widths]
     return found
@@ -146,22 +149,27 @@ def _memory(given: _Call) -> list[Tensor]:
 @custom_op("grouped_program_native", _memory)
 def run(given: _Call, found: list[Tensor]) -> None:
     """A program."""
-    (program, n, r), lowered, (rows, how) = given.plan, given.lowered, given
-    inputs, parameters, offsets, order, ray_index, kept = rows
-    if lowered is None:
-        made = in_torch([x.float() for x in inputs], parameters, offsets, order, ray_index, program.text)
+    rows, how = given
+    program = program_of(rows, how)
+    if not compiled_runs(program.text):
+        inputs = [x.float() for x in rows.inputs]
+        made = in_torch(inputs, rows.parameters, rows.offsets, rows.order, rows.ray_index, program.text)
         for to, result in zip(found, made, strict=True):
             to.copy_(result)
         return
+    (n, r), on_cuda = _sizes(program, rows), native.on_cuda(rows.offsets)
+    lowered = lower(program.text, _layout(how.products, rows.offsets), on_cuda)
     split, end = len(program.outputs), len(program.outputs) + len(program.sums)
     outputs, sums, keeps = found[:split], found[split:end], found[end:]
     gradients = -1 if keeps else how.gradients  # what is kept is of all rows
-    looked = keeps or kept or None
+    looked = keeps or rows.kept or None
     taken = program_inputs(lowered, rows, n, r, kept=looked, ready=not keeps, gradients=gradients, caller=how.caller)
-    if native.on_cuda(offsets):
+    if on_cuda:
         _run_on_cuda(program, lowered, rows, how, taken, outputs, sums)
         return
-    made = [to.float() if i in program.by_ray else to for i, to in enumerate(outputs)]  # sums of rays are float32
+    made = outputs
+    if program.by_ray:  # sums of rays are float32
+        made = [to.float() if i in program.by_ray else to for i, to in enumerate(outputs)]
     results = native.compiled.ProgramResults(outputs=made, output_types=[_NAMES[to.dtype] for to in made], sums=sums)
     for result in found:
         on_huge_pages(result)
@@ -240,7 +248,7 @@ def program_inputs(
     inputs, parameters, offsets, order, ray_index, _ = rows
     samples = -1 if ray_index is not None and n == r else n  # which inputs are of samples, none if that is not known
     turned = [0 if x.is_contiguous() else int(_columns_lie_together(x, samples)) for x in inputs]
-    if any(turned):
+    if 1 in turned:
         inputs = [x.t() if turn else x for x, turn in zip(inputs, turned)]
     kind, kinds = _NAMES[inputs[0].dtype], ["float32"] * len(parameters)
     for table in lowered.tables:
@@ -276,11 +284,8 @@ _NAMES = {torch.float32: "float32", torch.bfloat16: "bfloat16", torch.float16: "
 
 
 _LAYOUTS = {
-    ("avx512_bf16", "bfloat16"): "pairs",
-    ("avx512_bf16", "bf16"): "pairs",
-    ("amx", "bfloat16"): "tiles",
-    ("amx", "bf16"): "tiles",
-    ("amx", "tf32"): "parts",
+    "avx512_bf16": {"bfloat16": "pairs", "bf16": "pairs"},
+    "amx": {"bfloat16": "tiles", "bf16": "tiles", "tf32": "parts"},
 }
 
 
@@ -289,8 +294,10 @@ def _layout(products: str, tensor: Tensor) -> str:
     on the CPU as ``torch.set_float32_matmul_precision`` says, of which "high" are products in parts."""
     if native.on_cuda(tensor):
         return "tiles" if products != "float32" and _multiplies_halves(products, tensor.device) else "floats"
-    asked = backends.cpu_precision() if products == "float32" else products
-    return _LAYOUTS.get((native.cpu().isa, asked), "floats")
+    layouts = _LAYOUTS.get(native.cpu().isa)
+    if layouts is None:
+        return "floats"
+    return layouts.get(backends.cpu_precision() if products == "float32" else products, "floats")
 
 
 @functools.lru_cache(maxsize=64)
@@ -335,14 +342,12 @@ def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted
     """
     program, count = program_of(rows, how), len(rows.inputs)
     split, given = len(program.outputs), tuple([g is not None for g in arriving])
-    own = _gradient(program.text, count, split, tuple(wanted), given)
-    more = [[g for g in part if g is not None] for part in (arriving[:split], arriving[split:])]
-    sifts = own.sifts and not more[1]
-    following = How(own.text, "", how.caller, how.products, False, count if sifts else -1)
-    inputs, parameters, kept = [*rows.inputs, *more[0]], [*rows.parameters, *more[1]], rows.kept if own.keeps else ()
-    call = rows._replace(inputs=inputs, parameters=parameters, kept=kept)
+    own = _gradient(program.text, how.caller, how.products, count, tuple(wanted), given)
+    inputs = [*rows.inputs, *[g for g in arriving[:split] if g is not None]]
+    parameters = [*rows.parameters, *[g for g in arriving[split:] if g is not None]]
+    call = Rows(inputs, parameters, rows.offsets, rows.order, rows.ray_index, rows.kept if own.keeps else ())
     # Of a pass that is differentiated again, what is looked up may be kept once more.
-    found = run_program(call, following) if torch.is_grad_enabled() else run(call, following)
+    found = run_program(call, own.how) if torch.is_grad_enabled() else run(call, own.how)
     results, learning = found[: own.outputs], [p for p, want in zip(rows.parameters, wanted[count:]) if want]
     for total, p in zip(found[own.outputs :], learning, strict=True):
         total = total.sum(0, keepdim=True) if p.shape[0] == 1 and total.shape[0] > 1 else total
@@ -351,23 +356,25 @@ def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted
 
 
 class _Gradient(NamedTuple):
-    """The program of gradients: its text, how many of its results are gradients of inputs, whether it sifts rows (see
-    `How.gradients`), and whether what the program kept is what it looks up."""
+    """The program of gradients and how it runs, how many of its results are gradients of inputs, and whether what the
+    program kept is what it looks up."""
 
-    text: str
+    how: How
     outputs: int
-    sifts: bool
     keeps: bool
 
 
 @functools.lru_cache(maxsize=1024)
-def _gradient(text: str, count: int, split: int, wanted: tuple[bool, ...], given: tuple[bool, ...]) -> _Gradient:
+def _gradient(
+    text: str, caller: str, products: str, count: int, wanted: tuple[bool, ...], given: tuple[bool, ...]
+) -> _Gradient:
     program = Program.parse(text)
+    split = len(program.outputs)
     own = gradient(program, wanted[:count], wanted[count:], given[:split], given[split:])
-    sifts = not own.outputs and all(i < count for i in own.rays)
+    sifts = not own.outputs and all(i < count for i in own.rays) and not any(given[split:])
     keeps = bool(program.grids) and compiled_runs(own.text) and compiled_runs(text)
     keeps = keeps and lower(own.text).lookups == lower(text).lookups
-    return _Gradient(own.text, len(own.outputs), sifts, keeps)
+    return _Gradient(How(own.text, "", caller, products, False, count if sifts else -1), len(own.outputs), keeps)
 
 
 run.register_autograd(_gradients, setup_context=_keep)

@@ -99,11 +99,14 @@ def run_routed(
         frozen: see ``voronerf.ops.routed_mlp``.
         **places: `Where`, with coords beside centres.
     """
-    if (centres := places.get("centres")) is not None:
-        if centres.device != inputs[0].device:
-            check_same_device("VoronoiRouter", samples=inputs[0], centres=centres)
-        places["coords"], places["centres"] = of_one_dtype(places["coords"], centres)
-    cells, order, offsets = find(inputs[0], Where(**places), k)
+    first, where = inputs[0], Where(**places)
+    if (centres := where.centres) is not None and where.coords is not None:
+        if centres.device != first.device:
+            check_same_device("VoronoiRouter", samples=first, centres=centres)
+        if centres.dtype is not where.coords.dtype:
+            coords, centres = of_one_dtype(where.coords, centres)
+            where = where._replace(coords=coords, centres=centres)
+    cells, order, offsets = find(first, where, k)
     found = run_program(Rows(inputs, parameters, offsets, order, None), how)
     if frozen is not None:
         rows = of_samples(frozen, cells)
@@ -121,33 +124,44 @@ class Route(NamedTuple):
 
 def find(positions: Tensor, where: Where, k: int) -> Route:
     """The cells of samples, and their order by cell; None where there is one cell."""
-    if where.coords is not None and where.coords.requires_grad:
-        where = where._replace(coords=where.coords.detach())
-    cells, order, offsets = locate_and_sort(positions.detach() if positions.requires_grad else positions, where, k)
-    return Route(cells if where.cells is None else where.cells, order if order.numel() else None, offsets)
+    centres, child_offsets, child, depth, known, coords, rows = where
+    if coords is not None and coords.requires_grad:
+        coords = coords.detach()
+    if positions.requires_grad:
+        positions = positions.detach()
+    cells, order, offsets = locate_and_sort(positions, centres, child_offsets, child, depth, known, coords, rows, k)
+    return Route(cells if known is None else known, order if order.numel() else None, offsets)
 
 
 class _Samples(NamedTuple):
+    """Samples, the members of `Where`, and the number of cells."""
+
     positions: Tensor
-    where: Where
+    centres: Tensor | None
+    child_offsets: Tensor | None
+    child: Tensor | None
+    depth: int
+    cells: Tensor | None
+    coords: Tensor | None
+    rows: Tensor | None
     k: int
 
 
 def _memory(given: _Samples) -> tuple[Tensor, Tensor, Tensor]:
     """Cells (empty where they are given), the order (empty where there is one cell) and offsets."""
-    positions, where, k = given
-    n, alone = rows_of(positions), where.cells is None and where.centres is None
-    sizes = n if where.cells is None else 0, 0 if alone else n, k + 1
-    cells, order, offsets = (new_empty(positions, size, dtype=torch.int32) for size in sizes)
-    return cells, order, offsets
+    n, alone = rows_of(given.positions), given.cells is None and given.centres is None
+    cells = new_empty(given.positions, n if given.cells is None else 0, dtype=torch.int32)
+    order = new_empty(cells, 0 if alone else n)
+    return cells, order, new_empty(cells, given.k + 1)
 
 
 @custom_op("routed_mlp_native", _memory)
 def locate_and_sort(given: _Samples, results: tuple[Tensor, Tensor, Tensor]) -> None:
     """Where samples are, and their order by cell."""
-    positions, (centres, child_offsets, child, depth, cells, coords, rows), _ = given
-    n, (found, order, offsets) = rows_of(positions), results
+    positions, centres, child_offsets, child, depth, cells, coords, rows, _ = given
+    found, order, offsets = results
     if cells is None and centres is None:  # one cell
+        n = rows_of(positions)
         if not native.on_cuda(positions):
             native.compiled.one_cell(found, offsets, n, native.cpu())
         elif rows is None:
@@ -171,7 +185,7 @@ def _setup(ctx: Any, inputs: Any, output: tuple[Tensor, ...]) -> None:
 
 
 def _nothing(ctx: Any, *gradients: None) -> tuple[Any, ...]:
-    return None, Where(*(None,) * len(Where._fields)), None  # type: ignore[arg-type]
+    return (None,) * len(_Samples._fields)
 
 
 locate_and_sort.register_autograd(_nothing, setup_context=_setup)  # integers, which torch.func asks for all the same
