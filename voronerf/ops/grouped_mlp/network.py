@@ -59,12 +59,15 @@ class Network(NamedTuple):
     def run(self, offsets: Tensor, order: Tensor | None = None) -> Tensor:
         """The result [n, out]."""
         (out,) = run_program(self.rows(offsets, order), self.how)
-        return out.to(self.dtype)
+        return out if out.dtype is self.dtype else out.to(self.dtype)
 
 
 def half_products(dtype: torch.dtype) -> str:
     """What products take for results of a dtype."""
-    return {torch.bfloat16: "bfloat16", torch.float16: "float16"}.get(dtype, "float32")
+    return _HALF.get(dtype, "float32")
+
+
+_HALF = {torch.bfloat16: "bfloat16", torch.float16: "float16"}
 
 
 def as_network(given: Given, caller: str) -> Network:
@@ -81,18 +84,19 @@ def as_network(given: Given, caller: str) -> Network:
         directions = encode_directions(directions, layers)
         layers = replace(layers, direction_octaves=None, direction_encoding="frequency", direction_degree=None)
     taken = [*weights, *(bias for bias in biases if bias is not None)]
-    parameters = [parameter.float() for parameter in taken]
+    parameters = [p if p.dtype is torch.float32 else p.float() for p in taken]
     if features is not None:
         taken.append(features)
         features = features.float() if features.dtype == torch.float64 else features
         parameters.append(features if features.dim() == 3 else features[None])
     rows = [positions]
-    seen = layers.uses_directions and directions is not None
-    if seen:
-        assert directions is not None
+    if directions is not None and layers.uses_directions:
         rows.append(directions)
-    stored = features is None and {dtype, *(x.dtype for x in rows)} == {torch.bfloat16}  # hash grids read float32
-    inputs = rows if stored else [x.float() for x in rows]
+    else:
+        index = None
+    stored = dtype is torch.bfloat16 and features is None  # hash grids read float32
+    stored = stored and all(x.dtype is torch.bfloat16 for x in rows)
+    inputs = rows if stored else [x if x.dtype is torch.float32 else x.float() for x in rows]
     biased = "".join(["0" if bias is None else "1" for bias in biases])
     how = How(layers.text, biased, caller, half_products(dtype))
-    return Network(inputs, parameters, index if seen else None, how, dtype, [*rows, *taken])
+    return Network(inputs, parameters, index, how, dtype, [*rows, *taken])

@@ -81,6 +81,8 @@ def grouped_program(
 
 def run_program(rows: Rows, how: How) -> list[Tensor]:
     """The outputs and sums of a program, with gradients of every order."""
+    if how.biased and not torch.compiler.is_compiling():
+        how = how._replace(text=program_of(rows, how).text, biased="")
     if (how.biased or _looks_up(how.text)) and torch.is_grad_enabled():
         how = how._replace(keep=any(t.requires_grad for t in (*rows.inputs, *rows.parameters)))
     found: list[Tensor] = run(rows, how)
@@ -277,7 +279,8 @@ def program_inputs(
 def _columns_lie_together(x: Tensor, n: int) -> bool:
     """Whether rows of samples lie as PyTorch's look-ups in planes give them. Points of hash grids, which are read where
     they are, are copied."""
-    return x.shape[0] == n and x.shape[1] != 3 and x.dtype == torch.float32 and x.t().is_contiguous()
+    planes = x.stride(0) == 1 and x.t().is_contiguous()
+    return planes and x.shape[0] == n and x.shape[1] != 3 and x.dtype == torch.float32
 
 
 _NAMES = {torch.float32: "float32", torch.bfloat16: "bfloat16", torch.float16: "float16"}
