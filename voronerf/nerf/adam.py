@@ -68,7 +68,6 @@ class Adam(torch.optim.Adam):
     leaves_frozen = True
 
     # The first call of torch's own imports its compiler, to keep it off them, which takes over a second.
-    zero_grad = inspect.unwrap(torch.optim.Adam.zero_grad)
     state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
     load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
 
@@ -111,6 +110,15 @@ class Adam(torch.optim.Adam):
         if tables:
             groups.append({"params": tables, "sparse": True, "shrink": TABLE_DECAY / max(1.0, views / DECAY_VIEWS)})
         return cls(groups, lr=lr, average=average, backend=backend)
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """See ``torch.optim.Adam``; leaves no mark for profilers, which takes as long as a small layer."""
+        if not set_to_none:
+            inspect.unwrap(torch.optim.Adam.zero_grad)(self, False)
+            return
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Adds a group of parameters, as ``torch.optim.Adam``.
@@ -213,18 +221,17 @@ class Adam(torch.optim.Adam):
         Raises:
             ValueError: A group sets an option of ``torch.optim.Adam`` that is not supported.
         """
+        held, rules, tensors = [], [], []
         for group in self.param_groups:
             _check_group(group)
-        rules, tensors = [], []
-        rates = {id(group): varying(functools.partial(group.__getitem__, "lr")) for group in self.param_groups}
-        held = [(p, group) for group in self.param_groups for p in group["params"] if p.grad is not None]
-        for (parameter, group), parts in zip(held, trained_parts([entry[0] for entry in held]), strict=True):
+            rate = varying(functools.partial(group.__getitem__, "lr"))
+            rule = rate, group["betas"], group["eps"], not group.get("sparse", False)
+            held += [(p, gradient, rule) for p in group["params"] if (gradient := p.grad) is not None]
+        for (parameter, gradient, rule), parts in zip(held, trained_parts([entry[0] for entry in held]), strict=True):
             state = self._state(parameter)
-            step, every = state["step"], not group.get("sparse", False)
-            whole = parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]
+            step, whole = state["step"], (parameter, gradient, state["exp_avg"], state["exp_avg_sq"])
             for number, part in enumerate(parts):
-                counted = step.clone() if number else step  # once for a parameter
-                rules.append(Rule(counted, rates[id(group)], group["betas"], group["eps"], every))
+                rules.append(Rule(step.clone() if number else step, *rule))  # counted once for a parameter
                 tensors.append(whole if part is ... else tuple(tensor[part] for tensor in whole))
         if rules:
             adam(rules, *zip(*tensors, strict=True), guard=guard, loss=loss, backend=self.backend)
@@ -235,13 +242,18 @@ class Adam(torch.optim.Adam):
         if not state:
             state["step"] = torch.zeros((), device=parameter.device)
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        if state["step"].device != parameter.device:
+        if state["step"].get_device() != parameter.get_device():
             state["step"] = state["step"].to(parameter.device)
         return state
 
 
+_REFUSED = ("weight_decay", "amsgrad", "maximize", "differentiable")
+
+
 def _check_group(group: Mapping[str, Any]) -> None:
-    for option in ("weight_decay", "amsgrad", "maximize", "differentiable"):
+    if not any(map(group.get, _REFUSED)):
+        return
+    for option in _REFUSED:
         if group.get(option):
             remedy = "; use shrink=RATE for decoupled weight decay" if option == "weight_decay" else ""
             raise ValueError(f"Adam: {option} of a group must be 0 or False, got {group[option]}{remedy}")

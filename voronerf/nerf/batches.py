@@ -190,6 +190,8 @@ class RayBatches:
         radii = None
         if self.cones:
             radii = cameras.radii(rays_seen.directions, index // (cameras.width * cameras.height)).to(self.device)
-        origins, directions, near, far, colour = (tensor.to(self.device) for tensor in rays_seen)
-        background = None if background is None else background.to(self.device)
+        origins, directions, near, far, colour = rays_seen
+        if self.device != self.place:
+            origins, directions, near, far, colour = (tensor.to(self.device) for tensor in rays_seen)
+            background = None if background is None else background.to(self.device)
         return Batch(Rays(origins, directions, radii), near, far, colour, background, depths, triples)

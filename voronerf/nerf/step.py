@@ -451,8 +451,9 @@ class TrainingStep:
                 # A graph of autograd that lives on gives the next step's gradients the stream of this one, and a
                 # capture may wait for no other stream than its own.
                 output = output._replace(loss=output.loss.detach())
-            for stage in self._telling():
-                stage.function(output)
+            for part in (self.loss.renderer.sampler, self.strategy):
+                if part is not None:
+                    part.step_post_backward(output)
             return batch, output
 
     def _in_precision(self) -> AbstractContextManager[Any]:

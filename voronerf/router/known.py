@@ -128,7 +128,7 @@ class KnownCall:
             rows.append(x.view_as(x) if x.requires_grad and self._learns else x)
         parameters = self._parameters(k, rows[0].device, router.backend)
         if self._shares:
-            parameters = [p[None] if p.dim() == len(size) else p for p, size in zip(parameters, self._shapes)]
+            parameters = [p.unsqueeze(0) if p.dim() == len(size) else p for p, size in zip(parameters, self._shapes)]
         results = self._run(self._how, rows, parameters, k, **router._places_of(self._method, positions))
         if not self._as_they_are:
             results = [rows.reshape(*lead, *tail).to(dtype) for rows, (tail, dtype) in zip(results, self._results)]

@@ -30,7 +30,7 @@ def forward_with_tape(network: Mapping[str, Any]) -> Tape:
     prepared = routed_mlp.prepared_program if "program" in network else routed_mlp.prepared
     taken, where = prepared(**given)
     first, k = taken.inputs[0], cells_of(taken.parameters)
-    plain = {tensor.dtype for tensor in taken.given} == {torch.float32}
+    plain = all(tensor.dtype is torch.float32 for tensor in taken.given)
     if not plain or torch.is_autocast_enabled(first.device.type) or not torch.is_grad_enabled():
         cells, order, offsets = routed_mlp.find(first, where, k)
         out, cells = first_rows(taken.run(offsets, order), cells, where.rows)
@@ -46,7 +46,7 @@ def forward_with_tape(network: Mapping[str, Any]) -> Tape:
     return _Kept(out, rows._replace(kept=kept), how, taken.given, count, cells, frozen)
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class _Kept(Tape):
     """What the backward pass takes of the forward pass."""
 
@@ -64,7 +64,7 @@ class _Kept(Tape):
             found = self._gradients(gradient, wanted)
             learning = [tensor for tensor, want in zip(self.given, wanted) if want]
             pairs = zip(found, learning, strict=True)
-            found = [slope if slope.shape == tensor.shape else slope.view_as(tensor) for slope, tensor in pairs]
+            found = [slope if slope.dim() == tensor.dim() else slope.view_as(tensor) for slope, tensor in pairs]
             if not defer and all(map(_takes_gradients, learning)):
                 _give(learning, found)
                 return loss

@@ -80,9 +80,10 @@ def prepared_program(
     kind = inputs[0].device.type
     dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else inputs[0].dtype
     shaped, tables = with_cells(program, parameters), program.tables
-    kept = [p if p.dtype == torch.float32 or i in tables else p.float() for i, p in enumerate(shaped)]
+    kept = [p if p.dtype is torch.float32 or i in tables else p.float() for i, p in enumerate(shaped)]
+    rows = [x if x.dtype is torch.float32 else x.float() for x in inputs]
     how = How(program.text, products=half_products(dtype))
-    network = Network([x.float() for x in inputs], kept, ray_index, how, dtype, [*inputs, *parameters])
+    network = Network(rows, kept, ray_index, how, dtype, [*inputs, *parameters])
     return network, _of_cells(Where(**places), cells_of(kept))
 
 

@@ -35,7 +35,7 @@ def check_routed_program(
 def with_cells(program: Program, parameters: Sequence[Tensor]) -> Sequence[Tensor]:
     """Parameters [1, ...] in the place of those that have no dimension of cells, since all cells share them."""
     shapes = program.parameters
-    shaped = [p[None] if p.dim() == len(shape) else p for p, shape in zip(parameters, shapes)]
+    shaped = [p.unsqueeze(0) if p.dim() == len(shape) else p for p, shape in zip(parameters, shapes)]
     return [*shaped, *parameters[len(shapes) :]]
 
 
