@@ -60,10 +60,16 @@ def _class_described_by_table(kind: type[nn.Module]) -> bool:
 
 def _is_plain(part: nn.Module) -> bool:
     """Whether nothing is hooked into a module and its parts; the iterators of ``nn.Module`` take ten times as long."""
-    parts = part._modules
-    if part._forward_hooks or part._forward_pre_hooks or part._backward_hooks or part._backward_pre_hooks:
-        return False
-    return "parametrizations" not in parts and all(_is_plain(each) for each in parts.values() if each is not None)
+    parts: list[nn.Module | None] = [part]
+    for each in parts:
+        if each is None:
+            continue
+        if each._forward_hooks or each._forward_pre_hooks or each._backward_hooks or each._backward_pre_hooks:
+            return False
+        if (children := each._modules) and "parametrizations" in children:
+            return False
+        parts += children.values()
+    return True
 
 
 def parameters_of_table(field: LayeredField, k: int) -> dict[str, Any]:

@@ -28,22 +28,24 @@ def forward_with_tape(network: Mapping[str, Any]) -> Tape:
     given = dict(network)
     frozen = given.pop("frozen", None)
     prepared = routed_mlp.prepared_program if "program" in network else routed_mlp.prepared
-    taken, where = prepared(**given)
-    first, k = taken.inputs[0], cells_of(taken.parameters)
-    plain = all(tensor.dtype is torch.float32 for tensor in taken.given)
-    if not plain or torch.is_autocast_enabled(first.device.type) or not torch.is_grad_enabled():
-        cells, order, offsets = routed_mlp.find(first, where, k)
-        out, cells = first_rows(taken.run(offsets, order), cells, where.rows)
-        return Graph(out.detach().float(), out, cells, frozen)
+    recorded = torch.is_grad_enabled()
     with torch.no_grad():
-        learning = any(tensor.requires_grad for tensor in taken.given)
-        cells, order, offsets = routed_mlp.find(first, where, k)
-        rows, how = taken.rows(offsets, order), taken.how
-        out, *kept = run(rows, how._replace(keep=learning))
-        count = None if native.on_cuda(out) else where.rows  # CUDA has left out the others
-        if count is not None:
-            out, cells = first_rows(out, cells, count)
-    return _Kept(out, rows._replace(kept=kept), how, taken.given, count, cells, frozen)
+        taken, where = prepared(**given)
+        first, k = taken.inputs[0], cells_of(taken.parameters)
+        plain = all(tensor.dtype is torch.float32 for tensor in taken.given)
+        if recorded and plain and not torch.is_autocast_enabled(first.device.type):
+            cells, order, offsets = routed_mlp.find(first, where, k)
+            rows, how = taken.rows(offsets, order), taken.how
+            learning = any(tensor.requires_grad for tensor in taken.given)
+            out, *kept = run(rows, how._replace(keep=True) if learning else how)
+            count = None if native.on_cuda(out) else where.rows  # CUDA has left out the others
+            if count is not None:
+                out, cells = first_rows(out, cells, count)
+            return _Kept(out, rows._replace(kept=kept), how, taken.given, count, cells, frozen)
+    taken, where = prepared(**given)
+    cells, order, offsets = routed_mlp.find(first, where, k)
+    out, cells = first_rows(taken.run(offsets, order), cells, where.rows)
+    return Graph(out.detach().float(), out, cells, frozen)
 
 
 @dataclass(eq=False)

@@ -18,7 +18,7 @@ from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import asked_for
 from voronerf.ops._core.layers import MLP
-from voronerf.ops._core.memory import on_huge_pages
+from voronerf.ops._core.memory import LARGE, on_huge_pages
 from voronerf.ops._core.program import Program, gradient
 from voronerf.ops._core.rows import new_empty, rows_of
 from voronerf.ops.grouped_program.lowering import Lowered, compiled_runs, lower
@@ -174,7 +174,8 @@ def run(given: _Call, found: list[Tensor]) -> None:
         made = [to.float() if i in program.by_ray else to for i, to in enumerate(outputs)]
     results = native.compiled.ProgramResults(outputs=made, output_types=[_NAMES[to.dtype] for to in made], sums=sums)
     for result in found:
-        on_huge_pages(result)
+        if result.nbytes >= LARGE:
+            on_huge_pages(result)
     native.compiled.grouped_program(lowered.program, taken, results, native.cpu())
     for to, result in zip(outputs, made):
         if to is not result:
@@ -353,8 +354,9 @@ def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted
     found = run_program(call, own.how) if torch.is_grad_enabled() else run(call, own.how)
     results, learning = found[: own.outputs], [p for p, want in zip(rows.parameters, wanted[count:]) if want]
     for total, p in zip(found[own.outputs :], learning, strict=True):
-        total = total.sum(0, keepdim=True) if p.shape[0] == 1 and total.shape[0] > 1 else total
-        results.append(total if p.dtype == total.dtype else total.to(p.dtype))
+        if p.shape[0] == 1 and total.shape[0] > 1:
+            total = total.sum(0, keepdim=True)
+        results.append(total if p.dtype is total.dtype else total.to(p.dtype))
     return results
 
 
