@@ -16,15 +16,17 @@ from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.checks import check_same_device, of_one_dtype
-from voronerf.ops._core.custom_op import custom_op
+from voronerf.ops._core.custom_op import custom_op, is_watched
 from voronerf.ops._core.layers import MLP
 from voronerf.ops._core.program import Program
 from voronerf.ops._core.rows import new_empty, rows_of
-from voronerf.ops.cell_sort import native as cell_sort
+from voronerf.ops.cell_sort import cell_sort
+from voronerf.ops.cell_sort.native import sort
 from voronerf.ops.grouped_mlp.network import Given, Network, as_network, half_products
 from voronerf.ops.grouped_program.native import How, Rows, run_program
-from voronerf.ops.locate_cell import native as locate_cell
-from voronerf.ops.nearest_centre import native as nearest_centre
+from voronerf.ops.locate_cell.native import find as find_leaves
+from voronerf.ops.nearest_centre import nearest_centre
+from voronerf.ops.nearest_centre.native import find as find_nearest
 from voronerf.ops.routed_mlp import hold, of_samples
 from voronerf.ops.routed_mlp.program import cells_of, with_cells
 from voronerf.ops.routed_mlp.reference import Where, first_rows
@@ -126,6 +128,12 @@ class Route(NamedTuple):
 def find(positions: Tensor, where: Where, k: int) -> Route:
     """The cells of samples, and their order by cell; None where there is one cell."""
     centres, child_offsets, child, depth, known, coords, rows = where
+    watched = torch.compiler.is_compiling() or rows is not None or not positions.is_cpu or is_watched()
+    if coords is not None and centres is not None and child is None and not watched:
+        # Two calls that the compiled module makes by itself take less time than one op in Python.
+        found = nearest_centre(coords, centres, backend="native")
+        order, offsets = cell_sort(found, k, backend="native")
+        return Route(found, order if order.numel() else None, offsets)
     if coords is not None and coords.requires_grad:
         coords = coords.detach()
     if positions.requires_grad:
@@ -175,10 +183,10 @@ def locate_and_sort(given: _Samples, results: tuple[Tensor, Tensor, Tensor]) -> 
         return
     if coords is not None and centres is not None:
         if child_offsets is None or child is None:
-            nearest_centre.find(found, coords, centres, rows)
+            find_nearest(found, coords, centres, rows)
         else:
-            locate_cell.find(found, coords, centres, (child_offsets, child, depth), "routed_mlp", rows)
-    cell_sort.sort(found if cells is None else cells, order, offsets, "routed_mlp")
+            find_leaves(found, coords, centres, (child_offsets, child, depth), "routed_mlp", rows)
+    sort(found if cells is None else cells, order, offsets, "routed_mlp")
 
 
 def _setup(ctx: Any, inputs: Any, output: tuple[Tensor, ...]) -> None:
