@@ -8,6 +8,7 @@
 #include <set>
 
 #include "bindings/frame.h"
+#include "bindings/program_call.h"
 #include "bindings/signature.h"
 #include "common/cuda_device.h"
 #include "common/parallel.h"
@@ -340,6 +341,12 @@ constexpr const char* kStub =
     "    def __init__(self, rows: Sequence[Any], names: Sequence[str]) -> None: ...\n"
     "    def __call__(self, tensors: list[Tensor]) -> tuple[int, ...] | None: ...\n"
     "\n"
+    "class ProgramCall:\n"
+    "    def __init__(self, program: Program, widths: Sequence[Any], sums: Sequence[Any], kept: Sequence[int],\n"
+    "                 tables: Sequence[int], sizes: Sequence[int], rays: int, large: int, on_large: Any) -> None: ...\n"
+    "    def __call__(self, rows: tuple[Any, ...], keep: bool, gradients: int, caller: str) -> list[Tensor] | None: "
+    "...\n"
+    "\n"
     "def signature(op: str, rows: Sequence[Any], positional: int, more: dict[str, Any]) -> Any: ...\n"
     "def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool: ...\n"
     "def way_of(arguments: tuple[Any, ...]) -> int: ...\n"
@@ -469,6 +476,7 @@ void bind_all(PyObject* python) {
       .def("__len__", &Recording::size)
       .def_property_readonly("obstacle", &Recording::obstacle);
   bind_signatures(bound);
+  bind_program_calls(bound);
   // The dtypes and the plain classes of tensors, objects of Python that this module knows by name alone, and the
   // exchange of tensor_view.h or None.
   bound.def("know_torch", [](const py::dict& names, const py::tuple& classes, const py::object& exchange) {

@@ -7,12 +7,13 @@
 #include <optional>
 
 #include "bindings/frame.h"
+#include "bindings/questions.h"
 
 namespace voronerf {
 
 namespace {
 
-constexpr int kMostLetters = 32, kMostArguments = 32, kMostDimensions = 8;
+constexpr int kMostLetters = 32, kMostArguments = 32;
 constexpr int64_t kMostRows = (int64_t{1} << 31) - 1, kMostGroups = int64_t{1} << 27;  // checks.MAX_COUNT, MAX_GROUPS
 
 unsigned dtypes_of(const py::handle& names) {
@@ -126,76 +127,6 @@ struct TensorRule {
     return common.device_type == view.device_type && common.device_index == view.device_index;
   }
 };
-
-bool is_true(PyObject* answer) {
-  PyErr_Clear();
-  Py_XDECREF(answer);
-  return answer == Py_True;
-}
-bool requires_gradient(PyObject* tensor) {
-  static PyObject* const word = PyUnicode_InternFromString("requires_grad");
-  return is_true(PyObject_GetAttr(tensor, word));
-}
-bool is_inference(PyObject* tensor) {
-  static PyObject* const word = PyUnicode_InternFromString("is_inference");
-  return is_true(PyObject_CallMethodNoArgs(tensor, word));
-}
-
-// What torch and voronerf answer to questions of every call; objects live as long as Python.
-struct Questions {
-  PyObject *own, *torch, *grad_enabled, *tangents, *threads, *kept, *native, *choose;
-  std::vector<PyObject*> listeners;
-  std::map<unsigned, PyObject*> dtypes;
-
-  bool grad() const { return is_true(PyObject_CallNoArgs(grad_enabled)); }
-  // Whether modes, transforms, tracers or profilers of torch are to see what is called, or tangents have to.
-  bool is_watched() const {
-    for (PyObject* listener : listeners) {
-      PyObject* const answer = PyObject_CallNoArgs(listener);
-      const bool listens = answer == nullptr || PyObject_IsTrue(answer) != 0;
-      PyErr_Clear();
-      Py_XDECREF(answer);
-      if (listens) return true;
-    }
-    static PyObject* const word = PyUnicode_InternFromString("_current_level");
-    PyObject* const level = PyDict_GetItemWithError(tangents, word);
-    return level == nullptr || PyLong_AsLong(level) >= 0;
-  }
-  // torch.empty: beside a tensor of the CPU it gives what Tensor.new_empty gives, in half the time.
-  PyObject* empty() const {
-    static PyObject* const word = PyUnicode_InternFromString("empty");
-    return PyDict_GetItemWithError(torch, word);
-  }
-  // native.cpu()
-  Cpu cpu() const {
-    static PyObject *const isa_word = PyUnicode_InternFromString("_isa"), *const threads_word =
-                                                                              PyUnicode_InternFromString("threads");
-    static PyObject* known = nullptr;  // a name stays, and almost always the one that was looked at last
-    static Isa isa;
-    PyObject* const name = PyDict_GetItemWithError(native, isa_word);
-    if (name != known) {
-      Frame frame;
-      void* place = &isa;
-      if (!frame.load(type_of<Isa>(), name, place)) throw py::type_error("_isa");
-      Py_INCREF(name);
-      known = name;
-    }
-    PyObject* count = PyObject_GetAttr(kept, threads_word);
-    if (count == Py_None) {
-      Py_DECREF(count);
-      count = PyObject_CallNoArgs(threads);
-    }
-    const auto many = static_cast<int>(PyLong_AsLong(count));
-    Py_XDECREF(count);
-    return {isa, many};
-  }
-  // Whether the compiled module is this one, and no other one stands in.
-  bool compiled_here() const {
-    static PyObject* const word = PyUnicode_InternFromString("compiled");
-    return PyDict_GetItemWithError(native, word) == own;
-  }
-};
-Questions questions;
 
 // The rules of tensors whose number is not that of arguments, such as those of a network.
 class Rules {
@@ -452,26 +383,21 @@ class Plan {
   }
 
   py::object memory(const Result& result, Call& call, const py::object& inputs, size_t count) const {
-    static PyObject* const names = PyTuple_Pack(1, PyUnicode_InternFromString("dtype"));
     const bool other = result.condition >= 0 && call.values[result.condition] == Py_None;
-    const auto& sizes = other ? result.otherwise : result.shape;
-    py::object shape[kMostDimensions];
-    PyObject* arguments[kMostDimensions + 1];
-    for (size_t i = 0; i < sizes.size(); ++i) {
-      if (sizes[i].function) {
-        shape[i] = sizes[i].function(given(call, inputs, count));
-      } else {
-        shape[i] = py::int_(call.common.size(sizes[i].size));
-      }
-      arguments[i] = shape[i].ptr();
+    std::vector<py::object> sizes;
+    std::vector<PyObject*> arguments;
+    for (const Size& size : other ? result.otherwise : result.shape) {
+      sizes.push_back(size.function ? size.function(given(call, inputs, count))
+                                    : py::int_(call.common.size(size.size)));
+      arguments.push_back(sizes.back().ptr());
     }
-    if (sizes.empty()) arguments[0] = (shape[0] = py::tuple()).ptr();
-    const size_t given_count = std::max<size_t>(sizes.size(), 1);
-    arguments[given_count] =
-        result.dtype.is_none() ? questions.dtypes.at(call.views[result.like].dtype()) : result.dtype.ptr();
-    PyObject* const made = PyObject_Vectorcall(questions.empty(), arguments, given_count, names);
-    if (made == nullptr) throw py::error_already_set();
-    return py::reinterpret_steal<py::object>(made);
+    if (sizes.empty()) {
+      sizes.push_back(py::tuple());
+      arguments.push_back(sizes.back().ptr());
+    }
+    const py::object& dtype = result.dtype;
+    return questions.new_memory(arguments,
+                                dtype.is_none() ? questions.dtypes.at(call.views[result.like].dtype()) : dtype.ptr());
   }
 
   // What a call of the function is loaded from.

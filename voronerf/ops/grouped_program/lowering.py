@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from voronerf.ops._core import native
+from voronerf.ops._core.memory import LARGE, on_huge_pages
 from voronerf.ops._core.program import (
     PARAMETER,
     VALUE,
@@ -52,6 +53,7 @@ class Lowered:
         widths: floats of a row of each.
         sizes: entries of each parameter for one cell.
         tables: numbers of the parameters that are tables of hash grids.
+        call: calls it on the CPU, with memory for its results.
     """
 
     program: native.compiled.Program
@@ -59,6 +61,7 @@ class Lowered:
     widths: tuple[int, ...]
     sizes: tuple[int, ...]
     tables: tuple[int, ...]
+    call: native.compiled.ProgramCall
 
 
 @functools.lru_cache(maxsize=1024)
@@ -514,13 +517,21 @@ class _Lowering:
             scratch_width=self.scratch_width,
             layout=self.layout,
         )
-        return Lowered(
-            compiled.make_program(table),
-            tuple(lookup for lookup, _ in self.lookups),
-            tuple(self.memories[memory] for _, memory in self.lookups),
-            tuple(map(math.prod, program.parameters)),
+        made = compiled.make_program(table)
+        widths = tuple(self.memories[memory] for _, memory in self.lookups)
+        sizes = tuple(map(math.prod, program.parameters))
+        call = compiled.ProgramCall(
+            made,
+            [(columns.width, i in program.by_ray) for i, columns in enumerate(program.outputs)],
+            [(-1 if of is None else of, shape) for of, shape in zip(program.sum_tables, program.sums)],
+            widths,
             program.tables,
+            sizes,
+            program.rays[0] if program.rays else -1,
+            LARGE,
+            on_huge_pages,
         )
+        return Lowered(made, tuple(lookup for lookup, _ in self.lookups), widths, sizes, program.tables, call)
 
 
 def _sum_records(parts: list[tuple[int, str, int, int, int, int, int, int, int]]) -> list[Any]:

@@ -18,7 +18,6 @@ from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import asked_for
 from voronerf.ops._core.layers import MLP
-from voronerf.ops._core.memory import LARGE, on_huge_pages
 from voronerf.ops._core.program import Program, gradient
 from voronerf.ops._core.rows import new_empty, rows_of
 from voronerf.ops.grouped_program.lowering import Lowered, compiled_runs, lower
@@ -148,38 +147,45 @@ def _memory(given: _Call) -> list[Tensor]:
     return found
 
 
-@custom_op("grouped_program_native", _memory)
-def run(given: _Call, found: list[Tensor]) -> None:
+@custom_op("grouped_program_native", _memory, counted=True)
+def run(given: _Call) -> list[Tensor]:
     """A program."""
     rows, how = given
     program = program_of(rows, how)
     if not compiled_runs(program.text):
+        found = _memory(given)
         inputs = [x.float() for x in rows.inputs]
         made = in_torch(inputs, rows.parameters, rows.offsets, rows.order, rows.ray_index, program.text)
         for to, result in zip(found, made, strict=True):
             to.copy_(result)
-        return
-    (n, r), on_cuda = _sizes(program, rows), native.on_cuda(rows.offsets)
+        return found
+    on_cuda = native.on_cuda(rows.offsets)
     lowered = lower(program.text, _layout(how.products, rows.offsets), on_cuda)
+    results = None if on_cuda else lowered.call(rows, how.keep, how.gradients, how.caller)
+    return _by_structs(program, lowered, given) if results is None else results
+
+
+def _by_structs(program: Program, lowered: Lowered, given: _Call) -> list[Tensor]:
+    """The call where it is recorded, or not of the CPU alone: with memory, and structs that Python makes."""
+    (rows, how), found = given, _memory(given)
+    n, r = _sizes(program, rows)
     split, end = len(program.outputs), len(program.outputs) + len(program.sums)
     outputs, sums, keeps = found[:split], found[split:end], found[end:]
     gradients = -1 if keeps else how.gradients  # what is kept is of all rows
     looked = keeps or rows.kept or None
     taken = program_inputs(lowered, rows, n, r, kept=looked, ready=not keeps, gradients=gradients, caller=how.caller)
-    if on_cuda:
+    if native.on_cuda(rows.offsets):
         _run_on_cuda(program, lowered, rows, how, taken, outputs, sums)
-        return
+        return found
     made = outputs
     if program.by_ray:  # sums of rays are float32
         made = [to.float() if i in program.by_ray else to for i, to in enumerate(outputs)]
     results = native.compiled.ProgramResults(outputs=made, output_types=[_NAMES[to.dtype] for to in made], sums=sums)
-    for result in found:
-        if result.nbytes >= LARGE:
-            on_huge_pages(result)
     native.compiled.grouped_program(lowered.program, taken, results, native.cpu())
     for to, result in zip(outputs, made):
         if to is not result:
             to.copy_(result)
+    return found
 
 
 def _run_on_cuda(

@@ -1,0 +1,195 @@
+#include "bindings/program_call.h"
+
+#include <pybind11/stl.h>
+
+#include <utility>
+
+#include "bindings/program.h"
+#include "bindings/questions.h"
+
+namespace voronerf {
+
+namespace {
+
+TableType table_type(unsigned dtype) {
+  return dtype == kBfloat16 ? TableType::bfloat16 : dtype == kFloat16 ? TableType::float16 : TableType::float32;
+}
+
+// A program with what the memory of its results is to be.
+class ProgramCall {
+ public:
+  // Of outputs (columns, whether they have a row for each ray), sums (table whose tables they have, or -1, and the
+  // shape for one of them), the columns of kept look-ups, the parameters that are tables, the entries of each for one
+  // cell, the first input of rays or -1, and what gives a large tensor other memory.
+  ProgramCall(py::object program, std::vector<std::pair<int64_t, bool>> widths,
+              std::vector<std::pair<int, std::vector<int64_t>>> sums, std::vector<int64_t> kept,
+              std::vector<size_t> tables, std::vector<int64_t> sizes, int rays, int64_t large, py::object on_large)
+      : program_(std::move(program)),
+        widths_(std::move(widths)),
+        sums_(std::move(sums)),
+        kept_(std::move(kept)),
+        tables_(std::move(tables)),
+        sizes_(std::move(sizes)),
+        rays_(rays),
+        large_(large),
+        on_large_(std::move(on_large)) {
+    const Function& function = functions().at("grouped_program");
+    for (const Bound& bound : function.overloads) {
+      if (bound.machine == &type_of<Cpu>()) bound_ = &bound;
+    }
+    function_ = &function;
+  }
+
+  // The outputs, sums and, if they are to be kept, look-ups, of inputs, parameters, offsets, order, ray_index and what
+  // was looked up before. None where Python has to make the call: while it is recorded, or of tensors of other kinds.
+  py::object call(const py::tuple& rows, bool keep, int64_t gradients, const char* caller) const {
+    if (recorded() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here()) {
+      return py::none();
+    }
+    Loaded loaded{function_, bound_, {}, {}};
+    Frame& frame = loaded.frame;
+    loaded.values.place(type_of<Program>()) = PyCapsule_GetPointer(program_.ptr(), "Program");
+    auto& in = *static_cast<ProgramInputs*>(loaded.values.place(type_of<ProgramInputs>()));
+    auto& out = *static_cast<ProgramResults*>(loaded.values.place(type_of<ProgramResults>()));
+    *static_cast<Cpu*>(loaded.values.place(type_of<Cpu>())) = questions.cpu();
+
+    const py::object inputs = fast(rows[0]), parameters = fast(rows[1]), before = fast(rows[5]);
+    const size_t count = size(inputs), learnt = size(parameters);
+    if (learnt != sizes_.size() || count == 0) return py::none();
+    std::vector<TensorView> views(count), of_parameters(learnt);
+    for (size_t i = 0; i < count; ++i) {
+      if (!views[i].look(at(inputs, i)) || views[i].dimensions != 2) return py::none();
+    }
+    for (size_t i = 0; i < learnt; ++i) {
+      if (!of_parameters[i].look(at(parameters, i)) || of_parameters[i].dimensions < 1) return py::none();
+    }
+    TensorView offsets, index;
+    PyObject* const ray_index = PyTuple_GET_ITEM(rows.ptr(), 4);
+    if (!offsets.look(PyTuple_GET_ITEM(rows.ptr(), 2)) || !offsets.on_cpu()) return py::none();
+    if (ray_index != Py_None && !index.look(ray_index)) return py::none();
+    in.n = ray_index == Py_None ? views[0].shape[0] : index.shape[0];
+    in.r = rays_ < 0 ? 0 : views[static_cast<size_t>(rays_)].shape[0];
+    in.k = offsets.shape[0] - 1;
+
+    // Which inputs are of samples: none where that is not known.
+    const int64_t samples = ray_index != Py_None && in.n == in.r ? -1 : int64_t{in.n};
+    const unsigned dtype = views[0].dtype();
+    if (dtype != kFloat32 && dtype != kBfloat16) return py::none();
+    std::vector<void*> pointers(count + learnt + kept_.size());
+    for (size_t i = 0; i < count; ++i) {
+      if (views[i].dtype() != dtype) return py::none();
+      const bool turned = is_turned(views[i], samples) && !is_negative(at(inputs, i));
+      in.input_types.push_back(table_type(dtype));
+      in.turned.push_back(static_cast<int32_t>(turned));
+      if (turned) {
+        frame.keep(at(inputs, i));
+        pointers[i] = views[i].address();
+      } else if (!frame.load_view(any(), at(inputs, i), views[i], pointers[i])) {
+        return py::none();
+      }
+    }
+    for (size_t i = 0; i < learnt; ++i) {
+      const TensorView& view = of_parameters[i];
+      const bool table = std::find(tables_.begin(), tables_.end(), i) != tables_.end();
+      if (!table && view.dtype() != kFloat32) return py::none();
+      in.parameter_types.push_back(table_type(view.dtype()));
+      in.strides.push_back(view.shape[0] > 1 ? sizes_[i] : 0);
+      if (!frame.load_view(any(), at(parameters, i), view, pointers[count + i])) return py::none();
+    }
+    in.inputs = pointers.data();
+    in.parameters = pointers.data() + count;
+    if (!load(frame, rows, 2, in.offsets) || !load(frame, rows, 3, in.order) || !load(frame, rows, 4, in.ray_index)) {
+      return py::none();
+    }
+    in.gradients = keep && !kept_.empty() ? -1 : gradients;  // what is kept is of all rows
+    in.caller = caller;
+    in.ray_name = std::strcmp(caller, "grouped_program") == 0 ? "ray_index" : "direction_index";
+
+    py::list found;
+    std::vector<void*> made;
+    for (const auto& [width, by_ray] : widths_) {
+      if (by_ray && dtype != kFloat32) return py::none();  // sums of rays are float32
+      out.output_types.push_back(table_type(dtype));
+      made.push_back(memory(found, dtype, {by_ray ? in.r : in.n, width}));
+    }
+    for (const auto& [table, shape] : sums_) {
+      std::vector<int64_t> sizes = {table < 0 ? in.k : of_parameters[static_cast<size_t>(table)].shape[0]};
+      sizes.insert(sizes.end(), shape.begin(), shape.end());
+      made.push_back(memory(found, kFloat32, sizes));
+    }
+    in.kept = nullptr;
+    in.ready = true;
+    void** const looked_up = pointers.data() + count + learnt;
+    if (keep) {
+      for (size_t i = 0; i < kept_.size(); ++i) looked_up[i] = memory(found, kFloat32, {in.n, kept_[i]});
+      in.ready = kept_.empty();
+    } else {
+      for (size_t i = 0; i < size(before); ++i) {
+        TensorView view;
+        if (i >= kept_.size() || !view.look(at(before, i))) return py::none();
+        if (!frame.load_view(any(), at(before, i), view, looked_up[i])) return py::none();
+      }
+    }
+    if (!kept_.empty() && (keep || size(before) != 0)) in.kept = reinterpret_cast<float* const*>(looked_up);
+    out.outputs = made.data();
+    out.sums = reinterpret_cast<float* const*>(made.data() + widths_.size());
+    run(loaded);
+    return std::move(found);
+  }
+
+ private:
+  static const Type& any() { return type_of<const void*>(); }
+  static py::object fast(const py::handle& sequence) {
+    return py::reinterpret_steal<py::object>(PySequence_Fast(sequence.ptr(), "a program takes lists"));
+  }
+  static size_t size(const py::object& items) { return static_cast<size_t>(PySequence_Fast_GET_SIZE(items.ptr())); }
+  static PyObject* at(const py::object& items, size_t i) {
+    return PySequence_Fast_GET_ITEM(items.ptr(), static_cast<Py_ssize_t>(i));
+  }
+  // Whether rows of samples lie as PyTorch's look-ups in planes give them. Points of hash grids, which are read where
+  // they are, are copied.
+  static bool is_turned(const TensorView& view, int64_t samples) {
+    if (view.is_contiguous() || view.shape[0] != samples || view.shape[1] == 3 || view.dtype() != kFloat32)
+      return false;
+    return view.strides[0] == 1 && (view.shape[1] == 1 || view.strides[1] == view.shape[0]);
+  }
+  template <typename T>
+  static bool load(Frame& frame, const py::tuple& rows, Py_ssize_t place, const T*& address) {
+    void* found = &address;
+    return frame.load(type_of<const T*>(), PyTuple_GET_ITEM(rows.ptr(), place), found);
+  }
+  void* memory(py::list& found, unsigned dtype, const std::vector<int64_t>& shape) const {
+    const auto made = questions.new_memory(shape, dtype);
+    int64_t bytes = dtype == kBfloat16 ? 2 : 4;
+    for (const int64_t each : shape) bytes *= each;
+    if (bytes >= large_) on_large_(made);
+    found.append(made);
+    TensorView view;
+    view.look(made.ptr());
+    return view.address();
+  }
+
+  py::object program_;
+  std::vector<std::pair<int64_t, bool>> widths_;
+  std::vector<std::pair<int, std::vector<int64_t>>> sums_;
+  std::vector<int64_t> kept_;
+  std::vector<size_t> tables_;
+  std::vector<int64_t> sizes_;
+  int rays_;
+  int64_t large_;
+  py::object on_large_;
+  const Function* function_;
+  const Bound* bound_ = nullptr;
+};
+
+}  // namespace
+
+void bind_program_calls(py::module_& module) {
+  py::class_<ProgramCall>(module, "ProgramCall")
+      .def(
+          py::init<py::object, std::vector<std::pair<int64_t, bool>>, std::vector<std::pair<int, std::vector<int64_t>>>,
+                   std::vector<int64_t>, std::vector<size_t>, std::vector<int64_t>, int, int64_t, py::object>())
+      .def("__call__", &ProgramCall::call);
+}
+
+}  // namespace voronerf

@@ -1,0 +1,11 @@
+// Calls of programs (network/program.h) from Python, with whatever their tensors tell.
+#pragma once
+
+#include <pybind11/pybind11.h>
+
+namespace voronerf {
+
+// Adds ProgramCall to the module.
+void bind_program_calls(pybind11::module_& module);
+
+}  // namespace voronerf

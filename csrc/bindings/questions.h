@@ -1,0 +1,100 @@
+// What torch and voronerf are asked in every call, by functions of Python that the module is handed once.
+#pragma once
+
+#include <vector>
+
+#include "bindings/frame.h"
+
+namespace voronerf {
+
+inline bool is_true(PyObject* answer) {
+  PyErr_Clear();
+  Py_XDECREF(answer);
+  return answer == Py_True;
+}
+inline bool requires_gradient(PyObject* tensor) {
+  static PyObject* const word = PyUnicode_InternFromString("requires_grad");
+  return is_true(PyObject_GetAttr(tensor, word));
+}
+inline bool is_inference(PyObject* tensor) {
+  static PyObject* const word = PyUnicode_InternFromString("is_inference");
+  return is_true(PyObject_CallMethodNoArgs(tensor, word));
+}
+
+// What torch and voronerf answer to questions of every call; objects live as long as Python.
+struct Questions {
+  PyObject *own, *torch, *grad_enabled, *tangents, *threads, *kept, *native, *choose;
+  std::vector<PyObject*> listeners;
+  std::map<unsigned, PyObject*> dtypes;
+
+  bool grad() const { return is_true(PyObject_CallNoArgs(grad_enabled)); }
+  // Whether modes, transforms, tracers or profilers of torch are to see what is called, or tangents have to.
+  bool is_watched() const {
+    for (PyObject* listener : listeners) {
+      PyObject* const answer = PyObject_CallNoArgs(listener);
+      const bool listens = answer == nullptr || PyObject_IsTrue(answer) != 0;
+      PyErr_Clear();
+      Py_XDECREF(answer);
+      if (listens) return true;
+    }
+    static PyObject* const word = PyUnicode_InternFromString("_current_level");
+    PyObject* const level = PyDict_GetItemWithError(tangents, word);
+    return level == nullptr || PyLong_AsLong(level) >= 0;
+  }
+  // Memory of the CPU.
+  py::object new_memory(const std::vector<int64_t>& shape, unsigned dtype) const {
+    std::vector<py::object> sizes;
+    std::vector<PyObject*> arguments;
+    for (const int64_t size : shape) {
+      sizes.push_back(py::int_(size));
+      arguments.push_back(sizes.back().ptr());
+    }
+    if (shape.empty()) {
+      sizes.push_back(py::tuple());
+      arguments.push_back(sizes.back().ptr());
+    }
+    return new_memory(arguments, dtypes.at(dtype));
+  }
+  // Of sizes as Python has them, to which the dtype is added.
+  py::object new_memory(std::vector<PyObject*>& sizes, PyObject* dtype) const {
+    static PyObject *const word = PyUnicode_InternFromString("empty"), *const names = PyTuple_Pack(
+                                                                           1, PyUnicode_InternFromString("dtype"));
+    const size_t count = sizes.size();
+    sizes.push_back(dtype);
+    // torch.empty gives what Tensor.new_empty gives beside a tensor of the CPU, in half the time.
+    PyObject* const made = PyObject_Vectorcall(PyDict_GetItemWithError(torch, word), sizes.data(), count, names);
+    if (made == nullptr) throw py::error_already_set();
+    return py::reinterpret_steal<py::object>(made);
+  }
+  // native.cpu()
+  Cpu cpu() const {
+    static PyObject *const isa_word = PyUnicode_InternFromString("_isa"), *const threads_word =
+                                                                              PyUnicode_InternFromString("threads");
+    static PyObject* known = nullptr;  // a name stays, and almost always the one that was looked at last
+    static Isa isa;
+    PyObject* const name = PyDict_GetItemWithError(native, isa_word);
+    if (name != known) {
+      Frame frame;
+      void* place = &isa;
+      if (!frame.load(type_of<Isa>(), name, place)) throw py::type_error("_isa");
+      Py_INCREF(name);
+      known = name;
+    }
+    PyObject* count = PyObject_GetAttr(kept, threads_word);
+    if (count == Py_None) {
+      Py_DECREF(count);
+      count = PyObject_CallNoArgs(threads);
+    }
+    const auto many = static_cast<int>(PyLong_AsLong(count));
+    Py_XDECREF(count);
+    return {isa, many};
+  }
+  // Whether the compiled module is this one, and no other one stands in.
+  bool compiled_here() const {
+    static PyObject* const word = PyUnicode_InternFromString("compiled");
+    return PyDict_GetItemWithError(native, word) == own;
+  }
+};
+inline Questions questions;
+
+}  // namespace voronerf
