@@ -233,8 +233,14 @@ _kept = _Kept()
 
 def cpu_precision() -> str:
     """``torch.set_float32_matmul_precision`` of the CPU: "ieee" (highest), "tf32" (high) or "bf16" (medium)."""
+    if _precision is not None:
+        return str(_precision("mkldnn", "matmul"))
     backend: Any = torch.backends.mkldnn  # whose stubs lack it
     return str(backend.matmul.fp32_precision)
+
+
+# What the public property calls, in a fifteenth of its time.
+_precision: Callable[[str, str], str] | None = getattr(torch._C, "_get_fp32_precision_getter", None)
 
 
 def threads() -> int:

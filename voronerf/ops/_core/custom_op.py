@@ -205,8 +205,16 @@ class Op:
 
     def _learning(self, flat: Sequence[Any], arguments: Sequence[Any]) -> Any:
         """The op with its node of autograd."""
-        entries, lengths = _flattened(flat) if self._lists else (flat, None)
-        return self._given(_apply_directly(*entries, lengths, self, arguments))
+        entries = self._tensors_of(flat) if self._lists else flat
+        return self._given(_apply_directly(*entries, None, self, arguments))
+
+    def _tensors_of(self, flat: Sequence[Any]) -> list[Any]:
+        """The entries of lists among the arguments of the custom op, and its tensors, or what is in their places."""
+        found: list[Any] = []
+        for place in self._lists:
+            found += flat[place]
+        found += [flat[place] for place in self.tensors]
+        return found
 
     def _transformed(self, flat: Sequence[Any]) -> Any:
         """The op for ``torch.func``, which does not differentiate custom ops."""
@@ -261,8 +269,9 @@ class Op:
 class _Differentiable(torch.autograd.Function):
     """An op with gradients, as PyTorch's autograd and ``torch.func`` take it.
 
-    Its arguments are those of the custom op, lists of tensors taken apart; the lengths of these lists, or None where
-    there are none; the op; and its arguments once more, where ``torch.func`` does not replace their tensors by its own.
+    Its arguments are those of the custom op, lists of tensors taken apart; the lengths of these lists; the op; and its
+    arguments once more, where ``torch.func`` does not replace their tensors by its own. Then there are no lengths, and
+    of an op with lists it gets the tensors alone, as `Op._tensors_of` has them.
     """
 
     @staticmethod
@@ -281,10 +290,11 @@ class _Differentiable(torch.autograd.Function):
         if any(own is not None and torch._C._functorch.is_legacy_batchedtensor(own) for own in of_results):
             raise op.no_batches
         found = op.gradients(ctx, of_results) if op._listed else op.gradients(ctx, *of_results)
-        if ctx.lengths:
-            lists = zip(found, ctx.lengths, strict=True)
-            found = tuple(_flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0])
-        return *found, None, None, None
+        if ctx.lengths is None:
+            return *(op._tensors_of(found) if op._lists else found), None, None, None
+        lists = zip(found, ctx.lengths, strict=True)
+        every = _flattened([[None] * n if part is None and n >= 0 else part for part, n in lists])[0]
+        return *every, None, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, *flat: Any) -> Any:
