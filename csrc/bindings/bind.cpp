@@ -7,6 +7,7 @@
 #include <optional>
 #include <set>
 
+#include "bindings/adam_call.h"
 #include "bindings/frame.h"
 #include "bindings/program_call.h"
 #include "bindings/signature.h"
@@ -349,6 +350,7 @@ constexpr const char* kStub =
     "\n"
     "def signature(op: str, rows: Sequence[Any], positional: int, more: dict[str, Any]) -> Any: ...\n"
     "def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool: ...\n"
+    "def adam_step(rule: type, guard: type, *given: Any) -> bool: ...\n"
     "def way_of(arguments: tuple[Any, ...]) -> int: ...\n"
     "def know_calls(objects: dict[str, Any]) -> None: ...\n"
     "def know_torch(dtypes: dict[str, torch.dtype], classes: tuple[type, ...], exchange: Any) -> None: ...\n"
@@ -477,6 +479,7 @@ void bind_all(PyObject* python) {
       .def_property_readonly("obstacle", &Recording::obstacle);
   bind_signatures(bound);
   bind_program_calls(bound);
+  bind_adam_step(bound);
   // The dtypes and the plain classes of tensors, objects of Python that this module knows by name alone, and the
   // exchange of tensor_view.h or None.
   bound.def("know_torch", [](const py::dict& names, const py::tuple& classes, const py::object& exchange) {

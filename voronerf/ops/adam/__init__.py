@@ -81,12 +81,26 @@ def adam(
         >>> (table[0] != 0).tolist()
         [False, True, False]
     """
-    _check_all(rules, parameters, gradients, means, squares, guard, loss)
+    taken = rules, parameters, gradients, means, squares, guard, loss
+    if _makes_step(parameters, backend):
+        from voronerf.ops._core import native
+
+        if native.adam_step(Rule, Guard, *taken):
+            return
+    _check_all(*taken)
     if not rules:
         return
     loss = None if loss is None else loss.detach()
     run = backends.resolve(_OP, backend=backend, device=parameters[0].device, dtype=torch.float32)
     run(rules, parameters, [gradient.contiguous() for gradient in gradients], means, squares, guard, loss)
+
+
+def _makes_step(parameters: Any, backend: str) -> bool:
+    """Whether the compiled module is asked to check and make the whole step."""
+    first = parameters[0] if isinstance(parameters, (list, tuple)) and parameters else None
+    if not isinstance(first, Tensor) or torch.compiler.is_dynamo_compiling():
+        return False
+    return backends.chosen(_OP, first.device, torch.float32, backend=backend) == "native"
 
 
 def average(

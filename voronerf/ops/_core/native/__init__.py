@@ -93,7 +93,7 @@ def know_torch(module: Any) -> None:
 
 know_torch(compiled)
 
-signature, Rules, alike = compiled.signature, compiled.Rules, compiled.alike
+signature, Rules, alike, adam_step = compiled.signature, compiled.Rules, compiled.alike, compiled.adam_step
 """What checks arguments and makes calls (csrc/bindings/signature.h), of this module where another one stands in."""
 
 ISAS = compiled.Isa
