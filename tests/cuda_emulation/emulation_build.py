@@ -95,7 +95,10 @@ def _for_python(path):
     """One file with everything that is written for Python: the compiler's time goes into pybind11's headers."""
     bindings = ROOT / "csrc" / "bindings"
     files = [file for file in sorted(bindings.glob("*.cpp")) if "VN_CUDA(" in file.read_text()]
-    files += [bindings / name for name in ("adam_call.cpp", "bind.cpp", "program_call.cpp", "signature.cpp", "tensor_view.cpp")]
+    files += [
+        bindings / name
+        for name in ("adam_call.cpp", "bind.cpp", "program_call.cpp", "signature.cpp", "tensor_view.cpp")
+    ]
     files += [HERE / name for name in sorted(PYTHON)]
     text = "".join(f'#include "{file}"\n' for file in files)
     _write(path, text)

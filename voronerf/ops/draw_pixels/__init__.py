@@ -8,27 +8,32 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import EVERYWHERE, PLAIN, Implementation
-from voronerf.ops._core.checks import INDEX, Checked, check_integer
+from voronerf.ops._core.checks import INDEX, Row, check_integer, check_rows
 from voronerf.ops._core.declare import declare
 from voronerf.ops.draw_pixels.reference import Known, Runs
+
+_SEED = Row("seed", INDEX, (1,))
+
+
+def _of_known() -> list[Row]:
+    return [_SEED, Row("pixels", (torch.int64,), ("p",)), Row("distances", (torch.float32,), ("p",))]
+
+
+def _of_runs() -> list[Row]:
+    of_pixels = [Row(name, (torch.int64,), ("n",)) for name in ("ends", "shift")]
+    return [_SEED, *of_pixels, Row("first", INDEX, ("p",))]
 
 
 def _prepare(given: Any) -> Any:
     runs, below, known = given.runs, given.below, given.known
     if known is not None:
-        checked = Checked("draw_pixels")
-        checked.tensor("seed", given.seed, INDEX, 1)
-        checked.tensor("pixels", known.pixels, (torch.int64,), "p")
-        checked.tensor("distances", known.distances, (torch.float32,), "p")
-        if not checked.sizes["p"]:
+        sizes = check_rows("draw_pixels", _of_known, [given.seed, known.pixels, known.distances])
+        if not sizes["p"]:
             raise ValueError("draw_pixels: known must hold at least one pixel, got none")
         check_integer("draw_pixels", "several", known.several, 0, given.count)
     if runs is not None:
-        checked = Checked("draw_pixels")
-        checked.tensor("seed", given.seed, INDEX, 1)
-        for name, dtype in (("ends", torch.int64), ("shift", torch.int64), ("first", torch.int32)):
-            checked.tensor(name, getattr(runs, name), (dtype,), "p" if name == "first" else "n")
-        if not (checked.sizes["n"] and checked.sizes["p"]):
+        sizes = check_rows("draw_pixels", _of_runs, [given.seed, runs.ends, runs.shift, runs.first])
+        if not (sizes["n"] and sizes["p"]):
             raise ValueError("draw_pixels: runs must hold at least one run, got none")
         check_integer("draw_pixels", "bits", runs.bits, 0, 48)
         check_integer("draw_pixels", "total", runs.total, 1, 2**48)

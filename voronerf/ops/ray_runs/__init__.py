@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.backends import Implementation
-from voronerf.ops._core.checks import INDEX, LIKE_FIRST, Checked, check_range, check_shape
+from voronerf.ops._core.checks import INDEX, Row, check_range, check_rows, check_shape
 from voronerf.ops._core.declare import declare
 from voronerf.ops._core.rows import rows_of
 from voronerf.ops.ray_runs.reference import OwnSamples
@@ -184,13 +184,16 @@ def run_gradients(
     """
 
 
+def _of_samples(dtype: torch.dtype) -> list[Row]:
+    of_raw = [Row(name, (dtype,), ("m",), like="raw") for name in ("deltas", "depths")]
+    rest = [Row("ray_index", INDEX, ("m",)), Row("run_offsets", INDEX, ("q+1",))]
+    return [Row("raw", (dtype,), ("m", 4)), *of_raw, *rest]
+
+
 def _check_samples(op: str, given: Any) -> Any:
-    raw, samples, checked = given.raw, given.samples, Checked(op)
-    checked.tensor("raw", raw, (raw.dtype,), "m", 4)
-    checked.tensor("deltas", samples.deltas, LIKE_FIRST, "m")
-    checked.tensor("depths", samples.depths, LIKE_FIRST, "m")
-    checked.tensor("ray_index", samples.ray_index, INDEX, "m")
-    checked.tensor("run_offsets", samples.run_offsets, INDEX, "q+1")
+    raw, samples = given.raw, given.samples
+    tensors = [raw, samples.deltas, samples.depths, samples.ray_index, samples.run_offsets]
+    check_rows(op, _of_samples, tensors, raw.dtype)
     if not raw.is_cpu or torch.compiler.is_compiling():
         return given
     m, offsets = len(raw), samples.run_offsets.numpy()  # without a call of torch's, which no recording could replay
