@@ -41,11 +41,13 @@ class ProgramCall {
   }
 
   // The outputs, sums and, if they are to be kept, look-ups, of inputs, parameters, offsets, order, ray_index and what
-  // was looked up before. None where Python has to make the call: while it is recorded, or of tensors of other kinds.
-  py::object call(const py::tuple& rows, bool keep, int64_t gradients, const char* caller) const {
+  // was looked up before. None where Python has to make the call: while it is recorded, or of tensors of other kinds;
+  // if it is asked, also where something of torch's is to see the call.
+  py::object call(const py::tuple& rows, bool keep, int64_t gradients, const char* caller, bool asked) const {
     if (recorded() != nullptr || bound_ == nullptr || bound_->function == nullptr || !questions.compiled_here()) {
       return py::none();
     }
+    if (asked && questions.is_watched()) return py::none();
     Loaded loaded{function_, bound_, {}, {}};
     Frame& frame = loaded.frame;
     loaded.values.place(type_of<Program>()) = PyCapsule_GetPointer(program_.ptr(), "Program");

@@ -122,9 +122,11 @@ class Op:
     Attributes:
         tensors: places of the arguments of the custom op that are tensors, or None.
         plan: how the compiled module calls it by itself (`Declaration.compiled_op`); None where it does not.
+        at_once: gives the results where no gradients are recorded, or None where this class has to look at the call.
     """
 
     plan: Any = None
+    at_once: Callable[..., Any] | None = None
     way: Callable[[tuple[Any, ...]], int] = staticmethod(lambda flat: 2)
     """The compiled module's answer, once that is there (csrc/bindings/signature.cpp): 0 for plain tensors of the CPU
     past the dispatcher, 1 for those with gradients, 2 where only what follows in Python knows."""
@@ -174,8 +176,13 @@ class Op:
 
     def __call__(self, *arguments: Any) -> Any:
         """What the op gives."""
+        traced = torch.compiler.is_dynamo_compiling()
+        if self.at_once is not None and not traced and not torch.is_grad_enabled():
+            found = self.at_once(*arguments)
+            if found is not None:
+                return found
         flat = self._flat(arguments) if self._nested else arguments
-        if torch.compiler.is_dynamo_compiling():
+        if traced:
             return self._op(*flat)
         way = self.way(tuple(flat))
         if way == 0:

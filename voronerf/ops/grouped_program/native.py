@@ -82,7 +82,7 @@ def run_program(rows: Rows, how: How) -> list[Tensor]:
     """The outputs and sums of a program, with gradients of every order."""
     if how.biased and not torch.compiler.is_compiling():
         how = how._replace(text=program_of(rows, how).text, biased="")
-    if (how.biased or _looks_up(how.text)) and torch.is_grad_enabled():
+    if torch.is_grad_enabled() and (how.biased or _looks_up(how.text)):
         how = how._replace(keep=any(t.requires_grad for t in (*rows.inputs, *rows.parameters)))
     found: list[Tensor] = run(rows, how)
     return found[: _results(how)] if how.keep else found
@@ -161,8 +161,21 @@ def run(given: _Call) -> list[Tensor]:
         return found
     on_cuda = native.on_cuda(rows.offsets)
     lowered = lower(program.text, _layout(how.products, rows.offsets), on_cuda)
-    results = None if on_cuda else lowered.call(rows, how.keep, how.gradients, how.caller)
+    results = None if on_cuda else lowered.call(rows, how.keep, how.gradients, how.caller, False)
     return _by_structs(program, lowered, given) if results is None else results
+
+
+def _at_once(rows: Rows, how: How) -> list[Tensor] | None:
+    """The results where no gradients are recorded and nothing of torch's is to see the call; else None."""
+    text = how.text
+    if how.biased or native.on_cuda(rows.offsets) or not compiled_runs(text):
+        return None
+    lowered = lower(text, _layout(how.products, rows.offsets), False)
+    found: list[Tensor] | None = lowered.call(rows, how.keep, how.gradients, how.caller, True)
+    return found
+
+
+run.at_once = _at_once
 
 
 def _by_structs(program: Program, lowered: Lowered, given: _Call) -> list[Tensor]:
@@ -304,7 +317,7 @@ def _layout(products: str, tensor: Tensor) -> str:
     on the CPU as ``torch.set_float32_matmul_precision`` says, of which "high" are products in parts."""
     if native.on_cuda(tensor):
         return "tiles" if products != "float32" and _multiplies_halves(products, tensor.device) else "floats"
-    layouts = _LAYOUTS.get(native.cpu().isa)
+    layouts = _LAYOUTS.get(native.isa())
     if layouts is None:
         return "floats"
     return layouts.get(backends.cpu_precision() if products == "float32" else products, "floats")

@@ -145,6 +145,11 @@ def stream(tensor: Tensor) -> tuple[int, int]:
     return index, torch.cuda.current_stream(index).cuda_stream
 
 
+def isa() -> str:
+    """The instruction set in use."""
+    return _isa
+
+
 def cpu() -> compiled.Cpu:
     """The processor as compiled functions take it: instruction set and threads."""
     return _cpu(_isa, backends.threads())
