@@ -38,6 +38,7 @@ bool is_negative(PyObject* tensor) {
 void know_tensors(PyObject* classes, PyObject* capsule) {
   Py_INCREF(classes);
   plain_classes = classes;
+  exchange = nullptr;
   if (capsule == Py_None) return;
   const auto* const found = static_cast<const Exchange*>(PyCapsule_GetPointer(capsule, "dlpack_exchange_api"));
   if (found != nullptr && found->major == 1) exchange = found;

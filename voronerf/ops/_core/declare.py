@@ -50,8 +50,6 @@ from voronerf.ops._core.derivatives import register_derivatives
 from voronerf.ops._core.rows import new_empty, rows_of
 
 F = TypeVar("F", bound=Callable[..., Any])
-Check = Callable[[checks.Checked, dict[str, Any]], None]
-"""Checks one of the values of a call, by the names of its arguments."""
 _DECLARED: dict[str, Declaration] = {}
 _DTYPES = {"floating": FLOATING, "same": LIKE_FIRST, "wide": LIKE_FIRST}
 
@@ -110,19 +108,6 @@ def _entries(text: str) -> tuple[int | str, ...]:
     return tuple(int(part) if part.isdigit() else part for part in parts)
 
 
-def _check_kind(op: str, name: str, value: Any, rule: Any) -> None:
-    if isinstance(rule, type):
-        checks.check_kind(op, name, value, rule)
-
-
-_CHECKS: dict[Any, Callable[[str, str, Any, Any], None]] = {
-    int: lambda op, name, value, rule: checks.check_integer(op, name, value, *rule),
-    float: lambda op, name, value, rule: rule(op, name, value),
-    bool: lambda op, name, value, rule: checks.check_flag(op, name, value),
-    str: checks.check_choice,
-}
-
-
 class Argument(NamedTuple):
     """An argument of a signature."""
 
@@ -132,63 +117,52 @@ class Argument(NamedTuple):
     rule: Any
     text: str = ""
 
-    def check(self, op: str, detach: bool, bind: bool) -> Check:
-        """What checks its value in a call, and puts it right.
+    @property
+    def floating(self) -> bool:
+        """Whether it is a tensor that may have gradients."""
+        return self.kind is Tensor and (not self.rule.dtypes or bool({*self.rule.dtypes} & {*FLOATING}))
 
-        Args:
-            op: Named in errors.
-            detach: Whether it has no gradients.
-            bind: Whether shapes speak of it.
-        """
-        name, kind, rule = self.name, self.kind, self.rule
+    def check(self, given: checks.Checked, values: dict[str, Any]) -> None:
+        """Checks its value in a call, one of ``values`` by name, and makes an integer a float where one is asked."""
+        name, kind, rule, value = self.name, self.kind, self.rule, values[self.name]
         if kind is Tensor:
-            return self._check_tensor(op, detach and (not rule.dtypes or bool({*rule.dtypes} & {*FLOATING})))
-        own = _CHECKS.get(kind, _check_kind)
+            self._check_tensor(given, values)
+        elif kind is int:
+            checks.check_integer(given.op, name, value, *rule)
+        elif kind is float:
+            rule(given.op, name, value)
+            values[name] = float(value)
+        elif kind is bool:
+            checks.check_flag(given.op, name, value)
+        elif kind is str:
+            checks.check_choice(given.op, name, value, rule)
+        elif isinstance(rule, type):
+            checks.check_kind(given.op, name, value, rule)
 
-        def check(given: checks.Checked, values: dict[str, Any]) -> None:
-            own(op, name, values[name], rule)
-            if kind is float:
-                values[name] = float(values[name])
-            elif bind:
-                given.sizes[name] = values[name]
-
-        return check
-
-    def _check_tensor(self, op: str, detach: bool) -> Check:
-        name, (dtypes, first, wide, condition, second, _), either = self.name, self.rule, self.rule.either
-
-        def check(given: checks.Checked, values: dict[str, Any]) -> None:
-            tensor, shape = values[name], first
-            if either:
-                checks.check_tensor(op, name, tensor)
-                shape = first if tensor.dim() == len(first) else second
-            elif condition and values[condition] is None:
-                shape = second
-            own = [torch.promote_types(given.first_float().dtype, torch.float32)] if wide else dtypes
-            given.tensor(name, tensor, own, *shape)
-            if detach and tensor.requires_grad:
-                values[name] = tensor.detach()
-
-        return check
+    def _check_tensor(self, given: checks.Checked, values: dict[str, Any]) -> None:
+        rule, tensor = self.rule, values[self.name]
+        other = bool(rule.condition) and values[rule.condition] is None
+        if rule.either:
+            checks.check_tensor(given.op, self.name, tensor)
+            other = tensor.dim() != len(rule.shape)
+        dtypes = [torch.promote_types(given.first_float().dtype, torch.float32)] if rule.wide else rule.dtypes
+        given.tensor(self.name, tensor, dtypes, *(rule.otherwise if other else rule.shape))
 
 
-@dataclass(frozen=True)
-class Struct:
-    """What makes a struct of the compiled module: of the arguments of an op, or of the memory for its results.
+class Source(NamedTuple):
+    """Where a parameter of a compiled function comes from, or a member of its structs.
 
     Attributes:
-        make: it does.
-        of_results: whether of these.
-        source: what the compiled module is told.
+        of: gives it, of the arguments of an op and the memory for its results.
+        told: what the compiled module is told, which takes it from there itself.
     """
 
-    make: Callable[[Any], Any]
-    of_results: bool
-    source: tuple[Any, ...]
+    of: Callable[[Any, Any], Any]
+    told: tuple[Any, ...]
 
     def __call__(self, given: Any) -> Any:
-        """The struct."""
-        return self.make(given)
+        """The same of the arguments alone, or of the results alone."""
+        return self.of(given, given)
 
 
 class Memory:
@@ -259,8 +233,6 @@ class Declaration:
         self._results_class = of_result if hasattr(of_result, "_fields") else None
         self._Results = _named("results", dict.fromkeys(self.results, Tensor))
         self.allocate = self._memory()
-        hint: Any = Tensor if len(self.results) == 1 else tuple[(Tensor,) * len(self.results)]  # type: ignore[misc]
-        self.allocate.__annotations__ = {"given": self.Inputs, "return": hint if self.results else None}
         _DECLARED[self.name] = self
 
     def _tensors(self) -> list[Argument]:
@@ -290,25 +262,20 @@ class Declaration:
 
     def _memory(self) -> Callable[[Any], Any]:
         """What gives new memory for the results: a named tuple where they have names."""
-        parts = []
-        sizes = dict.fromkeys(entry for each in self.results.values() for entry in (*each.shape, *each.otherwise))
-        names = [entry for entry in sizes if isinstance(entry, str)]
-        numbers = [entry for entry in sizes if isinstance(entry, int)]
-        for name in names:
-            if name.endswith("+1"):
-                setattr(self.Inputs, name, property(_one_more(name[:-2])))
-        places, known = {entry: place for place, entry in enumerate([*names, *numbers])}, _getter(names)
-        for result, (like, dtype) in zip(self.results.values(), self._likes()):
-            shapes = [_picker([places[entry] for entry in shape]) for shape in (result.shape, result.otherwise)]
-            parts.append(_new(self._places[like], dtype, self._places.get(result.condition), *shapes))
-        if len(parts) < 2:
-            return (lambda given: parts[0](given, (*known(given), *numbers))) if parts else lambda given: None
-        new, kind = tuple.__new__, tuple if "result0" in self.results else self._Results
+        rows, kind = [*zip(self.results.values(), self._likes())], tuple
+        if "result0" not in self.results:
+            kind = self._Results
 
         def allocate(given: Any) -> Any:
-            sizes = (*known(given), *numbers)
-            return new(kind, [part(given, sizes) for part in parts])
+            found = []
+            for result, (like, dtype) in rows:
+                other = bool(result.condition) and getattr(given, result.condition) is None
+                shape = [_size_in(given, entry) for entry in (result.otherwise if other else result.shape)]
+                found.append(new_empty(getattr(given, like), *shape, dtype=dtype))
+            return tuple.__new__(kind, found) if len(found) > 1 else found[0] if found else None
 
+        hint: Any = Tensor if len(rows) == 1 else tuple[(Tensor,) * len(rows)]  # type: ignore[misc]
+        allocate.__annotations__ = {"given": self.Inputs, "return": hint if rows else None}
         return allocate
 
     def public(self) -> Any:
@@ -333,10 +300,6 @@ class Declaration:
         self._positional = sum(each.kind is not each.KEYWORD_ONLY for each in parameters.values())
         shapes = [each.rule.shape for each in self._tensors()] + [each.shape for each in self.results.values()]
         self._bound = {str(entry).removesuffix("+1") for shape in shapes for entry in shape}
-        self._checks = [
-            (each.name, each.optional, each.check(self.name, each.name not in self.smooth, each.name in self._bound))
-            for each in self.arguments
-        ]
         public.__doc__ = self._described()
         return public
 
@@ -347,9 +310,14 @@ class Declaration:
         if twice or len(args) > self._positional or values.keys() != self._ordered.keys():
             self.function(*args, **options)  # which has no body, and says what is wrong
         given = checks.Checked(self.name)
-        for name, optional, check in self._checks:
-            if not optional or values[name] is not None:
-                check(given, values)
+        for each in self.arguments:
+            if each.optional and values[each.name] is None:
+                continue
+            each.check(given, values)
+            if each.kind is not Tensor and each.name in self._bound:
+                given.sizes[each.name] = values[each.name]
+            if each.floating and each.name not in self.smooth and values[each.name].requires_grad:
+                values[each.name] = values[each.name].detach()
         if self.smooth:
             given.no_inference()
         for name in self.writes:
@@ -398,14 +366,13 @@ class Declaration:
         name, kind, optional, rule, text = argument
         row = {"name": name, "optional": optional, "bound": name in self._bound, "rule": rule, "kind": "any"}
         if kind is Tensor:
-            floating = not rule.dtypes or bool({*rule.dtypes} & {*FLOATING})
             return {
                 **row,
                 "kind": "tensor",
                 "rule": rule.row,
                 "either": rule.either,
                 "condition": self._places.get(rule.condition, -1),
-                "detached": name not in self.smooth and floating,
+                "detached": name not in self.smooth and argument.floating,
                 "small": name in self.small,
                 "written": name in self.writes,
             }
@@ -485,7 +452,7 @@ class Declaration:
 
         return of
 
-    def inputs(self, kind: Any, **others: Any) -> Struct:
+    def inputs(self, kind: Any, **others: Any) -> Source:
         """What makes a struct of the compiled module of the arguments.
 
         Args:
@@ -496,65 +463,70 @@ class Declaration:
         Raises:
             NameError: a member that is none of this.
         """
-        return self._struct(kind, {name: others.get(name, name) for name in kind._fields}, self.Inputs)
+        return self._struct(kind, others, self.Inputs)
 
-    def outputs(self, kind: Any, **others: str) -> Struct:
+    def outputs(self, kind: Any, **others: str) -> Source:
         """What makes a struct of the compiled module, whose members are the results, of memory for these.
 
         Args:
             kind: the struct.
             others: results by the names of members, where they have another.
         """
-        return self._struct(kind, {name: others.get(name, name) for name in kind._fields}, self._Results)
+        return self._struct(kind, others, self._Results)
 
-    def _struct(self, kind: Any, members: dict[str, Any], source: Any) -> Struct:
-        names = [value for value in members.values() if isinstance(value, str)]
+    def _struct(self, kind: Any, others: dict[str, Any], source: Any) -> Source:
+        values = [others.get(name, name) for name in kind._fields]
+        names = [value for value in values if isinstance(value, str)]
         if unknown := [name for name in names if not hasattr(source, name.partition(".")[0])]:
             raise NameError(f"{self.name}: {kind.__name__} must have members of its declaration, got {unknown}")
-        others = [(place, value) for place, value in enumerate(members.values()) if not isinstance(value, str)]
-        known, new, of_results = _getter(names), tuple.__new__, source is self._Results
+        of_results, new, known = source is self._Results, tuple.__new__, operator.attrgetter(*names, "__len__")
+        rest = [(place, value) for place, value in enumerate(values) if not isinstance(value, str)]
 
-        def made(given: Any) -> Any:
-            values = [*known(given)]
-            for place, value in others:
-                values.insert(place, value(given) if callable(value) else value)
-            return new(kind, values)
+        def of(given: Any, found: Any) -> Any:
+            *parts, _ = known(found if of_results else given)  # all at once: members are many
+            for place, value in rest:
+                parts.insert(place, value(given) if callable(value) else value)
+            return new(kind, parts)
 
-        sources = [self._source(value, of_results) for value in members.values()]
-        return Struct(made if others else lambda given: new(kind, known(given)), of_results, ("structure", sources))
+        return Source(of, ("structure", [self._source(value, of_results).told for value in values]))
 
-    def _source(self, value: Any, of_results: bool = False) -> tuple[Any, ...]:
-        """What the compiled module is told of where a parameter or a member comes from."""
-        if isinstance(value, Struct):
-            return value.source
+    def _source(self, value: Any, of_results: bool = False) -> Source:
+        """Where a parameter or a member comes from, by its name or what else `compiled_op` takes."""
+        if isinstance(value, Source):
+            return value
         if isinstance(value, Memory):
-            return "memory", value.dtype.itemsize, value.shape
+            shape, dtype = value.shape, value.dtype
+            make = lambda given, _: new_empty(given[0], *[getattr(given, n) for n in shape], dtype=dtype)  # noqa: E731
+            return Source(make, ("memory", dtype.itemsize, shape))
         if not isinstance(value, str):
-            return ("function", value) if callable(value) else ("constant", value)
-        if not of_results and value in self._places:
-            return "argument", self._places[value]
-        if value in self.results:
-            return "result", [*self.results].index(value)
-        if value.endswith("_per_ray"):
-            return "rays", self._places[value.removesuffix("_per_ray")]
-        return ("letter", value) if value in self._letters() else ("function", operator.attrgetter(value))
+            if callable(value):
+                return Source(lambda given, _: value(given), ("function", value))
+            return Source(lambda given, _: value, ("constant", value))
+        if value in self.results and (of_results or value not in self._places):
+            place = [*self.results].index(value)
+            alone = len(self.results) == 1
+            return Source(lambda _, found: found if alone else found[place], ("result", place))
+        get = operator.attrgetter(value)
+        told: tuple[Any, ...] = ("letter", value) if value in self._letters() else ("function", get)
+        if value in self._places:
+            told = "argument", self._places[value]
+        elif value.endswith("_per_ray"):
+            told = "rays", self._places[value.removesuffix("_per_ray")]
+        return Source(lambda given, _: get(given), told)
 
     def _result_rows(self) -> list[tuple[Any, ...]]:
         """What the compiled module is told of the results."""
+        known = {*self._places, *self._letters()}
 
-        def size(entry: int | str) -> Any:
-            name = str(entry).removesuffix("+1")
-            known = isinstance(entry, int) or name in self._places or name in self._letters()
-            return entry if known else operator.attrgetter(name)
+        def told(shape: Sequence[int | str]) -> list[Any]:
+            """Letters that only a function of the arguments gives, as that."""
+            return [
+                entry if isinstance(entry, int) or entry.removesuffix("+1") in known else operator.attrgetter(entry)
+                for entry in shape
+            ]
 
         return [
-            (
-                self._places[like],
-                dtype,
-                self._places.get(each.condition, -1),
-                [size(entry) for entry in each.shape],
-                [size(entry) for entry in each.otherwise],
-            )
+            (self._places[like], dtype, self._places.get(each.condition, -1), told(each.shape), told(each.otherwise))
             for each, (like, dtype) in zip(self.results.values(), self._likes())
         ]
 
@@ -574,8 +546,8 @@ class Declaration:
         Args:
             name: of the custom op; without it that of the op.
             function: its name.
-            parameters: of the function, without the machine: names of arguments, results and letters, a `Struct`, a
-                `Memory`, a function of the arguments, or what is the same in every call.
+            parameters: of the function, without the machine: names of arguments, results and letters, what `inputs`
+                and `outputs` give, a `Memory`, a function of the arguments, or what is the same in every call.
             on_cuda: what fills the results there, of the arguments, the results and the machine, where that function
                 has other parameters.
             fault: what is called with the arguments where the function gives False: it raises the error.
@@ -583,37 +555,22 @@ class Declaration:
         """
         from voronerf.ops._core import native
 
-        known, on_devices = [self._value(value) for value in parameters], "cuda" in options.get("devices", ("cuda",))
+        sources, on_devices = [*map(self._source, parameters)], "cuda" in options.get("devices", ("cuda",))
 
         def fill(given: Any, found: Any) -> None:
             machine = native.machine(given[0]) if on_devices else native.cpu()
             if on_cuda is not None and isinstance(machine, native.compiled.Cuda):
                 on_cuda(given, found, machine)
                 return
-            said = getattr(native.compiled, function)(*[value(given, found) for value in known], machine)
+            said = getattr(native.compiled, function)(*[source.of(given, found) for source in sources], machine)
             if said is False and fault is not None:
                 fault(given)
 
         op = self.custom_op(name, **options)(functools.wraps(self.function)(fill))
         op.__module__ = f"voronerf.ops.{backends.folder(self.name)}.native"
         pack = self._results_class or self._pack
-        op.plan = function, [self._source(value) for value in parameters], self._result_rows(), pack, fault
+        op.plan = function, [source.told for source in sources], self._result_rows(), pack, fault
         return op
-
-    def _value(self, value: Any) -> Callable[[Any, Any], Any]:
-        """What gives a parameter, from the arguments and the results."""
-        if isinstance(value, Struct):
-            return lambda given, found: value(found if value.of_results else given)
-        if isinstance(value, Memory):
-            sizes = _getter([entry for entry in value.shape if isinstance(entry, str)])
-            return lambda given, found: new_empty(given[0], *sizes(given), dtype=value.dtype)
-        if not isinstance(value, str):
-            return (lambda given, found: value(given)) if callable(value) else lambda given, found: value
-        if value in self._places or value not in self.results:
-            known = operator.attrgetter(value)
-            return lambda given, found: known(given)
-        place = [*self.results].index(value)
-        return (lambda given, found: found) if len(self.results) == 1 else lambda given, found: found[place]
 
 
 def _size_of(ways: Sequence[tuple[int, int, int, int]]) -> Callable[[Any], int]:
@@ -635,37 +592,12 @@ def _is_per_ray(place: int) -> Callable[[Any], bool]:
     return lambda given: given[place] is not None and given[place].dim() > 1
 
 
-def _one_more(letter: str) -> Callable[[Any], int]:
-    return lambda given: getattr(given, letter) + 1
-
-
-def _getter(names: Sequence[str]) -> Callable[[Any], Sequence[Any]]:
-    """What gives attributes of these names."""
-    if len(names) > 1:
-        return operator.attrgetter(*names)
-    return lambda given: [getattr(given, name) for name in names]
-
-
-def _new(
-    like: int, dtype: torch.dtype | None, told: int | None, shape: Callable[[Any], Any], otherwise: Callable[[Any], Any]
-) -> Callable[[Any, Sequence[int]], Tensor]:
-    """What gives new memory of a dtype, beside the tensor at a place, and of one shape where another argument is there.
-
-    Its arguments are those of the op, and all sizes.
-    """
-
-    def memory(given: Any, sizes: Sequence[int]) -> Tensor:
-        own = shape if told is None or given[told] is not None else otherwise
-        return new_empty(given[like], *own(sizes), dtype=dtype)
-
-    return memory
-
-
-def _picker(places: Sequence[int]) -> Callable[[Any], Any]:
-    """What gives entries of a sequence at these places."""
-    if len(places) > 1:
-        return operator.itemgetter(*places)
-    return lambda given: [given[place] for place in places]
+def _size_in(given: Any, entry: int | str) -> int:
+    """A size of a shape."""
+    if isinstance(entry, int):
+        return entry
+    size: int = getattr(given, entry.removesuffix("+1"))
+    return size + 1 if entry.endswith("+1") else size
 
 
 def _named(name: str, hints: dict[str, Any]) -> Any:

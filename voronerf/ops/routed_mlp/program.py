@@ -20,8 +20,8 @@ def check_routed_program(
 ) -> dict[str, Any]:
     """Arguments of `routed_program` but for the backend, and ``frozen``, checked; what is compared has one dtype."""
     network = {**PLACES, "ray_index": None, **given}
-    if unknown := network.keys() - PLACES.keys() - {"ray_index"}:
-        raise TypeError(f"{op}: unknown arguments {', '.join(unknown)}")
+    if len(network) > len(PLACES) + 1:
+        raise TypeError(f"{op}: unknown arguments {', '.join(network.keys() - PLACES.keys() - {'ray_index'})}")
     known = isinstance(program, Program) and isinstance(parameters, Sequence)
     known = known and all(isinstance(p, Tensor) for p in parameters)
     shaped = with_cells(program, parameters) if known else parameters  # the others are refused

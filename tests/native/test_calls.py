@@ -1,0 +1,97 @@
+"""Calls that the compiled module checks and makes by itself (csrc/bindings/signature.cpp)."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from unittest import mock
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+
+from voronerf import ops
+from voronerf.ops import Rule, adam, cell_sort, composite, nearest_centre
+from voronerf.ops._core import backends
+from voronerf.ops._core.cases import Draw, cases
+from voronerf.ops._core.custom_op import Op
+
+pytestmark = pytest.mark.native
+native = pytest.importorskip("voronerf.ops._core.native", exc_type=backends.BackendUnavailable)
+CASES = {name: case for name, case in cases().items() if "native" in backends.implemented(name)}
+
+
+def results(name, given):
+    """What an op gives, and what it has written into its arguments."""
+    found = getattr(ops, CASES[name].call or name)(**given, backend="native")
+    leaves = tree_leaves((found.raw if hasattr(found, "raw") else found, given))
+    return [leaf.clone() for leaf in leaves if isinstance(leaf, Tensor)]
+
+
+@contextlib.contextmanager
+def without_the_exchange():
+    """As torch is before 2.10."""
+    native.compiled.know_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
+    yield
+    native.know_torch(native.compiled)
+
+
+@pytest.mark.parametrize(("name", "kind"), [(name, kind) for name, case in CASES.items() for kind in case.kinds])
+def test_the_same_bits_as_by_the_methods_of_tensors(name, kind):
+    """Whether torch tells of tensors at once or not: then every call is checked, and made, in Python."""
+    found, wanted = (CASES[name].make(Draw(**CASES[name].kinds[kind]), 33) for _ in range(2))
+    with torch.no_grad():
+        made = results(name, found)
+        with without_the_exchange():
+            expected = results(name, wanted)
+    for one, other in zip(made, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
+
+
+def test_plain_calls_are_made_without_python():
+    points, centres = torch.rand(8, 3), torch.rand(4, 3)
+    nearest_centre(points, centres)
+    with mock.patch.object(Op, "__call__", side_effect=AssertionError):
+        cells = nearest_centre(points, centres)
+        cell_sort(cells, 4)
+        assert torch.equal(cells, nearest_centre(points, centres, backend="reference"))
+
+
+def test_what_learns_is_seen_by_torch():
+    sigma = torch.rand(2, 5, requires_grad=True)
+    rest = torch.rand(2, 5, 3), torch.rand(2, 5), torch.rand(2, 5)
+    assert composite(sigma, *rest).colour.requires_grad
+    with torch.no_grad():
+        assert not composite(sigma, *rest).colour.requires_grad
+    with pytest.raises(NotImplementedError, match="composite: has no forward-mode derivative"):
+        torch.func.jvp(lambda x: composite(x, *rest).colour, (sigma.detach(),), (torch.ones(2, 5),))
+
+
+def test_calls_keep_nothing():
+    points, centres, grid = torch.rand(8, 3), torch.rand(4, 3), [torch.rand(3)]
+    rule, other = Rule(torch.zeros(()), 0.1), [torch.zeros(3)]
+    held = points, centres, rule, *grid, *other, torch.int32, "native", None
+
+    def calls():
+        for _ in range(200):
+            nearest_centre(points, centres, backend="native")
+            adam([rule], other, grid, [torch.zeros(3)], [torch.zeros(3)])
+            with contextlib.suppress(ValueError):
+                nearest_centre(points, centres[:, :2])
+            with contextlib.suppress(ValueError):
+                cell_sort(torch.full((3,), 9, dtype=torch.int32), 4)
+
+    calls()
+    before = [sys.getrefcount(each) for each in held]
+    calls()
+    assert [sys.getrefcount(each) - was for each, was in zip(held, before)] == pytest.approx([0] * len(held), abs=50)
+
+
+def test_arguments_of_other_kinds_are_checked_in_python():
+    """Integers of other classes, names that are not interned, numbers beyond a machine's."""
+    cells = torch.zeros(3, dtype=torch.int32)
+    assert cell_sort(**{"".join(["ce", "lls"]): cells, "k": 2})[1].tolist() == [0, 3, 3]
+    for k, error in ((True, "must be an integer, got bool"), (2**70, "must be at most 134217728"), (0, "at least 1")):
+        with pytest.raises((TypeError, ValueError), match=error):
+            cell_sort(cells, k)
