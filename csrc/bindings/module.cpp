@@ -1,6 +1,5 @@
-// The Python module voronerf.ops._core._C, which knows tensors by their dtypes and addresses alone and owns nothing.
-// voronerf/ops/_core/native is its only importer, and has validated shapes and devices and allocated outputs and
-// workspaces.
+// The Python module voronerf.ops._core._C, which is not linked with torch: it knows of tensors what they tell
+// (tensor_view.h, frame.h). voronerf/ops/_core/native is its only importer.
 #include <pybind11/pybind11.h>
 
 #include "bindings/bind.h"

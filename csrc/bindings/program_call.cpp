@@ -161,7 +161,7 @@ class ProgramCall {
     return frame.load(type_of<const T*>(), PyTuple_GET_ITEM(rows.ptr(), place), found);
   }
   void* memory(py::list& found, unsigned dtype, const std::vector<int64_t>& shape) const {
-    const auto made = questions.new_memory(shape, dtype);
+    const auto made = questions.new_memory(shape, questions.dtypes.at(dtype));
     int64_t bytes = dtype == kBfloat16 ? 2 : 4;
     for (const int64_t each : shape) bytes *= each;
     if (bytes >= large_) on_large_(made);

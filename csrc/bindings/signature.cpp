@@ -101,6 +101,7 @@ class Plan {
   // Null where the function does not take these arguments.
   py::object run(Call& call, const py::object& inputs, size_t count) const {
     std::vector<py::object> found;
+    found.reserve(results_.size());
     std::vector<TensorView> views(results_.size());
     for (size_t i = 0; i < results_.size(); ++i) {
       found.push_back(memory(results_[i], call, inputs, count));
@@ -190,19 +191,14 @@ class Plan {
 
   py::object memory(const Result& result, Call& call, const py::object& inputs, size_t count) const {
     const bool other = result.condition >= 0 && call.values[result.condition] == Py_None;
-    std::vector<py::object> sizes;
-    std::vector<PyObject*> arguments;
+    std::vector<int64_t> shape;
+    shape.reserve(4);
     for (const Size& size : other ? result.otherwise : result.shape) {
-      sizes.push_back(size.function ? size.function(given(call, inputs, count))
-                                    : py::int_(call.common.size(size.size)));
-      arguments.push_back(sizes.back().ptr());
-    }
-    if (sizes.empty()) {
-      sizes.push_back(py::tuple());
-      arguments.push_back(sizes.back().ptr());
+      shape.push_back(size.function ? py::cast<int64_t>(size.function(given(call, inputs, count)))
+                                    : call.common.size(size.size));
     }
     const py::object& dtype = result.dtype;
-    return questions.new_memory(arguments,
+    return questions.new_memory(shape,
                                 dtype.is_none() ? questions.dtypes.at(call.views[result.like].dtype()) : dtype.ptr());
   }
 

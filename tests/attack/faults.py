@@ -548,8 +548,8 @@ FAULTS = (
     _python(
         "Steps of a parameter in parts are counted for each of them",
         "nerf/adam.py",
-        "counted = step.clone() if number else step",
-        "counted = step",
+        "Rule(step.clone() if number else step, *rule)",
+        "Rule(step, *rule)",
         "tests/nerf/test_optimizer.py",
     ),
     Fault(

@@ -28,7 +28,7 @@ def registers(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
         with native.using_isa("amx"):
             yield "amx"
         return
-    double = {("portable", asked): layout for (isa, asked), layout in programs._LAYOUTS.items() if isa == "amx"}
+    double = {"portable": programs._LAYOUTS["amx"]}
     monkeypatch.setattr(programs, "_LAYOUTS", double)
     with native.using_isa("portable"):
         yield "double"

@@ -12,9 +12,10 @@
         \"\"\"What it computes, which needs no body.\"\"\"
 
 The decorator makes the function: it checks the arguments, chooses a backend, and calls its implementation with the
-arguments one after another. From the same signature come the schema of custom ops, memory for their results (which is
-their fake), their gradients (`Declaration.backward_op`), and the members of compiled structs (`Declaration.inputs` and
-`Declaration.outputs`).
+arguments one after another. The compiled module does all of it where it can (csrc/bindings/signature.cpp), and Python
+where an argument is wrong, or is no plain tensor. From the same signature come the schema of custom ops, memory for
+their results (which is their fake), their gradients (`Declaration.backward_op`), and the members of compiled structs
+(`Declaration.inputs` and `Declaration.outputs`).
 
 A tensor is written as its dtypes and its shape. The dtypes are ``floating``, names of some (``float32|float64``),
 ``same`` as the first floating-point tensor, or ``wide``, the same but at least float32. The shape has numbers, letters,
