@@ -64,7 +64,7 @@ def by_hand(x: Tensor, centres: Tensor, layers: list[tuple[Tensor, Tensor]]) -> 
 
 
 def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
-    """What is compared, by the name of the row."""
+    """The contenders of each row, by their names."""
     found: dict[str, dict[str, Callable[[int], Any]]] = {}
     points, centres, cells, cpu = torch.rand(8, 3), torch.rand(4, 3), torch.empty(8, dtype=torch.int32), native.cpu()
     found["nearest_centre, 8 points"] = {

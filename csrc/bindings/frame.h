@@ -145,7 +145,6 @@ class Frame {
     if (type.dtypes != 0 && (view.dtype() & type.dtypes) == 0) return false;
     if (!view.is_contiguous() || is_negative(given)) return load_by_methods(type, given, address);
     keep(given);
-    if (view.data == nullptr && view.entries() != 0) return false;  // memory that was freed, as by storage.resize_
     address = view.address();
     if (recorded() != nullptr && add_tensor(*recorded(), given)) has_rows_ = true;
     return true;

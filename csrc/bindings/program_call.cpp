@@ -167,7 +167,7 @@ class ProgramCall {
     if (bytes >= large_) on_large_(made);
     found.append(made);
     TensorView view;
-    view.look(made.ptr());
+    if (!view.look(made.ptr())) throw std::runtime_error("torch does not tell where new memory is");
     return view.address();
   }
 
@@ -187,7 +187,7 @@ class ProgramCall {
 }  // namespace
 
 void bind_program_calls(py::module_& module) {
-  py::class_<ProgramCall>(module, "ProgramCall")
+  py::class_<ProgramCall>(module, "ProgramCall", py::module_local())
       .def(
           py::init<py::object, std::vector<std::pair<int64_t, bool>>, std::vector<std::pair<int, std::vector<int64_t>>>,
                    std::vector<int64_t>, std::vector<size_t>, std::vector<int64_t>, int, int64_t, py::object>())

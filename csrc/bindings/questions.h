@@ -23,7 +23,8 @@ inline bool is_inference(PyObject* tensor) {
 
 // What torch and voronerf answer to questions of every call; objects live as long as Python.
 struct Questions {
-  PyObject *own, *torch, *grad_enabled, *tangents, *threads, *kept, *native, *choose;
+  PyObject *own = nullptr, *torch = nullptr, *grad_enabled = nullptr, *tangents = nullptr, *threads = nullptr,
+           *kept = nullptr, *native = nullptr, *choose = nullptr;
   std::vector<PyObject*> listeners;
   std::map<unsigned, PyObject*> dtypes;
 
@@ -83,7 +84,7 @@ struct Questions {
   // Whether the compiled module is this one, and no other one stands in.
   bool compiled_here() const {
     static PyObject* const word = PyUnicode_InternFromString("compiled");
-    return PyDict_GetItemWithError(native, word) == own;
+    return native != nullptr && PyDict_GetItemWithError(native, word) == own;
   }
 };
 inline Questions questions;

@@ -4,7 +4,6 @@
 
 #include <algorithm>
 #include <memory>
-#include <optional>
 
 #include "bindings/frame.h"
 #include "bindings/questions.h"
@@ -43,7 +42,7 @@ struct Argument {
   enum class Kind { tensor, integer, flag, number, text, instance, any };
   Kind kind = Kind::any;
   py::str name;
-  bool optional = false, bound = false, detached = false, small = false, written = false;
+  bool optional = false, detached = false, small = false, written = false;
   py::object otherwise;  // the default, null for none
   TensorRule rule;
   int condition = -1;  // the argument with which the shape is the first of two
@@ -68,9 +67,9 @@ struct Call {
 class Plan {
  public:
   struct Source {
-    enum class Kind { argument, form, rays, letter, result, memory, constant, function, structure };
+    enum class Kind { argument, rays, letter, result, memory, constant, function, structure };
     Kind kind = Kind::constant;
-    int place = 0, dimensions = 0;
+    int place = 0;
     int64_t bytes = 0;
     std::vector<Letters::Size> sizes;
     py::object object;
@@ -168,10 +167,6 @@ class Plan {
                     : kind == "rays" ? Source::Kind::rays
                                      : Source::Kind::argument;
       source.place = py::cast<int>(parts[1]);
-    } else if (kind == "form") {
-      source.kind = Source::Kind::form;
-      source.place = py::cast<int>(parts[1]);
-      source.dimensions = py::cast<int>(parts[2]);
     } else if (kind == "letter") {
       source.kind = Source::Kind::letter;
       source.sizes = letters.sizes(py::make_tuple(parts[1]));
@@ -214,15 +209,10 @@ class Plan {
 
     bool load(const Source& source, const Type& type, void*& place) const {
       switch (source.kind) {
-        case Source::Kind::argument:
-        case Source::Kind::form: {
+        case Source::Kind::argument: {
           PyObject* const value = call.values[source.place];
-          const TensorView& view = call.views[source.place];
-          if (source.kind == Source::Kind::form && value != Py_None && view.dimensions != source.dimensions) {
-            return frame.load(type, Py_None, place);
-          }
           if (type.kind != Type::Kind::tensor || value == Py_None) return frame.load(type, value, place);
-          return frame.load_view(type, value, view, *static_cast<void**>(place));
+          return frame.load_view(type, value, call.views[source.place], *static_cast<void**>(place));
         }
         case Source::Kind::rays:  // whether there is a row for each of them
           if (type.kind != Type::Kind::boolean) return false;
@@ -280,7 +270,7 @@ class Plan {
 
 class Signature {
  public:
-  // From the op's name, rows of its arguments, and what Declaration.signature (declare.py) says.
+  // From the op's name, rows of its arguments, and what Declaration._first_call (declare.py) says.
   Signature(const py::str& op, const py::sequence& rows, int positional, const py::dict& more)
       : op_(op), positional_(positional) {
     for (const auto& row : rows) arguments_.push_back(argument_of(py::cast<py::dict>(row)));
@@ -301,12 +291,13 @@ class Signature {
     if (!bind(args, options, call) || !check(call)) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
     bool learns = false;
     for (size_t i = 0; i < count; ++i) learns = detach(i, call) || learns;
-    learns = learns && questions.grad();
-    if (learns && !no_inference_of(call)) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
+    const bool recorded_gradients = call.common.learns && questions.grad();
+    learns = learns && recorded_gradients;
+    if (recorded_gradients && !no_inference_of(call)) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
     if (!prepare_.is_none()) prepare(call);
     const Implementation* const chosen = choose(call);
     if (chosen == nullptr) return py::reinterpret_borrow<py::object>(Py_NotImplemented);
-    if (chosen->plan && !learns && call.views[0].on_cpu() && questions.compiled_here() &&
+    if (chosen->plan && !learns && recorded() == nullptr && call.views[0].on_cpu() && questions.compiled_here() &&
         (!chosen->narrow || call.common.first_float == kFloat32) && !questions.is_watched()) {
       if (py::object result = chosen->plan->run(call, inputs_, count)) return result;
     }
@@ -449,6 +440,7 @@ class Signature {
   bool detach(size_t i, Call& call) const {
     if (!call.views[i].is_there() || (call.views[i].dtype() & kFloating) == 0) return false;
     if (!requires_gradient(call.values[i])) return false;
+    call.common.learns = true;
     if (!arguments_[i].detached) return true;
     static PyObject* const word = PyUnicode_InternFromString("detach");
     call.own.push_back(py::reinterpret_steal<py::object>(PyObject_CallMethodNoArgs(call.values[i], word)));
@@ -559,6 +551,7 @@ void bind_signatures(py::module_& module) {
     questions.kept = held("kept");
     questions.native = held("native");
     questions.choose = held("choose");
+    questions.listeners.clear();
     for (const auto& listener : objects["listeners"]) {
       questions.listeners.push_back(py::reinterpret_borrow<py::object>(listener).release().ptr());
     }

@@ -7,7 +7,7 @@
 
 namespace voronerf {
 
-// Adds Rules, Signature and alike to the module.
+// Adds Rules, signature, alike, way_of and know_calls to the module.
 void bind_signatures(pybind11::module_& module);
 
 }  // namespace voronerf

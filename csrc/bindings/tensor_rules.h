@@ -18,7 +18,10 @@ inline unsigned dtypes_of(const py::handle& names) {
       {"float16", kFloat16}, {"bfloat16", kBfloat16}, {"float32", kFloat32}, {"float64", kFloat64},
       {"int32", kInt32},     {"int64", kInt64},       {"uint8", kUint8},     {"bool", kBool}};
   unsigned found = 0;
-  for (const auto& name : names) found |= known.at(py::cast<std::string>(name));
+  for (const auto& name : names) {
+    const auto one = known.find(py::cast<std::string>(name));
+    if (one != known.end()) found |= one->second;  // no tensor of another dtype fits: Python says why
+  }
   return found;
 }
 

@@ -23,8 +23,8 @@ bool TensorView::look(PyObject* tensor) {
   bool plain = false;
   for (Py_ssize_t i = 0; i < PyTuple_GET_SIZE(plain_classes); ++i) plain |= kind == PyTuple_GET_ITEM(plain_classes, i);
   if (!plain) return false;
-  if (exchange->look(tensor, this) == 0) return true;
-  return PyErr_Clear(), false;
+  if (exchange->look(tensor, this) != 0) return PyErr_Clear(), false;
+  return data != nullptr || entries() == 0;  // else its memory was freed, as by storage.resize_
 }
 
 bool is_negative(PyObject* tensor) {

@@ -27,7 +27,7 @@ PYTHON = {"module.cpp", "index_maps.cpp"}
 PLAIN = {"emulation.cpp", "emulated_products.cpp", "python.cpp"}
 """Files with nothing to watch."""
 FAST = {"emulation.cpp", "emulated_products.cpp"}
-"""Of these, the scheduler and the products, where a launch spends most of its time."""
+"""The scheduler and the products among these, where a launch spends most of its time."""
 SHARED = ("cell_sort_plan.cpp",)
 """What the launchers need of the C++ beside them."""
 REPLACED = {"radix_sort.cu"}

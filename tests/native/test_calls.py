@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import warnings
 from unittest import mock
 
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 from torch.utils._pytree import tree_leaves
 
 from voronerf import ops
-from voronerf.ops import Rule, adam, cell_sort, composite, nearest_centre
+from voronerf.ops import Rule, adam, cell_sort, composite, grouped_program, nearest_centre
 from voronerf.ops._core import backends
 from voronerf.ops._core.cases import Draw, cases
 from voronerf.ops._core.custom_op import Op
+from voronerf.ops._core.program import Builder
+from voronerf.ops._core.recording import Recording
 
 pytestmark = pytest.mark.native
 native = pytest.importorskip("voronerf.ops._core.native", exc_type=backends.BackendUnavailable)
@@ -23,7 +27,7 @@ CASES = {name: case for name, case in cases().items() if "native" in backends.im
 
 
 def results(name, given):
-    """What an op gives, and what it has written into its arguments."""
+    """Results of an op, and its arguments, into which it may have written."""
     found = getattr(ops, CASES[name].call or name)(**given, backend="native")
     leaves = tree_leaves((found.raw if hasattr(found, "raw") else found, given))
     return [leaf.clone() for leaf in leaves if isinstance(leaf, Tensor)]
@@ -31,7 +35,7 @@ def results(name, given):
 
 @contextlib.contextmanager
 def without_the_exchange():
-    """As torch is before 2.10."""
+    """Torch as before 2.10."""
     native.compiled.know_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
     yield
     native.know_torch(native.compiled)
@@ -95,3 +99,60 @@ def test_arguments_of_other_kinds_are_checked_in_python():
     for k, error in ((True, "must be an integer, got bool"), (2**70, "must be at most 134217728"), (0, "at least 1")):
         with pytest.raises((TypeError, ValueError), match=error):
             cell_sort(cells, k)
+
+
+def test_freed_memory_is_refused():
+    """Also transposed inputs of programs and the scalars of Adam, whose addresses are taken as they are."""
+    gone = torch.tensor(0.0)
+    gone.untyped_storage().resize_(0)
+    ones = [torch.ones(3)], [torch.ones(3)], [torch.zeros(3)], [torch.zeros(3)]
+    for rule in (Rule(gone, 0.1), Rule(torch.zeros(()), gone)):
+        with pytest.raises(TypeError, match=r"AdamRule: (step|rate_at) is no"):
+            adam([rule], *ones)
+    b = Builder()
+    program = b.program([b.linear(b.input(4), b.parameter(2, 4), 2)])
+    x, weights, offsets = torch.rand(4, 4000).t(), [torch.rand(1, 2, 4)], torch.tensor([0, 4000], dtype=torch.int32)
+    (expected,) = grouped_program([x.contiguous()], weights, offsets, program=program)
+    torch.testing.assert_close(grouped_program([x], weights, offsets, program=program)[0], expected, rtol=0, atol=0)
+    x.untyped_storage().resize_(0)
+    with pytest.raises((RuntimeError, TypeError)):
+        grouped_program([x], weights, offsets, program=program)
+
+
+def test_other_dtypes_are_named():
+    b = Builder()
+    program = b.program([b.linear(b.input(4), b.parameter(2, 4), 2)])
+    given = torch.ones(3, 4), [torch.rand(1, 2, 4)], torch.tensor([0, 3], dtype=torch.int32)
+    for dtype in (torch.int16, torch.complex64):
+        with pytest.raises(TypeError, match=r"inputs\[0\] must have dtype .*, got " + str(dtype)[6:]):
+            grouped_program([given[0].to(dtype)], *given[1:], program=program)
+
+
+def test_a_trace_of_torch_sees_the_op():
+    centres = torch.rand(4, 3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        traced = torch.jit.trace(lambda points: nearest_centre(points, centres), (torch.rand(5, 3),), check_trace=False)
+    points = torch.rand(7, 3)
+    assert torch.equal(traced(points), nearest_centre(points, centres))
+
+
+def test_a_recording_has_calls_of_which_modes_hear_nothing():
+    points, others, centres = torch.rand(5, 3), torch.rand(5, 3), torch.rand(4, 3)
+    with Recording() as recording:
+        taken = recording.take(points)
+        with _disable_current_modes():
+            cells = nearest_centre(taken, centres)
+    assert recording.replay(threads=1, taken=[others])
+    assert torch.equal(recording.now(cells), nearest_centre(others, centres))
+
+
+def test_what_autograd_cannot_keep_is_refused_by_both():
+    with torch.inference_mode():
+        sigma = torch.rand(2, 5)
+    rest = torch.rand(2, 5, 3, requires_grad=True), torch.rand(2, 5), torch.rand(2, 5)
+    for way in (contextlib.nullcontext, without_the_exchange):
+        with way(), pytest.raises(TypeError, match="composite: sigma must be a copy where gradients are recorded"):
+            composite(sigma, *rest)
+        with way(), torch.no_grad():
+            composite(sigma, *rest)

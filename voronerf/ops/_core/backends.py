@@ -218,6 +218,22 @@ def _import(module: str) -> ModuleType:
         raise BackendUnavailable("the Warp kernels are not installed; run `pip install -e .`") from None
 
 
+def compiled() -> Any:
+    """The package of the compiled module, which checks calls; None where it cannot be used."""
+    try:
+        return _compiled()
+    except ValueError:  # of what the process asks it for: a call of that backend says so
+        return None
+
+
+@functools.cache
+def _compiled() -> Any:
+    try:
+        return _import(_PACKAGES["native"])
+    except BackendUnavailable:
+        return None
+
+
 @functools.cache
 def _warn_once(line: str) -> None:
     """Warns of what keeps a backend from being used, the first time in a process that it is asked for."""

@@ -193,7 +193,7 @@ class Checked:
 
 
 class Row(NamedTuple):
-    """What a tensor must be, as `Checked.tensor` has it.
+    """The rule of a tensor, as `Checked.tensor` has it.
 
     Attributes:
         name: in errors.
@@ -211,7 +211,7 @@ class Row(NamedTuple):
 
 
 class Default(NamedTuple):
-    """What a letter is that no tensor before has bound."""
+    """The number of a letter that no tensor before has bound."""
 
     letter: str
     number: int
@@ -222,7 +222,9 @@ Others = tuple[Sequence[Row], Sequence[Any]]
 """Rows, and as many tensors."""
 
 
-def check_rows(op: str, make: Callable[..., Rows], tensors: list[Any], *given: Any) -> dict[str, int]:
+def check_rows(
+    op: str, make: Callable[..., Rows], tensors: list[Any], *given: Any, smooth: bool = True
+) -> dict[str, int]:
     """Checks tensors by the rows of a table: those of a network, which tells how many there are.
 
     The compiled module reads the rows once, and checks all later tensors of the network by itself. Where one breaks a
@@ -233,6 +235,7 @@ def check_rows(op: str, make: Callable[..., Rows], tensors: list[Any], *given: A
         make: gives the rows of the tensors.
         tensors: one for each row.
         given: the arguments of ``make``, which are hashed.
+        smooth: whether autograd keeps the tensors, which it cannot of inference tensors.
 
     Returns:
         What the letters stand for; 0 for one that no tensor has bound.
@@ -262,7 +265,8 @@ def check_rows(op: str, make: Callable[..., Rows], tensors: list[Any], *given: A
         checked.tensor(row.name, tensor, row.dtypes, *shape)
         if row.empty and checked.sizes[str(shape[0]).removesuffix("+1")] < 1:
             raise ValueError(f"{op}: {row.name} {row.empty}, got {list(tensor.shape)}")
-    checked.no_inference()
+    if smooth:
+        checked.no_inference()
     return {**dict.fromkeys(_letters(rows), 0), **checked.sizes}
 
 
@@ -271,9 +275,8 @@ def _compiled(make: Callable[..., Rows], *given: Any) -> tuple[list[str], Callab
     """The letters of rows, and what checks tensors by them in the compiled module, or gives None."""
     rows = make(*given)
     letters = _letters(rows)
-    try:
-        from voronerf.ops._core import native
-    except backends.BackendUnavailable:
+    native = backends.compiled()
+    if native is None:
         return letters, lambda tensors: None
     told: list[Any] = []
     for row in rows:
@@ -288,13 +291,8 @@ def _compiled(make: Callable[..., Rows], *given: Any) -> tuple[list[str], Callab
 def alike(lists: Sequence[Any], written: Sequence[bool], scalars: list[Any]) -> bool:
     """Whether tensors at one place of several lists have one shape, all are float32 and on one device, those of lists
     that are written lie in order, and scalars are tensors [] like them. False also where only Python can tell."""
-    if torch.compiler.is_dynamo_compiling():
-        return False
-    try:
-        from voronerf.ops._core import native
-    except backends.BackendUnavailable:
-        return False
-    return native.alike(lists, written, scalars)
+    native = None if torch.compiler.is_dynamo_compiling() else backends.compiled()
+    return native is not None and native.alike(lists, written, scalars)
 
 
 def _letters(rows: Rows) -> list[str]:

@@ -20,6 +20,7 @@ LISTENERS = [
     getattr(torch._C, "_len_torch_dispatch_stack", lambda: True),
     getattr(torch._C, "_are_functorch_transforms_active", lambda: True),
     getattr(torch.autograd, "_profiler_enabled", lambda: True),
+    getattr(torch._C, "_is_tracing", lambda: True),
 ]
 _PLAIN = (Tensor, torch.nn.Parameter)
 _is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor

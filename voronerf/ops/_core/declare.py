@@ -44,7 +44,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import backends, checks
-from voronerf.ops._core.backends import BackendUnavailable, Implementation
+from voronerf.ops._core.backends import Implementation
 from voronerf.ops._core.checks import FLOATING, LIKE_FIRST, MAX_COUNT
 from voronerf.ops._core.custom_op import Op, custom_op
 from voronerf.ops._core.derivatives import register_derivatives
@@ -87,7 +87,7 @@ class Shaped(NamedTuple):
 
     @property
     def row(self) -> tuple[Any, ...]:
-        """What the compiled module is told."""
+        """The same for the compiled module."""
         names = [str(dtype).removeprefix("torch.") for dtype in self.dtypes]
         kind = "wide" if self.wide else "" if names else "same"
         return names, kind, self.shape, self.otherwise or None
@@ -151,7 +151,7 @@ class Argument(NamedTuple):
 
 
 class Source(NamedTuple):
-    """Where a parameter of a compiled function comes from, or a member of its structs.
+    """The origin of a parameter of a compiled function, or of a member of its structs.
 
     Attributes:
         of: gives it, of the arguments of an op and the memory for its results.
@@ -340,23 +340,21 @@ class Declaration:
 
     def _first_call(self, args: tuple[Any, ...], options: dict[str, Any]) -> Any:
         """Makes what the compiled module calls the op with, and calls it."""
-        try:
-            from voronerf.ops._core import native
-        except BackendUnavailable:
-            self._calls = lambda args, options: NotImplemented
-        else:
-            rows = [{**self._row(each), **self._default(each.name)} for each in self.arguments]
-            rows.append({"name": "backend", "kind": "any", "optional": False, "rule": None, **self._default("backend")})
-            more = {
-                "filled": list(self.filled),
-                "compared": [self._places[name] for name in self.compared],
-                "smooth": bool(self.smooth),
-                "inputs": self.Inputs,
-                "prepare": self.prepare,
-                "found": self._found,
-                "pack": self._pack,
-            }
-            self._calls = native.signature(self.name, rows, self._positional, more)
+        native = backends.compiled()
+        if native is None:
+            return NotImplemented
+        rows = [{**self._row(each), **self._default(each.name)} for each in self.arguments]
+        rows.append({"name": "backend", "kind": "any", "optional": False, "rule": None, **self._default("backend")})
+        more = {
+            "filled": list(self.filled),
+            "compared": [self._places[name] for name in self.compared],
+            "smooth": bool(self.smooth),
+            "inputs": self.Inputs,
+            "prepare": self.prepare,
+            "found": self._found,
+            "pack": self._pack,
+        }
+        self._calls = native.signature(self.name, rows, self._positional, more)
         return self._calls(args, options)
 
     def _default(self, name: str) -> dict[str, Any]:

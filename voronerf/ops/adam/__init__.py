@@ -82,11 +82,8 @@ def adam(
         [False, True, False]
     """
     taken = rules, parameters, gradients, means, squares, guard, loss
-    if _makes_step(parameters, backend):
-        from voronerf.ops._core import native
-
-        if native.adam_step(Rule, Guard, *taken):
-            return
+    if _makes_step(parameters, backend) and backends.compiled().adam_step(Rule, Guard, *taken):
+        return
     _check_all(*taken)
     if not rules:
         return

@@ -27,12 +27,12 @@ def _of_runs() -> list[Row]:
 def _prepare(given: Any) -> Any:
     runs, below, known = given.runs, given.below, given.known
     if known is not None:
-        sizes = check_rows("draw_pixels", _of_known, [given.seed, known.pixels, known.distances])
+        sizes = check_rows("draw_pixels", _of_known, [given.seed, known.pixels, known.distances], smooth=False)
         if not sizes["p"]:
             raise ValueError("draw_pixels: known must hold at least one pixel, got none")
         check_integer("draw_pixels", "several", known.several, 0, given.count)
     if runs is not None:
-        sizes = check_rows("draw_pixels", _of_runs, [given.seed, runs.ends, runs.shift, runs.first])
+        sizes = check_rows("draw_pixels", _of_runs, [given.seed, runs.ends, runs.shift, runs.first], smooth=False)
         if not (sizes["n"] and sizes["p"]):
             raise ValueError("draw_pixels: runs must hold at least one run, got none")
         check_integer("draw_pixels", "bits", runs.bits, 0, 48)

@@ -193,7 +193,7 @@ def _of_samples(dtype: torch.dtype) -> list[Row]:
 def _check_samples(op: str, given: Any) -> Any:
     raw, samples = given.raw, given.samples
     tensors = [raw, samples.deltas, samples.depths, samples.ray_index, samples.run_offsets]
-    check_rows(op, _of_samples, tensors, raw.dtype)
+    check_rows(op, _of_samples, tensors, raw.dtype, smooth=False)
     if not raw.is_cpu or torch.compiler.is_compiling():
         return given
     m, offsets = len(raw), samples.run_offsets.numpy()  # without a call of torch's, which no recording could replay

@@ -106,7 +106,7 @@ def run_routed(
     if (centres := where.centres) is not None and where.coords is not None:
         if centres.device != first.device:
             check_same_device("VoronoiRouter", samples=first, centres=centres)
-        if centres.dtype is not where.coords.dtype:
+        if centres.dtype is not where.coords.dtype or centres.dtype not in (torch.float32, torch.float64):
             coords, centres = of_one_dtype(where.coords, centres)
             where = where._replace(coords=coords, centres=centres)
     cells, order, offsets = find(first, where, k)
