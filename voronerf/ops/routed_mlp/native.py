@@ -102,14 +102,16 @@ def run_routed(
         frozen: see ``voronerf.ops.routed_mlp``.
         **places: `Where`, with coords beside centres.
     """
-    first, where = inputs[0], Where(**places)
-    if (centres := where.centres) is not None and where.coords is not None:
+    first, centres, coords = inputs[0], places.get("centres"), places.get("coords")
+    if centres is None or coords is None:
+        cells, order, offsets = find(first, Where(**places), k)
+    elif len(places) == 2 and centres.is_cpu and not _is_seen(first):  # without a tree
+        cells, order, offsets = _in_two_calls(coords, centres, k)
+    else:
         if centres.device != first.device:
             check_same_device("VoronoiRouter", samples=first, centres=centres)
-        if centres.dtype is not where.coords.dtype or centres.dtype not in (torch.float32, torch.float64):
-            coords, centres = of_one_dtype(where.coords, centres)
-            where = where._replace(coords=coords, centres=centres)
-    cells, order, offsets = find(first, where, k)
+        places["coords"], places["centres"] = of_one_dtype(coords, centres)
+        cells, order, offsets = find(first, Where(**places), k)
     found = run_program(Rows(inputs, parameters, offsets, order, None), how)
     if frozen is not None:
         rows = of_samples(frozen, cells)
@@ -128,18 +130,26 @@ class Route(NamedTuple):
 def find(positions: Tensor, where: Where, k: int) -> Route:
     """The cells of samples, and their order by cell; None where there is one cell."""
     centres, child_offsets, child, depth, known, coords, rows = where
-    watched = torch.compiler.is_compiling() or rows is not None or not positions.is_cpu or is_watched()
-    if coords is not None and centres is not None and child is None and not watched:
-        # Two calls that the compiled module makes by itself take less time than one op in Python.
-        found = nearest_centre(coords, centres, backend="native")
-        order, offsets = cell_sort(found, k, backend="native")
-        return Route(found, order if order.numel() else None, offsets)
+    if coords is not None and centres is not None and child is None and rows is None and not _is_seen(positions):
+        return _in_two_calls(coords, centres, k)
     if coords is not None and coords.requires_grad:
         coords = coords.detach()
     if positions.requires_grad:
         positions = positions.detach()
     cells, order, offsets = locate_and_sort(positions, centres, child_offsets, child, depth, known, coords, rows, k)
     return Route(cells if known is None else known, order if order.numel() else None, offsets)
+
+
+def _is_seen(positions: Tensor) -> bool:
+    """Whether torch has to see where samples are, or they are on a GPU."""
+    return not positions.is_cpu or torch.compiler.is_compiling() or is_watched()
+
+
+def _in_two_calls(coords: Tensor, centres: Tensor, k: int) -> Route:
+    """Cells of a flat diagram: calls that the compiled module makes by itself take less time than one op in Python."""
+    cells = nearest_centre(coords, centres, backend="native")
+    order, offsets = cell_sort(cells, k, backend="native")
+    return Route(cells, order if order.numel() else None, offsets)
 
 
 class _Samples(NamedTuple):
