@@ -35,7 +35,7 @@ class Options:
     seconds: float = 1.0
     """For each row."""
     json: Path | None = None
-    """Where the results go; default: printed only."""
+    """A file for the results; default: printed only."""
 
 
 def network() -> nn.Sequential:

@@ -55,7 +55,6 @@ class Letters {
     }
     return found;
   }
-  size_t count() const { return names_.size(); }
 
  private:
   std::map<std::string, int> names_;

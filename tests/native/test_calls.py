@@ -26,11 +26,23 @@ native = pytest.importorskip("voronerf.ops._core.native", exc_type=backends.Back
 CASES = {name: case for name, case in cases().items() if "native" in backends.implemented(name)}
 
 
+def refused_dtypes(name):
+    """Dtypes that the native implementation does not take."""
+    reason = backends.why_not(CASES[name].call or name, "native", torch.device("cpu"), torch.bfloat16)
+    return () if reason is None else (torch.bfloat16,)
+
+
 def results(name, given):
-    """Results of an op, and its arguments, into which it may have written."""
+    """Results of an op, its arguments, into which it may have written, and the gradients of those that learn."""
     found = getattr(ops, CASES[name].call or name)(**given, backend="native")
-    leaves = tree_leaves((found.raw if hasattr(found, "raw") else found, given))
-    return [leaf.clone() for leaf in leaves if isinstance(leaf, Tensor)]
+    leaves = [leaf for leaf in tree_leaves((found, given)) if isinstance(leaf, Tensor)]
+    if hasattr(found, "raw"):
+        found.backward(found.raw.sum(), torch.ones_like(found.raw))
+        leaves.append(found.raw)
+    elif made := [leaf for leaf in tree_leaves(found) if isinstance(leaf, Tensor) and leaf.requires_grad]:
+        torch.autograd.backward([leaf.sum() for leaf in made])
+    gradients = [leaf.grad for leaf in tree_leaves(given) if isinstance(leaf, Tensor) and leaf.grad is not None]
+    return [leaf.detach().clone() for leaf in (*leaves, *gradients)]
 
 
 @contextlib.contextmanager
@@ -41,16 +53,24 @@ def without_the_exchange():
     native.know_torch(native.compiled)
 
 
+@pytest.mark.parametrize("learns", [False, True])
 @pytest.mark.parametrize(("name", "kind"), [(name, kind) for name, case in CASES.items() for kind in case.kinds])
-def test_the_same_bits_as_by_the_methods_of_tensors(name, kind):
+def test_the_same_bits_as_by_the_methods_of_tensors(name, kind, learns):
     """Whether torch tells of tensors at once or not: then every call is checked, and made, in Python."""
-    found, wanted = (CASES[name].make(Draw(**CASES[name].kinds[kind]), 33) for _ in range(2))
-    with torch.no_grad():
+    case = CASES[name]
+    for n, dtype in ((0, torch.float32), (1, torch.float32), (33, torch.float32), (33, torch.bfloat16)):
+        if (learns and not case.differentiable) or dtype in refused_dtypes(name):
+            continue
+        pinned = {"dtype": dtype, **case.kinds[kind]}
+        found, wanted = (case.make(Draw(**pinned), n) for _ in range(2))
+        for leaf in tree_leaves((found, wanted)):
+            if learns and isinstance(leaf, Tensor) and leaf.is_floating_point():
+                leaf.requires_grad_()
         made = results(name, found)
         with without_the_exchange():
             expected = results(name, wanted)
-    for one, other in zip(made, expected, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
+        for one, other in zip(made, expected, strict=True):
+            torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
 
 
 def test_plain_calls_are_made_without_python():

@@ -262,7 +262,7 @@ class Declaration:
         return found
 
     def _memory(self) -> Callable[[Any], Any]:
-        """What gives new memory for the results: a named tuple where they have names."""
+        """Makes the function that allocates the results: a named tuple where they have names."""
         rows, kind = [*zip(self.results.values(), self._likes())], tuple
         if "result0" not in self.results:
             kind = self._Results
@@ -361,7 +361,7 @@ class Declaration:
         return {"default": self._defaults[name]} if name in self._defaults else {}
 
     def _row(self, argument: Argument) -> dict[str, Any]:
-        """What the compiled module is told of an argument."""
+        """Describes an argument to the compiled module."""
         name, kind, optional, rule, text = argument
         row = {"name": name, "optional": optional, "bound": name in self._bound, "rule": rule, "kind": "any"}
         if kind is Tensor:
@@ -490,7 +490,7 @@ class Declaration:
         return Source(of, ("structure", [self._source(value, of_results).told for value in values]))
 
     def _source(self, value: Any, of_results: bool = False) -> Source:
-        """Where a parameter or a member comes from, by its name or what else `compiled_op` takes."""
+        """The origin of a parameter or a member, by its name or what else `compiled_op` takes."""
         if isinstance(value, Source):
             return value
         if isinstance(value, Memory):
@@ -514,7 +514,7 @@ class Declaration:
         return Source(lambda given, _: get(given), told)
 
     def _result_rows(self) -> list[tuple[Any, ...]]:
-        """What the compiled module is told of the results."""
+        """Describes the results to the compiled module."""
         known = {*self._places, *self._letters()}
 
         def told(shape: Sequence[int | str]) -> list[Any]:

@@ -42,7 +42,7 @@ _OF_A_TREE = {**_OF_PLACES, "centres": Row("centres", FLOATING, ("m", 3))}
 
 
 NETWORK = ("positions", "weights", "biases", "layers", "directions", "direction_index", "features")
-"""Of the arguments that are checked together."""
+"""Names of the arguments that `check_network` takes."""
 
 
 def check_network(
@@ -119,7 +119,7 @@ def _rows(
     behind: Sequence[Row],
     last: Sequence[Row],
 ) -> list[Row]:
-    """What the tensors of a network must be: positions, what they are read with, and parameters, between others.
+    """The rules for the tensors of a network: positions, what they are read with, and parameters, between others.
 
     ``form``: whether directions have an index, the dimensions of the features or 0, and whether there are directions.
     """

@@ -131,7 +131,7 @@ _ORDER = Row("order", INDEX, ("n",))
 
 
 def _rows(program: Program, dtype: torch.dtype, first: Sequence[Row], last: Sequence[Row]) -> Rows:
-    """What the tensors of a program must be: inputs, parameters and the index of rays, between others."""
+    """The rules for the tensors of a program: inputs, parameters and the index of rays, between others."""
     rows: list[Row | Default] = [*first]
     for i, width in enumerate(program.inputs):
         letter = "r" if _among(i, program.rays) else "n"

@@ -117,7 +117,7 @@ def program_of(rows: Rows, how: How) -> Program:
 
 
 class _Call(NamedTuple):
-    """What a program runs on, and how."""
+    """The tensors of a program, and how it runs."""
 
     rows: Rows
     how: How

@@ -94,7 +94,7 @@ def know_torch(module: Any) -> None:
 know_torch(compiled)
 
 signature, Rules, alike, adam_step = compiled.signature, compiled.Rules, compiled.alike, compiled.adam_step
-"""What checks arguments and makes calls (csrc/bindings/signature.h), of this module where another one stands in."""
+"""They check arguments and make calls (csrc/bindings/signature.h); of this module, also where tests put another one."""
 
 ISAS = compiled.Isa
 SUPPORTED_ISAS = tuple(isa for isa in ISAS if compiled.isa_supported(isa))
