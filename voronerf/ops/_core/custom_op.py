@@ -124,10 +124,13 @@ class Op:
         tensors: places of the arguments of the custom op that are tensors, or None.
         plan: how the compiled module calls it by itself (`Declaration.compiled_op`); None where it does not.
         at_once: gives the results where no gradients are recorded, or None where this class has to look at the call.
+        learning: gives them, with a node of autograd of its own, for plain tensors of the CPU with gradients; None
+            where this class makes the node.
     """
 
     plan: Any = None
     at_once: Callable[..., Any] | None = None
+    learning: Callable[..., Any] | None = None
     way: Callable[[tuple[Any, ...]], int] = staticmethod(lambda flat: 2)
     """The compiled module's answer, once that is there (csrc/bindings/signature.cpp): 0 for plain tensors of the CPU
     past the dispatcher, 1 for those with gradients, 2 where only what follows in Python knows."""
@@ -189,7 +192,7 @@ class Op:
         if way == 0:
             return self._run(arguments)
         if way == 1 and self._backward is not None:
-            return self._learning(flat, arguments)
+            return self._learning(flat, arguments) if self.learning is None else self.learning(*arguments)
         if forward_ad._current_level >= 0:
             self._refuse_tangents(flat)
         if active.recording is None and is_watched():
@@ -233,6 +236,12 @@ class Op:
 
     def _given(self, results: Any) -> Any:
         return list(results) if self._listed else results  # autograd.Function knows no lists
+
+    def refuse_batches(self, of_results: Sequence[Any]) -> None:
+        """Raises NotImplementedError for gradients of several results at once."""
+        for gradient in of_results:
+            if gradient is not None and torch._C._functorch.is_legacy_batchedtensor(gradient):
+                raise self.no_batches
 
     @property
     def no_batches(self) -> NotImplementedError:
@@ -295,8 +304,7 @@ class _Differentiable(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *of_results: Any) -> tuple[Any, ...]:
         op: Op = ctx.op
-        if any(own is not None and torch._C._functorch.is_legacy_batchedtensor(own) for own in of_results):
-            raise op.no_batches
+        op.refuse_batches(of_results)
         found = op.gradients(ctx, of_results) if op._listed else op.gradients(ctx, *of_results)
         if ctx.lengths is None:
             return *(op._tensors_of(found) if op._lists else found), None, None, None

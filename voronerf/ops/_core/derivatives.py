@@ -22,18 +22,19 @@ def asked_for(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
     nodes = [None if tensor is None else next(edges)[0] for tensor in inputs]
     if _ask is None:
         return [node is not None for node in nodes]
-    answers, refused = list[bool](), False
-    # The engine refuses to answer for a leaf that torch.autograd.grad was asked for, which takes 10 us. Parameters are
-    # the last inputs, and mostly leaves: after the first refusal, the leaves before it count as asked for.
+    answers, sure = list[bool](), False
+    # Parameters are the last inputs, and mostly leaves: after the first whose gradient is used, the leaves before it
+    # count as asked for. The engine refuses to answer for one that torch.autograd.grad was asked for, which takes 10 us.
     for node in reversed(nodes):
-        if node is None or (refused and type(node).__name__ == "AccumulateGrad"):
+        leaf = type(node).__name__ == "AccumulateGrad"
+        if node is None or (sure and leaf):
             answers.append(node is not None)
             continue
         try:
             answers.append(bool(_ask(node)))
         except RuntimeError:
             answers.append(True)
-            refused = True
+        sure = sure or (leaf and answers[-1])
     return answers[::-1]
 
 
