@@ -5,12 +5,12 @@
 
 #include <algorithm>
 #include <optional>
-#include <set>
 
 #include "bindings/adam_call.h"
 #include "bindings/frame.h"
 #include "bindings/program_call.h"
 #include "bindings/signature.h"
+#include "bindings/unchanged.h"
 #include "common/cuda_device.h"
 #include "common/parallel.h"
 #include "common/trace.h"
@@ -71,82 +71,6 @@ void call(const Loaded& loaded, Result& result) {
 
 }  // namespace
 
-// Where a tensor's memory is and, with its layout, how it lies there; null without an answer. That it is contiguous
-// takes half the time to find that its size and stride take.
-struct Place {
-  py::object answers[3];
-
-  Place(PyObject* tensor, bool layout, bool contiguous) {
-    static PyObject* const methods[] = {PyUnicode_InternFromString("data_ptr"), PyUnicode_InternFromString("size"),
-                                        PyUnicode_InternFromString("stride"), PyUnicode_InternFromString("numel"),
-                                        PyUnicode_InternFromString("is_contiguous")};
-    for (int i = 0; i < (layout ? 3 : 1); ++i) {
-      PyObject* const method = methods[i + (i > 0 && contiguous ? 2 : 0)];
-      answers[i] = py::reinterpret_steal<py::object>(PyObject_CallMethodNoArgs(tensor, method));
-    }
-    PyErr_Clear();
-  }
-  bool operator==(const Place& other) const {
-    for (int i = 0; i < 3; ++i) {
-      PyObject *const one = answers[i].ptr(), *const two = other.answers[i].ptr();
-      if (one == nullptr && two == nullptr) continue;
-      if (one == nullptr || two == nullptr || PyObject_RichCompareBool(one, two, Py_EQ) != 1)
-        return PyErr_Clear(), false;
-    }
-    return true;
-  }
-};
-
-// Members of dictionaries that must stay the same objects, but for those of the keys `free`, and tensors that must stay
-// where and as they are. Their storages are held too: memory that a tensor has left (`x.data = y`) is not freed.
-class Guards {
- public:
-  void add(const py::dict& members, const std::vector<std::string>& free) {
-    Guard guard{members, {}};
-    for (const auto& [key, value] : members) {
-      const bool any =
-          py::isinstance<py::str>(key) && std::count(free.begin(), free.end(), py::cast<std::string>(key)) != 0;
-      guard.values.push_back(any ? py::object() : py::reinterpret_borrow<py::object>(value));
-    }
-    guards_.push_back(std::move(guard));
-  }
-  void add_tensor(const py::object& tensor, bool layout) {
-    if (!known_.insert(tensor.ptr()).second) return;
-    const bool contiguous = py::cast<bool>(tensor.attr("is_contiguous")());
-    const Place place(tensor.ptr(), layout, contiguous);
-    tensors_.push_back({tensor, tensor.attr("untyped_storage")(), place, layout, contiguous});
-  }
-  // Compares as little as may be: between the kernels of a loop, whatever is looked at must come from memory.
-  bool hold() const {
-    for (const Guard& guard : guards_) {
-      size_t i = 0;
-      PyObject *key, *value;
-      for (Py_ssize_t place = 0; PyDict_Next(guard.members.ptr(), &place, &key, &value) != 0; ++i) {
-        if (i == guard.values.size()) return false;
-        if (guard.values[i] && guard.values[i].ptr() != value) return false;
-      }
-      if (i != guard.values.size()) return false;
-    }
-    return std::all_of(tensors_.begin(), tensors_.end(), [](const Held& held) {
-      return Place(held.tensor.ptr(), held.layout, held.contiguous) == held.place;
-    });
-  }
-
- private:
-  struct Guard {
-    py::dict members;
-    std::vector<py::object> values;  // null for any
-  };
-  struct Held {
-    py::object tensor, storage;
-    Place place;
-    bool layout, contiguous;
-  };
-  std::vector<Guard> guards_;
-  std::vector<Held> tensors_;
-  std::set<PyObject*> known_;  // the tensors
-};
-
 // Calls of a step in their order, with what they have taken, to be made again on the same memory, which is held. A
 // number of rows is read again from where it lies, so the memory must do for the most rows.
 class Recording {
@@ -160,14 +84,14 @@ class Recording {
   bool add_tensor(const py::object& tensor) {
     const auto found = made_.find(py::cast<std::uintptr_t>(tensor.attr("untyped_storage")().attr("data_ptr")()));
     if (found != made_.end()) return found->second;
-    tensors_.add_tensor(tensor, true);
+    tensors_.layout(tensor);
     return false;
   }
   // One that was made for the calls, and that others hold too.
-  void hold_tensor(const py::object& tensor) { tensors_.add_tensor(tensor, false); }
+  void hold_tensor(const py::object& tensor) { tensors_.place(tensor); }
   // The storage at an address is memory for these calls, or for others that are made before; of counted rows, or not.
   void made(std::uintptr_t address, bool counted) { made_[address] = counted; }
-  bool hold() const { return tensors_.hold(); }
+  bool hold() const { return tensors_.holds(); }
   void add(std::unique_ptr<Loaded> loaded) {
     if (loaded->bound->machine != &type_of<Cpu>()) refuse(loaded->function->name + " runs on a device");
     if (loaded->frame.misses_rows()) refuse(loaded->function->name + " takes no number of rows that is counted");
@@ -224,7 +148,7 @@ class Recording {
 
   std::vector<std::unique_ptr<Loaded>> calls_;
   std::string obstacle_;
-  Guards tensors_;
+  Unchanged tensors_;
   std::map<std::uintptr_t, bool> made_;
 };
 
@@ -321,10 +245,14 @@ constexpr const char* kStub =
     "cuda_major: int\n"
     "most_sources: int\n"
     "\n"
-    "class Guards:\n"
-    "    def add(self, members: Any, free: Sequence[str]) -> None: ...\n"
-    "    def add_tensor(self, tensor: Tensor, layout: bool) -> None: ...\n"
-    "    def hold(self) -> bool: ...\n"
+    "class Unchanged:\n"
+    "    def contents(self, container: Any, free: Sequence[str] = ...) -> None: ...\n"
+    "    def entries(self, dictionary: dict[str, Any], names: Sequence[str]) -> None: ...\n"
+    "    def attributes(self, object: Any, names: Sequence[str]) -> None: ...\n"
+    "    def place(self, tensor: Tensor) -> None: ...\n"
+    "    def layout(self, tensor: Tensor) -> None: ...\n"
+    "    def kind(self, dictionary: dict[str, Any], name: str) -> None: ...\n"
+    "    def holds(self) -> bool: ...\n"
     "\n"
     "class Recording:\n"
     "    obstacle: str\n"
@@ -461,11 +389,7 @@ void bind_all(PyObject* python) {
     bound.def(name.c_str(), [one = &function](const py::args& given) { return call_any(*one, given); });
   }
   // Local: the emulated module of the tests has them too.
-  py::class_<Guards>(bound, "Guards", py::module_local())
-      .def(py::init())
-      .def("add", &Guards::add)
-      .def("add_tensor", &Guards::add_tensor)
-      .def("hold", &Guards::hold);
+  bind_unchanged(bound);
   py::class_<Recording>(bound, "Recording", py::module_local())
       .def(py::init())
       .def("begin", &Recording::begin)

@@ -97,7 +97,14 @@ def _for_python(path):
     files = [file for file in sorted(bindings.glob("*.cpp")) if "VN_CUDA(" in file.read_text()]
     files += [
         bindings / name
-        for name in ("adam_call.cpp", "bind.cpp", "program_call.cpp", "signature.cpp", "tensor_view.cpp")
+        for name in (
+            "adam_call.cpp",
+            "bind.cpp",
+            "program_call.cpp",
+            "signature.cpp",
+            "tensor_view.cpp",
+            "unchanged.cpp",
+        )
     ]
     files += [HERE / name for name in sorted(PYTHON)]
     text = "".join(f'#include "{file}"\n' for file in files)

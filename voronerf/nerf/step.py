@@ -521,7 +521,7 @@ class TrainingStep:
             return
         from voronerf.ops._core import native  # which is not everywhere
 
-        self._known, self._guards, self._cpu = known, native.compiled.Guards(), native.cpu
+        self._known, self._guards, self._cpu = known, native.compiled.Unchanged(), native.cpu
         field, grid = cast(nn.Module, renderer.field), getattr(renderer.sampler, "grid", None)
         parts = [self.loss, renderer, renderer.sampler]  # those that segments read
         parts += [each for each in self.loss.terms if hasattr(each, "add") and not in_python(each, "add")]
@@ -530,9 +530,9 @@ class TrainingStep:
         if self.strategy is not None and not in_python(self.strategy, "step_post_backward"):
             parts.append(self.strategy)
         for part in parts:
-            self._guards.add(vars(part), free_names(part))
+            self._guards.contents(vars(part), free_names(part))
         if grid is not None:
-            self._guards.add(vars(grid), [])
+            self._guards.contents(vars(grid))
         dictionaries: list[dict[Any, Any]] = [renderer.fields]
         for module in field.modules():  # the router, perhaps in a wrapper
             for name, members in vars(module).items():
@@ -540,21 +540,21 @@ class TrainingStep:
                     dictionaries.append(members)
         dictionaries += [*map(vars, known.router.module.modules()), optimizer.state, *optimizer.state.values()]
         for members in dictionaries:
-            self._guards.add(members, [])
-        self._guards.add(vars(optimizer), ["steps_done"])
+            self._guards.contents(members)
+        self._guards.contents(vars(optimizer), ["steps_done"])
         for group in optimizer.param_groups:
-            self._guards.add(group, ["lr"])
+            self._guards.contents(group, ["lr"])
         if self._on_gpu():  # a capture does not see which tensors it takes, as a recording does
             owners = self.batches, renderer.sampler, self.strategy, self.guard, optimizer.state, self._gradients
             for tensor in (*tensors_of(owners), *field.parameters(), *field.buffers()):
-                self._guards.add_tensor(tensor, True)
+                self._guards.layout(tensor)
         learning = (p for group in optimizer.param_groups for p in group["params"])
         self._parameters = [*dict.fromkeys((*field.parameters(), *learning))]
         self._objects, self._values = self._current()
 
     def _holds(self) -> bool:
         """Whether all is as it was noted."""
-        if self._guards is None or not self._guards.hold():
+        if self._guards is None or not self._guards.holds():
             return False
         objects, values = self._current()
         if values != self._values or not all(map(operator.is_, objects, self._objects)):

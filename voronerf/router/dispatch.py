@@ -7,7 +7,6 @@ size, or with ``way=`` the one that was named.
 
 from __future__ import annotations
 
-import operator
 import os
 import re
 import sys
@@ -24,6 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.ops._core.backends import BackendUnavailable
+from voronerf.ops._core.unchanged import unchanged
 from voronerf.router import rules  # noqa: F401  registers the rules
 from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
@@ -125,7 +125,7 @@ class Dispatch:
         self.plans: dict[Any, list[CallPlan]] = {}  # the latest first; several where they are traced with other values
         self._fixed: dict[Any, tuple[set[Source], str]] = {}  # what cannot be an input of a trace, and why
         self.known: dict[Any, KnownCall] = {}  # by `kind_of`
-        self._known, self._trees = list[Any](), list[Any]()  # parameters, and parts of the module, at the last call
+        self._parts: Any = unchanged()  # parameters and parts of the module, at the last call
         self._k = 0  # cells, then
         self._inner: list[Any] = []  # shapes of one cell's parameters
         self._subclasses: set[Any] = set()  # methods and tensor types that are known to work with plain tensors
@@ -196,6 +196,7 @@ class Dispatch:
         if call.like is not None and not is_watched() and (known := KnownCall.of(plan, call, grouping)):
             if len(self.known) >= _PLANS:
                 self.known = {}
+            self._guard(known)
             self.known[call.like] = known
         return results
 
@@ -213,27 +214,34 @@ class Dispatch:
         entry = self.known.get(kind)
         if entry is None or torch.compiler.is_compiling():
             return entry
-        return None if is_watched() or not self._same_parameters(k) or entry.plan.watch.changed() else entry
+        if is_watched() or k != self._k:
+            return None
+        if not entry.unchanged.holds():
+            if not self._parts.holds() or entry.plan.watch.changed():
+                return None
+            self._guard(entry)  # of values that are equal, or parameters that are replaced by others of their kind
+        return entry
 
-    def _same_parameters(self, k: int) -> bool:
-        """Whether the module has the parameters and parts of the last call."""
-        if k != self._k:
-            return False
-        for registry, name, shape, dtype, device in self._known:
-            p = registry.get(name)
-            if p is None or p.shape != shape or p.dtype is not dtype or p.get_device() != device:
-                return False
-        for registry, was in self._trees:
-            if len(registry) != len(was) or not all(map(operator.is_, registry.values(), was)):
-                return False
-        return True
+    def _guard(self, entry: KnownCall) -> None:
+        entry.unchanged = unchanged()
+        self._note_parts(entry.unchanged, entry.module)
+        entry.plan.watch.note(entry.unchanged)
+
+    @staticmethod
+    def _note_parts(guard: Any, module: nn.Module) -> None:
+        """Which parameters and parts a module has."""
+        for part, name, _ in owned_parameters(module):
+            guard.kind(part._parameters, name)
+        for part in parts_of(module).values():
+            if part._modules:
+                guard.contents(part._modules)
 
     def _check_parameters(self, call: Call, k: int, names: Collection[str]) -> None:
         """Raises TypeError or ValueError where the module has not the parameters of k cells that it was wrapped with.
 
         A parametrisation, or memory of another shape, would send kernels to memory that is not theirs.
         """
-        if self._known and self._same_parameters(k):
+        if k == self._k and self._parts.holds():
             return
         now = dict(call.module.named_parameters())
         if gone := [name for name in names if name not in now]:
@@ -251,10 +259,8 @@ class Dispatch:
         inner = [(name, p.shape[id(p) in cells :], p.dtype) for name, p in now.items()]
         if inner != self._inner:
             self.forget()
-        self._inner, self._k, owned = inner, k, owned_parameters(call.module)
-        self._known = [(part._parameters, name, p.shape, p.dtype, p.get_device()) for part, name, p in owned]
-        trees = [part._modules for part in parts_of(call.module).values()]
-        self._trees = [(part, tuple(part.values())) for part in trees if part]
+        self._inner, self._k, self._parts = inner, k, unchanged()
+        self._note_parts(self._parts, call.module)
 
     def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
         """The plan for calls of this kind, which the first of them makes, and one that finds other values."""

@@ -47,7 +47,13 @@ def kind_of(method: str, training: bool, args: Sequence[Any], kwargs: dict[str, 
 
 
 class KnownCall:
-    """What is known of the calls of one kind, from the first of them and its plan."""
+    """What is known of the calls of one kind, from the first of them and its plan.
+
+    Attributes:
+        unchanged: Whether the module is as it was then.
+    """
+
+    unchanged: Any
 
     def __init__(self, plan: CallPlan, fused: Fused, whole: Whole, call: Call, grouping: Grouping) -> None:
         from voronerf.ops.routed_mlp.native import How, run_routed
@@ -56,7 +62,7 @@ class KnownCall:
         self._tensors = [i for i, value in enumerate(arguments) if isinstance(value, Tensor)]
         self._reads = [self._tensors[number] for number in reads]
         self._learns = torch.is_grad_enabled() and any(arguments[i].requires_grad for i in self._reads)
-        self._module = call.module
+        self.module = call.module
         self.plan, self._method, self._run, self._how = plan, call.method, run_routed, How(program.text)
         self._leading, device = len(call.layout.lead), grouping.device
         half = torch.is_autocast_enabled(device.type) or any(arguments[i].dtype in HALF for i in self._tensors)
@@ -106,7 +112,7 @@ class KnownCall:
             shape = positions.shape
         lead, k = shape[:-1], router.num_cells
         n = lead[0] if len(lead) == 1 else math.prod(lead)
-        if len(lead) != self._leading or not 0 < n <= MAX_COUNT or router._modules["module"] is not self._module:
+        if len(lead) != self._leading or not 0 < n <= MAX_COUNT or router._modules["module"] is not self.module:
             return None
         if self._learns and router.frozen_cells is not None:  # whose samples take no part in the backward pass
             return None

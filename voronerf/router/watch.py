@@ -100,6 +100,17 @@ class Watch:
         elif value is not _MISSING and (held := _held(value)) is not None:
             self._holders.append((source, value, held))
 
+    def note(self, guard: Any) -> None:
+        """Has a guard of `unchanged` look at the same."""
+        for registry, name in self._dicts:
+            guard.entries(registry, [name])
+        for tensor in self._tensors:
+            guard.attributes(tensor, ["_version"])
+        for _, value, _ in self._holders:
+            guard.contents(value if isinstance(value, (dict, list, tuple, set, frozenset)) else vars(value))
+        for hooks in self._hooks:
+            guard.contents(hooks)
+
     def changed(self) -> list[Source]:
         """The sources whose values have changed."""
         changed = list[Source]()

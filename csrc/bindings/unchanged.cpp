@@ -1,0 +1,183 @@
+#include "bindings/unchanged.h"
+
+#include <pybind11/stl.h>
+
+#include <algorithm>
+#include <cstring>
+
+namespace voronerf {
+
+namespace {
+
+bool are_equal(PyObject* one, PyObject* other) {
+  const int equal = one == nullptr || other == nullptr ? 0 : PyObject_RichCompareBool(one, other, Py_EQ);
+  PyErr_Clear();
+  return equal == 1;
+}
+
+bool is_same(PyObject* was, PyObject* is) {
+  if (was == is) return true;
+  if (was == nullptr || is == nullptr || Py_TYPE(was) != Py_TYPE(is)) return false;
+  const bool plain = PyLong_Check(is) || PyFloat_Check(is) || PyUnicode_Check(is) || PyComplex_Check(is) ||
+                     std::strcmp(Py_TYPE(is)->tp_name, "torch.device") == 0;
+  return plain && are_equal(was, is);
+}
+
+// Calls look(key or null, value) for all that a container holds, until that is false.
+template <typename Look>
+bool each(PyObject* container, Look&& look) {
+  if (PyDict_Check(container)) {
+    PyObject *key, *value;
+    for (Py_ssize_t at = 0; PyDict_Next(container, &at, &key, &value) != 0;) {
+      if (!look(key, value)) return false;
+    }
+    return true;
+  }
+  if (PyList_Check(container) || PyTuple_Check(container)) {
+    for (Py_ssize_t i = 0; i < PySequence_Fast_GET_SIZE(container); ++i) {
+      if (!look(nullptr, PySequence_Fast_GET_ITEM(container, i))) return false;
+    }
+    return true;
+  }
+  const auto items = py::reinterpret_steal<py::object>(PyObject_GetIter(container));
+  if (!items) throw py::error_already_set();
+  while (const auto item = py::reinterpret_steal<py::object>(PyIter_Next(items.ptr()))) {
+    if (!look(nullptr, item.ptr())) return false;
+  }
+  return true;
+}
+
+py::object value_of(PyObject* owner, bool dictionary, PyObject* name) {
+  if (dictionary) return py::reinterpret_borrow<py::object>(PyDict_GetItemWithError(owner, name));
+  auto value = py::reinterpret_steal<py::object>(PyObject_GetAttr(owner, name));
+  PyErr_Clear();
+  return value;
+}
+
+py::object interned(const std::string& name) {
+  return py::reinterpret_steal<py::object>(PyUnicode_InternFromString(name.c_str()));
+}
+
+}  // namespace
+
+Unchanged::Seen::Seen(PyObject* tensor, bool place, bool layout) : place(place), layout(layout) {
+  if (view.look(tensor)) {
+    sizes.assign(view.shape, view.shape + view.dimensions);
+    strides.assign(view.strides, view.strides + view.dimensions);
+  } else {
+    answers = ask(tensor);
+  }
+}
+
+std::vector<py::object> Unchanged::Seen::ask(PyObject* tensor) const {
+  std::vector<py::object> found;
+  const auto add = [&](const char* name, bool method) {
+    auto answer = py::reinterpret_steal<py::object>(PyObject_GetAttrString(tensor, name));
+    if (answer && method) answer = py::reinterpret_steal<py::object>(PyObject_CallNoArgs(answer.ptr()));
+    PyErr_Clear();
+    found.push_back(answer);
+  };
+  if (place) add("data_ptr", true);
+  if (layout) add("size", true);
+  if (layout && place) add("stride", true);
+  if (!place) add("dtype", false);
+  if (!place) add("device", false);
+  return found;
+}
+
+bool Unchanged::Seen::holds(PyObject* tensor) const {
+  if (!answers.empty()) {
+    const std::vector<py::object> now = ask(tensor);
+    return std::equal(answers.begin(), answers.end(), now.begin(), [](const py::object& was, const py::object& is) {
+      return (!was && !is) || are_equal(was.ptr(), is.ptr());
+    });
+  }
+  TensorView now;
+  if (!now.look(tensor)) return false;
+  if (place && now.address() != view.address()) return false;
+  const bool like = now.code == view.code && now.bits == view.bits && now.device_type == view.device_type &&
+                    now.device_index == view.device_index;
+  if (!place && !like) return false;
+  if (!layout) return true;
+  if (now.dimensions != view.dimensions || !std::equal(sizes.begin(), sizes.end(), now.shape)) return false;
+  return !place || std::equal(strides.begin(), strides.end(), now.strides);
+}
+
+void Unchanged::contents(const py::object& container, const std::vector<std::string>& free) {
+  Container noted{container, {}};
+  each(container.ptr(), [&](PyObject* key, PyObject* value) {
+    bool any = false;
+    if (key != nullptr) {
+      noted.values.push_back(py::reinterpret_borrow<py::object>(key));
+      any = PyUnicode_Check(key) && std::find(free.begin(), free.end(), py::cast<std::string>(key)) != free.end();
+    }
+    noted.values.push_back(any ? py::object() : py::reinterpret_borrow<py::object>(value));
+    return true;
+  });
+  containers_.push_back(std::move(noted));
+}
+
+void Unchanged::entries(const py::dict& dictionary, const std::vector<std::string>& names) {
+  add_named(dictionary, true, names);
+}
+
+void Unchanged::attributes(const py::object& object, const std::vector<std::string>& names) {
+  add_named(object, false, names);
+}
+
+void Unchanged::add_named(const py::object& owner, bool dictionary, const std::vector<std::string>& names) {
+  Named noted{owner, dictionary, {}};
+  for (const std::string& name : names) {
+    const py::object key = interned(name);
+    noted.values.emplace_back(key, value_of(owner.ptr(), dictionary, key.ptr()));
+  }
+  named_.push_back(std::move(noted));
+}
+
+void Unchanged::add(const py::object& tensor, bool layout) {
+  if (!known_.insert({tensor.ptr(), layout}).second) return;
+  tensors_.push_back({tensor, tensor.attr("untyped_storage")(), Seen(tensor.ptr(), true, layout)});
+}
+
+void Unchanged::kind(const py::dict& dictionary, const std::string& name) {
+  const py::object key = interned(name);
+  kinds_.push_back({dictionary, key, Seen(value_of(dictionary.ptr(), true, key.ptr()).ptr(), false, true)});
+}
+
+bool Unchanged::holds() const {
+  for (const Container& noted : containers_) {
+    size_t i = 0;
+    const bool all = each(noted.container.ptr(), [&](PyObject* key, PyObject* value) {
+      if (key != nullptr && (i == noted.values.size() || !is_same(noted.values[i++].ptr(), key))) return false;
+      if (i == noted.values.size()) return false;
+      PyObject* const was = noted.values[i++].ptr();
+      return was == nullptr || is_same(was, value);
+    });
+    if (!all || i != noted.values.size()) return false;
+  }
+  for (const Named& noted : named_) {
+    for (const auto& [name, was] : noted.values) {
+      if (!is_same(was.ptr(), value_of(noted.owner.ptr(), noted.dictionary, name.ptr()).ptr())) return false;
+    }
+  }
+  for (const Kind& noted : kinds_) {
+    PyObject* const tensor = PyDict_GetItemWithError(noted.dictionary.ptr(), noted.name.ptr());
+    if (tensor == nullptr || tensor == Py_None || !noted.seen.holds(tensor)) return false;
+  }
+  return std::all_of(tensors_.begin(), tensors_.end(),
+                     [](const Tensor& noted) { return noted.seen.holds(noted.tensor.ptr()); });
+}
+
+void bind_unchanged(py::module_& module) {
+  py::class_<Unchanged>(module, "Unchanged", py::module_local())
+      .def(py::init())
+      .def("contents", &Unchanged::contents, py::arg("container"), py::arg("free") = py::tuple())
+      .def("entries", &Unchanged::entries)
+      .def("attributes", &Unchanged::attributes)
+      .def("place", &Unchanged::place)
+      .def("layout", &Unchanged::layout)
+      .def("kind", &Unchanged::kind)
+      .def("holds", &Unchanged::holds);
+}
+
+}  // namespace voronerf
