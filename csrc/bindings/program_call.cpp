@@ -105,7 +105,7 @@ class ProgramCall {
     }
     in.gradients = keep && !kept_.empty() ? -1 : gradients;  // what is kept is of all rows
     in.caller = caller;
-    in.ray_name = std::strcmp(caller, "grouped_program") == 0 ? "ray_index" : "direction_index";
+    in.ray_name = std::strstr(caller, "_mlp") != nullptr ? "direction_index" : "ray_index";
 
     py::list found;
     std::vector<void*> made;

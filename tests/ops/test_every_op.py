@@ -40,7 +40,8 @@ RUNS = [
     for backend in backends.implemented(op)
     for device in ("cpu", "cuda")
 ]
-NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "adam", "average", "hash_encode")
+NETWORKS = ("grouped_mlp", "grouped_program", "forward_with_tape", "routed_mlp", "routed_program", "adam", "average")
+NETWORKS += ("hash_encode",)
 """Ops whose arguments tell how many tensors there are, and of which shapes."""
 SINGLE = ("balance_centres", "cell_sort", "march_rays", "pixel_rays")
 """Ops without floating-point numbers, or with those of one size alone."""

@@ -536,7 +536,7 @@ def test_high_derivatives_within_a_custom_op() -> None:
     assert sine is not None
     program = b.program([sine, b.encode("frequency", x, 1, along=[along, along])])
     rows = [torch.rand(5, 3), torch.rand(5, 3)]
-    how = (program.text, "", "grouped_program", "float32", False, -1)
+    how = (program.text, "grouped_program", "float32", False, -1)
     found = torch.ops.voronerf.grouped_program_native(rows, [], offsets_of([5]), None, None, [], *how)
     torch.testing.assert_close(found[0], rows[0].sin())
     second = -rows[1].square() * torch.stack([rows[0].sin(), rows[0].cos()])

@@ -37,6 +37,7 @@ from voronerf.ops.render_opaque import RaysSeen, render_opaque
 from voronerf.ops.rendered_gradient import rendered_gradient
 from voronerf.ops.resample import resample
 from voronerf.ops.routed_mlp import routed_mlp
+from voronerf.ops.routed_program import routed_program
 from voronerf.ops.smooth_depth_gradient import smooth_depth_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient
 from voronerf.ops.spherical_harmonics import spherical_harmonics
@@ -85,6 +86,7 @@ __all__ = [
     "rendered_gradient",
     "resample",
     "routed_mlp",
+    "routed_program",
     "run_gradients",
     "run_sums",
     "smooth_depth_gradient",

@@ -56,14 +56,14 @@ class KnownCall:
     unchanged: Any
 
     def __init__(self, plan: CallPlan, fused: Fused, whole: Whole, call: Call, grouping: Grouping) -> None:
-        from voronerf.ops.routed_mlp.native import How, run_routed
+        from voronerf.ops.routed_program.native import How, run_known
 
         (program, reads, results), arguments = whole, (*call.args, *call.kwargs.values())
         self._tensors = [i for i, value in enumerate(arguments) if isinstance(value, Tensor)]
         self._reads = [self._tensors[number] for number in reads]
         self._learns = torch.is_grad_enabled() and any(arguments[i].requires_grad for i in self._reads)
         self.module = call.module
-        self.plan, self._method, self._run, self._how = plan, call.method, run_routed, How(program.text)
+        self.plan, self._method, self._run, self._how = plan, call.method, run_known, How(program.text, caller="routed_program")
         self._leading, device = len(call.layout.lead), grouping.device
         half = torch.is_autocast_enabled(device.type) or any(arguments[i].dtype in HALF for i in self._tensors)
         ones = 0 if call.layout.flat else self._leading - 1

@@ -14,6 +14,7 @@ import functools
 import json
 from dataclasses import dataclass, field, replace
 
+from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.program import PARAMETER, Builder, Columns, Program, pruned
 
@@ -278,6 +279,12 @@ def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: 
         parts.append((values[output], at))
         at += values[output].width
     return pruned(b.program([b.move(at, parts)]))
+
+
+@constant_result
+def program_text(text: str, p: int, q: int, widths: tuple[int, ...], biased: tuple[bool, ...], ray: bool) -> str:
+    """The text of :meth:`MLP.program` of the table whose text this is; ``torch.compile`` takes it as it finds it."""
+    return _program(text, p, q, widths, biased, ray).text
 
 
 def encoded_width(features: int, octaves: int | None) -> int:

@@ -9,7 +9,7 @@ from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops.forward_with_tape.reference import Tape
 from voronerf.ops.grouped_mlp.checks import check_routed
-from voronerf.ops.routed_mlp.program import check_routed_program
+from voronerf.ops.routed_program import check_routed_program
 
 _OP = backends.declare("forward_with_tape", native=Implementation(EVERYWHERE, FLOATS), warp=PLAIN)
 _NEEDED = ("positions", "weights", "biases", "layers")
@@ -56,7 +56,7 @@ def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> T
         raise ValueError(f"{_OP}: network must hold {', '.join(needed[:-1])} and {needed[-1]}, got {came}")
     if not all(isinstance(name, str) for name in network):
         raise TypeError(f"{_OP}: network must hold arguments by name, got {list(network)!r:.100}")
-    network = check_routed_program(_OP, **network) if by_program else check_routed(_OP, **network)
+    network = check_routed_program(_OP, True, **network) if by_program else check_routed(_OP, **network)
     first = network["inputs" if by_program else "weights"][0]
     tape: Tape = backends.resolve_composed(_OP, backend=backend, device=first.device, dtype=first.dtype)(network)
     return tape

@@ -18,33 +18,31 @@ from voronerf.ops._core import native
 from voronerf.ops.forward_with_tape.reference import Graph, Tape, learnt, with_gradients
 from voronerf.ops.grouped_program.native import How, Rows, run, run_gradient
 from voronerf.ops.routed_mlp import native as routed_mlp
-from voronerf.ops.routed_mlp import of_samples
-from voronerf.ops.routed_mlp.program import cells_of
-from voronerf.ops.routed_mlp.reference import first_rows
+from voronerf.ops.routed_program import native as routed_program
+from voronerf.ops.routed_program import of_samples
+from voronerf.ops.routed_program.reference import cells_of, first_rows
 
 
 def forward_with_tape(network: Mapping[str, Any]) -> Tape:
     """The outputs and their tape, once differentiable; see ``voronerf.ops.forward_with_tape``."""
     given = dict(network)
     frozen = given.pop("frozen", None)
-    prepared = routed_mlp.prepared_program if "program" in network else routed_mlp.prepared
+    prepared = routed_program.prepared if "program" in network else routed_mlp.prepared
     recorded = torch.is_grad_enabled()
     with torch.no_grad():
         taken, where = prepared(**given)
         first, k = taken.inputs[0], cells_of(taken.parameters)
         plain = all(tensor.dtype is torch.float32 for tensor in taken.given)
         if recorded and plain and not torch.is_autocast_enabled(first.device.type):
-            cells, order, offsets = routed_mlp.find(first, where, k)
+            cells, order, offsets = routed_program.find(first, where, k, taken.how.caller)
             rows, how = taken.rows(offsets, order), taken.how
             learning = any(tensor.requires_grad for tensor in taken.given)
             out, *kept = run(rows, how._replace(keep=True) if learning else how)
             count = None if native.on_cuda(out) else where.rows  # CUDA has left out the others
             if count is not None:
-                out, cells = first_rows(out, cells, count)
+                (out,), cells = first_rows([out], cells, count)
             return _Kept(out, rows._replace(kept=kept), how, taken.given, count, cells, frozen)
-    taken, where = prepared(**given)
-    cells, order, offsets = routed_mlp.find(first, where, k)
-    out, cells = first_rows(taken.run(offsets, order), cells, where.rows)
+    (out,), cells = routed_program.run_routed(*prepared(**given))
     return Graph(out.detach().float(), out, cells, frozen)
 
 
@@ -77,7 +75,7 @@ class _Kept(Tape):
         if not any(wanted):
             return []
         if self.count is not None:
-            gradient, _ = first_rows(gradient, self.cells, self.count)
+            (gradient,), _ = first_rows([gradient], self.cells, self.count)
         if self.frozen is not None:  # rows of zeros leave the backward pass
             gradient = gradient.masked_fill(of_samples(self.frozen, self.cells), 0)
         return run_gradient(self.taken, self.how, [gradient], wanted)

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_flag, check_shape
-from voronerf.ops.routed_mlp import of_samples, routed_mlp
-from voronerf.ops.routed_mlp.program import routed_program
+from voronerf.ops.routed_mlp import routed_mlp
+from voronerf.ops.routed_program import of_samples
+from voronerf.ops.routed_program.reference import routed_program
 
 
 class Tape(ABC):
@@ -63,8 +64,10 @@ def forward_with_tape(network: Mapping[str, Any], backend: str = "reference") ->
     """The outputs and their tape; see ``voronerf.ops.forward_with_tape``."""
     network = dict(network)
     frozen = network.pop("frozen", None)
-    run = routed_program if "program" in network else routed_mlp
-    out, cells = run(**network, backend=backend)
+    if "program" in network:
+        (out,), cells = routed_program(**network, backend=backend)
+    else:
+        out, cells = routed_mlp(**network, backend=backend)
     return Graph(out.detach().float(), out, cells, frozen)
 
 

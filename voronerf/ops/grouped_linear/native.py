@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer
+from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer, program_text
 from voronerf.ops.grouped_program.native import How, Rows, run_program
 
 # Of one layer, whose width is that of its weight.
@@ -27,6 +27,7 @@ def grouped_linear(
     stored = dtype if dtype == torch.bfloat16 else torch.float32
     rounded = [p.to(dtype).float() for p in (weight, bias) if p is not None]
     rows = Rows([x.to(dtype).to(stored)], rounded, offsets, None, None)
-    how = How(_TABLES[activation], "0" if bias is None else "1", "grouped_linear", _PRODUCTS.get(dtype, "float32"))
+    shape = int(weight.shape[2]), 0, (int(weight.shape[1]),), (bias is not None,), False
+    how = How(program_text(_TABLES[activation], *shape), "grouped_linear", _PRODUCTS.get(dtype, "float32"))
     (out,) = run_program(rows, how)
     return out.to(dtype)

@@ -23,4 +23,5 @@ def grouped_mlp(
 ) -> Tensor:
     """Every sample through the network of its cell; see ``voronerf.ops.grouped_mlp``."""
     given = Given(positions, weights, biases, layers, directions, direction_index, features)
-    return as_network(given, "grouped_mlp").run(offsets)
+    (out,) = as_network(given, "grouped_mlp").run(offsets)
+    return out

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from voronerf.ops._core.layers import MLP
+from voronerf.ops._core.layers import MLP, program_text
 from voronerf.ops.grouped_mlp.reference import encode_directions, encode_positions
 from voronerf.ops.grouped_program.native import How, Rows, run_program
 
@@ -45,21 +45,21 @@ class Network(NamedTuple):
         given: what inputs and parameters were made of, in their order.
     """
 
-    inputs: list[Tensor]
-    parameters: list[Tensor]
+    inputs: Sequence[Tensor]
+    parameters: Sequence[Tensor]
     ray_index: Tensor | None
     how: How
     dtype: torch.dtype
-    given: list[Tensor]
+    given: Sequence[Tensor]
 
     def rows(self, offsets: Tensor, order: Tensor | None = None) -> Rows:
         """What the program runs on, for rows of cells by offsets [k + 1] and an order."""
         return Rows(self.inputs, self.parameters, offsets, order, self.ray_index)
 
-    def run(self, offsets: Tensor, order: Tensor | None = None) -> Tensor:
-        """The result [n, out]."""
-        (out,) = run_program(self.rows(offsets, order), self.how)
-        return out if out.dtype is self.dtype else out.to(self.dtype)
+    def run(self, offsets: Tensor, order: Tensor | None = None) -> list[Tensor]:
+        """The results, [n, w] each."""
+        found = run_program(self.rows(offsets, order), self.how)
+        return [out if out.dtype is self.dtype else out.to(self.dtype) for out in found]
 
 
 def half_products(dtype: torch.dtype) -> str:
@@ -97,6 +97,7 @@ def as_network(given: Given, caller: str) -> Network:
     stored = dtype is torch.bfloat16 and features is None  # hash grids read float32
     stored = stored and all(x.dtype is torch.bfloat16 for x in rows)
     inputs = rows if stored else [x if x.dtype is torch.float32 else x.float() for x in rows]
-    biased = "".join(["0" if bias is None else "1" for bias in biases])
-    how = How(layers.text, biased, caller, half_products(dtype))
-    return Network(inputs, parameters, index, how, dtype, [*rows, *taken])
+    q = int(directions.shape[1]) if len(rows) > 1 and directions is not None else 0
+    widths, biased = [int(weight.shape[1]) for weight in weights], [bias is not None for bias in biases]
+    text = program_text(layers.text, int(positions.shape[1]), q, tuple(widths), tuple(biased), index is not None)
+    return Network(inputs, parameters, index, How(text, caller, half_products(dtype)), dtype, [*rows, *taken])

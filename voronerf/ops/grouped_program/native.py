@@ -17,7 +17,6 @@ from voronerf.ops._core import backends, native
 from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import asked_for
-from voronerf.ops._core.layers import MLP
 from voronerf.ops._core.program import Program, gradient
 from voronerf.ops._core.rows import new_empty, rows_of
 from voronerf.ops.grouped_program.lowering import Lowered, compiled_runs, lower
@@ -49,9 +48,7 @@ class How(NamedTuple):
     """How a program runs.
 
     Attributes:
-        text: of the program, or of a layer table, whose program follows from it and the shapes of the tensors: sizes
-            may be symbolic under ``torch.compile``, and stand in no text.
-        biased: of a table "1" for each layer that has a bias and "0" for one that has none; empty for a program.
+        text: of the program.
         caller: the op that errors name.
         products: what they take: "float32", "bfloat16" or, on CUDA, "float16".
         keep: whether what hash grids are looked up to are further results, as `Rows` has it.
@@ -59,7 +56,6 @@ class How(NamedTuple):
     """
 
     text: str
-    biased: str = ""
     caller: str = "grouped_program"
     products: str = "float32"
     keep: bool = False
@@ -80,21 +76,15 @@ def grouped_program(
 
 def run_program(rows: Rows, how: How) -> list[Tensor]:
     """The outputs and sums of a program, with gradients of every order."""
-    if how.biased and not torch.compiler.is_compiling():
-        how = how._replace(text=program_of(rows, how).text, biased="")
-    if torch.is_grad_enabled() and (how.biased or _looks_up(how.text)):
+    if torch.is_grad_enabled() and _looks_up(how.text):
         how = how._replace(keep=any(t.requires_grad for t in (*rows.inputs, *rows.parameters)))
     found: list[Tensor] = run(rows, how)
-    return found[: _results(how)] if how.keep else found
-
-
-def _results(how: How) -> int:
-    """How many outputs and sums there are; behind them comes what is kept."""
-    return 1 if how.biased else _results_of(how.text)
+    return found[: _results(how.text)] if how.keep else found
 
 
 @constant_result
-def _results_of(text: str) -> int:
+def _results(text: str) -> int:
+    """How many outputs and sums there are; behind them comes what is kept."""
     program = Program.parse(text)
     return len(program.outputs) + len(program.sums)
 
@@ -103,17 +93,6 @@ def _results_of(text: str) -> int:
 def _looks_up(text: str) -> bool:
     """Whether a program has hash grids."""
     return bool(Program.parse(text).grids)
-
-
-def program_of(rows: Rows, how: How) -> Program:
-    """The program for tensors of these shapes."""
-    if not how.biased:
-        return Program.parse(how.text)
-    p, q = int(rows.inputs[0].shape[1]), int(rows.inputs[1].shape[1]) if len(rows.inputs) > 1 else 0
-    widths = tuple([int(weight.shape[1]) for weight in rows.parameters[: len(how.biased)]])
-    return MLP.parse(how.text).program(
-        p, q, widths, tuple([bias == "1" for bias in how.biased]), rows.ray_index is not None
-    )
 
 
 class _Call(NamedTuple):
@@ -132,7 +111,7 @@ def _sizes(program: Program, rows: Rows) -> tuple[int, int]:
 def _memory(given: _Call) -> list[Tensor]:
     """For the outputs of a program, its sums, and what is kept."""
     rows, how = given
-    program, like = program_of(rows, how), rows.inputs[0]
+    program, like = Program.parse(how.text), rows.inputs[0]
     n, r = _sizes(program, rows)
     found = [
         new_empty(like, r if i in program.by_ray else n, columns.width) for i, columns in enumerate(program.outputs)
@@ -155,7 +134,7 @@ def run(given: _Call) -> list[Tensor]:
 
 def _made(rows: Rows, how: How) -> list[Tensor]:
     """Its results."""
-    program = program_of(rows, how)
+    program = Program.parse(how.text)
     if not compiled_runs(program.text):
         found = _memory(_Call(rows, how))
         inputs = [x.float() for x in rows.inputs]
@@ -172,7 +151,7 @@ def _made(rows: Rows, how: How) -> list[Tensor]:
 def _at_once(rows: Rows, how: How) -> list[Tensor] | None:
     """The results where no gradients are recorded and nothing of torch's is to see the call; else None."""
     text = how.text
-    if how.biased or native.on_cuda(rows.offsets) or not compiled_runs(text):
+    if native.on_cuda(rows.offsets) or not compiled_runs(text):
         return None
     lowered = lower(text, _layout(how.products, rows.offsets), False)
     found: list[Tensor] | None = lowered.call(rows, how.keep, how.gradients, how.caller, True)
@@ -296,7 +275,7 @@ def program_inputs(
         ready=ready,
         gradients=gradients,
         caller=caller,
-        ray_name="ray_index" if caller == "grouped_program" else "direction_index",
+        ray_name="direction_index" if caller.endswith("_mlp") else "ray_index",
     )
 
 
@@ -336,7 +315,7 @@ def _multiplies_halves(products: str, device: torch.device) -> bool:
 
 def _keep(ctx: Any, inputs: tuple[Rows, How], output: Sequence[Tensor]) -> None:
     rows, ctx.how = inputs
-    ctx.count, ctx.parameters, ctx.results = len(rows.inputs), len(rows.parameters), _results(ctx.how)
+    ctx.count, ctx.parameters, ctx.results = len(rows.inputs), len(rows.parameters), _results(ctx.how.text)
     ctx.set_materialize_grads(False)
     ctx.kept, kept = len(rows.kept), output[ctx.results :]
     if kept:
@@ -373,7 +352,7 @@ def run_gradient(rows: Rows, how: How, arriving: Sequence[Tensor | None], wanted
         arriving: the gradient to each of its results, None where there is none.
         wanted: of each input, then of each parameter.
     """
-    program, count = program_of(rows, how), len(rows.inputs)
+    program, count = Program.parse(how.text), len(rows.inputs)
     split, given = len(program.outputs), tuple([g is not None for g in arriving])
     own = _gradient(program.text, how.caller, how.products, count, tuple(wanted), given)
     inputs = [*rows.inputs, *[g for g in arriving[:split] if g is not None]]
@@ -408,7 +387,7 @@ def _gradient(
     sifts = not own.outputs and all(i < count for i in own.rays) and not any(given[split:])
     keeps = bool(program.grids) and compiled_runs(own.text) and compiled_runs(text)
     keeps = keeps and lower(own.text).lookups == lower(text).lookups
-    return _Gradient(How(own.text, "", caller, products, False, count if sifts else -1), len(own.outputs), keeps)
+    return _Gradient(How(own.text, caller, products, False, count if sifts else -1), len(own.outputs), keeps)
 
 
 class _Node(torch.autograd.Function):

@@ -14,7 +14,7 @@ from voronerf.ops._core.declare import declare
 from voronerf.ops.grouped_mlp.checks import check_routed
 from voronerf.ops.render_loss.reference import scaled
 from voronerf.ops.render_opaque.reference import RaysSeen
-from voronerf.ops.routed_mlp.program import check_routed_program
+from voronerf.ops.routed_program import check_routed_program
 
 #: Names of the arguments of `routed_mlp` that a network has; the others are of the samples, or of the backward pass.
 OF_PROGRAM = ("program", "parameters", "centres", "child_offsets", "child", "depth")
@@ -49,7 +49,7 @@ def _program(op: str, given: Any, network: Mapping[str, Any]) -> dict[str, Any]:
     origins, reads = given.origins, bool(getattr(network["program"], "rays", ()))
     index = torch.arange(len(origins), dtype=torch.int32, device=origins.device) if reads else None
     inputs = [origins, given.directions] if reads else [origins]
-    table = check_routed_program(op, **{"parameters": [], **network}, inputs=inputs, ray_index=index)
+    table = check_routed_program(op, True, **{"parameters": [], **network}, inputs=inputs, ray_index=index)
     table.pop("frozen")
     if table["program"].outputs[0].width != 4:
         got = table["program"].outputs[0].width

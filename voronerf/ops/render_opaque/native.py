@@ -14,13 +14,14 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 from voronerf.ops.grouped_program.lowering import lower
-from voronerf.ops.grouped_program.native import program_inputs, program_of
+from voronerf.ops.grouped_program.native import program_inputs
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.render_opaque import reference
 from voronerf.ops.render_opaque.reference import RaysSeen
 from voronerf.ops.routed_mlp import native as routed_mlp
-from voronerf.ops.routed_mlp.program import cells_of
+from voronerf.ops.routed_program import native as routed_program
+from voronerf.ops.routed_program.reference import cells_of
 
 _OP = declared("render_opaque")
 _rays = _OP.inputs(
@@ -35,7 +36,7 @@ def render_opaque(*flat: Any) -> RaysSeen:
     """Every ray up to the first surface, in float32; see ``voronerf.ops.render_opaque``."""
     given = _OP.Inputs._make(flat)
     network = given.network
-    prepared = routed_mlp.prepared_program if "program" in network else routed_mlp.prepared
+    prepared = routed_program.prepared if "program" in network else routed_mlp.prepared
     ray_index = given.near.new_empty(0, dtype=torch.int32)  # of samples that are not there yet
     index = "ray_index" if "program" in network else "direction_index"
     seen = network.get("directions") is not None or network.get("ray_index") is not None
@@ -48,7 +49,7 @@ def render_opaque(*flat: Any) -> RaysSeen:
         composed: RaysSeen = partial(reference.render_opaque, backend="native")(*given._replace(network=narrow))
         return composed
     rows = taken.rows(torch.zeros(k + 1, dtype=torch.int32))
-    lowered = lower(program_of(rows, taken.how).text)
+    lowered = lower(taken.how.text)
     child_offsets, child, depth = network["child_offsets"], network["child"], network["depth"]
     if k == 1:
         centres = child_offsets = child = None

@@ -13,7 +13,7 @@ from voronerf.ops.composite import Composite, composite
 from voronerf.ops.march_rays import march_rays
 from voronerf.ops.render_loss.reference import activate
 from voronerf.ops.routed_mlp import routed_mlp
-from voronerf.ops.routed_mlp.program import routed_program
+from voronerf.ops.routed_program.reference import routed_program
 
 
 class RaysSeen(NamedTuple):
@@ -80,7 +80,7 @@ def render_opaque(*flat: Any, backend: str = "reference") -> RaysSeen:
         if by_program:
             rays = [x[live] for x in network["inputs"][1:]]
             index = march.ray_index if rays else None
-            raw, _ = routed_program(inputs=[positions, *rays], ray_index=index, **taken)
+            (raw,), _ = routed_program(inputs=[positions, *rays], ray_index=index, **taken)
         else:
             seen_from: dict[str, Any] = {"directions": None, "direction_index": None}
             if seen_by is not None:

@@ -4,15 +4,14 @@ features of a position and a direction."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
-import torch
 from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.grouped_mlp.checks import check_routed
+from voronerf.ops.routed_program import hold, of_samples
 
 _OP = backends.declare("routed_mlp", native=Implementation(EVERYWHERE, FLOATS), warp=PLAIN)
 
@@ -112,27 +111,3 @@ def routed_mlp(
     frozen = network.pop("frozen")
     out, found = run(**network)
     return (out if frozen is None else hold(out, of_samples(frozen, found))), found
-
-
-def of_samples(frozen: Tensor, cells: Tensor) -> Tensor:
-    """bool [n, 1], whether the cell of each sample is frozen; a sample in no cell, -1, is as the first."""
-    return frozen.index_select(0, cells.clamp(min=0))[:, None]
-
-
-def hold(out: Tensor, rows: Tensor) -> Tensor:
-    """The same values, with gradients of zero in rows bool [n, 1]; rows of zeros leave the backward pass of native."""
-    return _Hold.apply(out, rows) if out.requires_grad else out
-
-
-class _Hold(torch.autograd.Function):
-    @staticmethod
-    def forward(out: Tensor, rows: Tensor) -> Tensor:
-        return out.view_as(out)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(inputs[1])
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return gradient.masked_fill(ctx.saved_tensors[0], 0), None

@@ -1,0 +1,51 @@
+"""The case of ``routed_program``."""
+
+from __future__ import annotations
+
+import torch
+
+from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops._core.program import Builder, Program
+from voronerf.ops.locate_cell.case import tree
+
+
+def two_outputs(rays: bool) -> Program:
+    """A layer of positions and directions, and one of it, that cells share."""
+    b = Builder()
+    x, seen = b.input(3), b.input(3, ray=rays)
+    hidden = b.linear(x, b.parameter(5, 3), 5, add=b.linear(seen, b.parameter(5, 3), 5))
+    return b.program([b.apply("sigmoid", b.linear(hidden, b.parameter(4, 5), 4)), b.apply("tanh", hidden)])
+
+
+def _make(draw: Draw, n: int) -> Arguments:
+    by, rays = draw.among("by", "centres", "tree", "cells", "one cell"), draw.among("rays", False, True)
+    where, k = tree(draw) if by == "tree" else ({}, 1 if by == "one cell" else draw.among("k", 2, 1, 9))
+    if by in ("centres", "cells"):
+        where = {"centres": draw.uniform(k, 3)} if by == "centres" else {"cells": draw.integers(0, k, n)}
+    program, dtype, r = two_outputs(rays), draw.dtype(), draw.number("r", 4, 1, 9)
+    parameters = [draw.normal(k, *shape, dtype=dtype) / 2 for shape in program.parameters]
+    if draw.among("shared", False, True):
+        parameters[-1] = parameters[-1][0]
+    return {
+        "program": program,
+        "inputs": [draw.uniform(n, 3, dtype=dtype), draw.uniform(r if rays else n, 3, dtype=dtype)],
+        "parameters": parameters,
+        "ray_index": draw.integers(0, r, n) if rays else None,
+        **where,
+    }
+
+
+CASE = Case(
+    _make,
+    {
+        "": {},
+        "nested, of rays": {"by": "tree", "rays": True},
+        "one cell": {"by": "one cell"},
+        "of cells, with shared ones": {"by": "cells", "shared": True},
+    },
+    refused={
+        "centres must have shape [k, 3] with k = 2, got [1, 3]": {"centres": torch.zeros(1, 3)},
+        "parameters must be 3 tensors (inputs at least one), got 0": {"parameters": []},
+    },
+    differentiable=True,
+)

@@ -1,0 +1,91 @@
+"""Programs on samples in the cells of a diagram: find the cells, sort, run, put the results back in order.
+
+n samples, r rays, k cells, m centres of all diagrams together, g diagrams, w columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.ops._core.checks import check_range
+from voronerf.ops._core.program import Program
+from voronerf.ops.cell_sort import cell_sort
+from voronerf.ops.grouped_program import grouped_program
+from voronerf.ops.locate_cell import locate_cell
+from voronerf.ops.nearest_centre import nearest_centre
+
+
+class Where(NamedTuple):
+    """What tells the cells, as ``voronerf.ops.routed_program`` takes it."""
+
+    centres: Tensor | None = None
+    child_offsets: Tensor | None = None
+    child: Tensor | None = None
+    depth: int = 1
+    cells: Tensor | None = None
+    coords: Tensor | None = None
+    rows: Tensor | None = None
+
+
+def routed_program(
+    program: Program,
+    inputs: Sequence[Tensor],
+    parameters: Sequence[Tensor],
+    *,
+    ray_index: Tensor | None = None,
+    backend: str = "reference",
+    **where: Any,
+) -> tuple[list[Tensor], Tensor]:
+    """Outputs in the order of the samples, and the cells; see ``voronerf.ops.routed_program``.
+
+    ``backend`` is that of the operations it is made of.
+    """
+    places, parameters = Where(**where), with_cells(program, parameters)
+    k, n, device = cells_of(parameters), inputs[0].shape[0], inputs[0].device
+    cells, order = find_cells("routed_program", places, k, backend), None
+    if cells is None:
+        cells = torch.zeros(n, dtype=torch.int32, device=device)
+        offsets = torch.tensor([0, n], dtype=torch.int32, device=device)
+    else:
+        order, offsets = cell_sort(cells, k, backend=backend)
+    rest: dict[str, Any] = {"program": program, "order": order, "ray_index": ray_index, "backend": backend}
+    return first_rows(grouped_program(inputs, parameters, offsets, **rest), cells, places.rows)
+
+
+def with_cells(program: Program, parameters: Sequence[Tensor]) -> Sequence[Tensor]:
+    """Parameters [1, ...] in the place of those that have no dimension of cells, since all cells share them."""
+    shapes = program.parameters
+    shaped = [p.unsqueeze(0) if p.dim() == len(shape) else p for p, shape in zip(parameters, shapes)]
+    return [*shaped, *parameters[len(shapes) :]]
+
+
+def cells_of(parameters: Sequence[Tensor]) -> int:
+    """k, of parameters [k, ...] and those [1, ...] that all cells share."""
+    return max([parameter.shape[0] for parameter in parameters], default=1)
+
+
+def find_cells(op: str, where: Where, k: int, backend: str) -> Tensor | None:
+    """int32 [n], the cells of samples; None where there is one."""
+    centres, child_offsets, child, depth, cells, coords, _ = where
+    if cells is None and k == 1:
+        return None
+    if cells is None:
+        assert coords is not None and centres is not None
+        if child_offsets is None or child is None:
+            cells = nearest_centre(coords, centres, backend=backend)
+        else:
+            cells = locate_cell(coords, centres, child_offsets, child, depth=depth, backend=backend)
+    check_range(op, "cells", cells, k)
+    return cells
+
+
+def first_rows(outputs: Sequence[Tensor], cells: Tensor, rows: Tensor | None) -> tuple[list[Tensor], Tensor]:
+    """Outputs and cells of the first ``rows``, int32 [1] or None for all; the others are 0, and in no cell: -1."""
+    if rows is None:
+        return list(outputs), cells
+    beyond = torch.arange(cells.shape[0], device=cells.device) >= rows
+    return [out.masked_fill(beyond[:, None], 0) for out in outputs], cells.masked_fill(beyond, -1)
