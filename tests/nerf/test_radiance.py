@@ -249,7 +249,7 @@ def test_with_cells_that_are_drawn():
     for _ in range(2):
         router.generator = seeded(7)
         known = radiance_of(field, (torch.rand(20, 3), torch.rand(20, 3)))
-        found.append(known.arguments(torch.rand(50, 3, generator=seeded(1)), torch.rand(4, 3), None, "auto")["cells"])
+        found.append(known.arguments(torch.rand(50, 3, generator=seeded(1)), torch.rand(4, 3), None)["cells"])
     router.generator = seeded(7)
     assert torch.equal(found[0], found[1])
     assert torch.equal(found[0], router.assign(torch.rand(50, 3, generator=seeded(1))))
@@ -354,7 +354,7 @@ def test_what_keeps_a_field_from_the_fast_step():
     assert why(shared) == "all cells share all parameters"
     table, field = make("table")
     table.module.view.register_forward_hook(lambda module, args, found: found)
-    assert why(field) == "NeRF does more than its layer table says"
+    assert why(field) == "NeRF does more than its program says"
     cones = VoronoiRouter(MipNeRF(width=8, depth=1), centres)
     assert why(cones, first=False) == "the field takes 6 numbers for a sample, and there are 3"
 
@@ -371,16 +371,12 @@ def test_explains_the_step_in_one_way(monkeypatch):
 
 @pytest.mark.parametrize("name", ["relu", "table", "own table"])
 def test_on_every_backend(name, monkeypatch, device, backend):
-    """Warp runs a layer table whose activations are those of the loss, and separate operations for the others."""
+    """Warp has kernels for the layers, whatever activations follow."""
     if torch.device(device).type != "cpu":
         pytest.skip("the same as on the CPU")
     router, field = make(name, backend=backend if name != "relu" or backend != "warp" else "auto")
     fast, separate = losses(field, monkeypatch, backend=backend)
-    if backend == "warp" and name != "table":
-        fast(batch_of(16), seeded(0))
-        assert fast.why_not_fused() == "Warp runs layer tables with the activations of NeRF alone"
-    else:
-        compare(router, fast, separate, batch_of(16))
+    compare(router, fast, separate, batch_of(16))
 
 
 def test_softplus_is_that_of_the_loss():

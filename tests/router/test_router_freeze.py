@@ -181,7 +181,7 @@ def test_forward_with_tape_leaves_frozen_cells_out(backend):
     router, points = make("table"), torch.rand(100, 3)
     router.freeze(FROZEN)
     rays = torch.arange(100, dtype=torch.int32)
-    network = radiance_of(router).arguments(points, torch.ones(100, 3), rays, backend)
+    network = radiance_of(router).arguments(points, torch.ones(100, 3), rays)
     tape = forward_with_tape(network, backend=backend)
     tape.backward(tape.raw.square().sum(), 2 * tape.raw)
     for p in router.parameters():

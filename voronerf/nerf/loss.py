@@ -125,7 +125,7 @@ class RayLoss:
         renderer = self.renderer
         if renderer.sampler.grid is None:
             return "empty space is not skipped"
-        return radiance_of(renderer.field, samples, inputs=6 if renderer.cones else 3, backend=renderer.backend)
+        return radiance_of(renderer.field, samples, inputs=6 if renderer.cones else 3)
 
     def _sample(self, generator: torch.Generator | None, batch: Batch) -> dict[str, Any]:
         draw = self.renderer.sampler.sample
@@ -134,7 +134,7 @@ class RayLoss:
     def _look(self, field: Radiance, batch: Batch, samples: Samples) -> dict[str, Any]:
         """Evaluates the networks, and computes the loss of the colours with its gradient."""
         renderer = self.renderer
-        network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index, renderer.backend)
+        network = field.arguments(samples.inputs, batch.rays.directions, samples.ray_index)
         tape = forward_with_tape({**network, "rows": samples.rows}, backend=renderer.backend)
         # What next to no light reaches learns nothing, and takes no part in the backward pass.
         along = self._along(tape.raw, field.rule, batch, samples, HIDDEN)

@@ -124,7 +124,7 @@ def _network(field: Field, rays: Rays, sampler: Occupancy) -> dict[str, Any] | N
     known = radiance_of(field, (rays.origins, rays.directions))
     if isinstance(known, str):
         return None
-    arguments = known.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32), sampler.backend)
+    arguments = known.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32))
     if "cells" in arguments:  # which each sample has of its own
         return None
     return {"network": {name: value for name, value in arguments.items() if name in OF_PROGRAM}, **known.rule}

@@ -5,13 +5,12 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from voronerf.nerf.field import DirectionPerSample, Field
-from voronerf.ops._core import backends
 from voronerf.ops._core.program import VALUE, Builder, Columns, Program, Step, pruned
 from voronerf.ops.forward_with_tape import forward_with_tape
 from voronerf.router import VoronoiRouter
@@ -55,27 +54,22 @@ class Radiance(NamedTuple):
         scale = self.networks.density_scale
         return {"activated": True} if scale is None else {"density_scale": scale}
 
-    def arguments(self, inputs: Tensor, directions: Tensor, ray_index: Tensor, backend: str) -> dict[str, Any]:
+    def arguments(self, inputs: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any]:
         """The arguments of `forward_with_tape` for samples; see :class:`voronerf.nerf.Field` and :class:`Networks`."""
         places, rays = self.router.places(inputs), self.networks.program.rays
-        if _on_warp(inputs.device, backend):
-            seen = {"directions": directions, "direction_index": ray_index} if rays else {}
-            return {"positions": inputs, **cast(Any, self.cells.table)(), **seen, **places}
         tensors = {"inputs": [inputs, directions], "ray_index": ray_index} if rays else {"inputs": [inputs]}
         return {"program": self.networks.program, "parameters": self.cells.parameters, **tensors, **places}
 
     def density(self, points: Tensor) -> Tensor | None:
         """[n], of points [n, 3], without the layers of the colour; None if it depends on the direction."""
         router, program = self.router, self.networks.density
-        if program is None or _on_warp(points.device, router.backend):
+        if program is None:
             return None
         network = {"program": program, "inputs": [points], "parameters": self.cells.parameters, **router.places(points)}
         return forward_with_tape(network, backend=router.backend).raw[:, 0]
 
 
-def radiance_of(
-    field: Field, samples: tuple[Tensor, Tensor] | None = None, *, inputs: int = 3, backend: str = "auto"
-) -> Radiance | str:
+def radiance_of(field: Field, samples: tuple[Tensor, Tensor] | None = None, *, inputs: int = 3) -> Radiance | str:
     """The program of a field; or the reason why it is unknown.
 
     Args:
@@ -83,7 +77,6 @@ def radiance_of(
         samples: Positions [n, 3] or Gaussians [n, 6], and directions [n, 3], on which a module that has not been is
             traced; None for no trace.
         inputs: Columns of the former.
-        backend: Of the operations that take it.
     """
     router = router_of(field)
     if router is None:
@@ -93,8 +86,6 @@ def radiance_of(
     if isinstance(cells, str):
         return cells
     networks = _networks(cells.program.text, cells.reads, cells.shapes, inputs)
-    if isinstance(networks, Networks) and _on_warp(first.device, backend) and not _by_warp(cells, networks):
-        return "Warp runs layer tables with the activations of NeRF alone"
     return networks if isinstance(networks, str) else Radiance(router, cells, networks)
 
 
@@ -108,18 +99,6 @@ def router_of(field: Field) -> VoronoiRouter | None:
 def _example(inputs: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Samples [2, inputs] and a direction for each of them."""
     return torch.zeros(2, inputs, device=device), torch.zeros(2, 3, device=device)
-
-
-def _on_warp(device: torch.device, backend: str) -> bool:
-    return backends.chosen("forward_with_tape", device, torch.float32, backend=backend) == "warp"
-
-
-def _by_warp(cells: CellProgram, networks: Networks) -> bool:
-    """Whether a layer table has its outputs activated itself."""
-    if cells.table is None or cells.after is None or networks.density_scale is None:
-        return False
-    after = _networks(cells.after.text, (0,), cells.shapes, cells.after.inputs[0])
-    return isinstance(after, Networks) and len(after.program.steps) == 1
 
 
 @functools.lru_cache(maxsize=256)

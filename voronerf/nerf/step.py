@@ -560,8 +560,6 @@ class TrainingStep:
         if values != self._values or not all(map(operator.is_, objects, self._objects)):
             return False
         known = cast(Radiance, self._known)
-        if known.cells.table is not None:  # of a field with a layer table, whose members are guarded
-            return True
         with self._in_precision():
             now = self.loss.radiance()
         same = isinstance(now, Radiance) and now.networks is known.networks

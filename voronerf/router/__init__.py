@@ -1,7 +1,7 @@
 """VoronoiRouter: any module as one network per Voronoi cell."""
 
 from voronerf.router.grouped import register
+from voronerf.router.program import CellProgram, layered_program
 from voronerf.router.router import VoronoiRouter
-from voronerf.router.table import LayeredField
 
-__all__ = ["LayeredField", "VoronoiRouter", "register"]
+__all__ = ["CellProgram", "VoronoiRouter", "layered_program", "register"]

@@ -32,8 +32,7 @@ from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters
 from voronerf.router.known import KnownCall
 from voronerf.router.layout import Call, Results, map_tensors, tensors_of
 from voronerf.router.probe import FEWEST, Options, Probe, check_rays, check_subclasses
-from voronerf.router.program import Activation, CellProgram
-from voronerf.router.table import LayeredField
+from voronerf.router.program import CellProgram
 from voronerf.router.transforms import aside, is_watched, outside, recorded
 from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup, same
 
@@ -131,7 +130,6 @@ class Dispatch:
         self._subclasses: set[Any] = set()  # methods and tensor types that are known to work with plain tensors
         self._warned: set[str] = set()
         self._latest: dict[str, dict[str, str]] = {}
-        self._activation: Activation | None = None
 
     def explain(self, methods: tuple[str, ...], known: Mapping[str, str]) -> str:
         """How each method has run so far, and why; of some it is known beforehand."""
@@ -170,12 +168,6 @@ class Dispatch:
             return f"{call.name} is not one program: {whole}"
         shapes, encoded = tuple(shape for shape, _ in whole.results), plan.fused.encoded
         return CellProgram(encoded, whole.reads, shapes, plan.fused.parameters(k, device, backend))
-
-    def activation(self, field: LayeredField) -> Activation:
-        """The steps of a field behind its layer table."""
-        if self._activation is None or not self._activation.holds(field):
-            self._activation = Activation.of(field)
-        return self._activation
 
     def evaluate(self, call: Call, grouping: Grouping, options: Options, frozen: Tensor | None) -> Results:
         """Runs a call on the samples of all cells, or on two placeholders.

@@ -63,7 +63,8 @@ class KnownCall:
         self._reads = [self._tensors[number] for number in reads]
         self._learns = torch.is_grad_enabled() and any(arguments[i].requires_grad for i in self._reads)
         self.module = call.module
-        self.plan, self._method, self._run, self._how = plan, call.method, run_known, How(program.text, caller="routed_program")
+        self.plan, self._method, self._run = plan, call.method, run_known
+        self._how = How(program.text, caller="routed_program")
         self._leading, device = len(call.layout.lead), grouping.device
         half = torch.is_autocast_enabled(device.type) or any(arguments[i].dtype in HALF for i in self._tensors)
         ones = 0 if call.layout.flat else self._leading - 1

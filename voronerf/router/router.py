@@ -46,8 +46,7 @@ from voronerf.router.optimizers import (
     watch_optimizers,
 )
 from voronerf.router.probe import Options
-from voronerf.router.program import CellProgram, program_of_table
-from voronerf.router.table import LayeredField, Table, each_direction
+from voronerf.router.program import CellProgram, Given, each_direction
 from voronerf.router.transforms import outside, refuse_transforms, transformed, unwrapped
 
 _NO_GRAPH = (
@@ -72,8 +71,8 @@ class VoronoiRouter(nn.Module):
     The loop over cells defines the result. A call runs in the fastest of these ways, after one comparison with the loop
     for each kind of call; :meth:`explain` says which, why, and what was measured:
 
-    - fused: one operation for the whole network. This needs a field with a layer table (:class:`LayeredField`), or
-      ``fuse=True``.
+    - fused: one operation for the whole network. This needs a field with a method ``program``
+      (:func:`voronerf.router.layered_program`), or ``fuse=True``.
     - grouped: the module's own ``forward`` runs once, on the samples of all cells sorted by cell. Functions that meet
       parameters have a rule for all cells at once: linear layers (also ``F.linear``, ``@``, ``einsum``), embeddings,
       normalisation layers, scales. :func:`voronerf.router.register` adds a rule.
@@ -92,7 +91,7 @@ class VoronoiRouter(nn.Module):
         coords: Where the positions are: ``"first3"``, the first three features of the first tensor (``"first2"`` for
             d = 2 and so on); a slice of its features; or a function of the call's arguments that returns positions
             [..., d]. They can be given at the call instead, ``router(x, coords=positions)``, unless the module itself
-            has an argument ``coords``. For a field with a layer table they are its first argument.
+            has an argument ``coords``. For a field with a ``program`` they are its first argument.
         per_ray: Names or numbers of the arguments that have one row for each ray. None decides by shapes, and refuses
             shapes that fit both readings.
         shared: Names or numbers of tensor arguments that are the same for all samples.
@@ -169,7 +168,8 @@ class VoronoiRouter(nn.Module):
         self._watches: list[Any] = []  # of optimisers that hold the state of other cells
         self._doubts: list[Untrained | FrozenRows] = [Untrained(self.module)]  # asked in the first training calls
         self.assignment, self.temperature = assignment, temperature
-        if coords is None and isinstance(module, LayeredField):
+        given = Given.of(self.module)
+        if coords is None and given is not None:
             coords = cast(Coordinates, f"first{cells.centres.shape[1]}")
         self.backend, self.coords, self.fuse, self.way, self.layout = backend, coords, fuse, way, layout
         self.per_ray = None if per_ray is None else tuple(per_ray)
@@ -180,7 +180,7 @@ class VoronoiRouter(nn.Module):
         self._unseen = True  # no large batch has shown whether the centres fit the positions
         self._resized = False  # parameters have other sizes than where they were wrapped, perhaps
         self.register_buffer("frozen_cells", None, persistent=False)
-        self._table = Table(self.module) if isinstance(module, LayeredField) else None
+        self._given = given
 
     @classmethod
     def from_modules(
@@ -489,9 +489,9 @@ class VoronoiRouter(nn.Module):
     # Calls ------------------------------------------------------------------------------------------------------------
 
     @property
-    def field(self) -> LayeredField:
+    def field(self) -> nn.Module:
         """The field with stacked parameters; its own ``forward`` cannot be called any more."""
-        return cast(LayeredField, self.module)
+        return self.module
 
     def assign(self, positions: Tensor) -> Tensor:
         """The cell that evaluates each position: positions [n, d] -> int32 [n]."""
@@ -505,15 +505,14 @@ class VoronoiRouter(nn.Module):
         """Evaluates each sample in its cell; results are in the order of the samples.
 
         Args:
-            *args: Those of the module's ``forward``. For a field with a layer table: positions [n, 3] in scene units,
+            *args: Those of the module's ``forward``. For a field with a ``program``: positions [n, 3] in scene units,
                 directions, unit vectors [n, 3] or [r, 3] together with ray_index, int32 [n], the row of ``directions``
                 that belongs to each sample.
             coords: Positions [..., d] in scene units that decide the cells, instead of the router's own rule.
             **kwargs: Those of the module's ``forward``.
 
         Returns:
-            What the module returns. For a field with a layer table, what its ``activate`` gives: (colour [n, 3],
-            density [n]).
+            What the module returns, of a radiance field (colour [n, 3], density [n]).
 
         Raises:
             ValueError: For shapes that disagree, positions that are not given, arguments that are neither per sample
@@ -583,7 +582,7 @@ class VoronoiRouter(nn.Module):
     def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
         """The program of ``forward``; or the reason why it is unknown.
 
-        That of a field with a layer table is known at once; that of a module with ``fuse=True`` from a call with such
+        That of a field with a method ``program`` is known at once; that of a module with ``fuse=True`` from a call with such
         arguments on, which traces it.
 
         Args:
@@ -603,12 +602,9 @@ class VoronoiRouter(nn.Module):
         if callable(self.coords) or isinstance(self.coords, slice):
             return "other positions than those of the samples decide the cells"
         k, dispatch = self.num_cells, self._dispatch
-        if self._given is not None:
-            program = program_of_table(self.field, k, dispatch.activation(self.field))
-        elif self._table is not None and not self.fuse:
-            return f"{type(self.module).__name__} does more than its layer table says"
-        else:
-            arguments = args if self._table is None else (*args, None)
+        program = "" if self._given is None else self._given.look(self.module)
+        if isinstance(program, str) and (self.fuse or self._given is None):
+            arguments = args if self._given is None else (*args, None)
             positions, device, grouping = args[0][:, : self._d], args[0].device, None
             if trace and self.fuse:
                 cells = None if k == 1 else self.diagram.locate(positions, backend=self.backend)
@@ -634,14 +630,15 @@ class VoronoiRouter(nn.Module):
             >>> router.explain()
             'forward: not called yet'
         """
-        known = {"forward": self._given.name} if self._given is not None else {}
+        given = self._given is not None and not isinstance(self._given.look(self.module), str)
+        known = {"forward": "fused"} if given else {}
         return self._dispatch.explain(("forward", *self.methods), known)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Refuses attributes of the module, which would have no effect here."""
         members = self.__dict__
         known = hasattr(type(self), name) or any(name in names for names in (members, self._modules, self._buffers))
-        if "_table" in members and not known and hasattr(self.module, name):
+        if "_given" in members and not known and hasattr(self.module, name):
             raise AttributeError(
                 f"VoronoiRouter: {name} belongs to {type(self.module).__name__}; set router.module.{name}"
             )
@@ -678,8 +675,12 @@ class VoronoiRouter(nn.Module):
         """One call of a method of the module; one that is not known breaks a graph of ``torch.compile``."""
         if self._resized and not torch.compiler.is_compiling():
             self._check_wrapper()
-        known: Table | KnownCall | None = self._given if method == "forward" else None
-        if known is None and self.fuse:
+        if method == "forward" and self._given is not None:
+            results = self._given.run(self, args, kwargs, coords)
+            if results is not None:
+                return results
+        known: KnownCall | None = None
+        if self.fuse:
             module: Any = self._modules["module"]
             kind = kind_of(method, module.training, args, kwargs, coords)
             known = None if kind is None else self._dispatch.find(kind, self.num_cells)
@@ -707,18 +708,13 @@ class VoronoiRouter(nn.Module):
             )
         self._resized = False
 
-    @property
-    def _given(self) -> Table | None:
-        """The program of ``forward``, where it is given and need not be traced."""
-        return self._table if self._table is not None and self._table.holds(self.module) else None
-
     def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
         """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
         refuse_transforms()
         self._ask_doubts()
         called, like = getattr(self.module, method), kind_of(method, self.module.training, args, kwargs, coords)
-        layered = method == "forward" and self._table is not None
-        if layered and (each := each_direction(args, kwargs)) is not None:
+        field = method == "forward" and self._given is not None
+        if field and (each := each_direction(args, kwargs)) is not None:
             (args, kwargs), like = each, None
         if coords is not None and "coords" in (accepted_names([called]) or ()):  # the method's own argument
             kwargs, coords, like = {**kwargs, "coords": coords}, None, None

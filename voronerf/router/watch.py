@@ -9,6 +9,7 @@ from __future__ import annotations
 import operator
 from dataclasses import dataclass, field
 from numbers import Number
+from types import FunctionType
 from typing import Any
 
 import torch
@@ -85,8 +86,8 @@ class Watch:
         name = source[1]
         registry = next((entries for entries in (vars(part), part._buffers, part._modules) if name in entries), None)
         if registry is None:
-            if not isinstance(getattr(type(part), name, None), (bool, int, float, str)):
-                return  # a method, a property or none
+            if not isinstance(getattr(type(part), name, None), (bool, int, float, str, FunctionType)):
+                return  # a property or none
             registry = vars(part)  # of which a value would come before that of the class
         value = registry.get(name, _MISSING)
         self.sources.append(source)

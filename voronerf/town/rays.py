@@ -111,14 +111,12 @@ class Pass:
 
     def _look(self, directions: Tensor, *given: Tensor) -> Looked:
         samples, backend, field = OwnSamples(*given), self.territory.renderer.backend, self._field()
-        tape = forward_with_tape(
-            field.arguments(samples.positions, directions, samples.ray_index, backend), backend=backend
-        )
+        tape = forward_with_tape(field.arguments(samples.positions, directions, samples.ray_index), backend=backend)
         return Looked(samples, tape, *run_sums(tape.raw, samples, **field.rule, backend=backend))
 
     def _field(self) -> Radiance:
         renderer = self.territory.renderer
-        field = radiance_of(renderer.field, backend=renderer.backend)
+        field = radiance_of(renderer.field)
         if isinstance(field, str) or field.networks.density_scale is None:
             raise ValueError(f"Pass: field must put out what comes before its activations, got {field}")
         return field

@@ -24,6 +24,7 @@ from voronerf.app.train.checkpoint import checkpoint_path, load_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.defaults import resolve
 from voronerf.nerf.fields import FIELDS, NeRF, register_field
+from voronerf.router import CellProgram, layered_program
 
 
 class Table(nn.Module):
@@ -35,8 +36,8 @@ class Table(nn.Module):
         self.layers = MLP((Layer(("positions",), width, "sine"), Layer((0,), 4)), (1,))
         self.hidden, self.out = nn.Linear(3, width), nn.Linear(width, 4)
 
-    def linears(self) -> list[nn.Linear]:
-        return [self.hidden, self.out]
+    def program(self) -> CellProgram:
+        return layered_program(self.layers, [self.hidden, self.out], self.activate)
 
     def activate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         return torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * self.omega

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from voronerf.ops._core.layers import MLP
 from voronerf.ops.grouped_mlp import grouped_mlp
+from voronerf.router import CellProgram, layered_program
 
 #: Density of the untrained field, per scene unit. A scene of diameter 2 then starts with an opacity of about 0.2:
 #: translucent enough that every sample of a ray receives a gradient, opaque enough that the colours do as well.
@@ -99,6 +100,10 @@ class RadianceField(nn.Module):
     def linears(self) -> list[nn.Linear]:
         """The linear layers in the order of ``layers``."""
         raise NotImplementedError
+
+    def program(self) -> CellProgram:
+        """All that ``forward`` computes, as a router runs it for all cells at once."""
+        return layered_program(self.layers, self.linears(), self.activate, getattr(self, "features", None))
 
     def forward(
         self, positions: Tensor, directions: Tensor | None = None, ray_index: Tensor | None = None

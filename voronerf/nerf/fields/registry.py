@@ -23,11 +23,11 @@ have these attributes, all of which are optional:
 Its options are the named parameters of its constructor. A ``forward`` with a parameter ``ray_index`` is called with
 the directions [r, 3] of the rays, and with the row of them that belongs to each sample.
 
-A class with ``layers``, ``linears()`` and ``activate()`` is a layer table, as :class:`voronerf.nerf.fields.NeRF` is: a
-router evaluates the table for all cells in one operation and does not call ``forward``. A module with an encoding of
-its own before its linear layers becomes such a table by ``router_options = {"fuse": True}``, if the encoding has no
-parameters. Any other module runs its own ``forward``. Where all of a field is one operation, its colours, the loss and
-the gradients are part of it, whatever its activations (:class:`voronerf.nerf.RayLoss`).
+A class with a method ``program()`` says what it computes, as :class:`voronerf.nerf.fields.NeRF` does by a layer table
+(:func:`voronerf.router.layered_program`): a router runs that for all cells in one operation and does not call
+``forward``. Any other module runs its own ``forward``, which ``router_options = {"fuse": True}`` traces to a program.
+Where all of a field is one operation, its colours, the loss and the gradients are part of it, whatever its activations
+(:class:`voronerf.nerf.RayLoss`).
 """
 
 from __future__ import annotations

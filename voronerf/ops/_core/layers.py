@@ -23,7 +23,7 @@ POSITION_ENCODINGS = ("frequency", "integrated", "hash")
 DIRECTION_ENCODINGS = ("frequency", "spherical")
 POSITIONS = "positions"
 DIRECTIONS = "directions"
-_NUMBERS = {"softplus": (1.0, 20.0), "sine": (1.0, 0.0)}
+NUMBERS = {"softplus": (1.0, 20.0), "sine": (1.0, 0.0)}
 """Of activations that are functions with two numbers."""
 MOST_FEATURES = 2**20
 """Of a layer."""
@@ -272,7 +272,7 @@ def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: 
             start += x.width
         assert total is not None
         if layer.activation != "none":
-            total = b.apply(layer.activation, total, *_NUMBERS.get(layer.activation, (0.0, 0.0)))
+            total = b.apply(layer.activation, total, *NUMBERS.get(layer.activation, (0.0, 0.0)))
         values[index] = total
     parts, at = [], 0
     for output in table.outputs:

@@ -13,7 +13,9 @@ from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops._core.checks import INDEX, Default, Others, Row, Rows, check_rows, check_tensor
 from voronerf.ops._core.program import Program
 
-_OP = backends.declare("grouped_program", native=Implementation(EVERYWHERE, FLOATS))
+_OP = backends.declare(
+    "grouped_program", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
+)
 _HALF = (torch.float16, torch.bfloat16)  # computed in float32
 _TABLES = (torch.float32, torch.bfloat16, torch.float16)  # of hash grids, beside the dtype of the inputs
 
@@ -47,7 +49,8 @@ def grouped_program(
             sorted then. None for rows that are sorted.
         ray_index: int32 [n], values 0 to r - 1: the ray of each row of inputs and results, so that ``order`` leads to
             ``ray_index[order[i]]``. None for a program without inputs of rays.
-        backend: "auto", "reference" or "native".
+        backend: "auto", "reference", "native" or "warp", which has kernels for layers alone: what follows them, and a
+            program that is no chain of layers, runs in PyTorch there.
 
     Returns:
         [n, w] for each output of the program, or [r, w], the sum over the rows of each ray, for those of

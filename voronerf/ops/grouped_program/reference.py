@@ -58,6 +58,13 @@ def grouped_program(
     return [*results, *run.sums]
 
 
+def of_rows(inputs: Sequence[Tensor], text: str) -> list[Tensor]:
+    """The outputs of a program without parameters, for which rows need no cells; nothing is read on the host."""
+    program = Program.parse(text)
+    run = _Run(program, inputs, [], torch.zeros(1, dtype=torch.int32), slice(0))
+    return [run.columns(columns) for columns in program.outputs]
+
+
 class _Run:
     """The values of a program; ``inside`` are the rows of cells."""
 
@@ -73,7 +80,6 @@ class _Run:
         self.tables = {i: parameters[i].to(inputs[0].dtype) for i in program.tables}
         self.grids = [HashGrid.parse(text) for text in program.grids]
         self.parameters = [p.expand(self.k, *p.shape[1:]) for p in parameters]
-        self.cells = cells_of(offsets, inputs[0])
         self.values: dict[int, Tensor] = {}
         counts = program.cells_of_sums(parameters, self.k)
         self.sums = [inputs[0].new_zeros(count, *shape) for count, shape in zip(counts, program.sums)]
@@ -84,6 +90,11 @@ class _Run:
                 self.sums[step.out] = self.sums[step.out] + self.summed(step, self.sums[step.out])
             else:
                 self.values[step.out] = self.value(step)
+
+    @functools.cached_property
+    def cells(self) -> Tensor:
+        """int32 [n]."""
+        return cells_of(self.offsets, self.inputs[0])
 
     def columns(self, columns: Columns) -> Tensor:
         """[n, w] of an operand."""

@@ -1,0 +1,214 @@
+"""Programs that are chains of layers as Warp kernels: the layers in one, what follows them in plain PyTorch.
+
+n rows, w columns. Any other program runs in PyTorch.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.kernels.grouped_mlp import grouped_mlp
+from voronerf.ops._core.grids import HashGrid
+from voronerf.ops._core.layers import ACTIVATIONS, DIRECTIONS, MLP, NUMBERS, POSITIONS, Layer
+from voronerf.ops._core.program import VALUE, Builder, Columns, Program, Step
+from voronerf.ops.grouped_program.reference import grouped_program as in_torch
+from voronerf.ops.grouped_program.reference import of_rows
+
+
+class Chain(NamedTuple):
+    """A program as a layer table, and what follows it.
+
+    Attributes:
+        layers: the table, whose outputs are those of every layer that something else than a layer reads.
+        weights: the number of each layer's weight among the parameters of the program.
+        biases: of its bias, or None.
+        features: of the table of the hash grid, or None.
+        behind: the text of a program that takes the outputs, one input, to those of the whole one.
+    """
+
+    layers: MLP
+    weights: tuple[int, ...]
+    biases: tuple[int | None, ...]
+    features: int | None
+    behind: str
+
+
+def grouped_program(
+    inputs: Sequence[Tensor],
+    parameters: Sequence[Tensor],
+    offsets: Tensor,
+    order: Tensor | None,
+    ray_index: Tensor | None,
+    text: str,
+) -> list[Tensor]:
+    """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
+    chain, k = chain_of(text), offsets.shape[0] - 1
+    if chain is None:
+        return in_torch(inputs, parameters, offsets, order, ray_index, text)
+    rows, rays = list(inputs), Program.parse(text).rays
+    features = None if chain.features is None else parameters[chain.features]
+    if features is not None and features.shape[0] == 1:  # which all cells share
+        features = features[0]
+    if order is not None:
+        rows = [x if i in rays else x.index_select(0, order) for i, x in enumerate(inputs)]
+        ray_index = None if ray_index is None else ray_index.index_select(0, order)
+    raw = grouped_mlp(
+        rows[0],
+        offsets,
+        [parameters[i].expand(k, -1, -1) for i in chain.weights],
+        [None if i is None else parameters[i].expand(k, -1) for i in chain.biases],
+        layers=chain.layers,
+        directions=rows[1] if chain.layers.uses_directions else None,
+        direction_index=ray_index if chain.layers.uses_directions else None,
+        features=features,
+    )
+    row = torch.arange(raw.shape[0], device=raw.device)
+    inside = ((row >= offsets[0]) & (row < offsets[-1]))[:, None]
+    results = [torch.where(inside, result, 0) for result in of_rows([raw.to(inputs[0].dtype)], chain.behind)]
+    if order is None:
+        return results
+    return [torch.zeros_like(result).index_copy(0, order.long(), result) for result in results]
+
+
+@functools.lru_cache(maxsize=256)
+def chain_of(text: str) -> Chain | None:
+    """A program, given by its text, as a chain; None where it is none."""
+    program = Program.parse(text)
+    try:
+        return None if program.sums or program.by_ray else _Reader(program).chain()
+    except LookupError:
+        return None
+
+
+_INPUTS = POSITIONS, DIRECTIONS
+
+
+class _Layer(NamedTuple):
+    """A layer as far as its steps are read."""
+
+    weight: int
+    bias: int | None = None
+    inputs: tuple[int | str, ...] = ()
+    depth: int = 0
+
+
+class _Reader:
+    """Reads the steps of a program as a layer table; LookupError where they are none."""
+
+    def __init__(self, program: Program) -> None:
+        self.program, self.steps = program, {step.out: step for step in program.steps}
+        operands = [c for step in program.steps for c in step.operands]
+        self.read = Counter(c.index for c in (*operands, *program.outputs) if c.of == VALUE)
+        self.sources: dict[int, int | str] = {}  # what a value is to a layer that reads it
+        self.encodings: dict[str, Step] = {}
+        self.started: dict[int, _Layer] = {}  # by the value that is the sum so far
+        self.layers: list[Layer] = []
+        self.made: list[_Layer] = []
+
+    def chain(self) -> Chain:
+        """The whole program."""
+        behind = [step for step in self.program.steps if not self._takes(step)]
+        own, places, width = {step.out for step in behind}, dict[int, int](), 0
+        for columns in (*(c for step in behind for c in step.operands), *self.program.outputs):
+            if columns.index not in own | places.keys():
+                places[columns.index], width = width, width + self.layers[self._layer(columns)].width
+        b = Builder()
+        x, values = b.input(width), dict[int, Columns]()
+
+        def taken(c: Columns) -> Columns:
+            whole = x.part(places[c.index], width) if c.index in places else values[c.index]
+            return whole.part(c.start, c.width)._replace(spread=c.spread)
+
+        for step in behind:
+            values[step.out] = b.emit(step.op, step.width, [*map(taken, step.operands)], step.numbers, step.name)
+        outputs = tuple(int(self.sources[value]) for value in places)
+        features = [int(step.numbers[1]) for step in self.encodings.values() if step.name == "hash"]
+        return Chain(
+            MLP(tuple(self.layers), outputs, **self._encoded()),
+            tuple(layer.weight for layer in self.made),
+            tuple(layer.bias for layer in self.made),
+            features[0] if features else None,
+            b.program(map(taken, self.program.outputs)).text,
+        )
+
+    def _takes(self, step: Step) -> bool:
+        """Whether a step is read as a part of a layer."""
+        if step.op == "input":
+            self.sources[step.out] = _INPUTS[int(step.numbers[0])]
+        elif step.op == "encode":
+            if step.operands[0].index not in self.sources or step.numbers[2] or self.read[step.operands[0].index] > 1:
+                raise LookupError
+            name = self._source(step.operands[0])
+            self.encodings[str(name)], self.sources[step.out] = step, name
+        elif step.op == "linear":
+            self._add(step)
+        elif step.op == "function" and step.name in ACTIVATIONS and self._activates(step):
+            self._finish(step.operands[0].index, step.out, step.name)
+        else:
+            return False
+        return True
+
+    def _add(self, step: Step) -> None:
+        """A product of a layer, the first one or a further one."""
+        (x, *added), (weight, start, transposed) = step.operands, map(int, step.numbers)
+        layer, shapes = _Layer(weight), self.program.parameters
+        if added and added[0].of == VALUE:
+            layer = self.started.pop(added[0].index)
+        elif added:
+            layer = _Layer(weight, added[0].index)
+        fits = (weight, start, step.width) == (layer.weight, layer.depth, shapes[weight][0])
+        if step.name or transposed or not fits or (layer.bias is not None and shapes[layer.bias] != (step.width,)):
+            raise LookupError
+        inputs = (*layer.inputs, self._source(x))
+        self.started[step.out] = layer._replace(inputs=inputs, depth=start + x.width)
+
+    def _activates(self, step: Step) -> bool:
+        """Whether a function is the activation of a layer, of which nothing else is read."""
+        x, known = step.operands[0], step.numbers == (0, *NUMBERS.get(step.name, (0, 0)))
+        return known and len(step.operands) == 1 and x.index in self.started and self.read[x.index] == 1
+
+    def _finish(self, value: int, out: int, activation: str) -> None:
+        layer = self.started.pop(value)
+        self.sources[out] = len(self.made)
+        self.made.append(layer)
+        self.layers.append(Layer(layer.inputs, self.program.parameters[layer.weight][0], activation))
+
+    def _source(self, columns: Columns) -> int | str:
+        """What columns are to a layer: a whole value."""
+        value, whole = columns.index, columns.width == self.steps[columns.index].width and not columns.spread
+        if value in self.started:
+            self._finish(value, value, "none")
+        if columns.of != VALUE or not whole:
+            raise LookupError
+        return self.sources[value]
+
+    def _layer(self, columns: Columns) -> int:
+        """The number of the layer whose output columns are a part of."""
+        if columns.of != VALUE:
+            raise LookupError
+        found = self._source(Columns(VALUE, columns.index, 0, self.steps[columns.index].width))
+        if isinstance(found, str):
+            raise LookupError
+        return found
+
+    def _encoded(self) -> dict[str, Any]:
+        """The encodings as arguments of a table."""
+        found: dict[str, Any] = {}
+        for name, step in self.encodings.items():
+            size = int(step.numbers[0])
+            if step.name == "spherical" and name == DIRECTIONS:
+                found |= {"direction_encoding": step.name, "direction_degree": size}
+            elif step.name == "frequency":
+                found["position_octaves" if name == POSITIONS else "direction_octaves"] = size
+            elif step.name in ("integrated", "hash") and name == POSITIONS:
+                grid = HashGrid.parse(self.program.grids[size]) if step.name == "hash" else None
+                found |= {"position_encoding": step.name, "grid": grid, "position_octaves": None if grid else size}
+            else:
+                raise LookupError
+        return found
