@@ -249,6 +249,7 @@ constexpr const char* kStub =
     "    def contents(self, container: Any, free: Sequence[str] = ...) -> None: ...\n"
     "    def entries(self, dictionary: dict[str, Any], names: Sequence[str]) -> None: ...\n"
     "    def attributes(self, object: Any, names: Sequence[str]) -> None: ...\n"
+    "    def answer(self, function: Any) -> None: ...\n"
     "    def place(self, tensor: Tensor) -> None: ...\n"
     "    def layout(self, tensor: Tensor) -> None: ...\n"
     "    def kind(self, dictionary: dict[str, Any], name: str) -> None: ...\n"

@@ -134,6 +134,8 @@ void Unchanged::add_named(const py::object& owner, bool dictionary, const std::v
   named_.push_back(std::move(noted));
 }
 
+void Unchanged::answer(const py::object& function) { answers_.emplace_back(function, function()); }
+
 void Unchanged::add(const py::object& tensor, bool layout) {
   if (!known_.insert({tensor.ptr(), layout}).second) return;
   tensors_.push_back({tensor, tensor.attr("untyped_storage")(), Seen(tensor.ptr(), true, layout)});
@@ -160,6 +162,9 @@ bool Unchanged::holds() const {
       if (!is_same(was.ptr(), value_of(noted.owner.ptr(), noted.dictionary, name.ptr()).ptr())) return false;
     }
   }
+  for (const auto& [function, was] : answers_) {
+    if (!is_same(was.ptr(), function().ptr())) return false;
+  }
   for (const Kind& noted : kinds_) {
     PyObject* const tensor = PyDict_GetItemWithError(noted.dictionary.ptr(), noted.name.ptr());
     if (tensor == nullptr || tensor == Py_None || !noted.seen.holds(tensor)) return false;
@@ -174,6 +179,7 @@ void bind_unchanged(py::module_& module) {
       .def("contents", &Unchanged::contents, py::arg("container"), py::arg("free") = py::tuple())
       .def("entries", &Unchanged::entries)
       .def("attributes", &Unchanged::attributes)
+      .def("answer", &Unchanged::answer)
       .def("place", &Unchanged::place)
       .def("layout", &Unchanged::layout)
       .def("kind", &Unchanged::kind)

@@ -23,6 +23,8 @@ class Unchanged {
   // Some entries of a dictionary: their values, or that there are none.
   void entries(const py::dict& dictionary, const std::vector<std::string>& names);
   void attributes(const py::object& object, const std::vector<std::string>& names);
+  // What a function answers without arguments.
+  void answer(const py::object& function);
   // Where the memory of a tensor is; or that, and how it lies there.
   void place(const py::object& tensor) { add(tensor, false); }
   void layout(const py::object& tensor) { add(tensor, true); }
@@ -65,6 +67,7 @@ class Unchanged {
   void add(const py::object& tensor, bool layout);
   void add_named(const py::object& owner, bool dictionary, const std::vector<std::string>& names);
 
+  std::vector<std::pair<py::object, py::object>> answers_;  // by function
   std::vector<Container> containers_;
   std::vector<Named> named_;
   std::vector<Tensor> tensors_;

@@ -29,8 +29,12 @@ from voronerf.ops._core import backends
 from voronerf.ops._core.capture import Capture
 from voronerf.ops._core.custom_op import is_watched
 from voronerf.ops._core.recording import Recording
+from voronerf.ops._core.unchanged import Never, unchanged
 from voronerf.ops.adam.reference import judge
 from voronerf.router.layout import tensors_of
+
+_OWN = ("batches", "loss", "optimizer", "strategy", "guard", "generator", "autocast", "scaler")
+_HOOKS = ("_backward_hooks", "_post_accumulate_grad_hooks")  # of parameters
 
 
 class StepOutput:
@@ -150,11 +154,8 @@ class TrainingStep:
         self._last = Made({})
         self._spent = dict[str, tuple[float, int]]()  # seconds and calls of each hook in Python
         self._gradients = list[tuple[nn.Parameter, Tensor | None]]()  # the memory that replays write
-        self._guards: Any = None
-        self._cpu: Callable[[], Any]
+        self._guards: Any = Never()
         self._known: Radiance | None = None
-        self._parameters = list[nn.Parameter]()  # of the field and the optimiser
-        self._objects, self._values = list[Any](), list[Any]()
         self._obstacle = ""
 
     def explain(self) -> str:
@@ -517,12 +518,13 @@ class TrainingStep:
         renderer, optimizer = self.loss.renderer, self.optimizer
         with self._in_precision():
             known = self.loss.radiance()
-        if not isinstance(known, Radiance):
+        compiled = backends.compiled()
+        if not isinstance(known, Radiance) or compiled is None:
             return
-        from voronerf.ops._core import native  # which is not everywhere
-
-        self._known, self._guards, self._cpu = known, native.compiled.Unchanged(), native.cpu
+        self._known, guard = known, unchanged()
         field, grid = cast(nn.Module, renderer.field), getattr(renderer.sampler, "grid", None)
+        guard.entries(vars(self), _OWN)
+        guard.entries(vars(known.router), ["assignment", "temperature", "backend", "coords"])
         parts = [self.loss, renderer, renderer.sampler]  # those that segments read
         parts += [each for each in self.loss.terms if hasattr(each, "add") and not in_python(each, "add")]
         if not self._draws_in_python():
@@ -530,55 +532,54 @@ class TrainingStep:
         if self.strategy is not None and not in_python(self.strategy, "step_post_backward"):
             parts.append(self.strategy)
         for part in parts:
-            self._guards.contents(vars(part), free_names(part))
-        if grid is not None:
-            self._guards.contents(vars(grid))
-        dictionaries: list[dict[Any, Any]] = [renderer.fields]
+            guard.contents(vars(part), free_names(part))
+        dictionaries: list[dict[Any, Any]] = [renderer.fields, *([] if grid is None else [vars(grid)])]
         for module in field.modules():  # the router, perhaps in a wrapper
             for name, members in vars(module).items():
                 if name in ("_parameters", "_buffers", "_modules") or name.endswith("_hooks"):
                     dictionaries.append(members)
         dictionaries += [*map(vars, known.router.module.modules()), optimizer.state, *optimizer.state.values()]
         for members in dictionaries:
-            self._guards.contents(members)
-        self._guards.contents(vars(optimizer), ["steps_done"])
+            guard.contents(members)
+        guard.contents(vars(optimizer), ["steps_done"])
+        learning = list[nn.Parameter]()
         for group in optimizer.param_groups:
-            self._guards.contents(group, ["lr"])
+            guard.contents(group, ["lr"])
+            for each in (group["params"], group["betas"]):
+                guard.contents(each)
+            learning += group["params"]
         if self._on_gpu():  # a capture does not see which tensors it takes, as a recording does
             owners = self.batches, renderer.sampler, self.strategy, self.guard, optimizer.state, self._gradients
             for tensor in (*tensors_of(owners), *field.parameters(), *field.buffers()):
-                self._guards.layout(tensor)
-        learning = (p for group in optimizer.param_groups for p in group["params"])
-        self._parameters = [*dict.fromkeys((*field.parameters(), *learning))]
-        self._objects, self._values = self._current()
+                guard.layout(tensor)
+        for parameter in dict.fromkeys((*field.parameters(), *learning)):
+            guard.attributes(parameter, ["requires_grad", *_HOOKS])
+            for hooks in (getattr(parameter, name) for name in _HOOKS):
+                if hooks is not None:
+                    guard.contents(hooks)
+        kind = self.batches.device.type  # autocast of the caller, around the step's own
+        for question in (
+            backends.threads,
+            compiled.isa,
+            torch.is_grad_enabled,
+            torch.are_deterministic_algorithms_enabled,
+            self._scales,
+            functools.partial(torch.is_autocast_enabled, kind),
+            functools.partial(torch.get_autocast_dtype, kind),
+            self._precision,
+        ):
+            guard.answer(question)
+        self._guards = guard
+
+    def _precision(self) -> str:
+        return torch.backends.cuda.matmul.fp32_precision if self._on_gpu() else backends.cpu_precision()
 
     def _holds(self) -> bool:
         """Whether all is as it was noted."""
-        if self._guards is None or not self._guards.holds():
-            return False
-        objects, values = self._current()
-        if values != self._values or not all(map(operator.is_, objects, self._objects)):
+        if not self._guards.holds():
             return False
         known = cast(Radiance, self._known)
         with self._in_precision():
             now = self.loss.radiance()
         same = isinstance(now, Radiance) and now.networks is known.networks
         return same and all(map(operator.is_, cast(Radiance, now).cells.parameters, known.cells.parameters))
-
-    def _current(self) -> tuple[list[Any], list[Any]]:
-        """What is in no dictionary that is guarded: objects, and numbers."""
-        router, optimizer = cast(Radiance, self._known).router, self.optimizer
-        objects = [self.batches, self.loss, optimizer, self.strategy, self.guard, self.generator]
-        objects += [self.autocast, self.scaler, router.assignment, router.temperature, router.backend, router.coords]
-        values: list[Any] = [backends.threads(), self._cpu().isa, torch.is_grad_enabled(), len(optimizer.state)]
-        values.append(torch.are_deterministic_algorithms_enabled())
-        kind = self.batches.device.type  # autocast of the caller, around the step's own
-        values += [self._scales(), torch.is_autocast_enabled(kind) and torch.get_autocast_dtype(kind)]
-        values.append(torch.backends.cuda.matmul.fp32_precision if self._on_gpu() else backends.cpu_precision())
-        for group in optimizer.param_groups:
-            objects += group["params"]
-            values += [len(group["params"]), tuple(group["betas"])]
-        for parameter in self._parameters:
-            hooks = parameter._backward_hooks, parameter._post_accumulate_grad_hooks
-            values += [parameter.requires_grad, *([*each.values()] if each else [] for each in hooks)]
-        return objects, values

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -131,7 +131,9 @@ class Given:
 
     def __init__(self) -> None:
         self._unchanged: Any = Never()
+        self._watch: Watch | None = None
         self._known: CellProgram | str = ""
+        self._plain = False  # without hooks and parametrisations, and of a class whose program is that of its forward
         self._places: list[tuple[dict[str, Any], str]] = []  # where its parameters are
 
     def __reduce__(self) -> tuple[type[Given], tuple[()]]:
@@ -145,34 +147,35 @@ class Given:
     def look(self, field: nn.Module) -> CellProgram | str:
         """The program of a field, with its parameters; or why that is not known."""
         if not torch.compiler.is_compiling() and not self._unchanged.holds():  # while it compiles, what was found holds
-            self._look_anew(field)
+            kind, parts = cast(Any, type(field)), parts_of(field).values()
+            plain = _describes(kind) and "forward" not in vars(field) and all(map(_is_plain, parts))
+            if self._watch is None or plain != self._plain or self._watch.changed():
+                self._look_anew(field, plain)
+            self._unchanged = unchanged()
+            self._unchanged.entries(vars(field), ["forward"])
+            for part in parts:
+                for hooks in (vars(part)[key] for key in _HOOKS):
+                    self._unchanged.contents(hooks)
+            cast(Watch, self._watch).note(self._unchanged)
         if isinstance(self._known, str):
             return self._known
         return self._known._replace(parameters=[registry[name] for registry, name in self._places])
 
-    def _look_anew(self, field: nn.Module) -> None:
-        name, reads, guard = type(field).__name__, set[tuple[int, str]](), unchanged()
-        parts = list(parts_of(field).values())
-        guard.entries(vars(field), ["forward"])
-        for part in parts:
-            for hooks in (vars(part)[key] for key in _HOOKS):
-                guard.contents(hooks)
-            guard.contents(part._modules)
-        self._known, self._unchanged = f"{name} does more than its program says", guard
-        if not _describes(type(field)) or "forward" in vars(field) or not all(map(_is_plain, parts)):
-            return
-        try:
-            with outside():
-                found = Double(field, reads).module.program()
-        except NotAStep:
-            found = f"activate of {name} computes more than steps of a program"
-        Watch.of(field, reads, Inputs()).note(guard)
+    def _look_anew(self, field: nn.Module, plain: bool) -> None:
+        name, reads = type(field).__name__, set[tuple[int, str]]()
+        found: CellProgram | str = f"{name} does more than its program says"
+        if plain:
+            try:
+                with outside():
+                    found = cast(Any, Double(field, reads).module).program()
+            except NotAStep:
+                found = f"activate of {name} computes more than steps of a program"
         if isinstance(found, CellProgram):
             places = {id(p): (part._parameters, key) for part, key, p in owned_parameters(field)}
             if any(id(p) not in places for p in found.parameters):
                 raise ValueError(f"{_OP}: program of {name} must give parameters of the field as they are")
             self._places = [places[id(p)] for p in found.parameters]
-        self._known = found
+        self._known, self._plain, self._watch = found, plain, Watch.of(field, reads, Inputs())
 
     def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """The results of a call; coords [..., d] are those that it was given. None where the program is not known."""

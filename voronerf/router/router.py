@@ -582,8 +582,8 @@ class VoronoiRouter(nn.Module):
     def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
         """The program of ``forward``; or the reason why it is unknown.
 
-        That of a field with a method ``program`` is known at once; that of a module with ``fuse=True`` from a call with such
-        arguments on, which traces it.
+        A field's own, of its method ``program``, is known at once; that of a module with ``fuse=True`` from a call with
+        such arguments on, which traces it.
 
         Args:
             *args: Tensors [n, w] of the kinds that ``forward`` gets, of two samples or more.

@@ -18,7 +18,7 @@ class Never:
     def _note(self, *noted: Any) -> None:
         """Forgets it."""
 
-    contents = entries = attributes = place = layout = kind = _note
+    contents = entries = attributes = answer = place = layout = kind = _note
 
 
 def unchanged() -> Any:

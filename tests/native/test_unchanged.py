@@ -1,0 +1,105 @@
+"""The guard of routers, fields and steps: whatever is noted and then changed is seen, and nothing else."""
+
+from __future__ import annotations
+
+import contextlib
+
+import pytest
+import torch
+from torch import Tensor
+
+from voronerf.ops._core import native
+from voronerf.ops._core.unchanged import Never, unchanged
+
+pytestmark = pytest.mark.native
+
+
+class Thing:
+    def __init__(self):
+        self.rate, self.name, self.held, self.made = 0.5, "thing", [1, object()], torch.zeros(3, 2)
+
+
+def notes(guard, thing, tensors, table):
+    guard.contents(vars(thing), ["made"])
+    guard.contents(thing.held)
+    guard.contents(table)
+    guard.entries(vars(thing), ["rate", "absent"])
+    guard.attributes(thing, ["name", "missing"])
+    guard.answer(torch.is_grad_enabled)
+    guard.layout(tensors["here"])
+    guard.place(tensors["place"])
+    guard.kind(tensors, "kind")
+    guard.attributes(tensors["read"], ["_version"])
+
+
+SAME = {
+    "nothing": lambda thing, tensors, table: None,
+    "a free entry": lambda thing, tensors, table: setattr(thing, "made", None),
+    "equal numbers and texts": lambda thing, tensors, table: vars(thing).update(
+        rate=1 / 2, name="".join(["th", "ing"])
+    ),
+    "values of a tensor": lambda thing, tensors, table: tensors["here"].zero_(),
+    "another tensor of the kind": lambda thing, tensors, table: tensors.update(kind=torch.ones(4, 2)),
+    "other memory of the kind": lambda thing, tensors, table: setattr(tensors["kind"], "data", torch.ones(4, 2)),
+    "another shape in its place": lambda thing, tensors, table: tensors["place"].t_(),
+}
+CHANGED = {
+    "a number": lambda thing, tensors, table: setattr(thing, "rate", 0.25),
+    "a number of another type": lambda thing, tensors, table: thing.held.__setitem__(0, True),
+    "a text": lambda thing, tensors, table: setattr(thing, "name", "other"),
+    "an entry that is new": lambda thing, tensors, table: setattr(thing, "absent", 1),
+    "an attribute that is new": lambda thing, tensors, table: setattr(type(thing), "missing", 1),
+    "a longer list": lambda thing, tensors, table: thing.held.append(1),
+    "a shorter list": lambda thing, tensors, table: thing.held.pop(),
+    "an object of a list": lambda thing, tensors, table: thing.held.__setitem__(1, object()),
+    "a key": lambda thing, tensors, table: table.update(second=table.pop("first")),
+    "an equal list": lambda thing, tensors, table: table.update(first=[]),
+    "an answer": lambda thing, tensors, table: torch.set_grad_enabled(False),
+    "a place": lambda thing, tensors, table: setattr(tensors["place"], "data", torch.ones(2, 3)),
+    "memory of a layout": lambda thing, tensors, table: setattr(tensors["here"], "data", torch.ones(2, 3)),
+    "strides of a layout": lambda thing, tensors, table: tensors["here"].as_strided_((2, 3), (1, 2)),
+    "a shape of a kind": lambda thing, tensors, table: setattr(tensors["kind"], "data", torch.ones(2, 4)),
+    "a dtype of a kind": lambda thing, tensors, table: tensors.update(kind=torch.ones(4, 2).double()),
+    "no tensor of a kind": lambda thing, tensors, table: tensors.pop("kind"),
+    "values that are read": lambda thing, tensors, table: tensors["read"].add_(1),
+}
+
+
+@contextlib.contextmanager
+def exchange(there):
+    """With torch's exchange of tensors, or by the methods of Python alone."""
+    if not there:
+        native.compiled.know_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
+    try:
+        yield
+    finally:
+        native.know_torch(native.compiled)
+
+
+@pytest.mark.parametrize("there", [True, False], ids=["exchange", "methods"])
+@pytest.mark.parametrize("name", [*SAME, *CHANGED])
+def test_what_is_noted_is_followed(name, there):
+    kind = type("Own", (Thing,), {})
+    thing, table = kind(), {"first": []}
+    tensors = {"here": torch.zeros(2, 3), "place": torch.zeros(2, 3), "kind": torch.zeros(4, 2), "read": torch.zeros(2)}
+    with exchange(there), torch.set_grad_enabled(True):
+        guard = unchanged()
+        notes(guard, thing, tensors, table)
+        assert guard.holds()
+        (SAME | CHANGED)[name](thing, tensors, table)
+        assert guard.holds() == (name in SAME)
+
+
+def test_memory_that_a_tensor_has_left_is_not_given_to_another():
+    guard, tensor = unchanged(), torch.zeros(1 << 20)
+    guard.place(tensor)
+    tensor.data = torch.zeros(1)
+    assert torch.zeros(1 << 20).data_ptr() != 0 and not guard.holds()
+    tensor.data = torch.zeros(1 << 20)
+    assert not guard.holds()
+
+
+def test_without_the_compiled_module_nothing_is_known():
+    guard = Never()
+    notes(guard, Thing(), dict.fromkeys(("here", "place", "kind", "read"), torch.zeros(2)), {})
+    assert not guard.holds()
