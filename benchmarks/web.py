@@ -36,7 +36,7 @@ from voronerf.nerf import Cameras, Occupancy
 from voronerf.nerf.marching import FINE_WAVE, OPAQUE
 from voronerf.nerf.radiance import Radiance, radiance_of
 from voronerf.ops import composite
-from voronerf.ops.render_opaque.reference import Wave, walk
+from voronerf.ops.formulas import Wave, walk
 
 FLAGS = """--headless=new --no-sandbox --enable-unsafe-webgpu --use-webgpu-adapter=swiftshader
 --enable-features=Vulkan --use-vulkan=swiftshader --use-angle=swiftshader --no-first-run
@@ -175,7 +175,7 @@ def walked(run: Run, view: int) -> tuple[int, int]:
         return Wave(seen, found.ray_index, found.ray_offsets, found.depths, stop)
 
     with torch.no_grad():
-        walk(look, far, sampler.picture_samples, FINE_WAVE, OPAQUE, False)
+        walk(look, far, sampler.picture_samples, FINE_WAVE, OPAQUE, None, False)
     return APART**2 * int(stops.sum()), APART**2 * samples
 
 

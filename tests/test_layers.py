@@ -64,7 +64,7 @@ def imports(source: str, module: str) -> list[tuple[int, str]]:
             if node.level:
                 package = module.split(".")[: -node.level]
                 base = ".".join([*package, base] if base else package)
-            if base in ("voronerf", "voronerf.app", "voronerf.ops", "voronerf.ops._core"):
+            if base in ("voronerf", "voronerf.app") or base.startswith("voronerf.ops"):
                 found += [(node.lineno, f"{base}.{alias.name}") for alias in node.names]
             else:
                 found.append((node.lineno, base))
@@ -95,6 +95,8 @@ def faults(source: str, module: str) -> list[str]:
             wrong.append(f"{module}:{line} imports {name}, of which the table of commands alone knows")
         if name.endswith("._C") and not module.startswith("voronerf.ops._core.native"):
             wrong.append(f"{module}:{line} imports the compiled module, which only native may")
+        if target == "ops" and "reference" in name.split(".") and own not in ("ops", "kernels"):
+            wrong.append(f"{module}:{line} imports {name}, a specification that only ops read")
     return wrong
 
 
@@ -120,6 +122,8 @@ def test_backends_alone_choose() -> None:
         ("from voronerf import diagram", "voronerf.ops.cell_sort.reference", "from a layer above"),
         ("from ..train import loop", "voronerf.app.scenes.blender", "from a layer above"),
         ("from voronerf.ops._core import _C", "voronerf.ops.nearest_centre", "only native may"),
+        ("from voronerf.ops.pixel_rays.reference import pixel_rays", "voronerf.nerf.rays", "that only ops read"),
+        ("def f():\n    from voronerf.ops.resample import reference", "voronerf.town.rays", "that only ops read"),
         ("import voronerf.town.parts", "voronerf.app.nerfstudio.model", "the table of commands alone knows"),
         ("import numpy", "voronerf.nerf.loss", "nerf may import torch"),
         ("import voronerf", "voronerf.ops.nearest_centre", "from a layer above"),

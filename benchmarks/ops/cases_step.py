@@ -17,7 +17,7 @@ from torch import Tensor
 from ops.case import BACKWARD, FORWARD, Case, Contender, Work, generator, relative_error, rotation
 from voronerf import ops
 from voronerf.nerf.cameras import orbit_cameras
-from voronerf.ops.observe_occupancy.reference import cells_of
+from voronerf.ops.formulas import voxels_of
 
 RAYS, SAMPLES = 1 << 10, 1 << 13
 """Of a step."""
@@ -199,7 +199,7 @@ def _observe_all(
     hidden: float,
 ) -> None:
     """The cells of the samples, then the threshold for all cells, as nerfacc's ``OccGridEstimator`` does it."""
-    rows = cells_of(positions, box, density.shape).long()
+    rows = voxels_of(positions, box, density.shape).long()
     seen = weights > hidden * (1 - torch.exp(-sigma * deltas))
     flat = density.view(-1)
     flat[rows] = flat[rows] * decay

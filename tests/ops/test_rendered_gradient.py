@@ -12,7 +12,7 @@ from tolerances import assert_as_exact
 
 from voronerf.ops import composite, rendered_gradient
 from voronerf.ops._core.recording import Recording
-from voronerf.ops.render_loss.reference import activate
+from voronerf.ops.formulas import activate
 
 pytestmark = pytest.mark.op("rendered_gradient")
 

@@ -8,7 +8,8 @@ from voronerf import composite
 from voronerf.ops import compose_runs, render_loss, run_gradients, run_sums
 from voronerf.ops import own_samples as keep_own
 from voronerf.ops._core import backends
-from voronerf.ops.ray_runs.reference import along_rays, compose, own_samples, sum_runs
+from voronerf.ops.formulas import along_rays, compose
+from voronerf.ops.ray_runs.reference import own_samples, sum_runs
 
 
 @pytest.mark.parametrize("ranks", [1, 3])

@@ -9,14 +9,15 @@ Everything runs on the CPU in a fixed order, so the same samples and the same ge
 machine. For ten thousand samples a GPU would not help. Coordinates are in scene units.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from voronerf import ops
-from voronerf.ops.balance_centres.reference import balance_centres as balance_in_torch
-from voronerf.ops.nearest_centre.reference import nearest_centre as nearest_in_torch
+from voronerf.ops._core import backends
 
 _STEPS = 200  # of Lloyd's iteration at most
 _TOLERANCE = 1e-5  # it ends when a step lowers the energy by less than this part of it
@@ -150,7 +151,7 @@ def balance(
         after = weigh(chosen)
     elif centres == "balanced" and k > 1:
         if (d := samples.shape[1]) > 3:
-            chosen, after = balance_in_torch(samples, masses, chosen, steps, 0.05, 8)
+            chosen, after = in_torch("balance_centres", samples)(samples, masses, chosen, steps, 0.05, 8)
         else:
             arguments = in_space(samples), masses, in_space(chosen)
             chosen, after = ops.balance_centres(*arguments, steps=steps, backend=backend)
@@ -291,8 +292,13 @@ def in_space(points: Tensor) -> Tensor:
     return points if d == 3 else torch.nn.functional.pad(points, (0, 3 - d))
 
 
+def in_torch(op: str, points: Tensor) -> Callable[..., Any]:
+    """The reference of an operation, which takes points of any number of coordinates."""
+    return backends.resolve(op, backend="reference", device=points.device, dtype=points.dtype)
+
+
 def nearest_cell(points: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
     """int32 [n], the nearest of centres [k, d] for points [n, d]."""
     if points.shape[1] > 3:
-        return nearest_in_torch(points, centres)
+        return in_torch("nearest_centre", points)(points, centres)
     return ops.nearest_centre(in_space(points), in_space(centres), backend=backend)

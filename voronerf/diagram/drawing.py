@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf.ops.nearest_centre.reference import in_pieces
+from voronerf.ops.formulas import in_pieces
 
 _PIECE = {"cpu": 1 << 17}
 """Distances held at a time on a device: what a core's second-level cache holds."""

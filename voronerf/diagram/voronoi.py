@@ -20,9 +20,8 @@ import torch
 from torch import Tensor, nn
 
 from voronerf import ops
-from voronerf.diagram.balance import balance, in_space, nearest_cell
+from voronerf.diagram.balance import balance, in_space, in_torch, nearest_cell
 from voronerf.diagram.drawing import draw_cell
-from voronerf.ops.locate_cell.reference import locate_cell as locate_in_torch
 
 _DECIDE = 20_000  # samples that place the centres of `from_points`
 
@@ -207,7 +206,8 @@ class VoronoiDiagram(nn.Module):
         if self.depth == 1:
             cells = nearest_cell(flat, centres, backend=backend)
         elif centres.shape[1] > 3:
-            cells = locate_in_torch(flat, centres, self.child_offsets, self.child, self.depth)
+            locate = in_torch("locate_cell", flat)
+            cells = locate(flat, centres, self.child_offsets, self.child, self.depth)
         else:
             tree = in_space(centres), self.child_offsets, self.child
             cells = ops.locate_cell(in_space(flat), *tree, depth=self.depth, backend=backend)

@@ -16,8 +16,8 @@ from voronerf.nerf.segment import Stage, in_python, replayed, run_stages
 from voronerf.nerf.terms import LossAlongRays, Seen, Term, stages_of
 from voronerf.nerf.volume import Batch, Rendered, RenderOutput, Samples, ask, composed, render_samples, shares_of
 from voronerf.ops._core import backends
+from voronerf.ops._core.derivatives import learnt, with_gradients
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
-from voronerf.ops.forward_with_tape.reference import learnt, with_gradients
 from voronerf.ops.render_loss import render_loss_gradient
 
 

@@ -14,8 +14,8 @@ from voronerf.nerf.cameras import Rays
 from voronerf.nerf.field import Field
 from voronerf.nerf.radiance import radiance_of, router_of
 from voronerf.ops.composite import composite
+from voronerf.ops.formulas import Wave, walk
 from voronerf.ops.render_opaque import OF_PROGRAM
-from voronerf.ops.render_opaque.reference import Wave, walk
 
 if TYPE_CHECKING:
     from voronerf.nerf.samplers import Occupancy

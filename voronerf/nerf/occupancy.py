@@ -23,9 +23,9 @@ from voronerf.nerf.field import Field
 from voronerf.nerf.radiance import radiance_of
 from voronerf.ops._core.checks import check_range
 from voronerf.ops.draw_points import draw_points
+from voronerf.ops.formulas import voxels_of
 from voronerf.ops.march_rays import March, march_rays
 from voronerf.ops.observe_occupancy import observe_occupancy
-from voronerf.ops.observe_occupancy.reference import cells_of as voxels_of
 from voronerf.ops.render_opaque import RaysSeen, render_opaque
 
 #: Voxels of a grid along each axis, of a box and of contracted space, which is all the world.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf.ops.pixel_rays.reference import meet_box
+from voronerf.ops.formulas import meet_box
 
 
 def intersect_box(

@@ -30,7 +30,6 @@ from voronerf.ops._core.capture import Capture
 from voronerf.ops._core.custom_op import is_watched
 from voronerf.ops._core.recording import Recording
 from voronerf.ops._core.unchanged import Never, unchanged
-from voronerf.ops.adam.reference import judge
 from voronerf.router.layout import tensors_of
 
 _OWN = ("batches", "loss", "optimizer", "strategy", "guard", "generator", "autocast", "scaler")
@@ -475,7 +474,7 @@ class TrainingStep:
             return
         scaler.scale(loss).backward()
         if self.guard is not None:
-            judge(self.guard, loss.detach(), [])
+            self.guard.judge(loss.detach(), [])
         # The optimiser skips a step that is not finite by a flag on the device, so the host need not wait for it.
         scaler.step(self.optimizer)
         scaler.update()

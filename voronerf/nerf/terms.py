@@ -14,7 +14,7 @@ from torch import Tensor
 
 from voronerf.nerf.segment import Stage, in_python, replayed
 from voronerf.nerf.volume import Batch, Samples, normalised
-from voronerf.ops.render_loss.reference import activate
+from voronerf.ops.formulas import activate
 from voronerf.ops.rendered_gradient import rendered_gradient
 from voronerf.ops.smooth_depth_gradient import smooth_depth_gradient
 from voronerf.ops.sparse_depth_gradient import sparse_depth_gradient

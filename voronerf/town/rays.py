@@ -24,9 +24,9 @@ from voronerf.nerf.renderer import Renderer
 from voronerf.nerf.segment import Made
 from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.nerf.volume import Batch, RenderOutput, Samples, shares_of
+from voronerf.ops.formulas import along_rays, compose
 from voronerf.ops.forward_with_tape import Tape, forward_with_tape
 from voronerf.ops.ray_runs import OwnSamples, compose_runs, own_samples, run_gradients, run_sums
-from voronerf.ops.ray_runs.reference import along_rays, compose
 from voronerf.town.group import Group, Key
 from voronerf.town.territories import Place
 

@@ -167,3 +167,34 @@ def _kept(ctx: Any, op: Op) -> list[Any]:
     for place, tensor in zip(op.tensors, ctx.saved_tensors):
         found[place] = tensor
     return found
+
+
+def learnt(loss: Tensor, defer: bool) -> Tensor:
+    """A loss, after its backward pass unless that is deferred."""
+    if defer:
+        return loss
+    loss.backward()
+    return loss.detach()
+
+
+def with_gradients(loss: Tensor, tensors: Sequence[Tensor], gradients: Sequence[Tensor]) -> Tensor:
+    """A loss [] whose gradient to some tensors is known; it is handed over once."""
+    total: Tensor = _Known.apply(loss, list(gradients), *tensors)
+    return total
+
+
+class _Known(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, loss: Tensor, gradients: list[Tensor], *tensors: Tensor) -> Tensor:
+        ctx.gradients, ctx.dtypes = gradients, [tensor.dtype for tensor in tensors]
+        return loss.clone()
+
+    @staticmethod
+    def backward(ctx: Any, of_loss: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # what the gradients follow from is not known here
+            raise RuntimeError("forward_with_tape: gradients are differentiable no further, got create_graph=True")
+        found, ctx.gradients = ctx.gradients, None  # to be taken as they are, not copied
+        if not of_loss.is_cpu or float(of_loss) != 1:  # nothing is read of a device
+            found = [gradient * of_loss for gradient in found]
+        # Narrowed last: a scaled loss keeps small ones.
+        return (None, None, *(gradient.to(dtype) for gradient, dtype in zip(found, ctx.dtypes, strict=True)))

@@ -61,6 +61,20 @@ class Guard(NamedTuple):
         found, in_a_row = torch.zeros((), device=device), torch.zeros((), device=device)
         return Guard(found, torch.full((), float(skipped), device=device), in_a_row)
 
+    def judge(self, loss: Tensor | None, gradients: Sequence[Tensor]) -> None:
+        """Leaves out a step, where there is a loss, unless it and all gradients are below the limit; counts it.
+
+        Args:
+            loss: []; None leaves the guard as it is.
+            gradients: Of any shapes.
+        """
+        if loss is None:
+            return
+        beyond = ~torch.stack([(tensor.abs() < self.limit).all() for tensor in (loss, *gradients)])  # true for NaN
+        self.found.copy_(beyond.any())
+        self.skipped.add_(self.found)
+        self.in_a_row.add_(1).mul_(self.found)
+
 
 @torch.no_grad()
 def adam(
@@ -75,7 +89,7 @@ def adam(
     """A step of several parameters; see ``voronerf.ops.adam``."""
     left_out = torch.zeros((), dtype=torch.bool, device=parameters[0].device)
     if guard is not None:
-        judge(guard, loss, [gradient for rule, gradient in zip(rules, gradients) if rule.every])
+        guard.judge(loss, [gradient for rule, gradient in zip(rules, gradients) if rule.every])
         left_out = guard.found != 0
         if guard.scale is not None:
             gradients = [gradient / guard.scale for gradient in gradients]
@@ -102,13 +116,3 @@ def average(averages: Sequence[Tensor], parameters: Sequence[Tensor] | None, sha
         torch._foreach_mul_(list(averages), 1 - share)
     else:
         torch._foreach_lerp_(list(averages), list(parameters), cast(float, share))
-
-
-def judge(guard: Guard, loss: Tensor | None, gradients: Sequence[Tensor]) -> None:
-    """Whether a step is left out, where there is a loss: unless it and all gradients are below the limit."""
-    if loss is None:
-        return
-    beyond = ~torch.stack([(tensor.abs() < guard.limit).all() for tensor in (loss, *gradients)])  # true for NaN
-    guard.found.copy_(beyond.any())
-    guard.skipped.add_(guard.found)
-    guard.in_a_row.add_(1).mul_(guard.found)

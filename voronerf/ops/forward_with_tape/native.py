@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core import native
-from voronerf.ops.forward_with_tape.reference import Graph, Tape, learnt, with_gradients
+from voronerf.ops._core.derivatives import learnt, with_gradients
+from voronerf.ops.forward_with_tape.reference import Graph, Tape
 from voronerf.ops.grouped_program.native import How, Rows, run, run_gradient
 from voronerf.ops.routed_mlp import native as routed_mlp
 from voronerf.ops.routed_program import native as routed_program

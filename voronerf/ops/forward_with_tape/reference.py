@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_flag, check_shape
+from voronerf.ops._core.derivatives import learnt, with_gradients
 from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.routed_program import of_samples
 from voronerf.ops.routed_program.reference import routed_program
@@ -84,34 +84,3 @@ class Graph(Tape):
         if self.frozen is not None:
             gradient = gradient.masked_fill(of_samples(self.frozen, self.cells), 0)
         return learnt(with_gradients(loss, [self.out], [gradient]), defer)
-
-
-def learnt(loss: Tensor, defer: bool) -> Tensor:
-    """A loss, after its backward pass unless that is deferred."""
-    if defer:
-        return loss
-    loss.backward()
-    return loss.detach()
-
-
-def with_gradients(loss: Tensor, tensors: Sequence[Tensor], gradients: Sequence[Tensor]) -> Tensor:
-    """A loss [] whose gradient to some tensors is known; it is handed over once."""
-    total: Tensor = _Known.apply(loss, list(gradients), *tensors)
-    return total
-
-
-class _Known(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, loss: Tensor, gradients: list[Tensor], *tensors: Tensor) -> Tensor:
-        ctx.gradients, ctx.dtypes = gradients, [tensor.dtype for tensor in tensors]
-        return loss.clone()
-
-    @staticmethod
-    def backward(ctx: Any, of_loss: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():  # what the gradients follow from is not known here
-            raise RuntimeError("forward_with_tape: gradients are differentiable no further, got create_graph=True")
-        found, ctx.gradients = ctx.gradients, None  # to be taken as they are, not copied
-        if not of_loss.is_cpu or float(of_loss) != 1:  # nothing is read of a device
-            found = [gradient * of_loss for gradient in found]
-        # Narrowed last: a scaled loss keeps small ones.
-        return (None, None, *(gradient.to(dtype) for gradient, dtype in zip(found, ctx.dtypes, strict=True)))

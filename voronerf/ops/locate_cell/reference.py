@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from voronerf.ops.nearest_centre.reference import distances, in_pieces
+from voronerf.ops.formulas import in_pieces
+from voronerf.ops.nearest_centre.reference import distances
 
 _PIECE = 1 << 17
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
+
+from voronerf.ops.formulas import in_pieces
 
 _PIECE = 1 << 17
 """Distances evaluated at a time: 1 MiB of float64, what a core's second-level cache holds."""
@@ -15,13 +15,6 @@ def nearest_centre(points: Tensor, centres: Tensor) -> Tensor:
     """Index of the nearest centre of every point; see ``voronerf.ops.nearest_centre``."""
     run = lambda points: distances(points, centres).argmin(dim=1).to(torch.int32)  # noqa: E731
     return in_pieces(run, _PIECE // centres.shape[0], points)
-
-
-def in_pieces(run: Callable[..., Tensor], rows: int, *tensors: Tensor) -> Tensor:
-    """``run`` on so many rows of the tensors at a time; a compiler, which would unroll the loop, gets them whole."""
-    if torch.compiler.is_compiling() or tensors[0].shape[0] <= rows:
-        return run(*tensors)
-    return torch.cat([run(*piece) for piece in zip(*(tensor.split(max(1, rows)) for tensor in tensors))])
 
 
 def distances(points: Tensor, centres: Tensor) -> Tensor:

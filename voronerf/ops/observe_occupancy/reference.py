@@ -7,13 +7,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from voronerf.ops.formulas import voxels_of
+
 
 @torch.no_grad()
 def observe_occupancy(*given: Any) -> None:
     """Fades and raises the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
     density, occupied, box, positions, sigma, deltas, weights, decay, threshold, hidden, contraction, fixed = given
     found = sigma.nan_to_num(nan=float("inf"), posinf=float("inf"))
-    rows = cells_of(positions, box, density.shape).long()
+    rows = voxels_of(positions, box, density.shape).long()
     count = density.numel()
     # One cell more, for samples that say nothing.
     if fixed is not None:
@@ -41,10 +43,3 @@ def stretch(points: Tensor, contraction: Tensor) -> Tensor:
         length = (x * x + y * y + z * z).sqrt() / contraction[3]
         return (2 - length).nan_to_num(0).clamp(1e-3, 1).square().reciprocal()
     return 2 * contraction[4, 0] / (1 - points[:, 2]).nan_to_num(0).clamp_min(1e-3).square()
-
-
-def cells_of(points: Tensor, box: Tensor, shape: torch.Size) -> Tensor:
-    """Flat numbers int32 [n] of the cells that points [n, 3] lie in; outside the box the nearest at its border."""
-    places = (points - box[0]) / (box[1] - box[0])
-    x, y, z = ((places[:, i] * size).nan_to_num(0).clamp(0, size - 1).int() for i, size in enumerate(shape))
-    return (x * shape[1] + y) * shape[2] + z

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_range
+from voronerf.ops.formulas import meet_box
 
 
 class PixelRays(NamedTuple):
@@ -67,19 +68,3 @@ def pixel_rays(*given: Any) -> PixelRays:
         alpha = values[:, 3:]
         colour = colour * alpha + background * (1 - alpha)
     return PixelRays(origins, directions, enter, leave, colour.contiguous())
-
-
-def meet_box(origins: Tensor, directions: Tensor, box: Tensor, near: float, far: float) -> tuple[Tensor, Tensor]:
-    """Where rays [b, 3] enter and leave a box [2, 3] between `near` and `far` (slab method); equal if they miss it."""
-    low, high = (box[0] - origins) / directions, (box[1] - origins) / directions
-    first, last = torch.minimum(low, high), torch.maximum(low, high)
-    # 0 / 0 and +-inf: a ray parallel to a slab is inside it at all distances or at none
-    parallel = directions == 0
-    if not parallel.is_cpu or torch.compiler.is_compiling() or bool(parallel.any()):
-        inside = (origins >= box[0]) & (origins <= box[1])
-        infinity = torch.full_like(first, float("inf"))
-        first = torch.where(parallel, torch.where(inside, -infinity, infinity), first)
-        last = torch.where(parallel, torch.where(inside, infinity, -infinity), last)
-    (a, b, c), (x, y, z) = first.unbind(-1), last.unbind(-1)  # in half the time of amax and amin
-    enter = a.maximum(b).maximum(c).clamp(near, far)
-    return enter, torch.maximum(enter, x.minimum(y).minimum(z).clamp(near, far))

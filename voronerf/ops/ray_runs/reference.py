@@ -11,14 +11,11 @@ from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from voronerf.ops.composite.reference import Composite, composite, kept
+from voronerf.ops.composite.reference import Composite, composite, kept, optical_depth
+from voronerf.ops.formulas import Composed, activate, along_rays, compose
 from voronerf.ops.render_loss.reference import robust_error
-
-#: Stands for infinite density, as in `composite`.
-_OPAQUE = 1e30
 
 
 class OwnSamples(NamedTuple):
@@ -75,35 +72,6 @@ class Runs(NamedTuple):
     weights: Tensor
 
 
-class Composed(NamedTuple):
-    """Rays made of runs."""
-
-    colour: Tensor  # [r, c], without a background
-    through: Tensor  # [r], the light that passes all of them
-    before: Tensor  # [q], the optical depth in front of each run
-    place: Tensor  # int64 [q], where each run is in a table with a row for each ray
-    width: int  # the columns of the table
-
-    @property
-    def front(self) -> Tensor:
-        """[q], the light that arrives at each run."""
-        return torch.exp(-self.before)
-
-    def behind(self, colour: Tensor, ray: Tensor, slopes: Tensor, background: Tensor) -> Tensor:
-        """What the light from behind each run [q] adds to the loss, which more optical depth takes away.
-
-        Args:
-            colour: [q, c], of the runs.
-            ray: int64 [q], their rays.
-            slopes: [r, c], the gradient of each ray's colour over its background.
-            background: [r, c].
-        """
-        table = slopes.new_zeros(len(slopes), self.width)
-        table.view(-1)[self.place] = self.front * (slopes[ray] * colour).sum(1)
-        table = torch.cat((table[:, 1:], (self.through * (slopes * background).sum(1))[:, None]), 1)
-        return table.flip(1).cumsum(1).flip(1).view(-1)[self.place]
-
-
 def own_samples(
     positions: Tensor,
     ray_index: Tensor,
@@ -139,45 +107,14 @@ def sum_runs(samples: OwnSamples, colour: Tensor, density: Tensor, blend: Callab
     first = offsets[:-1].long()
     run = torch.repeat_interleave(offsets.diff())
     found = blend(density, colour, samples.depths, samples.deltas, ray_offsets=offsets)
-    optical = torch.zeros_like(samples.depths[first]).index_add(0, run, density.clamp(max=_OPAQUE) * samples.deltas)
+    optical = torch.zeros_like(samples.depths[first]).index_add(0, run, optical_depth(density, samples.deltas))
     ray, start = samples.ray_index[first].long(), samples.depths[first]
     return Runs(found.colour, optical, found.depth.detach(), ray, start, found.weights.detach())
 
 
-def compose(colour: Tensor, optical: Tensor, ray: Tensor, rays: int) -> Composed:
-    """Puts runs together, without gradients of its own.
-
-    Args:
-        colour: [q, c].
-        optical: [q].
-        ray: int64 [q], ascending; the runs of a ray from near to far.
-        rays: r.
-    """
-    counts = torch.bincount(ray, minlength=rays)
-    slot = torch.arange(len(ray), device=ray.device) - (counts.cumsum(0) - counts)[ray]
-    width = int(counts.max()) if len(ray) else 1
-    place = ray * width + slot
-    table = optical.new_zeros(rays, width)
-    table.view(-1)[place] = optical
-    # The sum is shifted: less its last term it would be inf - inf for an opaque run.
-    before = F.pad(table[:, :-1], (1, 0)).cumsum(1).view(-1)[place]
-    whole = colour.new_zeros(rays, colour.shape[1]).index_add(0, ray, torch.exp(-before)[:, None] * colour)
-    return Composed(whole, torch.exp(-table.sum(1)), before, place, width)
-
-
-def along_rays(ray: Tensor, start: Tensor) -> Tensor:
-    """The order of runs [q] by their rays, int64, and from near to far, by their starts >= 0."""
-    bits = start.float().view(torch.int32)  # as large as the floats themselves
-    return ((ray << 32) + bits).argsort(stable=True)
-
-
-def _activated(raw: Tensor, density_scale: float) -> tuple[Tensor, Tensor]:
-    return torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
-
-
 def run_sums(raw: Tensor, samples: OwnSamples, density_scale: float) -> tuple[Tensor, Tensor]:
     """Partial sums [q, 6] and densities [m]; see ``voronerf.ops.run_sums``."""
-    colour, density = _activated(raw, density_scale)
+    colour, density = activate(raw, density_scale)
     runs = sum_runs(samples, colour, density)
     return torch.cat((runs.colour, runs.optical[:, None], runs.start[:, None], runs.ray[:, None]), 1), density
 
@@ -217,7 +154,7 @@ def run_gradients(
     """Gradient of the loss to the outputs [m, 4], and weights [m]; see ``voronerf.ops.run_gradients``."""
     samples, answers = OwnSamples._make(map(kept, samples)), kept(answers)
     raw = kept(raw.detach()).requires_grad_()
-    colour, density = _activated(raw, density_scale)
+    colour, density = activate(raw, density_scale)
     runs, front = sum_runs(samples, colour, density), torch.exp(-answers[:, 4])
     run = torch.repeat_interleave(samples.run_offsets.diff())
     weights = runs.weights * front[run]

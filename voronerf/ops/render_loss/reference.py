@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from voronerf.ops.composite.reference import check_ray_offsets, composite, kept, optical_depth, packed_light
+from voronerf.ops.formulas import activate
 
 
 class RenderLoss(NamedTuple):
@@ -84,13 +85,6 @@ def scaled(op: str, given: Any) -> Any:
     if scale is not None:
         raise ValueError(f"{op}: density_scale must not be given for activated values, got {scale}")
     return given._replace(density_scale=1.0)
-
-
-def activate(raw: Tensor, density_scale: float = 1.0, activated: bool = False) -> tuple[Tensor, Tensor]:
-    """Colours [m, 3] and densities [m] of what networks put out [m, 4]; as they are where they are activated."""
-    if activated:
-        return raw[:, :3], raw[:, 3]
-    return torch.sigmoid(raw[:, :3]), F.softplus(raw[:, 3]) * density_scale
 
 
 @torch.inference_mode(False)

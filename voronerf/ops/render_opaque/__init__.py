@@ -11,9 +11,9 @@ from torch import Tensor
 from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
+from voronerf.ops.formulas import RaysSeen
 from voronerf.ops.grouped_mlp.checks import check_routed
 from voronerf.ops.render_loss.reference import scaled
-from voronerf.ops.render_opaque.reference import RaysSeen
 from voronerf.ops.routed_program import check_routed_program
 
 #: Names of the arguments of `routed_mlp` that a network has; the others are of the samples, or of the backward pass.

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
+from voronerf.ops.formulas import RaysSeen
 from voronerf.ops.grouped_program.lowering import lower
 from voronerf.ops.grouped_program.native import program_inputs
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.render_opaque import reference
-from voronerf.ops.render_opaque.reference import RaysSeen
 from voronerf.ops.routed_mlp import native as routed_mlp
 from voronerf.ops.routed_program import native as routed_program
 from voronerf.ops.routed_program.reference import cells_of

@@ -6,7 +6,7 @@ import torch
 
 from voronerf.ops._core.cases import Arguments, Case, Draw
 from voronerf.ops.composite.reference import composite
-from voronerf.ops.render_loss.reference import activate
+from voronerf.ops.formulas import activate
 
 
 def _make(draw: Draw, n: int) -> Arguments:
