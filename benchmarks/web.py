@@ -33,8 +33,8 @@ from voronerf.app.run import Run
 from voronerf.app.web import export_web
 from voronerf.app.web.shader import fours
 from voronerf.nerf import Cameras, Occupancy
-from voronerf.nerf.marching import FINE_WAVE, OPAQUE
 from voronerf.nerf.radiance import Radiance, radiance_of
+from voronerf.nerf.samplers import FINE_WAVE, OPAQUE
 from voronerf.ops import composite
 from voronerf.ops.formulas import Wave, walk
 

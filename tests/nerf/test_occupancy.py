@@ -21,7 +21,6 @@ from voronerf.nerf import (
     intersect_box,
     orbit_cameras,
     render_rays,
-    render_until_opaque,
 )
 from voronerf.nerf.radiance import radiance_of
 from voronerf.nerf.samplers import SETTLING_PART
@@ -307,7 +306,7 @@ def test_a_ray_that_ends_has_the_colour_before_its_end():
     rays = Rays(torch.tensor([[0.0, 0, -1], [0, 0, 0.9]]), torch.tensor([[0.0, 0, 1]]).expand(2, 3))
     sampler = Occupancy(OccupancyGrid(BOX, 4, threshold=0.1), 200, picture_samples=200)
     ends = torch.zeros(2), torch.tensor([2.0, 0.1])
-    seen = render_until_opaque(fog, rays, *ends, sampler, background=WHITE)
+    seen = sampler.see(fog, rays, *ends, background=WHITE, heaviest=True)
     left = math.exp(-0.8)  # of the second ray, which does not end
     torch.testing.assert_close(seen.colour[:, 0], torch.tensor([0.25, 0.25 * (1 - left) + left]))
     torch.testing.assert_close(seen.opacity, torch.tensor([1.0, 1 - left]))
@@ -340,7 +339,8 @@ def test_rays_that_meet_nothing_show_the_background():
     rays = Rays(torch.zeros(3, 3), torch.eye(3))
     ends = torch.full((3,), 0.1), torch.full((3,), 0.9)
     asked = Ball()
-    seen = render_until_opaque(asked, rays, *ends, Occupancy(grid, 8, picture_samples=8), background=WHITE)
+    sampler = Occupancy(grid, 8, picture_samples=8)
+    seen = sampler.see(asked, rays, *ends, background=WHITE, heaviest=True)
     assert asked.asked == 0
     assert torch.equal(seen.colour, torch.ones(3, 3)) and torch.equal(seen.depth, ends[1])
     assert torch.equal(seen.heaviest, 0.9 * torch.eye(3))

@@ -6,7 +6,6 @@ from voronerf.nerf.cameras import Cameras, Rays, focus_point, orbit_cameras, tur
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import DirectionPerSample, Field
 from voronerf.nerf.loss import RayLoss
-from voronerf.nerf.marching import RayColours, render_until_opaque
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.rays import intersect_box
 from voronerf.nerf.renderer import RenderedImage, Renderer, render_rays
@@ -16,7 +15,7 @@ from voronerf.nerf.segment import replayed
 from voronerf.nerf.split import PlannedSplit, SplitDone, SplitStrategy, Strategy
 from voronerf.nerf.step import StepOutput, TrainingStep
 from voronerf.nerf.terms import LossAlongRays, Seen, SmoothDepth, SparseDepth, Term
-from voronerf.nerf.volume import Batch, Rendered, RenderOutput, Samples, Space
+from voronerf.nerf.volume import Batch, RayColours, Rendered, RenderOutput, Samples, Space
 
 __all__ = [
     "SAMPLERS",
@@ -58,7 +57,6 @@ __all__ = [
     "intersect_box",
     "orbit_cameras",
     "render_rays",
-    "render_until_opaque",
     "replayed",
     "stratified_depths",
     "turntable_cameras",

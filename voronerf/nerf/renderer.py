@@ -14,11 +14,10 @@ from torch import Tensor, nn
 from voronerf.nerf.cameras import Cameras, Rays
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
-from voronerf.nerf.marching import RayColours
 from voronerf.nerf.occupancy import OccupancyGrid
 from voronerf.nerf.samplers import Sampler, Stratified
 from voronerf.nerf.segment import replayed
-from voronerf.nerf.volume import Rendered, Samples, per_ray, render_samples
+from voronerf.nerf.volume import RayColours, Rendered, Samples, per_ray, render_samples
 
 
 class RenderedImage(NamedTuple):

@@ -18,8 +18,8 @@ from voronerf.nerf.cameras import Rays
 from voronerf.nerf.contraction import Contraction
 from voronerf.nerf.field import Field
 from voronerf.nerf.fields.hashgrid import LONG
-from voronerf.nerf.marching import RayColours, render_until_opaque
 from voronerf.nerf.occupancy import DECAY, OccupancyGrid, draw_seed
+from voronerf.nerf.radiance import radiance_of, router_of
 from voronerf.nerf.sampling import (
     blurred_weights,
     colour_loss,
@@ -30,8 +30,11 @@ from voronerf.nerf.sampling import (
 )
 from voronerf.nerf.schedule import WARMUP_STEPS
 from voronerf.nerf.segment import replayed
-from voronerf.nerf.volume import Rendered, RenderOutput, Samples, Space
+from voronerf.nerf.volume import RayColours, Rendered, RenderOutput, Samples, Space
 from voronerf.ops._core.rows import fixed_count
+from voronerf.ops.composite import composite
+from voronerf.ops.formulas import Wave, walk
+from voronerf.ops.render_opaque import OF_PROGRAM
 from voronerf.ops.resample import resample
 
 #: Share of the first pass in the loss if one network is evaluated in two passes (mip-NeRF, section 3.2).
@@ -48,6 +51,13 @@ REVISITED, MOST_REVISITED = 1 / 8, 32_768
 #: Samples of a ray of a picture for each of training, whose samples are jittered and so cover each stratum over time.
 #: At most so many: of the 256 of a long training, twice as many would make no picture more than 0.05 dB better.
 PICTURE_SAMPLES, MOST_PICTURE_SAMPLES = 2, 384
+#: A ray of a picture ends when it lets less than this through: what is behind counts as of the colour before it.
+OPAQUE = 0.05
+#: Samples of a ray in a wave: fewer need more waves, more evaluate samples behind the surface in vain. Pictures of
+#: contracted space, photographs, have so many rays that a wave's own costs count less.
+WAVE, CONTRACTED_WAVE = 12, 8
+#: The same where one operation takes all waves, which cost next to nothing then.
+FINE_WAVE = 4
 #: Samples of a ray through contracted space whose empty part is skipped, by the seconds of a training from which on it
 #: has them: shorter strata make steps dearer at first, and sharper pictures in the end.
 CONTRACTED_SAMPLES = {0.0: 128, LONG: 256, 90.0: 384}
@@ -172,7 +182,13 @@ class Sampler:
     ) -> RayColours | None:
         """What rays of a picture see, where that needs fewer samples than :meth:`draw` gives; else None.
 
-        Arguments are those of :func:`voronerf.nerf.render_until_opaque`.
+        Args:
+            field: The field that has the colours.
+            rays: r rays.
+            near: [r].
+            far: [r].
+            background: [3] or [r, 3]; None is black.
+            heaviest: Whether to find the heaviest samples; without it that part of the result means nothing.
         """
         return None
 
@@ -341,11 +357,65 @@ class Occupancy(Sampler):
         """What is sampled, and what the grid leaves of it."""
         return f"{super().explain()}, of which {self.grid.share:.0%} of the grid are left"
 
+    @torch.no_grad()
     def see(
         self, field: Field, rays: Rays, near: Tensor, far: Tensor, *, background: Tensor | None, heaviest: bool
     ) -> RayColours:
-        """Walks rays to the first surface; see :meth:`Sampler.see`."""
-        return render_until_opaque(field, rays, near, far, self, background=background, heaviest=heaviest)
+        """Walks rays in waves, each until it is opaque; see :meth:`Sampler.see`.
+
+        A wave is a few samples of every ray that is not opaque yet. So the field evaluates little more than the samples
+        in front of the first surface of each ray. A ray that has ended counts as opaque, with the colour that it has by
+        then. Samples are the middles of the strata for pictures.
+
+        Examples:
+            >>> import torch
+            >>> from voronerf import OccupancyGrid
+            >>> from voronerf.nerf import Occupancy, Rays
+            >>> def wall(positions, directions, ray_index):  # from z = 0 on
+            ...     return torch.ones_like(positions), torch.where(positions[:, 2] > 0, 1e9, 0.0)
+            >>> grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 4, threshold=0.1)
+            >>> rays = Rays(torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]))
+            >>> ends = torch.zeros(1), torch.full((1,), 4.0)
+            >>> seen = Occupancy(grid, 8).see(wall, rays, *ends, background=None, heaviest=True)
+            >>> seen.colour, seen.depth
+            (tensor([[1., 1., 1.]]), tensor([2.1250]))
+        """
+        contraction = self.space.contraction
+        network = self._network(field, rays)
+        if network is not None:
+            rule = {"spacing": self.space.spacing, "backend": self.backend, "heaviest": heaviest, "wave": FINE_WAVE}
+            rule |= {"opaque": OPAQUE, "background": None if background is None else background.to(near)}
+            seen = self.grid.see(rays, near, far, self.picture_samples, **network, **rule)
+        else:
+            wave = WAVE if contraction is None else CONTRACTED_WAVE
+
+            def look(live: Tensor, start: Tensor | None) -> Wave:
+                now = rays if start is None else rays[live]
+                samples, stop = self.march(now, near[live], far[live], start=start, most=wave, picture=True)
+                rgb, sigma = (each.to(near.dtype) for each in field(samples.inputs, now.directions, samples.ray_index))
+                along = samples.depths, samples.deltas
+                part = composite(sigma, rgb, *along, ray_offsets=samples.ray_offsets, backend=self.backend)
+                return Wave(part, samples.ray_index, samples.ray_offsets, samples.depths, stop)
+
+            seen = walk(look, far, self.picture_samples, wave, OPAQUE, background, heaviest)
+        places = rays.origins
+        if heaviest:
+            places = rays.origins + seen.heaviest[:, None] * rays.directions
+            places = places if contraction is None else contraction.points(places)
+        return RayColours(seen.colour, seen.opacity, seen.depth, places)
+
+    def _network(self, field: Field, rays: Rays) -> dict[str, Any] | None:
+        """The arguments with which `render_opaque` asks a field; None for more than networks, for Warp and CUDA."""
+        router = router_of(field)
+        if router is None or not rays.origins.is_cpu or "warp" in (self.backend, router.backend):
+            return None
+        known = radiance_of(field, (rays.origins, rays.directions))
+        if isinstance(known, str):
+            return None
+        arguments = known.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32))
+        if "cells" in arguments:  # which each sample has of its own
+            return None
+        return {"network": {name: value for name, value in arguments.items() if name in OF_PROGRAM}, **known.rule}
 
     def _leave_empty(self) -> None:
         if self.empty is not None:
@@ -432,11 +502,11 @@ class Occupancy(Sampler):
             picture: Whether the strata are those of a picture.
         """
         samples = self.picture_samples if picture else self.strata
-        walk: dict[str, Any] = {"seed": seed, "start": start, "most": most, "backend": self.backend}
+        options: dict[str, Any] = {"seed": seed, "start": start, "most": most, "backend": self.backend}
         if seed is not None and start is None and not near.is_cpu:  # a training step waits for no device
-            walk["capacity"] = max(1, len(near) * samples)
-        found = self.grid.march(rays, near, far, samples, spacing=self.space.spacing, **walk)
-        rows = found.ray_offsets[-1:] if "capacity" in walk else None
+            options["capacity"] = max(1, len(near) * samples)
+        found = self.grid.march(rays, near, far, samples, spacing=self.space.spacing, **options)
+        rows = found.ray_offsets[-1:] if "capacity" in options else None
         parts = found.positions, found.ray_index, found.ray_offsets, found.depths, found.deltas
         return Samples(*parts, rows=rows), found.stop
 

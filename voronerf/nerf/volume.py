@@ -148,6 +148,32 @@ class Rendered(NamedTuple):
     samples: Samples
 
 
+class RayColours(NamedTuple):
+    """Colours and depths of the rays of a picture.
+
+    Attributes:
+        colour: [r, 3], the background included.
+        opacity: [r].
+        depth: [r], as in `Rendered`.
+        heaviest: [r, 3], the position of the heaviest sample of each ray, or its far end if it has no samples.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.nerf import Rays, Renderer, Stratified
+        >>> def fog(positions, directions, ray_index):
+        ...     return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+        >>> rays = Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0, 1]]))
+        >>> seen = Renderer({"field": fog}, Stratified(8)).see(rays, torch.zeros(1), torch.ones(1))
+        >>> seen.opacity.round(decimals=4)  # 1 - exp(-0.5)
+        tensor([0.3935])
+    """
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    heaviest: Tensor
+
+
 @dataclass(frozen=True)
 class Batch:
     """Rays [r], where they enter and leave the scene, and the colours to learn.

@@ -28,9 +28,8 @@ from voronerf.app.run import Run
 from voronerf.app.web.shader import BLOCK, CannotDraw, Layout, fours, networks_text, shader_text
 from voronerf.nerf.cameras import Cameras, focus_point
 from voronerf.nerf.contraction import Contraction, Perspective
-from voronerf.nerf.marching import FINE_WAVE, OPAQUE
 from voronerf.nerf.radiance import Radiance, radiance_of
-from voronerf.nerf.samplers import Occupancy
+from voronerf.nerf.samplers import FINE_WAVE, OPAQUE, Occupancy
 
 #: Bytes of a part: WebGPU lets every shader read so many at once.
 LARGEST = 2**27
