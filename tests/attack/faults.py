@@ -384,7 +384,7 @@ FAULTS = (
     ),
     _python(
         "What few samples have shown is not looked at again with more of them",
-        "router/dispatch.py",
+        "router/plan.py",
         "if self.skip or (self.few and n >= FEWEST):",
         "if self.skip:",
         "tests/router/test_known.py",

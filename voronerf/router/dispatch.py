@@ -15,7 +15,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -31,82 +31,21 @@ from voronerf.router.grouped import Grouped, Loop, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters, owned_parameters, parts_of
 from voronerf.router.known import KnownCall
 from voronerf.router.layout import Call, Results, map_tensors, tensors_of
+from voronerf.router.plan import SLICE, CallPlan, measured_samples
 from voronerf.router.probe import FEWEST, Options, Probe, check_rays, check_subclasses
 from voronerf.router.program import CellProgram
 from voronerf.router.transforms import aside, is_watched, outside, recorded
-from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup, same
+from voronerf.router.watch import NUMBERS, Inputs, Source, Watch, is_number, lookup
 
 _OP = "VoronoiRouter"
 _PLANS = 256  # kinds of calls that are remembered
 _TRACES = 8  # of one kind of call; a module that changes more often runs grouped
 _TURNS, _SECONDS = 8, 0.08  # a way is measured at most so often, and no more than twice after so many seconds
-_SLICE, _BEHIND = 8192, 1.5  # samples of a batch that are measured; times behind the fastest, so not measured again
+_BEHIND = 1.5  # times behind the fastest, so not measured again
 _LOOKS, _APART, _CLEAR = 3, 1.0, 1.3  # measurements that a fused way must lose, seconds between them, factor of time
 _EQUAL = 1.02  # of the least time: an earlier way of a plan is taken unless it is slower by more
 _OF_DTYPES = re.compile("same dtype|expected scalar type|Input type")  # in messages of PyTorch
 _OWN = tuple(str(Path(file).absolute().parents[up]) + os.sep for file, up in ((str(torch.__file__), 0), (__file__, 1)))
-
-
-@dataclass
-class CallPlan:
-    """How the calls of one kind run.
-
-    Attributes:
-        ways: Those that give what the loop gives, the most promising first and the loop last.
-        measured: Whether the first batch of each size decides between the ways; else the first one runs.
-        open: Whether another batch may run grouped, though the first did not.
-        few: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another.
-        chosen: The fastest way and why, by the size of a batch and the number of cells.
-        lost: Measurements that the fused way has lost, by the same key: count, time of the next one, explanation.
-        constants: What is no tensor among the arguments of the call that it was made for, if it is fused.
-        watch: Values of the module that its trace read.
-        skip: The next calls that run cell by cell before another way is tried again.
-        wait: ``skip`` after the next batch that cannot be grouped.
-    """
-
-    ways: list[Way]
-    measured: bool = False
-    open: bool = False
-    few: bool = False
-    chosen: dict[tuple[int, int], tuple[int, str]] = field(default_factory=dict)
-    lost: dict[tuple[int, int], tuple[int, float, str]] = field(default_factory=dict)
-    constants: dict[str, Any] = field(default_factory=dict)
-    watch: Watch = field(default_factory=Watch)
-    skip: int = 0
-    wait: int = 0
-
-    def __post_init__(self) -> None:
-        self._most = measured_samples(self.ways)
-
-    @property
-    def fused(self) -> Fused | None:
-        """The way that a call takes as it was traced."""
-        return self.ways[0] if isinstance(self.ways[0], Fused) else None
-
-    def takes_first(self, n: int, k: int) -> bool:
-        """Whether n samples in k cells are known to go the first way."""
-        if self.skip or (self.few and n >= FEWEST):
-            return False
-        if not self.measured or len(self.ways) == 1 or n < FEWEST:
-            return True
-        return self.chosen.get(self.size(n, k), (1, ""))[0] == 0
-
-    def size(self, n: int, k: int) -> tuple[int, int]:
-        """The key of ``chosen``: batches of up to four times as many samples."""
-        return min(n, self._most).bit_length() // 2, k
-
-    def changed(self, constants: dict[str, Any]) -> list[Source]:
-        """The arguments, attributes and buffers that have changed since the module was traced."""
-        fused = self.fused
-        if fused is None:
-            return []
-        now = constants.keys() | self.constants.keys() if constants.keys() != self.constants.keys() else constants
-        names = [n for n in now if not same(constants.get(n), self.constants.get(n)) and n not in fused.inputs.sources]
-        return [*names, *self.watch.changed()]
-
-    def postpone(self) -> None:
-        """Runs the next calls cell by cell, twice as many each time."""
-        self.skip, self.wait = self.wait, 2 * self.wait or 1
 
 
 class Dispatch:
@@ -487,19 +426,14 @@ class _Constant(torch.autograd.Function):
         return (None,) * ctx.count
 
 
-def measured_samples(ways: list[Way]) -> int:
-    """Most samples on which ways are measured: more where PyTorch computes a part, whose tensors outgrow the cache."""
-    return _SLICE * 8 if any(way.name == "fused in runs" for way in ways) else _SLICE
-
-
 def measure(ways: list[Way], call: Call, grouping: Grouping) -> list[float]:
     """Seconds that each way takes for a part of a batch, forward and, where there are gradients, backward.
 
     The ways take turns, and the least time of each counts; the loop has one turn where it is far behind. A double of
     the module takes what they write and the gradients; random numbers go on as if nothing had run.
     """
-    most, times = measured_samples(ways), _least_times(ways, call, grouping, _SLICE, 2)
-    return _least_times(ways, call, grouping, most, 1) if min(most, call.layout.n) > 2 * _SLICE else times
+    most, times = measured_samples(ways), _least_times(ways, call, grouping, SLICE, 2)
+    return _least_times(ways, call, grouping, most, 1) if min(most, call.layout.n) > 2 * SLICE else times
 
 
 def _least_times(ways: list[Way], call: Call, grouping: Grouping, most: int, fewest: int) -> list[float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -19,9 +19,7 @@ from voronerf.ops._core.checks import MAX_COUNT
 from voronerf.router.fused import HALF, Fused, Whole
 from voronerf.router.grouping import Grouping
 from voronerf.router.layout import SAMPLE, Call, rebuild, tensors_of
-
-if TYPE_CHECKING:
-    from voronerf.router.dispatch import CallPlan
+from voronerf.router.plan import CallPlan
 
 _VALUES = {type(None), bool, int, float, str}
 
