@@ -491,8 +491,8 @@ FAULTS = (
     _python(
         "A resumed training forgets how many steps were left out",
         "app/train/state.py",
-        "Guard.on(self.device, skipped)",
-        "Guard.on(self.device, 0)",
+        "self.guard.begin(skipped)",
+        "self.guard.begin(0)",
         "tests/app/train/test_resume.py",
     ),
     _python(

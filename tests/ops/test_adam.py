@@ -50,7 +50,8 @@ def test_a_table_may_have_any_gradient(device, backend):
     """Its entries are not read to judge a step: they are products of gradients that are."""
     table = [torch.ones(4, device=device) for _ in range(4)]
     table[1][2] = torch.nan
-    guard, step = Guard.on(device, skipped=3), torch.zeros((), device=device)
+    guard, step = Guard.on(device), torch.zeros((), device=device)
+    guard.begin(3)
     given = [[tensor] for tensor in table]
     adam([Rule(step, 0.1, every=False)], *given, guard=guard, loss=step + 1, backend=backend)
     assert float(step) == 1 and float(guard.skipped) == 3 and float(guard.found) == 0

@@ -160,6 +160,10 @@ class RayBatches:
         """Number of rays to draw from."""
         return self._pixels if self.useful is None else self.useful.total
 
+    def end_unseen(self) -> None:
+        """Draws no more rays that no picture shows."""
+        self.unseen = 0.0
+
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """A batch of ``count`` rays, drawn with replacement; the first ones through points of the sparse model."""
         seed = draw_seed(self.place, generator)

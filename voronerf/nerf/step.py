@@ -138,10 +138,18 @@ class TrainingStep:
     ) -> None:
         self.batches, self.loss, self.optimizer, self.strategy, self.guard = batches, loss, optimizer, strategy, guard
         self.generator, self.autocast, self.scaler = generator, autocast, scaler
-        self.as_it_is: Callable[[], AbstractContextManager[None]] = nullcontext  # around a step that is not replayed
+        self.run_within(nullcontext)
         self._segments, self._same = dict[str, Segment](), False
         self._asked = self._wait = self._left = 0  # of a capture: as of a segment
         self.forget()
+
+    def run_within(self, context: Callable[[], AbstractContextManager[None]]) -> None:
+        """Sets the context of steps, and of their stages, that are not replayed.
+
+        Args:
+            context: Makes one for each of them.
+        """
+        self._context = context
 
     def forget(self) -> None:
         """Records the next step anew."""
@@ -356,7 +364,7 @@ class TrainingStep:
     def _call(self, stage: Stage, fresh: Mapping[str, Any]) -> Mapping[str, Any]:
         """A stage in Python, given what others there have made, or segments before."""
         began, last = time.perf_counter(), self._last
-        with self.as_it_is():
+        with self._context():
             values = [
                 fresh[name] if name in fresh else last.value[name] if stage.lazy else last.now(last.value[name])
                 for name in stage.reads
@@ -367,7 +375,7 @@ class TrainingStep:
         return found
 
     def _run_stages(self, stages: list[Stage], rays: int, before: Any, fresh: Any) -> dict[str, Any]:
-        with self.as_it_is():
+        with self._context():
             return run_stages(stages, {**before, **fresh, "rays": rays})
 
     def _settle_gradients(self, segment: Segment) -> None:
@@ -438,7 +446,7 @@ class TrainingStep:
 
     def _run(self, rays: int) -> tuple[Batch, RenderOutput]:
         """A step as it is."""
-        with self.as_it_is():
+        with self._context():
             batch = self.batches.draw(rays, self.generator)
             self.optimizer.zero_grad(set_to_none=True)
             if self.autocast is None:

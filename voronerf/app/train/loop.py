@@ -75,7 +75,8 @@ def train(
         clock: Counts seconds.
     """
     before, one_thread = state.step, backends.torch_on_one_thread if state.thread_deterministic else nullcontext
-    state.training_step.as_it_is, quick = one_thread, GROUP
+    quick = GROUP
+    state.training_step.run_within(one_thread)
     while state.fraction < 1 and state.seconds < until and not state.stopped:
         started = clock()
         with one_thread():
@@ -117,7 +118,7 @@ def prepare(state: State, callbacks: Sequence[Callback] = (), *, patient: bool =
     optimizer.set_learning_rate(state.learning_rate())
     group = state.step - (state.step - state.began) % GROUP  # its first step: the clock may cut a group anywhere
     if state.batches.unseen and state.fraction_at(group) >= state.unseen_share:
-        state.batches.unseen = 0.0
+        state.batches.end_unseen()
     if not state.router.training:
         state.renderer.train()
 

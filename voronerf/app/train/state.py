@@ -239,7 +239,7 @@ class State:
 
     def restore(self, skipped: int, stages: Sequence[Mapping[str, Any]], **counters: float) -> None:
         """Takes the counters of a checkpoint, by their names here."""
-        self.guard = self.training_step.guard = Guard.on(self.device, skipped)
+        self.guard.begin(skipped)
         self.stages[:] = (Stage(**stage) for stage in stages)
         for name, value in counters.items():
             setattr(self, name, value)

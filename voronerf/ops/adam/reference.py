@@ -56,10 +56,15 @@ class Guard(NamedTuple):
     limit: float = 1e18  # from here on squares are beyond float32, and make the second moment infinite for good
 
     @staticmethod
-    def on(device: torch.device | str, skipped: int = 0) -> Guard:
-        """A guard that has left out so many steps."""
-        found, in_a_row = torch.zeros((), device=device), torch.zeros((), device=device)
-        return Guard(found, torch.full((), float(skipped), device=device), in_a_row)
+    def on(device: torch.device | str) -> Guard:
+        """A guard that has left out no steps."""
+        found, skipped, in_a_row = (torch.zeros((), device=device) for _ in range(3))
+        return Guard(found, skipped, in_a_row)
+
+    def begin(self, skipped: int) -> None:
+        """Begins anew, after so many steps that were left out."""
+        for tensor, value in zip(self[:3], (0, skipped, 0), strict=True):
+            tensor.fill_(value)
 
     def judge(self, loss: Tensor | None, gradients: Sequence[Tensor]) -> None:
         """Leaves out a step, where there is a loss, unless it and all gradients are below the limit; counts it.
