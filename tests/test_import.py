@@ -5,8 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+from voronerf import ops
+from voronerf.ops._core import backends
 
 START = """
 import sys, torch, voronerf
@@ -40,6 +44,17 @@ with tempfile.TemporaryDirectory() as folder:
         run(state, [Checkpoints(out), Scores(out)])
 assert not {"torch._dynamo", "sympy"} & sys.modules.keys()
 """
+
+
+@pytest.mark.parametrize("files", ["[!n]*.py", pytest.param("native.py", marks=pytest.mark.native)])
+def test_functions_of_ops_hide_no_modules(files: str) -> None:
+    """``import a.b as c`` looks for a module at what has the name of its package, which is the function of the op."""
+    paths = sorted(Path(ops.__path__[0]).glob(f"[a-z]*/{files}"))
+    lines = ["import sys", *(f"from voronerf.ops import {op}; assert callable({op})" for op in ops.__all__)]
+    for name in (f"voronerf.ops.{path.parent.name}.{path.stem}" for path in paths if path.stem != "__init__"):
+        lines.append(f"import {name} as module; assert module is sys.modules['{name}']")
+    assert len(lines) > len(backends.ops())
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True)
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ and the question whether a tensor is on CUDA is answered with yes.
 from __future__ import annotations
 
 import functools
-import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
@@ -17,8 +16,7 @@ from unittest import mock
 from emulation_build import build, load
 
 from voronerf.ops._core import native as _native
-
-_programs = importlib.import_module("voronerf.ops.grouped_program.native")
+from voronerf.ops.grouped_program import native as _programs
 
 
 @functools.cache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import sys
 from pathlib import Path
@@ -16,12 +15,11 @@ from torch import Tensor
 from voronerf import HashGrid
 from voronerf.ops import grouped_program
 from voronerf.ops._core.program import FUNCTIONS, PARAMETER, Builder, Columns, Program, gradient
+from voronerf.ops.grouped_program import native as plans
 from voronerf.ops.grouped_program.case import GRID, encoded, every_step, smooth
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "ops"))
 from test_grouped_program import NUMBERS, arguments, check, derivatives, offsets_of, random_program
-
-plans = importlib.import_module("voronerf.ops.grouped_program.native")
 
 KIB = 1024
 TILES = [227 * KIB, 40 * KIB, 12 * KIB]

@@ -2,7 +2,6 @@
 
 import contextlib
 import gc
-import importlib
 import itertools
 import weakref
 
@@ -15,6 +14,7 @@ from step_training import Scaled, Training
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
 from voronerf.nerf import SplitStrategy, replayed
+from voronerf.ops.keep_heaviest import reference
 
 pytestmark = pytest.mark.native
 
@@ -25,7 +25,6 @@ def on_device(monkeypatch):
     monkeypatch.setattr(torch.Tensor, "is_cpu", False)
     monkeypatch.setattr(torch.Tensor, "is_cuda", True)
     monkeypatch.setattr(State, "read_output", lambda state, output: None)
-    reference = importlib.import_module("voronerf.ops.keep_heaviest.reference")
     monkeypatch.setattr(reference, "check_range", lambda *_: None)  # which reads on a CPU alone
 
 

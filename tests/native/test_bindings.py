@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import zlib
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from voronerf.ops._core.program import BINARY, ENCODINGS, FUNCTIONS, Builder, Fu
 
 pytestmark = pytest.mark.native
 native = pytest.importorskip("voronerf.ops._core.native")
+lowering = pytest.importorskip("voronerf.ops.grouped_program.lowering")
 
 
 def test_the_interface_is_the_checksum_of_what_the_build_bound() -> None:
@@ -60,7 +60,6 @@ def test_an_instruction_set_that_is_not_there_is_refused() -> None:
 
 def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Names cross the border, not numbers: where the sides differ, nothing is computed by another function."""
-    lowering = importlib.import_module("voronerf.ops.grouped_program.lowering")
     monkeypatch.setitem(FUNCTIONS, "cube", Function(lambda x, a, b: x**3))
     b = Builder()
     program = b.program([b.apply("cube", b.input(3))])
@@ -69,7 +68,6 @@ def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_product_takes_as_many_sources_as_the_compiled_module_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    lowering = importlib.import_module("voronerf.ops.grouped_program.lowering")
     made, most = list[Any](), native.compiled.most_sources
     monkeypatch.setattr(native.compiled, "make_program", made.append)
     table = MLP((Layer(("positions",) * (2 * most + 3), 5),), (0,))

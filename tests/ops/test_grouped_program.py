@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import random
 from dataclasses import replace
 
@@ -19,9 +18,8 @@ from voronerf.ops import frequency_encode, grouped_program, hash_encode, integra
 from voronerf.ops._core import native
 from voronerf.ops._core.program import FUNCTIONS, PARAMETER, VALUE, Builder, Columns, Program, Step, gradient
 from voronerf.ops.grouped_mlp.reference import cells_of
+from voronerf.ops.grouped_program import native as plans
 from voronerf.ops.grouped_program.case import GRID, encoded, every_step
-
-plans = importlib.import_module("voronerf.ops.grouped_program.native")
 
 NUMBERS = {"softplus": (3.0, 20.0), "sine": (1.7, 0.3), "clamp": (-0.5, 0.6), "power": (1.5, 0.0), "affine": (2.0, 1.0)}
 SIZES = ([0], [1], [5, 0, 24], [96, 1], [97, 0, 3], [0, 95, 200, 23])

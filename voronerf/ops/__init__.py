@@ -8,6 +8,9 @@ Each raises ValueError for shapes, devices, numbers out of range and an unknown 
 `BackendUnavailable` where the named backend cannot run; what else an operation refuses stands beside it.
 """
 
+import sys
+from types import ModuleType
+
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import MLP, Layer
 from voronerf.ops.adam import Guard, Rule, adam, average
@@ -94,3 +97,22 @@ __all__ = [
     "spherical_harmonics",
     "unseen_rays",
 ]
+
+
+class _Package(ModuleType):
+    """The package of an op, which its function hides in this one: the function has the modules of the package, too.
+
+    ``import voronerf.ops.adam.reference as reference`` looks for a module at what ``voronerf.ops.adam`` is.
+    """
+
+    def __setattr__(self, name: str, value: object) -> None:
+        super().__setattr__(name, value)
+        if isinstance(value, ModuleType):  # which has been imported
+            setattr(globals()[self.__name__.removeprefix(f"{__name__}.")], name, value)
+
+
+for _op in __all__:
+    if (_package := sys.modules.get(f"{__name__}.{_op}")) is not None:
+        _package.__class__ = _Package
+        for _name in [name for name in vars(_package) if f"{_package.__name__}.{name}" in sys.modules]:
+            setattr(_package, _name, getattr(_package, _name))
