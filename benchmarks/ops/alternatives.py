@@ -19,7 +19,7 @@ from ops.case import BACKWARD, Contender, NotApplicable
 from ops.networks import Batch, with_gradients
 from voronerf import ops
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
-from voronerf.ops.grouped_mlp.reference import encode
+from voronerf.ops.grouped_mlp.reference import encode_directions, encode_positions
 
 PIECE = 4096
 """Rows of a piece whose activations stay in cache."""
@@ -34,10 +34,10 @@ class Encoded:
 
     def __init__(self, batch: Batch, dtype: torch.dtype) -> None:
         sets = batch.positions[:2]
-        self.positions = [encode(x, batch.net.position_octaves).to(dtype) for x in sets]
+        self.positions = [encode_positions(x, batch.net).to(dtype) for x in sets]
         self.directions: Tensor | None = None
         if batch.directions is not None:
-            encoded = encode(batch.directions, batch.net.direction_octaves).to(dtype)
+            encoded = encode_directions(batch.directions, batch.net).to(dtype)
             self.directions = encoded[batch.direction_index]
 
 

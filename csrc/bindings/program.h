@@ -9,8 +9,8 @@ namespace voronerf {
 VN_NAMES(ProgramOp, "input", "output", "linear", "function", "binary", "total", "move", "encode", "outer", "columns");
 VN_NAMES(ProgramBinary, "add", "sub", "mul", "div", "gate");
 VN_NAMES(ProgramFinish, "none", "relu", "relu_slope");
-VN_NAMES(ProgramEncoding, "frequency", "integrated", "spherical", "hash");
 #define VN_NAME(NAME, ...) #NAME,
+VN_NAMES(ProgramEncoding, VN_ENCODINGS(VN_NAME) "hash");
 VN_NAMES(ProgramFunction, VN_FUNCTIONS(VN_NAME));
 #undef VN_NAME
 VN_NAMES(ProgramPackKind, "matrix", "turned", "vector", "few", "few_turned", "waves");

@@ -39,6 +39,10 @@ struct Columns {
   int64_t width() const { return first() + 2 * d * octaves; }
 };
 
+// The kernel's name among those of encodings.h.
+template <bool kBlurred>
+struct Octaves {};
+
 // table [3][stride]: source feature (as an integer), scale and phase of each column.
 VN_INLINE void encode_table(float* table, int64_t stride, const Columns& columns) {
   const int64_t d = columns.d, first = columns.first();

@@ -3,6 +3,8 @@
 // other's banks.
 #include "common/cuda_wrappers.h"
 #include "encoding/spherical_harmonics.h"
+#include "network/cuda/words_device.h"
+// with the words above
 #include "encoding/spherical_harmonics_math.h"
 
 namespace voronerf {
@@ -10,7 +12,7 @@ namespace voronerf {
 namespace {
 
 constexpr int kThreads = 128;
-constexpr int kRow = kMostHarmonics + 1;
+constexpr int kRow = device::SphericalHarmonics::kMost + 1;
 
 __global__ void __launch_bounds__(kThreads)
     harmonics_kernel(const float* __restrict__ directions, float* __restrict__ out, int64_t n, int degree) {
@@ -18,13 +20,8 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t first = static_cast<int64_t>(blockIdx.x) * kThreads, row = first + threadIdx.x;
   const int count = n - first < kThreads ? static_cast<int>(n - first) : kThreads, width = degree * degree;
   if (row < n) {
-    const float* d = directions + 3 * row;
-    float value[kMostHarmonics];
-    spherical_harmonics_of(d[0], d[1], d[2], degree, value);
-#pragma unroll
-    for (int c = 0; c < kMostHarmonics; ++c) {
-      if (c < width) rows[threadIdx.x * kRow + c] = value[c];
-    }
+    device::SphericalHarmonics::values([&](int axis) { return directions[3 * row + axis]; }, 3, degree,
+                                       [&](int c, float value) { rows[threadIdx.x * kRow + c] = value; });
   }
   __syncthreads();
   for (int i = threadIdx.x; i < count * width; i += kThreads) {
@@ -43,12 +40,9 @@ __global__ void __launch_bounds__(kThreads)
   }
   __syncthreads();
   if (row >= n) return;
-  const float* d = directions + 3 * row;
-  float given[kMostHarmonics], found[3];
-#pragma unroll
-  for (int c = 0; c < kMostHarmonics; ++c) given[c] = c < width ? rows[threadIdx.x * kRow + c] : 0.0f;
-  spherical_harmonics_gradient(d[0], d[1], d[2], degree, given, found);
-  for (int axis = 0; axis < 3; ++axis) grad_directions[3 * row + axis] = found[axis];
+  device::SphericalHarmonics::gradient([&](int axis) { return directions[3 * row + axis]; }, 3, degree,
+                                       [&](int c) { return rows[threadIdx.x * kRow + c]; },
+                                       [&](int axis, float found) { grad_directions[3 * row + axis] = found; });
 }
 
 unsigned blocks_of(int64_t n) { return static_cast<unsigned>(ceil_div<int64_t>(n, kThreads)); }

@@ -10,6 +10,7 @@
 
 #include <cstdint>
 
+#include "encoding/encodings.h"
 #include "network/function_table.h"
 
 namespace voronerf {
@@ -20,8 +21,8 @@ constexpr int kMostSources = 8;  // of a linear step; Python reads it
 enum class ProgramOp : int { input, output, linear, function, binary, total, move, encode, outer, columns };
 enum class ProgramBinary : int { add, sub, mul, div, gate };
 enum class ProgramFinish : int { none, relu, relu_slope };
-enum class ProgramEncoding : int { frequency, integrated, spherical, hash };
 #define VN_NUMBER(NAME, ...) NAME,
+enum class ProgramEncoding : int { VN_ENCODINGS(VN_NUMBER) hash };
 enum class ProgramFunction : int { VN_FUNCTIONS(VN_NUMBER) };
 #undef VN_NUMBER
 
@@ -61,10 +62,10 @@ struct ProgramStep {
   // next to each other in the partial.
   int32_t order;
   int32_t width, slot, stride, memory;  // of what it makes; memory as in ProgramOperand
-  // input, output: which. linear: its pack. total: columns of a group. encode: its pack of waves, the degree, or the
-  // grid. outer, columns: place in the partial.
+  // input, output: which. linear: its pack. total: columns of a group. encode: its pack of waves, or the grid. outer,
+  // columns: place in the partial.
   int32_t number;
-  int32_t depth;         // linear: of the product. output: the first column where it goes. encode: octaves
+  int32_t depth;         // linear: of the product. output: the first column where it goes. encode: its size
   int32_t sources;       // linear: operands that are multiplied, next to each other in the matrix; on CUDA one
   int32_t parameter;     // encode of a hash grid: the table
   int32_t pairs;         // with 16-bit products: where its value is stored as pairs too; -1: nowhere

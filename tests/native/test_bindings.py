@@ -11,8 +11,9 @@ import torch
 from helpers import refuses
 
 import voronerf
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import MLP, Layer
-from voronerf.ops._core.program import BINARY, ENCODINGS, FUNCTIONS, Builder, Function
+from voronerf.ops._core.program import BINARY, FUNCTIONS, HASH, Builder, Function
 
 pytestmark = pytest.mark.native
 native = pytest.importorskip("voronerf.ops._core.native")
@@ -29,7 +30,7 @@ def test_the_interface_is_the_checksum_of_what_the_build_bound() -> None:
 def test_enumerations_have_the_names_that_users_write() -> None:
     assert sorted(native.compiled.ProgramFunction) == sorted(FUNCTIONS)
     assert sorted(native.compiled.ProgramBinary) == sorted(BINARY)
-    assert sorted(native.compiled.ProgramEncoding) == sorted(ENCODINGS)
+    assert sorted(native.compiled.ProgramEncoding) == sorted([*ENCODINGS, HASH])
     assert (
         set(native.SUPPORTED_ISAS) <= set(native.ISAS) == {"portable", "neon", "avx2", "avx512", "avx512_bf16", "amx"}
     )

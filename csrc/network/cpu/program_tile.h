@@ -1,8 +1,8 @@
 // The steps of a program on a tile of rows; see program_isa.cpp.
 #pragma once
 
+#include "encoding/by_row_tile.h"
 #include "encoding/hash_encode_isa.h"
-#include "encoding/spherical_harmonics_tile.h"
 #include "network/cpu/functions_tile.h"
 #include "network/cpu/program_pack.h"
 #include "network/cpu/program_rows_tile.h"
@@ -106,8 +106,7 @@ struct ProgramTile {
   // Whether a step leaves it to others to make pairs of its value.
   bool narrows(const ProgramStep& step) const {
     if (step.op == ProgramOp::input) return !narrowed_as_read(step);
-    const bool waves = step.op == ProgramOp::encode && step.order == 0 && step.encoding == ProgramEncoding::frequency;
-    return step.op != ProgramOp::linear && !waves;
+    return step.op != ProgramOp::linear && step.op != ProgramOp::encode;
   }
   bool narrowed_as_read(const ProgramStep& step) const {
     return step.pairs >= 0 && !call.turned[step.number] && !call.parts;
@@ -156,7 +155,16 @@ struct ProgramTile {
       case ProgramOp::move:
         return move(step, operands, to);
       case ProgramOp::encode:
-        return step.order == 0 ? encoding(step, operands, to) : encoding_slope(step, operands, to);
+        switch (step.encoding) {
+#define VN_CASE(NAME, ...)    \
+  case ProgramEncoding::NAME: \
+    return encode_by(__VA_ARGS__(), step, operands, to);
+          VN_ENCODINGS(VN_CASE)
+#undef VN_CASE
+          case ProgramEncoding::hash:
+            return look_up(step, operands, to);
+        }
+        return;
       case ProgramOp::outer:
         return outer(step, operands);
       case ProgramOp::columns:
@@ -398,56 +406,48 @@ struct ProgramTile {
     return own;
   }
 
-  void encoding(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
-    if (step.encoding == ProgramEncoding::hash) {
-      if (step.memory >= 0 && call.filled[step.memory]) return;
-      return hash_encode_rows(grid(step, close(operand(operands[0]), 3)), to, step.stride, 0, rows);
-    }
+  // The encoding of x or, of the order 1, its gradient. Operands x, the gradient of its encoding, and the encoding.
+  void look_up(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
     const Rows x = operand(operands[0]);
-    if (step.encoding == ProgramEncoding::spherical) {
-      return harmonics_of_rows(close(x, 3), rows, step.number, to, step.stride);
+    if (step.order == 0) {
+      if (step.memory >= 0 && call.filled[step.memory]) return;
+      return hash_encode_rows(grid(step, close(x, 3)), to, step.stride, 0, rows);
     }
-    const Columns columns = waves(step, operands[0]);
+    const Rows g = operand(operands[1]);
+    float* const points = scratch(1);
+    for (int64_t row = 0; row < rows; ++row) copy_row(x.data + row * x.stride, 3, points + 3 * row);
+    hash_encode_positions_backward(grid(step, points), g.data, g.stride, points, 0, rows);
+    for (int64_t row = 0; row < rows; ++row) copy_row(points + 3 * row, 3, to + row * step.stride);
+  }
+
+  template <typename Formula>
+  void encode_by(ByRow<Formula>, const ProgramStep& step, const ProgramOperand* operands, float* to) const {
+    const Rows x = operand(operands[0]);
+    const int64_t raw = operands[0].width, size = step.depth;
+    if (step.order == 0) return ByRow<Formula>::values(x.data, x.stride, raw, size, rows, to, step.stride);
+    const Rows g = operand(operands[1]);
+    ByRow<Formula>::gradient(x.data, x.stride, raw, size, g.data, g.stride, rows, to, step.stride);
+  }
+
+  template <bool kBlurred>
+  void encode_by(Octaves<kBlurred>, const ProgramStep& step, const ProgramOperand* operands, float* to) const {
+    const Rows x = operand(operands[0]);
+    const Columns columns{kBlurred ? operands[0].width / 2 : operands[0].width, step.depth, !kBlurred};
     const float* const table = packed + pack(step.number).at;
-    const bool integrated = step.encoding == ProgramEncoding::integrated;
-    float* const pairs = step.pairs < 0 || narrows(step) ? nullptr : slot(step.pairs);
-    encode(x.data, x.stride, table, rows, columns, to, step.stride, pairs, stride_of(step.width), left_of(step.width),
-           pairs == nullptr || step.floats);
-    if (integrated) {
-      blur(x.data + columns.d, x.stride, table, rows, to, step.stride);
-    }
-  }
-
-  Columns waves(const ProgramStep& step, const ProgramOperand& x) const {
-    const bool integrated = step.encoding == ProgramEncoding::integrated;
-    return {integrated ? x.width / 2 : x.width, step.depth, !integrated};
-  }
-
-  // Operands x, the gradient of its encoding, and the encoding.
-  void encoding_slope(const ProgramStep& step, const ProgramOperand* operands, float* to) const {
-    const Rows x = operand(operands[0]), g = operand(operands[1]);
     const int64_t stride = step.stride;
-    if (step.encoding == ProgramEncoding::hash || step.encoding == ProgramEncoding::spherical) {
-      float* const points = scratch(1);
-      for (int64_t row = 0; row < rows; ++row) copy_row(x.data + row * x.stride, 3, points + 3 * row);
-      if (step.encoding == ProgramEncoding::hash) {
-        hash_encode_positions_backward(grid(step, points), g.data, g.stride, points, 0, rows);
-      } else {
-        harmonics_of_rows_backward(points, g.data, g.stride, rows, step.number, points);
-      }
-      for (int64_t row = 0; row < rows; ++row) copy_row(points + 3 * row, 3, to + row * stride);
+    if (step.order == 0) {
+      float* const pairs = step.pairs < 0 ? nullptr : slot(step.pairs);
+      encode(x.data, x.stride, table, rows, columns, to, stride, pairs, stride_of(step.width), left_of(step.width),
+             pairs == nullptr || step.floats);
+      if (kBlurred) blur(x.data + columns.d, x.stride, table, rows, to, stride);
       return;
     }
-    const Rows value = operand(operands[2]);
-    const Columns columns = waves(step, operands[0]);
-    const float* const table = packed + pack(step.number).at;
+    const Rows g = operand(operands[1]), value = operand(operands[2]);
     const int64_t of_table = pack(step.number).width;
     for (int64_t row = 0; row < rows; ++row, to += stride) {
       const float *encoded = value.data + row * value.stride, *given = g.data + row * g.stride;
       encode_row_backward(encoded, given, table, of_table, columns, to);
-      if (step.encoding == ProgramEncoding::integrated) {
-        blur_row_backward(encoded, given, table, of_table, columns, to + columns.d);
-      }
+      if (kBlurred) blur_row_backward(encoded, given, table, of_table, columns, to + columns.d);
     }
   }
 

@@ -6,8 +6,10 @@
 
 #include "encoding/encode_math.h"
 #include "encoding/hash_encode_device.h"
-#include "encoding/spherical_harmonics_math.h"
 #include "network/cuda/program_cuda_tile.h"
+#include "network/cuda/words_device.h"
+// with the words above
+#include "encoding/encodings.h"
 
 namespace voronerf {
 
@@ -165,31 +167,22 @@ __device__ __noinline__ void look_up_gradient(const Tile& tile, const ProgramSte
   });
 }
 
-// A row a thread: the polynomials share their terms.
-template <typename Tile>
-__device__ __noinline__ void harmonics(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
-  const Rows x = tile.value(operands[0]);
-  const Target to = tile.target(step);
-  const int row = threadIdx.x, degree = step.number;
-  if (row >= tile.rows) return;
-  float values[kMostHarmonics] = {}, found[3];
-  if (step.order == 0) {
-    spherical_harmonics_of(x.at(row, 0), x.at(row, 1), x.at(row, 2), degree, values);
-#pragma unroll
-    for (int c = 0; c < kMostHarmonics; ++c) {
-      if (c < step.width) to.put(row, c, values[c]);
-    }
-    return;
+// The formula of a row, by a thread for each: what its columns share is computed once.
+template <typename Formula>
+struct ByRow {
+  template <typename Tile>
+  static __device__ __noinline__ void run(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
+    const Rows x = tile.value(operands[0]);
+    const Target to = tile.target(step);
+    const int row = threadIdx.x, raw = operands[0].width;
+    if (row >= tile.rows) return;
+    const auto of = [&](int column) { return x.at(row, column); };
+    const auto put = [&](int column, float value) { to.put(row, column, value); };
+    if (step.order == 0) return Formula::values(of, raw, step.depth, put);
+    const Rows g = tile.value(operands[1]);
+    Formula::gradient(of, raw, step.depth, [&](int column) { return g.at(row, column); }, put);
   }
-  const Rows g = tile.value(operands[1]);
-#pragma unroll
-  for (int c = 0; c < kMostHarmonics; ++c) {
-    if (c < degree * degree) values[c] = g.at(row, c);
-  }
-  spherical_harmonics_gradient(x.at(row, 0), x.at(row, 1), x.at(row, 2), degree, values, found);
-#pragma unroll
-  for (int c = 0; c < 3; ++c) to.put(row, c, found[c]);
-}
+};
 
 // By the hardware's own functions, whose error is 2^-21 near 0.
 __device__ __forceinline__ void fast_sine_and_cosine(float angle, float& sine, float& cosine) {
@@ -232,10 +225,9 @@ __device__ __forceinline__ void octave_pairs(const Tile& tile, int octaves, int 
 }
 template <typename Tile>
 __device__ __noinline__ void octaves(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands,
-                                     int features) {
+                                     int features, bool blurred) {
   const Rows x = tile.value(operands[0]);
   const Target to = tile.target(step);
-  const bool blurred = step.encoding == ProgramEncoding::integrated;
   if (!blurred) {
     for_each_entry(tile.rows, features, [&](int row, int column) { to.put(row, column, x.at(row, column)); });
   }
@@ -249,11 +241,10 @@ __device__ __noinline__ void octaves(const Tile& tile, const ProgramStep& step, 
 // The gradient to them from g, with what was encoded: the derivative of a sine is the cosine beside it.
 template <typename Tile>
 __device__ __noinline__ void octaves_gradient(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands,
-                                              int features) {
+                                              int features, bool blurred) {
   const Rows g = tile.value(operands[1]), encoded = tile.value(operands[2]);
   const Target to = tile.target(step);
   const int octaves = step.depth;
-  const bool blurred = step.encoding == ProgramEncoding::integrated;
   const int before = blurred ? 0 : features;
   for_each_entry(tile.rows, features, [&](int row, int feature) {
     float sum = blurred ? 0.0f : g.at(row, feature), of_variance = 0.0f;
@@ -269,16 +260,30 @@ __device__ __noinline__ void octaves_gradient(const Tile& tile, const ProgramSte
   });
 }
 
+template <bool kBlurred>
+struct Octaves {
+  template <typename Tile>
+  static __device__ __forceinline__ void run(const Tile& tile, const ProgramStep& step,
+                                             const ProgramOperand* operands) {
+    const int features = operands[0].width / (kBlurred ? 2 : 1);
+    if (step.order == 0) return octaves(tile, step, operands, features, kBlurred);
+    octaves_gradient(tile, step, operands, features, kBlurred);
+  }
+};
+
 // A step that encodes. Operands are x or, for the gradient, x, g and what was encoded.
 template <typename Tile>
 __device__ __forceinline__ void encode_step(const Tile& tile, const ProgramStep& step, const ProgramOperand* operands) {
-  if (step.encoding == ProgramEncoding::hash) {
-    return step.order > 0 ? look_up_gradient(tile, step, operands) : look_up(tile, step, operands);
+  using namespace device;  // the formulas
+  switch (step.encoding) {
+#define VN_CASE(NAME, ...)    \
+  case ProgramEncoding::NAME: \
+    return __VA_ARGS__::run(tile, step, operands);
+    VN_ENCODINGS(VN_CASE)
+#undef VN_CASE
+    case ProgramEncoding::hash:
+      return step.order > 0 ? look_up_gradient(tile, step, operands) : look_up(tile, step, operands);
   }
-  if (step.encoding == ProgramEncoding::spherical) return harmonics(tile, step, operands);
-  const int features = operands[0].width / (step.encoding == ProgramEncoding::integrated ? 2 : 1);
-  if (step.order == 0) return octaves(tile, step, operands, features);
-  octaves_gradient(tile, step, operands, features);
 }
 
 }  // namespace voronerf

@@ -15,12 +15,13 @@ import json
 from dataclasses import dataclass, field, replace
 
 from voronerf.ops._core.compiler import constant_result
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.grids import HashGrid
-from voronerf.ops._core.program import PARAMETER, Builder, Columns, Program, pruned
+from voronerf.ops._core.program import HASH, PARAMETER, Builder, Columns, Program, encoded_columns, pruned
 
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
-POSITION_ENCODINGS = ("frequency", "integrated", "hash")
-DIRECTION_ENCODINGS = ("frequency", "spherical")
+POSITION_ENCODINGS = (*(name for name, encoding in ENCODINGS.items() if encoding.positions), HASH)
+DIRECTION_ENCODINGS = tuple(name for name, encoding in ENCODINGS.items() if encoding.directions)
 POSITIONS = "positions"
 DIRECTIONS = "directions"
 NUMBERS = {"softplus": (1.0, 20.0), "sine": (1.0, 0.0)}
@@ -114,10 +115,12 @@ class MLP:
         ):
             if encoding not in known:
                 raise ValueError(f"MLP: {name} must be one of {', '.join(known)}, got {encoding!r:.60}")
-        if self.integrated and not self.position_octaves:
-            raise ValueError(
-                f"MLP: position_octaves must be at least 1 with the integrated encoding, got {self.position_octaves}"
-            )
+        for name, encoding, octaves in (
+            ("position_octaves", self.position_encoding, self.position_octaves),
+            ("direction_octaves", self.direction_encoding, self.direction_octaves),
+        ):
+            if encoding not in ("frequency", "spherical", HASH) and not octaves:
+                raise ValueError(f"MLP: {name} must be at least 1 with the {encoding} encoding, got {octaves}")
         if self.grid is not None and not isinstance(self.grid, HashGrid):
             raise ValueError(f"MLP: grid must be a HashGrid or None, got {type(self.grid).__name__}")
         hashed = self.position_encoding == "hash"
@@ -175,21 +178,22 @@ class MLP:
         """Whether any layer reads the view directions."""
         return any(DIRECTIONS in layer.inputs for layer in self.layers)
 
+    def encoding(self, source: str) -> tuple[str, int] | None:
+        """The encoding of positions or directions by its name in :data:`ENCODINGS`, and its size; None for none."""
+        if source == POSITIONS:
+            name, size = self.position_encoding, self.position_octaves
+        else:
+            name, size = self.direction_encoding, self.direction_degree or self.direction_octaves
+        return (name, size) if size else None
+
     def source_width(self, source: int | str, positions_d: int, directions_d: int = 0) -> int:
         """Features that a source contributes to a layer's input, after encoding."""
-        if source == POSITIONS:
-            if self.grid is not None:
-                return self.grid.out_features
-            if self.integrated:
-                assert self.position_octaves is not None
-                return positions_d * self.position_octaves
-            return encoded_width(positions_d, self.position_octaves)
-        if source == DIRECTIONS:
-            if self.direction_degree is not None:
-                return self.direction_degree**2
-            return encoded_width(directions_d, self.direction_octaves)
-        assert isinstance(source, int)
-        return self.layers[source].width
+        if isinstance(source, int):
+            return self.layers[source].width
+        if source == POSITIONS and self.grid is not None:
+            return self.grid.out_features
+        width, encoding = positions_d if source == POSITIONS else directions_d, self.encoding(source)
+        return width if encoding is None else encoded_columns(encoding[0], width, encoding[1])
 
     def input_width(self, layer: int, positions_d: int, directions_d: int = 0) -> int:
         """Input features i of layer number ``layer``, for raw positions and directions of the given widths."""
@@ -253,14 +257,11 @@ def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: 
 
     def source(name: int | str) -> Columns:
         if name not in values:
-            x = raw[str(name)]
-            octaves = table.position_octaves if name == POSITIONS else table.direction_octaves
+            x, encoding = raw[str(name)], table.encoding(str(name))
             if name == POSITIONS and table.grid is not None and features is not None:
-                x = b.encode("hash", x, b.grid(table.grid.text), features)
-            elif name == DIRECTIONS and table.direction_degree is not None:
-                x = b.encode("spherical", x, table.direction_degree)
-            elif octaves:
-                x = b.encode("integrated" if name == POSITIONS and table.integrated else "frequency", x, octaves)
+                x = b.encode(HASH, x, b.grid(table.grid.text), features)
+            elif encoding is not None:
+                x = b.encode(encoding[0], x, encoding[1])
             values[name] = x
         return values[name]
 
@@ -285,11 +286,6 @@ def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: 
 def program_text(text: str, p: int, q: int, widths: tuple[int, ...], biased: tuple[bool, ...], ray: bool) -> str:
     """The text of :meth:`MLP.program` of the table whose text this is; ``torch.compile`` takes it as it finds it."""
     return _program(text, p, q, widths, biased, ray).text
-
-
-def encoded_width(features: int, octaves: int | None) -> int:
-    """Width of ``features`` raw values after frequency encoding with the input included."""
-    return features if octaves is None else features * (1 + 2 * octaves)
 
 
 def _check_layer(index: int, layer: Layer) -> None:

@@ -16,7 +16,7 @@ The steps:
     binary     one of :data:`BINARY` of two values
     total      sums over groups of columns next to each other
     move       columns of values, put next to each other or added up
-    encode     one of :data:`ENCODINGS` of columns, or one of its derivatives
+    encode     one of :data:`ENCODINGS` of columns, or "hash", or one of its derivatives
     outer      g^T x, summed over the rows of a cell: the gradient of a matrix
     columns    the sum over the rows of a cell: the gradient of a vector
     scatter    the gradient of a table, summed over the rows of a cell, or over all rows where cells share the table
@@ -41,6 +41,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.grids import HashGrid
 
 VALUE, PARAMETER = "value", "parameter"
@@ -96,25 +97,20 @@ BINARY: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }
 """Of two values, by their names in the compiled module."""
 
-ENCODINGS = ("frequency", "integrated", "spherical", "hash")
-"""``frequency_encode`` with the input included, ``integrated_encode`` of means and then variances,
-``spherical_harmonics``, and ``hash_encode``."""
+HASH = "hash"
+"""The name of ``hash_encode``, the encoding that has a parameter, beside :data:`ENCODINGS`."""
 
 
 def encoded_columns(name: str, raw: int, size: int, grids: Sequence[str] = ()) -> int:
     """How many columns an encoding gives.
 
     Args:
-        name: one of :data:`ENCODINGS`.
+        name: one of :data:`ENCODINGS`, or "hash".
         raw: columns that are encoded.
-        size: octaves of "frequency" and "integrated", degree of "spherical", for "hash" the number of the grid.
+        size: the encoding's; for "hash" the number of the grid.
         grids: texts of the grids.
     """
-    if name == "frequency":
-        return raw * (1 + 2 * size)
-    if name == "integrated":
-        return raw * size
-    return size**2 if name == "spherical" else HashGrid.parse(grids[size]).out_features
+    return HashGrid.parse(grids[size]).out_features if name == HASH else ENCODINGS[name].columns(raw, size)
 
 
 class Columns(NamedTuple):
@@ -219,7 +215,6 @@ class Program:
 
 _WIDEST = 1 << 20  # columns
 _ORDERS = 20  # of derivatives
-_MOST_OCTAVES = 127
 
 
 def _order(step: Step) -> int:
@@ -271,12 +266,10 @@ def check(program: Program) -> None:
         if not (operands and all(fits(each, rows=True) for each in operands) and _sizes(numbers) and len(numbers) == 4):
             return False
         (x, *rest), (size, table, order, back) = operands, map(int, numbers)
-        sizes = {
-            "frequency": size <= _MOST_OCTAVES,
-            "integrated": 1 <= size <= _MOST_OCTAVES and x.width > 0 and x.width % 2 == 0,
-            "spherical": 1 <= size <= 4 and x.width == 3,
-        }
-        known = hashed(x, size, table) if step.name == "hash" else table == 0 and sizes.get(step.name, False)
+        if step.name == HASH:
+            known = hashed(x, size, table)
+        else:
+            known = table == 0 and step.name in ENCODINGS and ENCODINGS[step.name].fits(x.width, size)
         if not (known and back < 2 and back <= order < _ORDERS):
             return False
         encoded = encoded_columns(step.name, x.width, size, grids)
@@ -297,7 +290,7 @@ def check(program: Program) -> None:
         (x, *rest), (grid, table, order) = operands, map(int, numbers)
         if not (hashed(x, grid, table) and sums[step.out] == parameters[table]):
             return False
-        encoded = encoded_columns("hash", 3, grid, grids)
+        encoded = encoded_columns(HASH, 3, grid, grids)
         return [step.width, *(each.width for each in rest)] == [encoded, encoded] + [3] * order
 
     def right(step: Step) -> bool:
@@ -459,7 +452,7 @@ class Builder:
                 continue
             if step.op == "linear":
                 numbers = (first + int(numbers[0]), *numbers[1:])
-            elif step.op == "encode" and step.name == "hash":
+            elif step.op == "encode" and step.name == HASH:
                 numbers = (grids[int(numbers[0])], first + int(numbers[1]), *numbers[2:])
             values[step.out] = self.emit(step.op, step.width, [own(c) for c in step.operands], numbers, step.name)
         return [own(c) for c in program.outputs]
@@ -524,9 +517,9 @@ class Builder:
         """An encoding F_0(x), or its derivative F_m along m values.
 
         Args:
-            name: one of :data:`ENCODINGS`.
+            name: one of :data:`ENCODINGS`, or "hash".
             x: to encode; of "hash" a whole input.
-            size: octaves of "frequency" and "integrated", degree of "spherical", of "hash" the number of the grid.
+            size: the encoding's; of "hash" the number of the grid.
             parameter: the table of "hash".
             along: the directions of the derivative, each as wide as x.
         """
@@ -570,7 +563,7 @@ def _sums(step: Step) -> bool:
 
 
 def _reads_table(step: Step) -> bool:
-    return step.op == "scatter" or (step.op == "encode" and step.name == "hash")
+    return step.op == "scatter" or (step.op == "encode" and step.name == HASH)
 
 
 # Gradients ------------------------------------------------------------------------------------------------------------
@@ -702,7 +695,7 @@ def _of_sum(b: Builder, arriving: _Arriving, step: Step, parameter: int) -> None
     if step.op == "scatter":
         # <C, T_m(x, g; h ..)> is <g, F_m(x; h ..)> with C as the table.
         x, g, *along = step.operands
-        _of_product(b, arriving, "hash", int(step.numbers[0]), parameter, x, g, along)
+        _of_product(b, arriving, HASH, int(step.numbers[0]), parameter, x, g, along)
         return
     start = int(step.numbers[0])
     if step.op == "columns":
@@ -792,7 +785,7 @@ def _of_product(
         if arriving.wants(direction):
             others = [*along[:place], *along[place + 1 :]]
             arriving.add(direction, b.encode_backward(name, x, g, size, parameter, others))
-    if name == "hash" and parameter in arriving.sums:
+    if name == HASH and parameter in arriving.sums:
         b.add_scatter(arriving.sums[parameter], x, g, size, parameter, along)
 
 

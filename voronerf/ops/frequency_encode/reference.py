@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
+
+from voronerf.ops._core.encodings import frequency
 
 
 def frequency_encode(x: Tensor, octaves: int, include_input: bool = True) -> Tensor:
     """``[x, sin x, cos x, sin 2x, cos 2x, sin 4x, ...]``; see ``voronerf.ops.frequency_encode``."""
-    wide = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
-    parts = [wide if include_input else wide[:, :0]]
-    for octave in range(octaves):
-        angle = wide * 2.0**octave
-        parts += [angle.sin(), angle.cos()]
-    return torch.cat(parts, dim=1).to(x.dtype)
+    return frequency(x, octaves)[:, 0 if include_input else x.shape[1] :]

@@ -7,12 +7,10 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from voronerf.ops._core.encodings import ENCODINGS, wide
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
-from voronerf.ops.frequency_encode.reference import frequency_encode
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
 from voronerf.ops.hash_encode.reference import hash_encode
-from voronerf.ops.integrated_encode.reference import integrated_encode
-from voronerf.ops.spherical_harmonics.reference import spherical_harmonics
 
 
 def grouped_mlp(
@@ -51,30 +49,24 @@ def encode_positions(
     if layers.grid is not None:
         assert features is not None
         return hash_encode(positions, features, layers.grid, cells=cells)
-    if not layers.integrated:
-        return encode(positions, layers.position_octaves)
-    assert layers.position_octaves is not None
-    means, variances = positions.to(torch.promote_types(positions.dtype, torch.float32)).chunk(2, dim=1)
-    return integrated_encode(means, variances, layers.position_octaves)
+    return _encoded(positions, layers, POSITIONS)
 
 
 def encode_directions(directions: Tensor, layers: MLP) -> Tensor:
     """Directions as the layers of a table read them."""
-    if layers.direction_degree is None:
-        return encode(directions, layers.direction_octaves)
-    wide = directions.to(torch.promote_types(directions.dtype, torch.float32))
-    return spherical_harmonics(wide, layers.direction_degree)
+    return _encoded(directions, layers, DIRECTIONS)
+
+
+def _encoded(x: Tensor, layers: MLP, source: str) -> Tensor:
+    """Raw features encoded, in float32 at least; what is encoded already as it is."""
+    encoding = layers.encoding(source)
+    return x if encoding is None else ENCODINGS[encoding[0]].formula(wide(x), encoding[1])
 
 
 def cells_of(offsets: Tensor, rows: Tensor) -> Tensor:
     """int32 [n], the cell of each row that is sorted by cell; the nearest one for a row of no cell."""
     index = torch.arange(rows.shape[0], dtype=torch.int32, device=rows.device)
     return torch.searchsorted(offsets[1:-1].contiguous(), index, right=True, out_int32=True)
-
-
-def encode(x: Tensor, octaves: int | None) -> Tensor:
-    """Raw features encoded, in float32 at least; what is encoded already as it is."""
-    return x if octaves is None else frequency_encode(x.to(torch.promote_types(x.dtype, torch.float32)), octaves)
 
 
 def check_direction_index(op: str, directions: Tensor | None, direction_index: Tensor | None) -> None:

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from voronerf.ops._core import native
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.memory import LARGE, on_huge_pages
 from voronerf.ops._core.program import (
+    HASH,
     PARAMETER,
     VALUE,
     Columns,
@@ -28,7 +30,7 @@ from voronerf.ops.hash_encode.native import compiled_grid
 _ORDERS = 3  # of derivatives that the compiled module has
 _FLOATS = 96 << 10  # of the values of a tile: they share the second cache level with the weights
 _ROWS = (24, 96)  # of a tile, whole blocks of the products (gemm_tile.h)
-_WHOLE = 48  # rows of a tile where harmonics write whole vectors of rows
+_WHOLE = 48  # rows of a tile where encodings write whole vectors of rows
 _TILE = 32  # rows of a block of products in tile registers
 _GRANULE = 16
 _FEW = 4  # outputs of a layer that has a product of its own (few_outputs_tile.h)
@@ -190,7 +192,7 @@ class _Lowering:
         """Columns of each part of the memory that a step may use."""
         widths = [0]
         for step in [] if self.cuda else self.work:
-            if step.op == "encode" and step.name in ("spherical", "hash"):
+            if step.op == "encode" and step.name == HASH:
                 widths.append(_GRANULE)
             if self.half and step.op == "linear":
                 widths.append(self.pairs_of(step.operands[0].width))
@@ -298,7 +300,7 @@ class _Lowering:
         if scattered:
             value.memory = self.memory(value.stride)
         if self.cuda and self.half and any(as_pairs := self._as_pairs(step)):  # which any step makes there
-            looked_up = step.op == "encode" and step.name == "hash"  # and may be kept
+            looked_up = step.op == "encode" and step.name == HASH  # and may be kept
             value.pairs = self.slots.take(self.pairs_of(step.width))
             value.floats = value.memory != _NONE or looked_up or not all(as_pairs)
         if scattered or not value.floats:
@@ -333,7 +335,7 @@ class _Lowering:
         whole = value.stride == step.width and not all(encoded) and self._within(step, value.stride)
         if plain and readers and (whole or all(self._product(reader, place) for reader, place in readers)):
             value.input = number
-        hashed = [reader.op == "scatter" or (reader.name == "hash" and not reader.numbers[2]) for reader, _ in readers]
+        hashed = [reader.op == "scatter" or (reader.name == HASH and not reader.numbers[2]) for reader, _ in readers]
         points = bool(readers) and all(hashed)
         if self.tiles and not self.cuda and any(as_pairs := self._as_pairs(step)):
             value.pairs, value.floats = self.slots.take(self.pairs_of(step.width)), not all(as_pairs)
@@ -415,19 +417,17 @@ class _Lowering:
         size, parameter, order, _ = map(int, step.numbers)
         records = [self.operand(c) for c in step.operands]
         value = self.make(step, dying)
-        given: dict[str, Any] = {"encoding": step.name, "order": order, "number": size, "parameter": parameter}
-        if step.name == "hash" and not order and self._within(step, value.stride):
+        given: dict[str, Any] = {"encoding": step.name, "order": order, "parameter": parameter}
+        given |= {"number": size, "depth": size}
+        if step.name == HASH and not order and self._within(step, value.stride):
             value.memory = self.memory(value.stride)
             source = self._input_of(step.operands[0])
             self.lookups.append((Lookup(source, parameter, size), value.memory))
-        elif step.name in ("frequency", "integrated"):
-            raw, first = step.operands[0].width, step.name == "frequency"
-            width = _padded(encoded_columns(step.name, raw, size, self.program.grids))
-            features = raw if first else raw // 2
-            given["number"] = self.pack("waves", 0, int(first), width, 3 * width, (size, features))
-            given["depth"] = size
-        by_waves = self.tiles and not self.cuda and not order and step.name == "frequency"
-        if by_waves and any(as_pairs := self._as_pairs(step)):
+        if octaves := _by_octaves(step):
+            raw = step.operands[0].width
+            width = _padded(encoded_columns(step.name, raw, size))
+            given["number"] = self.pack("waves", 0, int(octaves == 1), width, 3 * width, (size, raw // octaves))
+        if self.tiles and not self.cuda and not order and octaves == 1 and any(as_pairs := self._as_pairs(step)):
             value.pairs = self.slots.take(self.pairs_of(step.width))
             value.floats = value.memory != _NONE or not all(as_pairs)
         self.emit("encode", records, value, **given)
@@ -491,7 +491,7 @@ class _Lowering:
             else step
             for step in self.steps
         ]
-        whole = any(step.op == "encode" and step.name == "spherical" for step in self.work)
+        whole = any(step.op == "encode" and step.name != HASH and not _by_octaves(step) for step in self.work)
         fewest, most = (_WHOLE if whole else _ROWS[0]), _ROWS[1]
         if self.tiles:
             fewest = most if whole else _TILE
@@ -555,6 +555,11 @@ def _all_of(c: Columns, width: int) -> bool:
 
 def _sums(step: Step) -> bool:
     return step.op in ("outer", "columns", "scatter")
+
+
+def _by_octaves(step: Step) -> int:
+    """Columns of x for each angle where a step makes sines and cosines of octaves, else 0."""
+    return ENCODINGS[step.name].octaves if step.name in ENCODINGS else 0
 
 
 def _sources(step: Step) -> int:

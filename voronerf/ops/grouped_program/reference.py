@@ -10,14 +10,12 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_range
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.program import BINARY, FUNCTIONS, VALUE, Columns, Program, Step
-from voronerf.ops.frequency_encode.reference import frequency_encode
 from voronerf.ops.grouped_linear.reference import check_offsets, grouped_linear
 from voronerf.ops.grouped_mlp.reference import cells_of
 from voronerf.ops.hash_encode.reference import interpolate
-from voronerf.ops.integrated_encode.reference import integrated_encode
-from voronerf.ops.spherical_harmonics.reference import spherical_harmonics
 
 
 def grouped_program(
@@ -146,13 +144,8 @@ class _Run:
 
     def encoding(self, name: str, size: int, x: Tensor, table: Tensor | None, rows: slice) -> Tensor:
         """The encoding of some rows, with a table [k, e, f] of cells or [1, e, f] of all of them."""
-        if name == "frequency":
-            return frequency_encode(x, size)
-        if name == "integrated":
-            means, variances = x.chunk(2, dim=1)
-            return integrated_encode(means, variances, size)
-        if name == "spherical":
-            return spherical_harmonics(x, size)
+        if name in ENCODINGS:
+            return ENCODINGS[name].formula(x, size)
         assert table is not None
         return interpolate(x, table, self.grids[size], self.cells[rows] if len(table) > 1 else None)
 

@@ -1,0 +1,81 @@
+// Encodings of the rows of a tile by the formula of a row (encodings.h), a vector of rows at a time: it gives columns,
+// which are turned into rows where they lie.
+#pragma once
+
+#include "network/cpu/functions_tile.h"
+#include "network/cpu/program_rows_tile.h"
+// with the words above
+#include "encoding/encodings.h"
+
+namespace voronerf {
+namespace VN_ISA_NAMESPACE {
+namespace {
+
+template <typename Formula>
+struct ByRow {
+  static constexpr int64_t kColumns = (Formula::kMost + kLanes - 1) / kLanes * kLanes;
+
+  // Columns of x [rows][stride] from `row` on. Behind the last row it stands again.
+  struct Of {
+    const float* x;
+    int64_t stride, row, rows;
+    F32 first[3];
+
+    Of(const float* x, int64_t stride, int64_t raw, int64_t row, int64_t rows)
+        : x(x), stride(stride), row(row), rows(rows) {
+      if (raw == 3 && stride == 3) {
+        load_points(x + 3 * row, first[0], first[1], first[2]);
+      } else {
+        for (int i = 0; i < 3; ++i) first[i] = gathered(smaller(i, raw - 1));
+      }
+    }
+    F32 gathered(int64_t column) const {
+      float lanes[kLanes];
+      for (int64_t lane = 0; lane < kLanes; ++lane) lanes[lane] = x[smaller(row + lane, rows - 1) * stride + column];
+      return load(lanes);
+    }
+    F32 operator()(int column) const { return column < 3 ? first[column] : gathered(column); }
+  };
+
+  // x [rows][x_stride], `raw` columns of each -> out [rows, rounded up to whole vectors][stride], with 0 behind the
+  // columns of the encoding. Where x_stride is 3, x is read as so many rows too.
+  static void values(const float* x, int64_t x_stride, int64_t raw, int64_t size, int64_t rows, float* out,
+                     int64_t stride) {
+    for (int64_t row = 0; row < rows; row += kLanes) {
+      F32 value[kColumns];
+      for (F32& column : value) column = splat(0.0f);
+      const Of of(x, x_stride, raw, row, rows);
+      Formula::values(of, static_cast<int>(raw), static_cast<int>(size), [&](int c, F32 v) { value[c] = v; });
+      for (int64_t column = 0; column < kColumns && column < stride; column += kLanes) {
+        transpose(value + column);
+        for (int64_t lane = 0; lane < kLanes; ++lane) store(out + (row + lane) * stride + column, value[column + lane]);
+      }
+    }
+  }
+
+  // Gradients g [rows][g_stride] to gradients of x, out [rows][stride].
+  static void gradient(const float* x, int64_t x_stride, int64_t raw, int64_t size, const float* g, int64_t g_stride,
+                       int64_t rows, float* out, int64_t stride) {
+    for (int64_t row = 0; row < rows; row += kLanes) {
+      F32 given[kColumns];
+      for (F32& column : given) column = splat(0.0f);
+      for (int64_t column = 0; column < kColumns && column < g_stride; column += kLanes) {
+        for (int64_t lane = 0; lane < kLanes; ++lane) {
+          given[column + lane] = load(g + smaller(row + lane, rows - 1) * g_stride + column);
+        }
+        transpose(given + column);
+      }
+      const Of of(x, x_stride, raw, row, rows);
+      const auto put = [&](int i, F32 v) {
+        float lanes[kLanes];
+        store(lanes, v);
+        for (int64_t lane = 0; lane < kLanes && row + lane < rows; ++lane) out[(row + lane) * stride + i] = lanes[lane];
+      };
+      Formula::gradient(of, static_cast<int>(raw), static_cast<int>(size), [&](int c) { return given[c]; }, put);
+    }
+  }
+};
+
+}  // namespace
+}  // namespace VN_ISA_NAMESPACE
+}  // namespace voronerf
