@@ -23,7 +23,7 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -39,10 +39,11 @@ from voronerf.kernels.spherical_harmonics import spherical_harmonics
 from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import register_derivatives
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops.grouped_linear.activation import activate
 from voronerf.ops.grouped_linear.reference import check_offsets
-from voronerf.ops.grouped_mlp.reference import cells_of, check_direction_index, encode_positions
+from voronerf.ops.grouped_mlp.reference import cells_of, check_direction_index
 
 ROWS, WIDTH, THREADS = 64, 16, 128
 """Wider columns would be emptier: heads have 1 to 4 outputs. Each thread has 4 x 2 sums of a tile and a column; with
@@ -304,16 +305,11 @@ def grouped_mlp(
         cell = cells_of(offsets, positions)
         if features is not None and layers.grid is not None:
             where = hash_encode(positions, features, layers.grid, cell if features.dim() == 3 else None)
-        elif layers.integrated:
-            where = encode_positions(positions, layers)
         else:
-            where = _octaves(positions, layers.position_octaves)
+            where = _encoded(positions, layers.encoding(POSITIONS))
         read = {POSITIONS: where, DIRECTIONS: positions[:, :0]}
         if directions is not None and layers.uses_directions:
-            if layers.direction_degree is None:
-                seen = _octaves(directions, layers.direction_octaves)
-            else:
-                seen = spherical_harmonics(directions.float(), layers.direction_degree)
+            seen = _encoded(directions, layers.encoding(DIRECTIONS))
             read[DIRECTIONS] = seen if direction_index is None else seen.index_select(0, direction_index)
         widths = {name: len(range(part.shape[1])) for name, part in (*read.items(), *enumerate(weights))}  # no symbols
         tiles, place, inside = _tiles(offsets, cell)
@@ -367,5 +363,16 @@ def _padded(x: Tensor) -> Tensor:
     return F.pad(x, (0, -x.shape[-1] % WIDTH))
 
 
-def _octaves(x: Tensor, octaves: int | None) -> Tensor:
-    return x if octaves is None else frequency_encode(x.float(), octaves, True)
+_ENCODINGS: dict[str, Callable[[Tensor, int], Tensor]] = {
+    "frequency": lambda x, octaves: frequency_encode(x, octaves, True),
+    "spherical": spherical_harmonics,
+}
+"""Those of `ENCODINGS` that have kernels."""
+
+
+def _encoded(x: Tensor, encoding: tuple[str, int] | None) -> Tensor:
+    """Raw features encoded in float32; what is encoded already as it is."""
+    if encoding is None:
+        return x
+    name, size = encoding
+    return _ENCODINGS.get(name, ENCODINGS[name].formula)(x.float(), size)

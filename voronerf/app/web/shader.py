@@ -10,14 +10,16 @@ o outputs and i inputs of a matrix, w columns.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
 from voronerf.app.train.config import ConfigError
 from voronerf.nerf.radiance import Networks
+from voronerf.ops._core.encodings import harmonics
 from voronerf.ops._core.grids import GridLevel, HashGrid
-from voronerf.ops._core.program import PARAMETER, VALUE, Columns, Program, Step
+from voronerf.ops._core.program import HASH, PARAMETER, VALUE, Columns, Program, Step
 
 #: Functions of one value x with numbers a and b; finite for every finite x.
 FUNCTIONS = {
@@ -133,10 +135,19 @@ def _step(
     if step.op == "input":
         return [declare, f"{out}[0] = vec4f({'direction' if step.numbers[0] in program.rays else 'place'}, 0);"]
     if step.op == "encode":
-        x = step.operands[0]
-        if step.numbers[2] or step.name == "integrated" or x.width != 3 or x.start:
-            raise CannotDraw(f"its networks encode by {step.name} encoding of {x.width} numbers")
-        return [declare, *_encoding(step, f"v{x.index}[0].xyz", out, grids)]
+        x, size = step.operands[0], int(step.numbers[0])
+        if step.numbers[2] or name not in (*ENCODINGS, HASH) or x.width != 3 or x.start:
+            raise CannotDraw(f"its networks encode by {name} encoding of {x.width} numbers")
+        place = f"v{x.index}[0].xyz"
+        if name == HASH:
+            return [declare, *_hash_grid(grids, size, place, out, wide)]
+        return [
+            declare,
+            "{",
+            f"  let s = {place};  // {name}",
+            *(f"  {line}" for line in ENCODINGS[name](out, size)),
+            "}",
+        ]
     if step.op == "linear":
         return [declare, *_linear(program, step, name, layout, made)]
     if step.op == "function" and step.numbers[0] == 0 and name in FUNCTIONS:
@@ -192,35 +203,18 @@ def _linear(program: Program, step: Step, name: str, layout: Layout, made: dict[
     ]
 
 
-def _encoding(step: Step, x: str, out: str, grids: list[HashGrid]) -> list[str]:
-    size = int(step.numbers[0])
-    if step.name == "hash":
-        grid = grids[size]
-        if len(grids) > 1 or grid.interpolation != "linear":
-            raise CannotDraw("its networks have a hash grid with smooth steps, or several grids")
-        lines = [f"let inside = clamp(({x} - GRID_LOW) * GRID_INVERSE, vec3f(), vec3f(1));  // hash grid"]
-        levels = [_level(level, half) for level in grid.rows for half in range(-(-grid.features // 4))]
-        per = max(1, 4 // grid.features)  # levels in a vec4f
-        levels += [f"vec{grid.features}f()" if grid.features > 1 else "0.0"] * (-len(levels) % per)
-        for number in range(fours(step.width)):
-            parts = ",\n  ".join(levels[per * number : per * (number + 1)])
-            lines += f"{out}[{number}] = vec4f(\n  {parts});".split("\n")
-        return lines
-    if step.name == "spherical":
-        return ["{", f"  let s = {x};  // spherical harmonics", *(f"  {line}" for line in _spherical(out, size)), "}"]
-    return [  # frequency: x, sin x, cos x, sin 2x, cos 2x, ...
-        f"{out}[0] = vec4f({x}, 0);",
-        f"for (var octave = 0u; octave < {size}u; octave++) {{  // frequencies",
-        f"  let angle = turned(vec4f({x} * exp2(f32(octave)), 0));",
-        "  let s = sin(angle);",
-        "  let c = cos(angle);",
-        "  for (var axis = 0u; axis < 3u; axis++) {",
-        "    let at = 3u + 6u * octave + axis;",
-        f"    {out}[at / 4u][at % 4u] = s[axis];",
-        f"    {out}[(at + 3u) / 4u][(at + 3u) % 4u] = c[axis];",
-        "  }",
-        "}",
-    ]
+def _hash_grid(grids: list[HashGrid], number: int, x: str, out: str, wide: int) -> list[str]:
+    grid = grids[number]
+    if len(grids) > 1 or grid.interpolation != "linear":
+        raise CannotDraw("its networks have a hash grid with smooth steps, or several grids")
+    lines = [f"let inside = clamp(({x} - GRID_LOW) * GRID_INVERSE, vec3f(), vec3f(1));  // hash grid"]
+    levels = [_level(level, half) for level in grid.rows for half in range(-(-grid.features // 4))]
+    per = max(1, 4 // grid.features)  # levels in a vec4f
+    levels += [f"vec{grid.features}f()" if grid.features > 1 else "0.0"] * (-len(levels) % per)
+    for number in range(wide):
+        parts = ",\n  ".join(levels[per * number : per * (number + 1)])
+        lines += f"{out}[{number}] = vec4f(\n  {parts});".split("\n")
+    return lines
 
 
 def _level(level: GridLevel, half: int) -> str:
@@ -247,27 +241,51 @@ def _grid_text(grid: HashGrid) -> str:
     ) + resources.files(__package__).joinpath("grid.wgsl").read_text()
 
 
-def _spherical(out: str, degree: int) -> list[str]:
-    """As in `voronerf.ops.spherical_harmonics.reference`."""
-    bands = [
-        "0.28209479177387814",
-        "-0.48860251190291987 * s.y",
-        "0.48860251190291987 * s.z",
-        "-0.48860251190291987 * s.x",
-        "1.0925484305920792 * s.x * s.y",
-        "-1.0925484305920792 * s.y * s.z",
-        "0.94617469575755997 * s.z * s.z - 0.31539156525251999",
-        "-1.0925484305920792 * s.x * s.z",
-        "0.54627421529603959 * (s.x * s.x - s.y * s.y)",
-        "0.59004358992664352 * s.y * (s.y * s.y - 3 * s.x * s.x)",
-        "2.8906114426405538 * s.x * s.y * s.z",
-        "0.45704579946446572 * s.y * (1 - 5 * s.z * s.z)",
-        "0.3731763325901154 * s.z * (5 * s.z * s.z - 3)",
-        "0.45704579946446572 * s.x * (1 - 5 * s.z * s.z)",
-        "1.4453057213202769 * s.z * (s.x * s.x - s.y * s.y)",
-        "0.59004358992664352 * s.x * (3 * s.y * s.y - s.x * s.x)",
+def _frequency(out: str, octaves: int) -> list[str]:
+    return [  # x, sin x, cos x, sin 2x, cos 2x, ...
+        f"{out}[0] = vec4f(s, 0);",
+        f"for (var octave = 0u; octave < {octaves}u; octave++) {{",
+        "  let angle = turned(vec4f(s * exp2(f32(octave)), 0));",
+        "  let sines = sin(angle);",
+        "  let cosines = cos(angle);",
+        "  for (var axis = 0u; axis < 3u; axis++) {",
+        "    let at = 3u + 6u * octave + axis;",
+        f"    {out}[at / 4u][at % 4u] = sines[axis];",
+        f"    {out}[(at + 3u) / 4u][(at + 3u) % 4u] = cosines[axis];",
+        "  }",
+        "}",
     ]
-    return [f"{out}[{n // 4}].{'xyzw'[n % 4]} = {text};" for n, text in enumerate(bands[: degree**2])]
+
+
+@dataclass(frozen=True)
+class _Term:
+    """A number of WGSL in a formula of Python."""
+
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __mul__(self, other: object) -> _Term:
+        return _Term(f"{self} * {other}")
+
+    def __rmul__(self, other: object) -> _Term:
+        return _Term(f"{other} * {self}")
+
+    def __sub__(self, other: object) -> _Term:
+        return _Term(f"({self} - {other})")
+
+    def __rsub__(self, other: object) -> _Term:
+        return _Term(f"({other} - {self})")
+
+
+def _spherical(out: str, degree: int) -> list[str]:
+    terms = harmonics(_Term("s.x"), _Term("s.y"), _Term("s.z"), degree)
+    return [f"{out}[{n // 4}].{'xyzw'[n % 4]} = {term};" for n, term in enumerate(terms)]
+
+
+ENCODINGS: dict[str, Callable[[str, int], list[str]]] = {"frequency": _frequency, "spherical": _spherical}
+"""The lines that encode a vec3f s, by the value that they fill and the encoding's size."""
 
 
 def _whole(columns: Columns, made: dict[int, Step], name: str) -> tuple[list[str], str]:
