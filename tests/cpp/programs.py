@@ -16,8 +16,9 @@ from typing import Any
 
 from voronerf import MLP, HashGrid, Layer
 from voronerf.ops._core import native
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import ACTIVATIONS
-from voronerf.ops._core.program import FUNCTIONS, PARAMETER, Builder, Columns, Program, gradient
+from voronerf.ops._core.program import FUNCTIONS, HASH, PARAMETER, Builder, Columns, Program, gradient
 from voronerf.ops.grouped_program import lowering
 
 compiled = native.compiled
@@ -84,15 +85,17 @@ def any_steps(draw: random.Random) -> Program:
         return x.part(draw.choice((0, draw.randint(0, x.width - width))), width)
 
     def encoded(name: str) -> Columns:
-        if name == "hash":
+        if name == HASH:
             own = grid(draw)
             return b.encode(name, inputs[1], b.grid(own.text), b.parameter(*own.table_shape))
-        x, size = {
-            "frequency": (draw.choice(inputs[1:]), draw.randint(0, 4)),
-            "integrated": (b.binary("mul", inputs[1], inputs[1]), draw.randint(1, 4)),
-            "spherical": (inputs[2], draw.randint(1, 4)),
-        }[name]
-        return b.encode(name, b.move(4, [(x, 0)]) if name == "integrated" else x, size)
+        wide = b.move(4, [(b.binary("mul", inputs[1], inputs[1]), 0)])  # the variances of a Gaussian are not negative
+        fitting = [
+            (x, size)
+            for x in (wide, *(inputs[1:] if name != "integrated" else ()))
+            for size in range(5)
+            if ENCODINGS[name].fits(x.width, size)
+        ]
+        return b.encode(name, *draw.choice(fitting))
 
     def step(kind: str) -> Columns:
         width = draw.choice(WIDTHS)
@@ -130,7 +133,7 @@ def any_steps(draw: random.Random) -> Program:
         return encoded(kind)
 
     kinds = ["linear", "linear", "function", "function", "jump", "binary", "binary", "total", "move"]
-    for kind in draw.choices([*kinds, "frequency", "integrated", "spherical", "hash"], k=draw.randint(2, 14)):
+    for kind in draw.choices([*kinds, *ENCODINGS, HASH], k=draw.randint(2, 14)):
         values.append(step(kind))
     outputs = [some(draw.choice(WIDTHS)) if draw.random() < 0.5 else draw.choice(values[-3:]) for _ in range(3)]
     outputs.append(b.apply("tanh", b.move(5, [(value.part(0, 1), i % 5) for i, value in enumerate(values)])))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
+import mmap
 import random
+import sys
 from dataclasses import replace
 
 import pytest
@@ -14,8 +17,9 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from voronerf import HashGrid
-from voronerf.ops import frequency_encode, grouped_program, hash_encode, integrated_encode, spherical_harmonics
+from voronerf.ops import grouped_program, hash_encode
 from voronerf.ops._core import native
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.program import FUNCTIONS, PARAMETER, VALUE, Builder, Columns, Program, Step, gradient
 from voronerf.ops.grouped_mlp.reference import cells_of
 from voronerf.ops.grouped_program import native as plans
@@ -345,11 +349,12 @@ def test_a_program_of_what_is_not_there_is_refused():
 ALL = (True,) * 3, (True,) * 3, (True,) * 2, ()
 """What is asked for of :func:`encoded`, and given."""
 ENCODED = {
-    "frequency": ("frequency", 3, 2),
+    **{
+        name: (name, *next((d, size) for d in (3, 6) for size in (4, 2) if encoding.fits(d, size)))
+        for name, encoding in ENCODINGS.items()
+    },
     "no octaves": ("frequency", 5, 0),
-    "integrated": ("integrated", 6, 2),
     "constant": ("spherical", 3, 1),
-    "spherical": ("spherical", 3, 4),
     "hash": ("hash", 3, 0),
     "hash of each cell": ("hash", 3, 0),
     "linear hash": ("hash", 3, 0),
@@ -370,14 +375,10 @@ def of_encoding(kind: str, ray: bool = False) -> tuple[Program, HashGrid]:
 
 
 def formula(kind: str, grid: HashGrid, x: Tensor, table: Tensor | None, cells: Tensor) -> Tensor:
-    """The encoding by its op in PyTorch."""
+    """The encoding in PyTorch."""
     name, _, size = ENCODED[kind]
-    if name == "frequency":
-        return frequency_encode(x, size, backend="reference")
-    if name == "integrated":
-        return integrated_encode(*x.chunk(2, dim=1), size, backend="reference")
-    if name == "spherical":
-        return spherical_harmonics(x, size, backend="reference")
+    if name in ENCODINGS:
+        return ENCODINGS[name].formula(x, size)
     assert table is not None
     own = len(table) > 1
     return hash_encode(x, table if own else table[0], grid, cells=cells if own else None, backend="reference")
@@ -437,7 +438,7 @@ def test_encodings_against_autograd(kind: str, ray: bool, ordered: bool) -> None
             torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["frequency", "integrated", "spherical", "hash", "hash of each cell"])
+@pytest.mark.parametrize("kind", [*ENCODINGS, "hash", "hash of each cell"])
 def test_gradient_programs_of_encodings_by_differences(kind: str) -> None:
     """gradcheck and gradgradcheck, whose oracle is no derivative."""
     program, _ = of_encoding(kind)
@@ -449,6 +450,31 @@ def test_gradient_programs_of_encodings_by_differences(kind: str) -> None:
 
     assert torch.autograd.gradcheck(run, tensors, fast_mode=True)
     assert torch.autograd.gradgradcheck(run, tensors, fast_mode=True)
+
+
+@pytest.mark.native
+@pytest.mark.skipif(sys.platform == "win32", reason="pages are protected otherwise")
+@pytest.mark.parametrize("name", ENCODINGS)
+def test_nothing_is_read_behind_a_gradient(name: str) -> None:
+    """An encoding's gradient of few rows reads its inputs where they are, in front of a page that is not there."""
+    _, raw, size = ENCODED[name]
+    b = Builder()
+    program = b.program([b.encode(name, b.input(raw), size)])
+    n, width, page = 5, program.outputs[0].width, mmap.PAGESIZE
+    pages = mmap.mmap(-1, 2 * page)
+    behind = ctypes.addressof(ctypes.c_char.from_buffer(pages)) + page
+    g = (
+        torch.frombuffer(pages, dtype=torch.float32, count=n * width, offset=page - 4 * n * width)
+        .view(n, width)
+        .fill_(1)
+    )
+    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(behind), page, 0) == 0
+    generator = torch.Generator().manual_seed(0)
+    x, _ = torch.rand(n, raw, generator=generator), g.uniform_(generator=generator)
+    arguments = [x, g], [], offsets_of([n])
+    options = {"program": gradient(program, (True,), (), (True,), ())}
+    found, exact = (grouped_program(*arguments, **options, backend=backend) for backend in ("native", "reference"))
+    torch.testing.assert_close(found, exact)
 
 
 def test_which_derivatives_the_compiled_module_has() -> None:

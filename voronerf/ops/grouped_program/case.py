@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 
 from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.grids import HashGrid
-from voronerf.ops._core.program import PARAMETER, Builder, Columns, Program
+from voronerf.ops._core.program import HASH, PARAMETER, Builder, Columns, Program
 
 
 def every_step() -> Program:
@@ -46,12 +47,10 @@ def encoded(width: int = 9) -> Program:
     """Every encoding, with directions of rays and a sum by ray beside the rows' own result."""
     b = Builder()
     x, gaussians, direction = b.input(3), b.input(4), b.input(3, ray=True)
-    parts = [
-        b.encode("frequency", x, 2),
-        b.encode("integrated", gaussians, 2),
-        b.encode("spherical", direction, 3),
-        b.encode("hash", x, b.grid(GRID.text), b.parameter(*GRID.table_shape)),
-    ]
+    parts = [b.encode(HASH, x, b.grid(GRID.text), b.parameter(*GRID.table_shape))]
+    for name, encoding in ENCODINGS.items():
+        raw = direction if not encoding.positions else x if encoding.fits(3, 2) else gaussians
+        parts.append(b.encode(name, raw, 2))
     places = [sum(part.width for part in parts[:i]) for i in range(len(parts))]
     total = sum(part.width for part in parts)
     h = b.linear(b.move(total, list(zip(parts, places))), b.parameter(width, total), width)
