@@ -8,7 +8,7 @@ from test_grouped_mlp import TABLES
 
 from voronerf.ops import grouped_mlp, grouped_program
 from voronerf.ops._core.grids import HashGrid
-from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops._core.layers import DIRECTION_ENCODINGS, DIRECTIONS, MLP, POSITION_ENCODINGS, POSITIONS, Layer
 
 SOURCES = "MLP: layer 0 must read 'positions', 'directions' or an earlier layer"
 
@@ -57,9 +57,8 @@ def test_text_of_integrated_positions():
     for octaves in (None, 0):
         with pytest.raises(ValueError, match=r"^MLP: position_octaves must be at least 1 with the integrated encoding"):
             MLP(layers, (1,), octaves, position_encoding="integrated")
-    with pytest.raises(
-        ValueError, match=r"^MLP: position_encoding must be one of frequency, integrated, hash, got 'wave'"
-    ):
+    known = ", ".join(POSITION_ENCODINGS)
+    with pytest.raises(ValueError, match=rf"^MLP: position_encoding must be one of {known}, got 'wave'"):
         MLP(layers, (1,), 4, position_encoding="wave")
 
 
@@ -78,7 +77,10 @@ def test_text_of_spherical_directions():
 def test_errors_of_directions():
     layers = (Layer((DIRECTIONS,), 4),)
     for options, message in (
-        ({"direction_encoding": "sh"}, "direction_encoding must be one of frequency, spherical, got 'sh'"),
+        (
+            {"direction_encoding": "sh"},
+            f"direction_encoding must be one of {', '.join(DIRECTION_ENCODINGS)}, got 'sh'",
+        ),
         ({"direction_encoding": "spherical"}, "direction_degree must be 1 to 4 with spherical harmonics, got None"),
         (
             {"direction_encoding": "spherical", "direction_degree": 5},

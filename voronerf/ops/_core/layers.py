@@ -60,7 +60,7 @@ class MLP:
         layers: in order of evaluation.
         outputs: indices of the layers whose results are concatenated into the network's output.
         position_octaves: octaves of the encoding of the positions; None takes the positions as they come.
-        direction_octaves: octaves of the frequency encoding of the view directions, or None.
+        direction_octaves: octaves of the encoding of the view directions, or None.
         position_encoding: "frequency", ``frequency_encode`` with the input included (d -> d + 2dL); or "integrated",
             ``integrated_encode`` of Gaussians: positions are [n, 6], the mean and then the diagonal variance (6 -> 6L);
             or "hash", ``hash_encode`` (3 -> levels * features), whose table of features is an argument of its own.

@@ -20,6 +20,7 @@ from voronerf.ops._core.checks import (
     check_tensor,
     of_one_dtype,
 )
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
 
 PLACES: dict[str, Any] = {
@@ -107,6 +108,9 @@ def _check_widths(op: str, layers: MLP, p: int, q: int, directed: bool) -> None:
     for source, width in ((POSITIONS, p), (DIRECTIONS, q)):
         if width < 1 and any(source in layer.inputs for layer in layers.layers):
             raise ValueError(f"{op}: {source} must have at least one feature where a layer reads them, got {width}")
+        name, size = layers.encoding(source) or ("frequency", 0)
+        if width and not ENCODINGS[name].fits(width, size):
+            raise ValueError(f"{op}: {source} must fit the {name} encoding of size {size}, got {width} features")
 
 
 def _rows(
