@@ -6,9 +6,9 @@
 //
 // in by_row_tile.h and frequency_encode_tile.h on the CPU, in program_cuda_encoding.h on CUDA.
 //
-// A formula is a struct in a header of its own, in F32 and the words of network/functions.h, which are there on both
-// devices before this is included; who wants the names alone has no words. of(i) is a column of x, g(c) the gradient to
-// a column of its encoding. kMost: columns that it has at most.
+// A formula is a struct in a header of its own, in F32 and the words of network/functions.h: it is there where they are
+// (VN_WORDS), on both devices; who wants the names alone has none. of(i) is a column of x, g(c) the gradient to a
+// column of its encoding. kMost: columns that it has at most.
 //
 //   values(of, columns of x, size, put)        put(c, value) for each column of the encoding
 //   gradient(of, columns of x, size, g, put)   put(i, value) for each column of x
@@ -17,6 +17,6 @@
   DO(integrated, Octaves<true>) \
   DO(spherical, ByRow<SphericalHarmonics>)
 
-#ifdef VN_INLINE
+#ifdef VN_WORDS
 #include "encoding/spherical_harmonics_math.h"
 #endif

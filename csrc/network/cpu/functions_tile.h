@@ -76,4 +76,5 @@ VN_INLINE F32 any_exponential(F32 x) {
 }  // namespace VN_ISA_NAMESPACE
 }  // namespace voronerf
 
+#define VN_WORDS
 #include "network/functions.h"

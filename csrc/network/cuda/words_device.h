@@ -26,3 +26,5 @@ VN_INLINE float rounded_down(float x) { return floorf(x); }
 }  // namespace
 }  // namespace device
 }  // namespace voronerf
+
+#define VN_WORDS
