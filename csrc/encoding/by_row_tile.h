@@ -4,7 +4,7 @@
 
 #include "network/cpu/functions_tile.h"
 #include "network/cpu/program_rows_tile.h"
-// with the words above
+// behind the words
 #include "encoding/encodings.h"
 
 namespace voronerf {

@@ -4,7 +4,7 @@
 #include "common/cuda_wrappers.h"
 #include "encoding/spherical_harmonics.h"
 #include "network/cuda/words_device.h"
-// with the words above
+// behind the words
 #include "encoding/spherical_harmonics_math.h"
 
 namespace voronerf {

@@ -8,7 +8,7 @@
 #include "encoding/hash_encode_device.h"
 #include "network/cuda/program_cuda_tile.h"
 #include "network/cuda/words_device.h"
-// with the words above
+// behind the words
 #include "encoding/encodings.h"
 
 namespace voronerf {

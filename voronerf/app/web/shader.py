@@ -257,14 +257,8 @@ def _frequency(out: str, octaves: int) -> list[str]:
     ]
 
 
-@dataclass(frozen=True)
-class _Term:
+class _Term(str):
     """A number of WGSL in a formula of Python."""
-
-    text: str
-
-    def __str__(self) -> str:
-        return self.text
 
     def __mul__(self, other: object) -> _Term:
         return _Term(f"{self} * {other}")
