@@ -15,8 +15,17 @@ from torch import Tensor
 
 from voronerf.kernels.grouped_mlp import grouped_mlp
 from voronerf.ops._core.grids import HashGrid
-from voronerf.ops._core.layers import ACTIVATIONS, DIRECTIONS, MLP, NUMBERS, POSITIONS, Layer
-from voronerf.ops._core.program import VALUE, Builder, Columns, Program, Step
+from voronerf.ops._core.layers import (
+    ACTIVATIONS,
+    DIRECTION_ENCODINGS,
+    DIRECTIONS,
+    MLP,
+    NUMBERS,
+    POSITION_ENCODINGS,
+    POSITIONS,
+    Layer,
+)
+from voronerf.ops._core.program import HASH, VALUE, Builder, Columns, Program, Step
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
 from voronerf.ops.grouped_program.reference import of_rows
 
@@ -128,7 +137,7 @@ class _Reader:
         for step in behind:
             values[step.out] = b.emit(step.op, step.width, [*map(taken, step.operands)], step.numbers, step.name)
         outputs = tuple(int(self.sources[value]) for value in places)
-        features = [int(step.numbers[1]) for step in self.encodings.values() if step.name == "hash"]
+        features = [int(step.numbers[1]) for step in self.encodings.values() if step.name == HASH]
         return Chain(
             MLP(tuple(self.layers), outputs, **self._encoded()),
             tuple(layer.weight for layer in self.made),
@@ -201,14 +210,12 @@ class _Reader:
         """The encodings as arguments of a table."""
         found: dict[str, Any] = {}
         for name, step in self.encodings.items():
-            size = int(step.numbers[0])
-            if step.name == "spherical" and name == DIRECTIONS:
-                found |= {"direction_encoding": step.name, "direction_degree": size}
-            elif step.name == "frequency":
-                found["position_octaves" if name == POSITIONS else "direction_octaves"] = size
-            elif step.name in ("integrated", "hash") and name == POSITIONS:
-                grid = HashGrid.parse(self.program.grids[size]) if step.name == "hash" else None
-                found |= {"position_encoding": step.name, "grid": grid, "position_octaves": None if grid else size}
-            else:
+            size, of = int(step.numbers[0]), name.removesuffix("s")
+            if step.name not in (POSITION_ENCODINGS if name == POSITIONS else DIRECTION_ENCODINGS):
                 raise LookupError
+            found[f"{of}_encoding"] = step.name
+            if step.name == HASH:
+                found["grid"] = HashGrid.parse(self.program.grids[size])
+            else:
+                found["direction_degree" if step.name == "spherical" else f"{of}_octaves"] = size
         return found
