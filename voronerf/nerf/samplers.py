@@ -34,7 +34,7 @@ from voronerf.nerf.volume import RayColours, Rendered, RenderOutput, Samples, Sp
 from voronerf.ops._core.rows import fixed_count
 from voronerf.ops.composite import composite
 from voronerf.ops.formulas import Wave, walk
-from voronerf.ops.render_opaque import OF_PROGRAM
+from voronerf.ops.render_opaque import NETWORK
 from voronerf.ops.resample import resample
 
 #: Share of the first pass in the loss if one network is evaluated in two passes (mip-NeRF, section 3.2).
@@ -415,7 +415,7 @@ class Occupancy(Sampler):
         arguments = known.arguments(rays.origins, rays.directions, torch.empty(0, dtype=torch.int32))
         if "cells" in arguments:  # which each sample has of its own
             return None
-        return {"network": {name: value for name, value in arguments.items() if name in OF_PROGRAM}, **known.rule}
+        return {"network": {name: value for name, value in arguments.items() if name in NETWORK}, **known.rule}
 
     def _leave_empty(self) -> None:
         if self.empty is not None:

@@ -8,22 +8,14 @@ from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 
 def _make(draw: Draw, n: int) -> Arguments:
     table = MLP((Layer((POSITIONS,), 6, "relu"), Layer((0,), 4)), (1,))
-    network = {"positions": draw.uniform(n, 3), "layers": table, "centres": draw.uniform(2, 3)}
-    weights, biases = [draw.normal(2, 6, 3), draw.normal(2, 4, 6)], [draw.normal(2, 6), None]
-    if draw.among("network", "table", "program") == "program":
-        program = table.program(3, 0, None, (True, False))
-        parameters = [*weights, biases[0]]
-        inputs = [network["positions"]]
-        return {
-            "network": {"program": program, "inputs": inputs, "parameters": parameters, "centres": network["centres"]}
-        }
-    network |= {"weights": weights, "biases": biases}
-    return {"network": network}
+    program, inputs, centres = table.program(3, 0, None, (True, False)), [draw.uniform(n, 3)], draw.uniform(2, 3)
+    parameters = [draw.normal(2, 6, 3), draw.normal(2, 4, 6), draw.normal(2, 6)]
+    return {"network": {"program": program, "inputs": inputs, "parameters": parameters, "centres": centres}}
 
 
 CASE = Case(
     _make,
-    {"": {}, "program": {"network": "program"}},
-    refused={"network must hold positions, weights, biases and layers, got 3": {"network": 3}},
+    {"": {}},
+    refused={"network must hold program, inputs and parameters, got 3": {"network": 3}},
     traced=False,
 )

@@ -18,9 +18,8 @@ from voronerf.ops._core import native
 from voronerf.ops._core.derivatives import learnt, with_gradients
 from voronerf.ops.forward_with_tape.reference import Graph, Tape
 from voronerf.ops.grouped_program.native import How, Rows, run, run_gradient
-from voronerf.ops.routed_mlp import native as routed_mlp
-from voronerf.ops.routed_program import native as routed_program
 from voronerf.ops.routed_program import of_samples
+from voronerf.ops.routed_program.native import find, prepared, run_routed
 from voronerf.ops.routed_program.reference import cells_of, first_rows
 
 
@@ -28,14 +27,13 @@ def forward_with_tape(network: Mapping[str, Any]) -> Tape:
     """The outputs and their tape, once differentiable; see ``voronerf.ops.forward_with_tape``."""
     given = dict(network)
     frozen = given.pop("frozen", None)
-    prepared = routed_program.prepared if "program" in network else routed_mlp.prepared
     recorded = torch.is_grad_enabled()
     with torch.no_grad():
         taken, where = prepared(**given)
         first, k = taken.inputs[0], cells_of(taken.parameters)
         plain = all(tensor.dtype is torch.float32 for tensor in taken.given)
         if recorded and plain and not torch.is_autocast_enabled(first.device.type):
-            cells, order, offsets = routed_program.find(first, where, k, taken.how.caller)
+            cells, order, offsets = find(first, where, k, taken.how.caller)
             rows, how = taken.rows(offsets, order), taken.how
             learning = any(tensor.requires_grad for tensor in taken.given)
             out, *kept = run(rows, how._replace(keep=True) if learning else how)
@@ -43,7 +41,7 @@ def forward_with_tape(network: Mapping[str, Any]) -> Tape:
             if count is not None:
                 (out,), cells = first_rows([out], cells, count)
             return _Kept(out, rows._replace(kept=kept), how, taken.given, count, cells, frozen)
-    (out,), cells = routed_program.run_routed(*prepared(**given))
+    (out,), cells = run_routed(*prepared(**given))
     return Graph(out.detach().float(), out, cells, frozen)
 
 

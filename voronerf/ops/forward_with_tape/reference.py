@@ -11,7 +11,6 @@ from torch import Tensor
 
 from voronerf.ops._core.checks import check_flag, check_shape
 from voronerf.ops._core.derivatives import learnt, with_gradients
-from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.routed_program import of_samples
 from voronerf.ops.routed_program.reference import routed_program
 
@@ -27,8 +26,8 @@ class Tape(ABC):
         >>> from voronerf import MLP, Layer
         >>> from voronerf.ops import forward_with_tape
         >>> weight = torch.tensor([[[2.0]]], requires_grad=True)
-        >>> table = MLP((Layer(("positions",), 1),), outputs=(0,))
-        >>> network = {"positions": torch.ones(4, 1), "weights": [weight], "biases": [None], "layers": table}
+        >>> program = MLP((Layer(("positions",), 1),), outputs=(0,)).program(1, 0, None, (False,))
+        >>> network = {"program": program, "inputs": [torch.ones(4, 1)], "parameters": [weight]}
         >>> tape = forward_with_tape(network)
         >>> loss = tape.backward(tape.raw.square().mean(), tape.raw * (2 / 4))
         >>> float(loss), float(weight.grad)
@@ -64,10 +63,7 @@ def forward_with_tape(network: Mapping[str, Any], backend: str = "reference") ->
     """The outputs and their tape; see ``voronerf.ops.forward_with_tape``."""
     network = dict(network)
     frozen = network.pop("frozen", None)
-    if "program" in network:
-        (out,), cells = routed_program(**network, backend=backend)
-    else:
-        out, cells = routed_mlp(**network, backend=backend)
+    (out,), cells = routed_program(**network, backend=backend)
     return Graph(out.detach().float(), out, cells, frozen)
 
 

@@ -12,13 +12,11 @@ from voronerf.ops._core.backends import PLAIN, Implementation
 from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
 from voronerf.ops.formulas import RaysSeen
-from voronerf.ops.grouped_mlp.checks import check_routed
 from voronerf.ops.render_loss.reference import scaled
 from voronerf.ops.routed_program import check_routed_program
 
-#: Names of the arguments of `routed_mlp` that a network has; the others are of the samples, or of the backward pass.
-OF_PROGRAM = ("program", "parameters", "centres", "child_offsets", "child", "depth")
-NETWORK = ("weights", "biases", "layers", "features", "centres", "child_offsets", "child", "depth")
+#: Names of the arguments of `routed_program` that a network has; the others are of samples, or of the backward pass.
+NETWORK = ("program", "parameters", "centres", "child_offsets", "child", "depth")
 
 
 def _prepare(given: Any) -> Any:
@@ -26,35 +24,20 @@ def _prepare(given: Any) -> Any:
     check_count(op, "samples of all rays", given.near.shape[0] * given.samples)
     if occupied.numel() < 1:
         raise ValueError(f"{op}: occupied must have at least one cell, got {list(occupied.shape)}")
-    if isinstance(network, Mapping) and "program" in network:
-        return scaled(op, given._replace(network=_program(op, given, network)))
-    if not isinstance(network, Mapping) or not {"weights", "biases", "layers"} <= network.keys():
+    if not isinstance(network, Mapping) or not {"program", "parameters"} <= network.keys():
         got = ", ".join(map(str, network)) or "nothing" if isinstance(network, Mapping) else repr(network)
-        raise ValueError(f"{op}: network must hold weights, biases and layers, got {got:.60}")
+        raise ValueError(f"{op}: network must hold program and parameters, got {got:.60}")
     if unknown := [name for name in network if name not in NETWORK]:
         raise TypeError(f"{op}: network must hold {', '.join(NETWORK)} alone, got {', '.join(map(str, unknown))}")
-    reads = getattr(network["layers"], "uses_directions", False)
-    table = check_routed(op, given.origins, **network, directions=given.directions if reads else None)
-    table.pop("frozen")
-    outputs = sum(table["weights"][output].shape[1] for output in table["layers"].outputs)
-    if outputs != 4:
-        raise ValueError(f"{op}: layers must put out 4 numbers, colour and density, got {outputs}")
-    return scaled(op, given._replace(network=table))
-
-
-def _program(op: str, given: Any, network: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of `routed_program` for one sample at the origin of each ray."""
-    if unknown := [name for name in network if name not in OF_PROGRAM]:
-        raise TypeError(f"{op}: network must hold {', '.join(OF_PROGRAM)} alone, got {', '.join(map(str, unknown))}")
+    # One sample at the origin of each ray has the same rules.
     origins, reads = given.origins, bool(getattr(network["program"], "rays", ()))
     index = torch.arange(len(origins), dtype=torch.int32, device=origins.device) if reads else None
     inputs = [origins, given.directions] if reads else [origins]
-    table = check_routed_program(op, True, **{"parameters": [], **network}, inputs=inputs, ray_index=index)
-    table.pop("frozen")
-    if table["program"].outputs[0].width != 4:
-        got = table["program"].outputs[0].width
-        raise ValueError(f"{op}: program must put out 4 numbers, colour and density, got {got}")
-    return table
+    checked = check_routed_program(op, True, **network, inputs=inputs, ray_index=index)
+    checked.pop("frozen")
+    if (width := checked["program"].outputs[0].width) != 4:
+        raise ValueError(f"{op}: program must put out 4 numbers, colour and density, got {width}")
+    return scaled(op, given._replace(network=checked))
 
 
 @declare(
@@ -82,9 +65,9 @@ def render_opaque(
 ) -> RaysSeen:
     """Renders rays without gradients and without randomness: each is walked until it is opaque.
 
-    Equivalent to ``march_rays``, ``routed_mlp``, activations as in ``render_loss`` and ``composite`` for a few samples
-    of each ray at a time, of all rays that are not opaque yet. So the networks are asked about little more than what
-    lies in front of the first surface of each ray.
+    Equivalent to ``march_rays``, ``routed_program``, activations as in ``render_loss`` and ``composite`` for a few
+    samples of each ray at a time, of all rays that are not opaque yet. So the networks are asked about little more than
+    what lies in front of the first surface of each ray.
 
     Args:
         origins: of the rays.
@@ -94,11 +77,10 @@ def render_opaque(
         occupied: as in ``march_rays``.
         box: as in ``march_rays``.
         samples: strata of a ray, s; samples are their middles.
-        network: Arguments of `routed_mlp` by name: weights, biases and layers, and where there are any, features,
-            centres, child_offsets, child and depth. Or ``program`` and ``parameters`` as `grouped_program` takes them,
-            in the place of weights, biases, layers and features; its inputs are positions [n, 3] and, if read,
-            directions with one row for each ray. The networks put out 4 numbers, colour before its sigmoid and density
-            before its softplus, or ``activated``.
+        network: Arguments of `routed_program` by name: ``program`` and ``parameters``, and where there are any,
+            centres, child_offsets, child and depth. Its inputs are positions [n, 3] and, if read, directions with one
+            row for each ray. It puts out 4 numbers, colour before its sigmoid and density before its softplus, or
+            ``activated``.
         density_scale: factor on the density, > 0; None with ``activated``.
         activated: whether the networks put out the colour and the density themselves, as for `composite`: no sigmoid,
             softplus or scale comes in between, and nothing is clamped.
@@ -119,8 +101,9 @@ def render_opaque(
         >>> import torch
         >>> from voronerf import MLP, Layer
         >>> from voronerf.ops import render_opaque
-        >>> weights, biases = [torch.zeros(1, 4, 3)], [torch.tensor([[0.0, 0, 0, 20]])]  # grey, and 20 dense
-        >>> network = {"weights": weights, "biases": biases, "layers": MLP((Layer(("positions",), 4),), outputs=(0,))}
+        >>> program = MLP((Layer(("positions",), 4),), outputs=(0,)).program(3, 0, None, (True,))
+        >>> parameters = [torch.zeros(1, 4, 3), torch.tensor([[0.0, 0, 0, 20]])]  # grey, and 20 dense
+        >>> network = {"program": program, "parameters": parameters}
         >>> ray = torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]), torch.zeros(1), torch.full((1,), 4.0)
         >>> box, occupied = torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), torch.ones(1, 1, 1, dtype=torch.bool)
         >>> seen = render_opaque(*ray, occupied, box, 64, network, density_scale=1.0)

@@ -19,16 +19,12 @@ def _make(draw: Draw, n: int) -> Arguments:
     colour, density = ("sigmoid", "relu") if activated else ("none", "none")
     ends = Layer((0, DIRECTIONS), 3, colour), Layer((0,), 1, density)
     table = MLP((Layer((POSITIONS,), 6, "relu"), *ends), (1, 2), **encoding)
-    network: Arguments = {"layers": table, "centres": draw.uniform(k, 3) - 0.5}
-    network["weights"] = [draw.normal(k, o, i) for o, i in table.weight_shapes(3, 3)]
-    network["biases"] = [draw.normal(k, 6), None, (4 if activated else 1) + draw.normal(k, 1)]
+    network: Arguments = {"program": table.program(3, 3, None, (True, False, True), True)}
+    network["centres"] = draw.uniform(k, 3) - 0.5
+    weights = [draw.normal(k, o, i) for o, i in table.weight_shapes(3, 3)]
+    network["parameters"] = [*weights, draw.normal(k, 6), (4 if activated else 1) + draw.normal(k, 1)]
     if hashed:
-        network["features"] = draw.normal(*_GRID.table_shape)
-    if draw.among("network", "table", "program") == "program":
-        biased = tuple(bias is not None for bias in network["biases"])
-        parameters = [*network.pop("weights"), *(bias for bias in network.pop("biases") if bias is not None)]
-        parameters += [network.pop("features")] if hashed else []
-        network |= {"program": network.pop("layers").program(3, 3, None, biased, True), "parameters": parameters}
+        network["parameters"].append(draw.normal(*_GRID.table_shape))
     directions = draw.unit(n)
     origins = 2 * draw.normal(n, 3) if draw.free else -directions
     call: Arguments = {"origins": origins, "directions": directions, "network": network}
@@ -45,10 +41,10 @@ def _make(draw: Draw, n: int) -> Arguments:
 
 CASE = Case(
     _make,
-    {"": {}, "activated": {"activated": True}, "program": {"network": "program"}},
+    {"": {}, "activated": {"activated": True}},
     refused={
-        "network must hold weights, biases and layers, got 3": {"network": 3},
-        "network must hold weights, biases and layers, got features": {"network": {"features": torch.zeros(2, 3)}},
+        "network must hold program and parameters, got 3": {"network": 3},
+        "network must hold program and parameters, got program": {"network": {"program": None}},
         "wave must be at least 1, got 0": {"wave": 0},
         "opaque must lie in [0, 1), got 1.0": {"opaque": 1.0},
         "density_scale must be positive, got 0": {"density_scale": 0},

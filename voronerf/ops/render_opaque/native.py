@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
@@ -19,8 +18,7 @@ from voronerf.ops.grouped_program.native import program_inputs
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.render_opaque import reference
-from voronerf.ops.routed_mlp import native as routed_mlp
-from voronerf.ops.routed_program import native as routed_program
+from voronerf.ops.routed_program.native import prepared
 from voronerf.ops.routed_program.reference import cells_of
 
 _OP = declared("render_opaque")
@@ -36,17 +34,12 @@ def render_opaque(*flat: Any) -> RaysSeen:
     """Every ray up to the first surface, in float32; see ``voronerf.ops.render_opaque``."""
     given = _OP.Inputs._make(flat)
     network = given.network
-    prepared = routed_program.prepared if "program" in network else routed_mlp.prepared
-    ray_index = given.near.new_empty(0, dtype=torch.int32)  # of samples that are not there yet
-    index = "ray_index" if "program" in network else "direction_index"
-    seen = network.get("directions") is not None or network.get("ray_index") is not None
-    taken, _ = prepared(**network | {index: ray_index if seen else None})
+    none = given.near.new_empty(0, dtype=torch.int32)  # of samples that are not there yet
+    taken, _ = prepared(**network | {"ray_index": None if network["ray_index"] is None else none})
     centres, k = network["centres"], cells_of(taken.parameters)
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in (*taken.given, centres))
     if not plain or torch.is_autocast_enabled("cpu"):
-        narrow = {name: [_narrow(part) for part in network.get(name, ())] for name in ("weights", "biases")}
-        narrow = network | ({} if "program" in network else {**narrow, "features": _narrow(network["features"])})
-        composed: RaysSeen = partial(reference.render_opaque, backend="native")(*given._replace(network=narrow))
+        composed: RaysSeen = partial(reference.render_opaque, backend="native")(*given)
         return composed
     rows = taken.rows(torch.zeros(k + 1, dtype=torch.int32))
     lowered = lower(taken.how.text)
@@ -75,8 +68,3 @@ def render_opaque(*flat: Any) -> RaysSeen:
     if not sound:
         raise too_shallow(depth, "render_opaque")
     return found if given.heaviest else found._replace(heaviest=given.far)
-
-
-def _narrow(tensor: Tensor | None) -> Tensor | None:
-    """Not float64, in which no network of the compiled module is."""
-    return tensor.float() if tensor is not None and tensor.dtype == torch.float64 else tensor

@@ -11,7 +11,6 @@ from voronerf.ops._core.declare import declared
 from voronerf.ops.composite import composite
 from voronerf.ops.formulas import RaysSeen, Wave, activate, walk
 from voronerf.ops.march_rays import march_rays
-from voronerf.ops.routed_mlp import routed_mlp
 from voronerf.ops.routed_program.reference import routed_program
 
 
@@ -23,30 +22,21 @@ def render_opaque(*flat: Any, backend: str = "reference") -> RaysSeen:
     """
     given = declared("render_opaque").Inputs._make(flat)
     network, wave = given.network, given.wave
-    centres, seen_by, by_program = network.get("centres"), network.get("directions"), "program" in network
-    dtype = (network["inputs"][0] if by_program else network["positions"]).dtype
-    of_samples = ("positions", "inputs", "coords", "directions", "direction_index", "ray_index")
-    fixed = {name: value for name, value in network.items() if name not in of_samples}
+    (origins, *seen), centres = network["inputs"], network["centres"]
+    fixed = {name: value for name, value in network.items() if name not in ("inputs", "coords", "ray_index")}
     space: dict[str, Any] = {"spacing": given.spacing, "most": wave, "contraction": given.contraction}
 
     def look(live: Tensor, start: Tensor | None) -> Wave:
         of_rays = given.origins[live], given.directions[live], given.near[live], given.far[live]
         march = march_rays(*of_rays, given.occupied, given.box, given.samples, start=start, **space, backend=backend)
-        positions = march.positions.to(dtype)
+        positions = march.positions.to(origins.dtype)
         coords = None if centres is None else positions.to(centres.dtype)
         taken: dict[str, Any] = {**fixed, "coords": coords, "backend": backend}
-        if by_program:
-            rays = [x[live] for x in network["inputs"][1:]]
-            index = march.ray_index if rays else None
-            (raw,), _ = routed_program(inputs=[positions, *rays], ray_index=index, **taken)
-        else:
-            seen_from: dict[str, Any] = {"directions": None, "direction_index": None}
-            if seen_by is not None:
-                seen_from = {"directions": seen_by[live], "direction_index": march.ray_index}
-            raw, _ = routed_mlp(positions=positions, **seen_from, **taken)
+        inputs, index = [positions, *(x[live] for x in seen)], march.ray_index if seen else None
+        (raw,), _ = routed_program(inputs=inputs, ray_index=index, **taken)
         colours, density = activate(raw.to(given.near.dtype), given.density_scale, given.activated)
         packed: dict[str, Any] = {"ray_offsets": march.ray_offsets, "backend": backend}
-        seen = composite(density, colours, march.depths, march.deltas, **packed)
-        return Wave(seen, march.ray_index, march.ray_offsets, march.depths, march.stop)
+        along = composite(density, colours, march.depths, march.deltas, **packed)
+        return Wave(along, march.ray_index, march.ray_offsets, march.depths, march.stop)
 
     return walk(look, given.far, given.samples, wave, given.opaque, given.background, given.heaviest)
