@@ -69,6 +69,13 @@ def test_figures_are_those_of_the_file(name: str, text: str) -> None:
     assert not all(absent), absent
 
 
+def test_a_page_or_a_script_names_every_file() -> None:
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+    texts = [path.read_text() for path in [*pages, *(ROOT / "benchmarks").rglob("*.py")]]
+    named = set(re.findall(r"[\w.]+\.json", " ".join(texts)))
+    assert not [path.name for path in RESULTS.iterdir() if path.name not in named]
+
+
 @pytest.mark.parametrize(
     ("page", "arguments"),
     [
