@@ -245,12 +245,12 @@ def small_cases(device: str) -> list[tuple[str, Callable[[], None]]]:
     return cases
 
 
-def captured_steps(device: str, n: int = 4096) -> list[tuple[str, Callable[[], None]]]:
+def captured_steps(device: str, n: int = 4096, replays: int = 3) -> list[tuple[str, Callable[[], None]]]:
     """Names and checks: replays of a step find what it finds, which is right."""
-    return [(name, functools.partial(_replay, settings, device, n)) for name, settings in STEPS.items()]
+    return [(name, functools.partial(_replay, settings, device, n, replays)) for name, settings in STEPS.items()]
 
 
-def _replay(settings: tuple[int, str, bool, int], device: str, n: int) -> None:
+def _replay(settings: tuple[int, str, bool, int], device: str, n: int, replays: int) -> None:
     import torch
     from gpu_journal import settling
 
@@ -266,7 +266,7 @@ def _replay(settings: tuple[int, str, bool, int], device: str, n: int) -> None:
     captured.warm_up(step)
     assert captured.obstacle is None, captured.obstacle
     found, settle = captured.capture(step), settling(device)
-    for _ in range(3):
+    for _ in range(replays):
         for part in found:
             part.zero_()
         captured.replay(1)

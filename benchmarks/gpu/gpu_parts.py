@@ -53,11 +53,11 @@ LISTS = {"@checked": CHECKED, "@racing": RACING}
 STEP: dict[str, Any] = {"width": 16, "samples": (8,), "rays": 16, "cells": (), "split_at": ()}
 LITTLE: dict[str, dict[str, Any]] = {
     "large": {"n": 300},
-    "captured": {"n": 16},
-    "trainings": {"count": 3, **STEP},
+    "captured": {"n": 16, "replays": 1},
+    "trainings": {"count": 1, **STEP},
     "rows": {"n": 128, "fewer": 64, "seconds": 0.1},
-    "profile": {"seconds": 0.1, **STEP},
-    "training": {"budget": 0.3, **STEP},
+    "profile": {"seconds": 0.05, **STEP},
+    "training": {"budget": 0.1, **STEP},
 }
 """Options of each part that the emulated device can make."""
 
