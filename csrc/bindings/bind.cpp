@@ -129,6 +129,17 @@ class Recording {
     if (obstacle_.empty()) obstacle_ = why;
   }
   size_t size() const { return calls_.size(); }
+  int each_held(const Visit& visit) const {
+    int found = tensors_.each_held(visit);
+    for (const auto& call : calls_) {
+      for (PyObject* const object : call->frame.kept()) found = found != 0 ? found : visit(object);
+    }
+    return found;
+  }
+  void release() {
+    calls_.clear();
+    tensors_.release();
+  }
   const std::string& obstacle() const { return obstacle_; }
 
  private:
@@ -391,7 +402,7 @@ void bind_all(PyObject* python) {
   }
   // Local: the emulated module of the tests has them too.
   bind_unchanged(bound);
-  py::class_<Recording>(bound, "Recording", py::module_local())
+  py::class_<Recording>(bound, "Recording", py::module_local(), in_cycles<Recording>())
       .def(py::init())
       .def("begin", &Recording::begin)
       .def("end", &Recording::end)

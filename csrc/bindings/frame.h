@@ -60,6 +60,7 @@ class Frame {
     int64_t more, most;
   };
   Frame() { kept_.reserve(16); }
+  const std::vector<PyObject*>& kept() const { return kept_; }
   Frame(const Frame&) = delete;
   Frame& operator=(const Frame&) = delete;
   ~Frame() {

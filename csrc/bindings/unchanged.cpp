@@ -173,8 +173,26 @@ bool Unchanged::holds() const {
                      [](const Tensor& noted) { return noted.seen.holds(noted.tensor.ptr()); });
 }
 
+int Unchanged::each_held(const Visit& visit) const {
+  std::vector<PyObject*> held;
+  for (const Container& noted : containers_) {
+    held.push_back(noted.container.ptr());
+    for (const py::object& value : noted.values) held.push_back(value.ptr());
+  }
+  for (const Named& noted : named_) {
+    held.push_back(noted.owner.ptr());
+    for (const auto& [name, value] : noted.values) held.push_back(value.ptr());
+  }
+  for (const auto& [function, answer] : answers_) held.insert(held.end(), {function.ptr(), answer.ptr()});
+  for (const Tensor& noted : tensors_) held.insert(held.end(), {noted.tensor.ptr(), noted.storage.ptr()});
+  for (const Kind& noted : kinds_) held.push_back(noted.dictionary.ptr());
+  int found = 0;
+  for (size_t i = 0; i < held.size() && found == 0; ++i) found = visit(held[i]);
+  return found;
+}
+
 void bind_unchanged(py::module_& module) {
-  py::class_<Unchanged>(module, "Unchanged", py::module_local())
+  py::class_<Unchanged>(module, "Unchanged", py::module_local(), in_cycles<Unchanged>())
       .def(py::init())
       .def("contents", &Unchanged::contents, py::arg("container"), py::arg("free") = py::tuple())
       .def("entries", &Unchanged::entries)

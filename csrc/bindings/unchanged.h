@@ -8,6 +8,7 @@
 #include <utility>
 #include <vector>
 
+#include "bindings/cycles.h"
 #include "bindings/tensor_view.h"
 
 namespace voronerf {
@@ -33,6 +34,9 @@ class Unchanged {
 
   // Compares as little as may be: between the kernels of a loop, whatever is looked at must come from memory.
   bool holds() const;
+
+  int each_held(const Visit& visit) const;
+  void release() { *this = {}; }
 
  private:
   // How a tensor was.

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import gc
+import weakref
 
 import pytest
 import torch
@@ -103,3 +106,15 @@ def test_without_the_compiled_module_nothing_is_known():
     guard = Never()
     notes(guard, Thing(), dict.fromkeys(("here", "place", "kind", "read"), torch.zeros(2)), {})
     assert not guard.holds()
+
+
+def test_who_asks_is_freed_with_what_is_noted():
+    """A cycle of Python through the guard: it holds what holds it."""
+    thing = Thing()
+    thing.guard = unchanged()
+    notes(thing.guard, thing, dict.fromkeys(("here", "place", "kind", "read"), thing.made), {})
+    thing.guard.answer(functools.partial(getattr, thing, "name"))
+    gone = weakref.ref(thing)
+    del thing
+    gc.collect()
+    assert gone() is None

@@ -1,6 +1,8 @@
 """A training step that is recorded and replayed."""
 
+import gc
 import threading
+import weakref
 from itertools import pairwise
 
 import pytest
@@ -97,6 +99,17 @@ def test_steps_in_one_call_are_the_same_bits(cells, threads):
 def test_no_steps_are_refused():
     with pytest.raises(ValueError, match="TrainingStep: steps must be >= 1, got 0"):
         Training().step(64, 0)
+
+
+def test_a_training_is_freed_with_its_recording():
+    """A recording holds what it is made of, and counts of rows that ask the step: Python finds such cycles."""
+    training = Training()
+    training.train(6)
+    assert training.recorded
+    parts = [weakref.ref(each) for each in (training.step, training.router, training.loss, training.optimizer)]
+    del training
+    gc.collect()
+    assert [each() for each in parts] == [None] * 4
 
 
 def test_gradients_are_there_after_each_step():
