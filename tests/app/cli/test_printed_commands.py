@@ -33,7 +33,7 @@ PROGRAMS = ("voronerf", "torchrun", "python", "make", "pip", "ns-train", "tensor
 #: Programs that are not this project's.
 FOREIGN = ("tensorboard", "ns-train")
 #: Values that make a command short; an option that is not there is added for these commands.
-SHORT = {"--budget": "0.5", "--frames": "2", "--resolution": "8", "--count": "20"}
+SHORT = {"--budget": "0.1", "--frames": "2", "--resolution": "8", "--count": "20"}
 ADDED = {
     "train": ("--budget",),
     "train-territories": ("--budget",),
