@@ -21,7 +21,7 @@ struct ByRow {
     int64_t stride, row, rows;
     F32 first[3];
 
-    Of(const float* x, int64_t stride, int64_t raw, int64_t row, int64_t rows)
+    __attribute__((always_inline)) Of(const float* x, int64_t stride, int64_t raw, int64_t row, int64_t rows)
         : x(x), stride(stride), row(row), rows(rows) {
       if (raw == 3 && stride == 3) {
         load_points(x + 3 * row, first[0], first[1], first[2]);
@@ -29,12 +29,14 @@ struct ByRow {
         for (int i = 0; i < 3; ++i) first[i] = gathered(smaller(i, raw - 1));
       }
     }
-    F32 gathered(int64_t column) const {
+    __attribute__((always_inline)) F32 gathered(int64_t column) const {
       float lanes[kLanes];
       for (int64_t lane = 0; lane < kLanes; ++lane) lanes[lane] = x[smaller(row + lane, rows - 1) * stride + column];
       return load(lanes);
     }
-    F32 operator()(int column) const { return column < 3 ? first[column] : gathered(column); }
+    __attribute__((always_inline)) F32 operator()(int column) const {
+      return column < 3 ? first[column] : gathered(column);
+    }
   };
 
   // x [rows][x_stride], `raw` columns of each -> out [rows, rounded up to whole vectors][stride], with 0 behind the
@@ -57,21 +59,34 @@ struct ByRow {
   static void gradient(const float* x, int64_t x_stride, int64_t raw, int64_t size, const float* g, int64_t g_stride,
                        int64_t rows, float* out, int64_t stride) {
     for (int64_t row = 0; row < rows; row += kLanes) {
+      const int64_t count = smaller(kLanes, rows - row);
+      const float* const from = g + row * g_stride;
       F32 given[kColumns];
       for (F32& column : given) column = splat(0.0f);
       for (int64_t column = 0; column < kColumns && column < g_stride; column += kLanes) {
         for (int64_t lane = 0; lane < kLanes; ++lane) {
-          given[column + lane] = load(g + smaller(row + lane, rows - 1) * g_stride + column);
+          given[column + lane] = load(from + smaller(lane, count - 1) * g_stride + column);
         }
         transpose(given + column);
       }
       const Of of(x, x_stride, raw, row, rows);
-      const auto put = [&](int i, F32 v) {
+      F32 found[3] = {splat(0.0f), splat(0.0f), splat(0.0f)};  // written together
+      float* const to = out + row * stride;
+      const auto put = [&](int i, F32 v) __attribute__((always_inline)) {
+        if (i < 3) {
+          found[i] = v;
+          return;
+        }
         float lanes[kLanes];
         store(lanes, v);
-        for (int64_t lane = 0; lane < kLanes && row + lane < rows; ++lane) out[(row + lane) * stride + i] = lanes[lane];
+        for (int64_t lane = 0; lane < count; ++lane) to[lane * stride + i] = lanes[lane];
       };
       Formula::gradient(of, static_cast<int>(raw), static_cast<int>(size), [&](int c) { return given[c]; }, put);
+      float lanes[3][kLanes];
+      for (int i = 0; i < 3; ++i) store(lanes[i], found[i]);
+      for (int64_t lane = 0; lane < count; ++lane) {
+        for (int i = 0; i < 3 && i < raw; ++i) to[lane * stride + i] = lanes[i][lane];
+      }
     }
   }
 };
