@@ -125,6 +125,8 @@ class _Reader:
         behind = [step for step in self.program.steps if not self._takes(step)]
         own, places, width = {step.out for step in behind}, dict[int, int](), 0
         for columns in (*(c for step in behind for c in step.operands), *self.program.outputs):
+            if columns.of != VALUE:
+                raise LookupError
             if columns.index not in own | places.keys():
                 places[columns.index], width = width, width + self.layers[self._layer(columns)].width
         b = Builder()
@@ -154,7 +156,9 @@ class _Reader:
             if step.operands[0].index not in self.sources or step.numbers[2] or self.read[step.operands[0].index] > 1:
                 raise LookupError
             name = self._source(step.operands[0])
-            self.encodings[str(name)], self.sources[step.out] = step, name
+            if not isinstance(name, str) or name in self.encodings:
+                raise LookupError
+            self.encodings[name], self.sources[step.out] = step, name
         elif step.op == "linear":
             self._add(step)
         elif step.op == "function" and step.name in ACTIVATIONS and self._activates(step):
@@ -179,28 +183,33 @@ class _Reader:
 
     def _activates(self, step: Step) -> bool:
         """Whether a function is the activation of a layer, of which nothing else is read."""
-        x, known = step.operands[0], step.numbers == (0, *NUMBERS.get(step.name, (0, 0)))
-        return known and len(step.operands) == 1 and x.index in self.started and self.read[x.index] == 1
+        x = step.operands[0]
+        numbers: tuple[float, ...] = (0, *NUMBERS.get(step.name, (0, 0)))
+        if len(step.operands) > 1 or step.numbers != numbers or not self._is_whole(x):
+            return False
+        return x.index in self.started and self.read[x.index] == 1
 
     def _finish(self, value: int, out: int, activation: str) -> None:
         layer = self.started.pop(value)
+        if layer.depth != self.program.parameters[layer.weight][1]:
+            raise LookupError
         self.sources[out] = len(self.made)
         self.made.append(layer)
         self.layers.append(Layer(layer.inputs, self.program.parameters[layer.weight][0], activation))
 
     def _source(self, columns: Columns) -> int | str:
         """What columns are to a layer: a whole value."""
-        value, whole = columns.index, columns.width == self.steps[columns.index].width and not columns.spread
-        if value in self.started:
-            self._finish(value, value, "none")
-        if columns.of != VALUE or not whole:
+        if not self._is_whole(columns):
             raise LookupError
-        return self.sources[value]
+        if columns.index in self.started:
+            self._finish(columns.index, columns.index, "none")
+        return self.sources[columns.index]
+
+    def _is_whole(self, columns: Columns) -> bool:
+        return columns.of == VALUE and not columns.spread and columns.width == self.steps[columns.index].width
 
     def _layer(self, columns: Columns) -> int:
         """The number of the layer whose output columns are a part of."""
-        if columns.of != VALUE:
-            raise LookupError
         found = self._source(Columns(VALUE, columns.index, 0, self.steps[columns.index].width))
         if isinstance(found, str):
             raise LookupError

@@ -143,6 +143,7 @@ void Unchanged::add(const py::object& tensor, bool layout) {
 
 void Unchanged::kind(const py::dict& dictionary, const std::string& name) {
   const py::object key = interned(name);
+  if (!value_of(dictionary.ptr(), true, key.ptr())) throw py::key_error(name);
   kinds_.push_back({dictionary, key, Seen(value_of(dictionary.ptr(), true, key.ptr()).ptr(), false, true)});
 }
 

@@ -252,20 +252,20 @@ FAULTS = (
     _step(
         "after a hook on a parameter whose gradient is there it is replayed without that",
         "nerf/step.py",
-        "hooks = parameter._backward_hooks, parameter._post_accumulate_grad_hooks",
-        "hooks = (parameter._backward_hooks,)",
+        '_HOOKS = ("_backward_hooks", "_post_accumulate_grad_hooks")',
+        '_HOOKS = ("_backward_hooks",)',
     ),
     _step(
         "where gradients are off it is replayed and learns",
         "nerf/step.py",
-        "self._cpu().isa, torch.is_grad_enabled(), len(optimizer.state)]",
-        "self._cpu().isa, len(optimizer.state)]",
+        "            torch.is_grad_enabled,",
+        "            compiled.isa,",
     ),
     _step(
         "betas that are changed in place are not seen",
         "nerf/step.py",
-        'values += [len(group["params"]), tuple(group["betas"])]',
-        'values += [len(group["params"])]',
+        'for each in (group["params"], group["betas"]):',
+        'for each in (group["params"],):',
     ),
     _step(
         "a parameter of a second optimiser keeps no step from being replayed",

@@ -10,7 +10,7 @@ from test_grouped_mlp import TABLES
 from voronerf.ops import grouped_program
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
-from voronerf.ops._core.program import Builder
+from voronerf.ops._core.program import PARAMETER, Builder, Columns
 
 pytest.importorskip("warp")
 from voronerf.kernels.grouped_program import chain_of  # which imports Warp
@@ -72,6 +72,10 @@ def test_chains_are_those_of_the_reference(name, shared, ray, ordered):
         lambda b, x, m, n: b.linear(b.linear(x, m, 4).part(1, 2), n, 2),
         lambda b, x, m, n: b.linear(b.linear(x, m, 4), n, 2, add=b.linear(b.linear(x, m, 4), n, 2)),
         lambda b, x, m, n: b.linear(b.linear(b.linear(x, m, 4), m, 3, transposed=True), m, 4),
+        lambda b, x, m, n: b.linear(b.linear(x, m, 4), b.parameter(2, 5), 2),
+        lambda b, x, m, n: b.binary("mul", b.linear(x, m, 4), Columns(PARAMETER, b.parameter(4), 0, 4)),
+        lambda b, x, m, n: b.encode("frequency", b.linear(x, m, 4), 1),
+        lambda b, x, m, n: b.linear(b.encode("frequency", b.encode("frequency", x, 1), 1), b.parameter(2, 27), 2),
         lambda b, x, m, n: b.binary("mul", b.linear(x, m, 4).part(0, 3), x),
         lambda b, x, m, n: b.linear(b.encode("frequency", x, 1), b.parameter(4, 9), 4, add=b.linear(x, m, 4)),
     ],
@@ -87,6 +91,17 @@ def test_what_is_no_chain_runs_all_the_same(change):
         for backend in ("warp", "reference")
     ]
     torch.testing.assert_close(*both)
+
+
+def test_an_activation_of_a_part_of_a_layer():
+    """It is a step behind the layers, of the part alone."""
+    b = Builder()
+    raw = b.linear(b.input(3), b.parameter(4, 3), 4)
+    program = b.program([b.apply("sigmoid", raw.part(2, 2))])
+    assert chain_of(program.text).layers.layers[0].activation == "none"
+    x, weight = torch.rand(6, 3) - 0.5, torch.randn(1, 4, 3)
+    (out,) = grouped_program([x], [weight], offsets_of([6]), program=program, backend="warp")
+    torch.testing.assert_close(out, (x @ weight[0].T)[:, 2:].sigmoid())
 
 
 def test_an_output_that_a_layer_reads_is_kept_before_its_activation():

@@ -5,7 +5,9 @@ n samples, r rays, k cells, w columns.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -20,7 +22,7 @@ from voronerf.ops._core.unchanged import Never, unchanged
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.routed_program import routed_program
 from voronerf.router.double import Double
-from voronerf.router.grouping import owned_parameters, parts_of
+from voronerf.router.grouping import parts_of
 from voronerf.router.layout import AS_TENSOR, as_plain, tensors_of
 from voronerf.router.lower import Lowering, NotAStep
 from voronerf.router.transforms import outside
@@ -39,6 +41,7 @@ class CellProgram(NamedTuple):
         reads: Of each input of the program, the number of the argument of the call whose rows it is.
         shapes: Of each tensor that the call returns, for one sample.
         parameters: [k, ...], or without k where all cells share it: the module's own, or made of them.
+        activate: Turns the outputs into what the call returns; None where they are that.
 
     Examples:
         >>> import torch
@@ -53,6 +56,7 @@ class CellProgram(NamedTuple):
     reads: tuple[int, ...]
     shapes: tuple[tuple[int, ...], ...]
     parameters: list[Tensor]
+    activate: Callable[..., Any] | None = None
 
 
 def layered_program(
@@ -65,9 +69,6 @@ def layered_program(
         linears: The linear layers in its order.
         activate: Turns its outputs [n, out] into what ``forward`` returns, sample by sample.
         features: The table of its hash grid, or None.
-
-    Raises:
-        NotAStep: An ``activate`` that does more than steps of a program.
 
     Examples:
         >>> import torch
@@ -88,19 +89,9 @@ def layered_program(
     """
     weights, biases = [layer.weight for layer in linears], [layer.bias for layer in linears]
     parameters = [*weights, *(bias for bias in biases if bias is not None), *([] if features is None else [features])]
-    steps, shapes = _steps_of(activate, layers.out_features)
-    program = _with_steps(layers.text, tuple(bias is not None for bias in biases), steps.text)
-    return CellProgram(program, (0, 1) if layers.uses_directions else (0,), shapes, parameters)
-
-
-@functools.lru_cache(maxsize=64)
-def _with_steps(text: str, biased: tuple[bool, ...], steps: str) -> Program:
-    """The program of a layer table and the steps behind it, both by their texts."""
-    layers = MLP.parse(text)
-    table = layers.program(6 if layers.integrated else 3, 3 if layers.uses_directions else 0, None, biased)
-    b = Builder()
-    inputs = {number: b.input(width) for number, width in enumerate(table.inputs)}
-    return b.program(b.replay(Program.parse(steps), {0: b.replay(table, inputs)[0]}))
+    biased, reads = tuple(bias is not None for bias in biases), (0, 1) if layers.uses_directions else (0,)
+    program = layers.program(6 if layers.integrated else 3, 3 if layers.uses_directions else 0, None, biased)
+    return CellProgram(program, reads, ((layers.out_features,),), parameters, activate)
 
 
 def _steps_of(function: Callable[..., Any], width: int) -> tuple[Program, tuple[tuple[int, ...], ...]]:
@@ -112,6 +103,8 @@ def _steps_of(function: Callable[..., Any], width: int) -> tuple[Program, tuple[
     result, _, entries_of = lowering.run(function, (x,), {}, lambda tensor: entries if tensor is x else None)
     made = [lowering.order(entries_of(tensor).codes)[1] for tensor in tensors_of(result)]
     program = lowering.builder.program([lowering.operand(numbers) for numbers in made])
+    if program.parameters:
+        raise NotAStep("a function with constants of its own")
     offsets = torch.tensor([0, rows], dtype=torch.int32)
     again = grouped_program([x], [], offsets, program=program, backend="reference")
     if not all(agree(a.reshape(b.shape), b) for a, b in zip(again, tensors_of(result), strict=True)):
@@ -127,63 +120,78 @@ class Given:
     layers compute.
     """
 
-    name = "fused"
-
     def __init__(self) -> None:
+        self._known: CellProgram | str = "its program is not known before its first call"
+        self._field: nn.Module | None = None  # of which that was found
+        self._by_ray: Program | None = None  # with a direction for each ray
         self._unchanged: Any = Never()
-        self._watch: Watch | None = None
-        self._known: CellProgram | str = ""
-        self._plain = False  # without hooks and parametrisations, and of a class whose program is that of its forward
-        self._places: list[tuple[dict[str, Any], str]] = []  # where its parameters are
+        self._asked: Any = None  # field, activation and columns, of which these are
+        self._steps: tuple[Program, tuple[tuple[int, ...], ...]] | None = None  # with the shapes of their results
+        self._watch: Watch | None = None  # of what the activation reads
+        self._steps_unchanged: Any = Never()
 
     def __reduce__(self) -> tuple[type[Given], tuple[()]]:
         return Given, ()
 
     @staticmethod
     def of(field: nn.Module) -> Given | None:
-        """That of a field that has the method."""
-        return Given() if callable(getattr(type(field), "program", None)) else None
+        """That of a field that has the method, without arguments."""
+        method = getattr(type(field), "program", None)
+        needed = [None] * 2 if not callable(method) else list(inspect.signature(method).parameters)
+        return Given() if len(needed) == 1 else None
 
     def look(self, field: nn.Module) -> CellProgram | str:
-        """The program of a field, with its parameters; or why that is not known."""
-        if not torch.compiler.is_compiling() and not self._unchanged.holds():  # while it compiles, what was found holds
-            kind, parts = cast(Any, type(field)), parts_of(field).values()
-            plain = _describes(kind) and "forward" not in vars(field) and all(map(_is_plain, parts))
-            if self._watch is None or plain != self._plain or self._watch.changed():
-                self._look_anew(field, plain)
-            self._unchanged = unchanged()
-            self._unchanged.entries(vars(field), ["forward"])
-            for part in parts:
-                for hooks in (vars(part)[key] for key in _HOOKS):
-                    self._unchanged.contents(hooks)
-            cast(Watch, self._watch).note(self._unchanged)
-        if isinstance(self._known, str):
+        """What the layers of a field put out, and its activation; or why that is not known."""
+        if torch.compiler.is_compiling():  # then what was found holds
             return self._known
-        return self._known._replace(parameters=[registry[name] for registry, name in self._places])
+        if field is not self._field or not self._unchanged.holds():
+            self._field = field
+            name, kind, parts = type(field).__name__, cast(Any, type(field)), [*parts_of(field).values()]
+            self._known = f"{name} does more than its program says"
+            if _describes(kind) and "forward" not in vars(field) and all(map(_is_plain, parts)):
+                self._known = _checked(name, cast(Any, field).program())
+            if isinstance(self._known, CellProgram):
+                self._by_ray = _by_ray(self._known.program.text, self._known.reads)
+            self._unchanged = guard = unchanged()
+            guard.attributes(kind, ["forward", "program"])
+            for part in parts:
+                guard.contents(vars(part))
+                for value in vars(part).values():
+                    if isinstance(value, (dict, list, set)):  # parameters, parts and hooks among them
+                        guard.contents(value)
+        return self._known
 
-    def _look_anew(self, field: nn.Module, plain: bool) -> None:
-        name, reads = type(field).__name__, set[tuple[int, str]]()
-        found: CellProgram | str = f"{name} does more than its program says"
-        if plain:
-            try:
-                with outside():
-                    found = cast(Any, Double(field, reads).module).program()
-            except NotAStep:
-                found = f"activate of {name} computes more than steps of a program"
-        if isinstance(found, CellProgram):
-            places = {id(p): (part._parameters, key) for part, key, p in owned_parameters(field)}
-            if any(id(p) not in places for p in found.parameters):
-                raise ValueError(f"{_OP}: program of {name} must give parameters of the field as they are")
-            self._places = [places[id(p)] for p in found.parameters]
-        self._known, self._plain, self._watch = found, plain, Watch.of(field, reads, Inputs())
+    def whole(self, field: nn.Module) -> CellProgram | str:
+        """The same with the steps of its activation; or why that is no program."""
+        known = self.look(field)
+        if isinstance(known, str) or known.activate is None:
+            return known
+        asked = field, known.activate, known.shapes
+        if asked != self._asked or (not self._steps_unchanged.holds() and cast(Watch, self._watch).changed()):
+            self._asked, self._steps, reads = asked, None, set[tuple[int, str]]()
+            with contextlib.suppress(Exception), outside():  # of any code: PyTorch computes it
+                double = cast(Any, Double(field, reads).module).program()
+                reads.clear()
+                found, parts = _steps_of(double.activate, known.shapes[0][0]), [*parts_of(field).values()]
+                if not any(name in parts[place]._parameters for place, name in reads):
+                    self._steps = found
+            self._watch, self._steps_unchanged = Watch.of(field, reads, Inputs()), Never()
+        if not self._steps_unchanged.holds():
+            self._steps_unchanged = unchanged()
+            cast(Watch, self._watch).note(self._steps_unchanged)
+        if self._steps is None:
+            return f"activate of {type(field).__name__} computes more than steps of a program"
+        steps, shapes = self._steps
+        return CellProgram(_with_steps(known.program.text, steps.text), known.reads, shapes, known.parameters)
 
     def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
         """The results of a call; coords [..., d] are those that it was given. None where the program is not known."""
         known = self.look(router.module)
-        if isinstance(known, str):
+        if isinstance(known, str) or len(args) > len(_NAMES) or kwargs.keys() - set(_NAMES):
             return None
-        positions, directions, ray_index = map(as_plain, _arguments(*args, **kwargs))
-        program, width = known.program, known.program.inputs[known.reads.index(0)]
+        given = {**dict.fromkeys(_NAMES), **dict(zip(_NAMES, args)), **kwargs}
+        positions, directions, ray_index = map(as_plain, given.values())
+        program, width = known.program, known.program.inputs[0]
         if not isinstance(positions, Tensor):
             raise TypeError(f"{_OP}: positions must be a tensor, got {type(positions).__name__}; {AS_TENSOR}")
         if positions.ndim != 2 or positions.shape[1] != width:
@@ -195,40 +203,55 @@ class Given:
         elif ray_index is None:
             check_shape(_OP, "directions", directions, ("n", 3), {"n": positions.shape[0]})
         else:
-            program = _by_ray(program.text, known.reads)
-        dtype = torch.promote_types(known.parameters[0].dtype, torch.float32)
-        rows = [(positions, directions)[number].to(dtype) for number in known.reads]
-        parameters = [p.to(dtype) for p in known.parameters]
+            program = cast(Program, self._by_ray)
+        kind, own, k = positions.device.type, known.parameters[0].dtype, router.num_cells
+        wide = torch.promote_types(own, torch.float32)
+        rows = [(positions, directions)[number].to(wide) for number in known.reads]
+        parameters = [p.to(wide) for p in known.parameters]
+        if all(p.dim() == len(shape) for p, shape in zip(parameters, program.parameters)):  # all cells share all
+            parameters[0] = parameters[0].expand(k, *parameters[0].shape)
         places = router.places(positions, router._positions(args, kwargs, coords))
-        outputs, _ = routed_program(program, rows, parameters, ray_index=ray_index, **places, backend=router.backend)
-        results = [out.reshape(-1, *shape).to(dtype) for out, shape in zip(outputs, known.shapes)]
+        half = own is not wide and not torch.is_autocast_enabled(kind)  # products as of these parameters
+        with torch.autocast(kind, own) if half else contextlib.nullcontext():
+            results, _ = routed_program(
+                program, rows, parameters, ray_index=ray_index, **places, backend=router.backend
+            )
+        if known.activate is not None:
+            return known.activate(*results)
+        results = [out.reshape(-1, *shape) for out, shape in zip(results, known.shapes)]
         return results[0] if len(results) == 1 else tuple(results)
 
 
-def _arguments(positions: Any, directions: Any = None, ray_index: Any = None) -> tuple[Any, Any, Any]:
-    """Those of a field's ``forward``."""
-    return positions, directions, ray_index
+_NAMES = ("positions", "directions", "ray_index")
+"""Arguments of a field's ``forward``."""
+
+
+def _checked(name: str, found: Any) -> CellProgram:
+    """What a method ``program`` has given; raises TypeError or ValueError for what cannot be run."""
+    if not isinstance(found, CellProgram):
+        raise TypeError(f"{_OP}: program of {name} must give a CellProgram, got {type(found).__name__}")
+    if found.reads not in ((0,), (0, 1)) or not found.parameters:
+        rule = "read positions, or these and directions, and have parameters"
+        raise ValueError(f"{_OP}: program of {name} must {rule}, got reads {found.reads}")
+    return found
 
 
 def each_direction(args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
     """The arguments for a field's own ``forward``, with a direction for each sample in the place of one for each ray;
     None where they are as they should be."""
-    names = ("positions", "directions", "ray_index")
-    positions, directions, index = ((dict(zip(names, args)) | kwargs).get(name) for name in names)
+    positions, directions, index = ((dict(zip(_NAMES, args)) | kwargs).get(name) for name in _NAMES)
     if directions is None or index is None:
         return None
-    others = {name: value for name, value in kwargs.items() if name not in names}
+    others = {name: value for name, value in kwargs.items() if name not in _NAMES}
     return (positions, directions.index_select(0, index), None, *args[3:]), others
 
 
-@functools.cache
 def _describes(kind: type[nn.Module]) -> bool:
     """Whether the program of a class is that of its ``forward``: none has been written since for one alone."""
-    first = {name: next((i for i, base in enumerate(kind.__mro__) if name in vars(base)), 0) for name in _BOTH}
-    return first["forward"] >= first["program"]
-
-
-_BOTH = ("forward", "program")
+    first = [
+        next((i for i, base in enumerate(kind.__mro__) if name in vars(base)), 0) for name in ("forward", "program")
+    ]
+    return first[0] >= first[1]
 
 
 def _is_plain(part: nn.Module) -> bool:
@@ -241,3 +264,11 @@ def _by_ray(text: str, reads: tuple[int, ...]) -> Program:
     program, b = Program.parse(text), Builder()
     inputs = {i: b.input(width, ray=reads[i] == 1) for i, width in enumerate(program.inputs)}
     return b.program(b.replay(program, inputs))
+
+
+@functools.lru_cache(maxsize=64)
+def _with_steps(text: str, steps: str) -> Program:
+    """A program of one output and the steps behind it, both by their texts."""
+    program, b = Program.parse(text), Builder()
+    inputs = {number: b.input(width) for number, width in enumerate(program.inputs)}
+    return b.program(b.replay(Program.parse(steps), {0: b.replay(program, inputs)[0]}))

@@ -181,6 +181,8 @@ class VoronoiRouter(nn.Module):
         self._resized = False  # parameters have other sizes than where they were wrapped, perhaps
         self.register_buffer("frozen_cells", None, persistent=False)
         self._given = given
+        if given is not None:
+            given.look(self.module)  # before a compiler
 
     @classmethod
     def from_modules(
@@ -602,7 +604,7 @@ class VoronoiRouter(nn.Module):
         if callable(self.coords) or isinstance(self.coords, slice):
             return "other positions than those of the samples decide the cells"
         k, dispatch = self.num_cells, self._dispatch
-        program = "" if self._given is None else self._given.look(self.module)
+        program = "" if self._given is None else self._given.whole(self.module)
         if isinstance(program, str) and (self.fuse or self._given is None):
             arguments = args if self._given is None else (*args, None)
             positions, device, grouping = args[0][:, : self._d], args[0].device, None

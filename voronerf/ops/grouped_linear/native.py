@@ -27,7 +27,8 @@ def grouped_linear(
     stored = dtype if dtype == torch.bfloat16 else torch.float32
     rounded = [p.to(dtype).float() for p in (weight, bias) if p is not None]
     rows = Rows([x.to(dtype).to(stored)], rounded, offsets, None, None)
-    shape = int(weight.shape[2]), 0, (int(weight.shape[1]),), (bias is not None,), False
+    o, i = len(range(weight.shape[1])), len(range(weight.shape[2]))  # no symbols
+    shape = i, 0, (o,), (bias is not None,), False
     how = How(program_text(_TABLES[activation], *shape), "grouped_linear", _PRODUCTS.get(dtype, "float32"))
     (out,) = run_program(rows, how)
     return out.to(dtype)

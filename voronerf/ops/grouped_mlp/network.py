@@ -97,7 +97,7 @@ def as_network(given: Given, caller: str) -> Network:
     stored = dtype is torch.bfloat16 and features is None  # hash grids read float32
     stored = stored and all(x.dtype is torch.bfloat16 for x in rows)
     inputs = rows if stored else [x if x.dtype is torch.float32 else x.float() for x in rows]
-    q = int(directions.shape[1]) if len(rows) > 1 and directions is not None else 0
-    widths, biased = [int(weight.shape[1]) for weight in weights], [bias is not None for bias in biases]
-    text = program_text(layers.text, int(positions.shape[1]), q, tuple(widths), tuple(biased), index is not None)
+    p, q, *widths = [len(range(x.shape[1])) for x in (rows[0], rows[-1], *weights)]  # no symbols
+    biased = tuple([bias is not None for bias in biases])
+    text = program_text(layers.text, p, q if len(rows) > 1 else 0, tuple(widths), biased, index is not None)
     return Network(inputs, parameters, index, How(text, caller, half_products(dtype)), dtype, [*rows, *taken])

@@ -65,7 +65,7 @@ def with_cells(program: Program, parameters: Sequence[Tensor]) -> Sequence[Tenso
 
 def cells_of(parameters: Sequence[Tensor]) -> int:
     """k, of parameters [k, ...] and those [1, ...] that all cells share."""
-    return max([parameter.shape[0] for parameter in parameters], default=1)
+    return next((p.shape[0] for p in parameters if p.shape[0] != 1), 1)
 
 
 def find_cells(op: str, where: Where, k: int, backend: str) -> Tensor | None:

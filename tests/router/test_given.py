@@ -1,0 +1,198 @@
+"""Fields that say their program: what changes is followed, and what is no program still gives what a loop gives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from voronerf import MLP, Layer, NeRF, VoronoiRouter
+from voronerf.router import CellProgram, layered_program
+
+K, N = 5, 60
+TABLE = MLP((Layer(("positions",), 6, "relu"), Layer((0,), 4)), outputs=(1,))
+
+
+class Said(nn.Module):
+    """Two layers, and any activation."""
+
+    def __init__(self, act: Any = torch.sigmoid) -> None:
+        super().__init__()
+        self.first, self.second, self.act = nn.Linear(3, 6), nn.Linear(6, 4), act
+
+    def program(self) -> CellProgram:
+        return layered_program(TABLE, [self.first, self.second], self.activate)
+
+    def activate(self, raw: Tensor) -> Any:
+        return self.act(raw)
+
+    def forward(self, positions: Tensor) -> Any:
+        return self.act(self.second(self.first(positions).relu()))
+
+
+def make(field: nn.Module | None = None, **options: Any) -> VoronoiRouter:
+    router = VoronoiRouter(Said() if field is None else field, torch.rand(K, 3), **options)
+    with torch.no_grad():
+        for p in router.module.parameters():
+            p += 0.1 * torch.randn(p.shape)
+    return router
+
+
+def loop(router: VoronoiRouter, *args: Tensor) -> tuple[Tensor, ...]:
+    """The cells' modules, each on its samples."""
+    cells = router.assign(args[0])
+    parts = [router.cell(cell)(*(x[cells == cell] for x in args)) for cell in range(K)]
+    parts = [part if isinstance(part, tuple) else (part,) for part in parts]
+    found = [torch.zeros(N, *each.shape[1:], dtype=each.dtype) for each in parts[0]]
+    for cell, part in enumerate(parts):
+        for out, own in zip(found, part, strict=True):
+            out[cells == cell] = own
+    return tuple(found)
+
+
+def agree(router: VoronoiRouter, *args: Tensor, **allowed: float) -> None:
+    assert router.explain() == "forward: fused"
+    found = router(*args)
+    found = found if isinstance(found, tuple) else (found,)
+    for a, b in zip(found, loop(router, *args), strict=True):
+        assert a.dtype == b.dtype
+        torch.testing.assert_close(a, b, **{"rtol": 1e-4, "atol": 1e-5, **allowed})
+
+
+def other_weight(router: VoronoiRouter) -> None:
+    router.module.second.weight = nn.Parameter(torch.randn(K, 4, 6))
+
+
+def other_layer(router: VoronoiRouter) -> None:
+    router.module.second = make().module.second
+
+
+def other_module(router: VoronoiRouter) -> None:
+    router.module = make().module
+
+
+def other_activation(router: VoronoiRouter) -> None:
+    router.module.act = router.module.activate = torch.tanh
+
+
+CHANGES = {each.__name__: each for each in (other_weight, other_layer, other_module, other_activation)}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_changes_is_followed(name: str) -> None:
+    router, x = make(), torch.rand(N, 3)
+    agree(router, x)
+    CHANGES[name](router)
+    agree(router, x)
+    router(x).sum().backward()
+    assert all(p.grad is not None for p in router.module.parameters())
+
+
+def test_a_layer_that_is_no_longer_tied_and_one_with_a_new_bias() -> None:
+    class Tied(Said):
+        def __init__(self) -> None:
+            super().__init__()
+            self.first, self.second = nn.Linear(3, 3, bias=False), nn.Linear(3, 3, bias=False)
+            self.second.weight = self.first.weight
+
+        def program(self) -> CellProgram:
+            table = MLP((Layer(("positions",), 3, "relu"), Layer((0,), 3)), outputs=(1,))
+            return layered_program(table, [self.first, self.second], self.activate)
+
+    router, x = make(Tied()), torch.rand(N, 3)
+    agree(router, x)
+    router.module.second.weight = nn.Parameter(torch.randn(K, 3, 3))
+    agree(router, x)
+    router.module.first.bias = nn.Parameter(torch.randn(K, 3))
+    agree(router, x)
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda raw: raw * torch.tensor([1.0, 2, 3, 4]),
+        lambda raw: torch.nn.functional.normalize(raw, dim=1),
+        lambda raw: raw.sort(dim=1).values,
+        lambda raw: raw @ torch.ones(4, 2),
+    ],
+    ids=["constants", "norms", "sorts", "products"],
+)
+def test_any_activation_stays_behind_the_fused_layers(act: Any) -> None:
+    agree(make(Said(act)), torch.rand(N, 3))
+
+
+def test_results_keep_their_structure() -> None:
+    router = make(Said(lambda raw: {"colour": raw[:, :3], "density": [raw[:, 3]]}))
+    found = router(torch.rand(N, 3))
+    assert found.keys() == {"colour", "density"} and isinstance(found["density"], list)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64])
+def test_parameters_of_other_dtypes(dtype: torch.dtype) -> None:
+    router = make().to(dtype)
+    wide = {} if dtype is torch.float64 else {"rtol": 0.02, "atol": 0.02}
+    agree(router, torch.rand(N, 3, dtype=dtype), **wide)
+
+
+def test_a_parameter_of_the_activation_learns() -> None:
+    class Scaled(Said):
+        def __init__(self) -> None:
+            super().__init__(None)
+            self.scale = nn.Parameter(torch.tensor(2.0))
+
+        def activate(self, raw: Tensor) -> Tensor:
+            return raw.sigmoid() * self.scale
+
+    router, x = make(Scaled(), share=["scale"]), torch.rand(N, 3)
+    before = router(x)
+    before.sum().backward()
+    assert float(router.module.scale.grad) != 0
+    with torch.no_grad():
+        router.module.scale.mul_(2)
+    torch.testing.assert_close(router(x), 2 * before)
+
+
+def test_all_parameters_may_be_shared() -> None:
+    router = make(share=["*"])
+    agree(router, torch.rand(N, 3))
+
+
+def test_weight_norm_afterwards_is_refused() -> None:
+    router = make()
+    router(torch.rand(N, 3))
+    torch.nn.utils.parametrizations.weight_norm(router.module.second)
+    with pytest.raises(TypeError, match="module must keep the parameters that it was wrapped with"):
+        router(torch.rand(N, 3))
+
+
+@pytest.mark.native
+def test_is_part_of_a_graph_before_any_call_and_with_directions_of_rays() -> None:
+    torch.compiler.reset()
+    router, x = VoronoiRouter(NeRF(width=16, depth=2), torch.rand(K, 3)), torch.rand(N, 3)
+    rays, index = nn.functional.normalize(torch.rand(4, 3), dim=1), (torch.arange(N) % 4).int()
+    compiled = torch.compile(router, fullgraph=True, backend="eager")
+    for a, b in zip(compiled(x, rays, index), router(x, rays[index]), strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_refuses_what_is_no_program() -> None:
+    class Nothing(Said):
+        def program(self) -> Any:
+            return None
+
+    class Turned(Said):
+        def program(self) -> CellProgram:
+            return super().program()._replace(reads=(1, 0))
+
+    class Unrelated(Said):
+        def program(self, name: str) -> Any:
+            raise AssertionError
+
+    with pytest.raises(TypeError, match="program of Nothing must give a CellProgram, got NoneType"):
+        make(Nothing())
+    with pytest.raises(ValueError, match=r"program of Turned must read positions, .* got reads \(1, 0\)"):
+        make(Turned())
+    router = make(Unrelated(), coords="first3")
+    assert router(torch.rand(N, 3)).shape == (N, 4)
