@@ -41,7 +41,7 @@ PICTURE_RESOLUTION, PICTURE_POINTS = 128, 2
 ROBUST = 0.05
 #: Factor of the loss on smooth depths of photographs from where no camera was.
 SMOOTH_DEPTH = 0.1
-#: Rays along the longer side of a picture that find what its camera looks through before its rays begin.
+#: At most so many rays along the longer side of a picture, one a pixel, find what its camera looks through.
 LOOKS = 64
 #: The least that a sample takes in a step: 100 bytes (kilonerf) to 230 (hashgrid) were measured.
 SAMPLE_BYTES = 64
@@ -229,7 +229,8 @@ def space_before(scene: Scene, grid: OccupancyGrid, contraction: Contraction) ->
     empty = torch.zeros(grid.occupied.numel(), dtype=torch.bool, device=device)
     for image in range(len(cameras)):
         width, height = cameras.size(image)
-        across, down = (torch.arange(0, side, max(width, height) / LOOKS, device=device) for side in (width, height))
+        apart = max(width, height, LOOKS) / LOOKS
+        across, down = (torch.arange(0, side, apart, device=device) for side in (width, height))
         y, x = torch.meshgrid(down, across, indexing="ij")
         rays = cameras.rays(image, x.reshape(-1), y.reshape(-1))
         points = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]
