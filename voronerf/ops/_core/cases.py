@@ -110,7 +110,7 @@ class Case:
         alternatives: name -> the same result by other means, from the same arguments, for the benchmark.
         differentiable: whether the op has gradients.
         in_place: whether it writes into its arguments.
-        compiles: whether its reference compiles as one graph.
+        compiles: whether it compiles as one graph where it is made of torch's operations.
         comparable: whether all backends give the same tensors.
         call: the public function, if it has another name than the op.
         traced: whether torch can trace it, on every backend.
