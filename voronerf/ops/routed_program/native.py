@@ -22,7 +22,7 @@ from voronerf.ops._core.rows import new_empty, rows_of
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.cell_sort.native import sort
 from voronerf.ops.grouped_mlp.network import Network, half_products
-from voronerf.ops.grouped_program.native import How
+from voronerf.ops.grouped_program.native import How, Rows, run_program
 from voronerf.ops.locate_cell.native import find as find_leaves
 from voronerf.ops.nearest_centre import nearest_centre
 from voronerf.ops.nearest_centre.native import find as find_nearest
@@ -78,12 +78,17 @@ def run_known(
 ) -> list[Tensor]:
     """The outputs for float32 inputs and parameters [k, ...] or [1, ...] that a router has checked before."""
     first, centres = inputs[0], places.get("centres")
-    if centres is not None:
-        if centres.device != first.device:
+    if centres is not None and len(places) == 2 and centres.is_cpu and not _is_seen(first):  # without a tree
+        cells, order, offsets = _in_two_calls(places["coords"], centres, k)
+    else:
+        if centres is not None and centres.device != first.device:
             check_same_device("VoronoiRouter", samples=first, centres=centres)
-        places["coords"], places["centres"] = of_one_dtype(places["coords"], centres)
-    network = Network(inputs, parameters, None, how, torch.float32, [])
-    outputs, cells = run_routed(network, of_cells(Where(**places), k))
+        where = Where(**places)
+        if where.coords is not None and centres is not None:
+            coords, centres = of_one_dtype(where.coords, centres)
+            where = where._replace(coords=coords, centres=centres)
+        cells, order, offsets = find(first, of_cells(where, k), k, how.caller)
+    outputs = run_program(Rows(inputs, parameters, offsets, order, None), how)
     if frozen is not None:
         rows = of_samples(frozen, cells)
         outputs = [hold(out, rows) for out in outputs]
