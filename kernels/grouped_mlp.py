@@ -367,7 +367,7 @@ _ENCODINGS: dict[str, Callable[[Tensor, int], Tensor]] = {
     "frequency": lambda x, octaves: frequency_encode(x, octaves, True),
     "spherical": spherical_harmonics,
 }
-"""Those of `ENCODINGS` that have kernels."""
+"""The kernels of some `ENCODINGS`, by their names."""
 
 
 def _encoded(x: Tensor, encoding: tuple[str, int] | None) -> Tensor:

@@ -198,7 +198,7 @@ class _Reader:
         self.layers.append(Layer(layer.inputs, self.program.parameters[layer.weight][0], activation))
 
     def _source(self, columns: Columns) -> int | str:
-        """What columns are to a layer: a whole value."""
+        """The source of a layer that a whole value is."""
         if not self._is_whole(columns):
             raise LookupError
         if columns.index in self.started:

@@ -20,7 +20,7 @@ from voronerf.ops.nearest_centre import nearest_centre
 
 
 class Where(NamedTuple):
-    """What tells the cells, as ``voronerf.ops.routed_program`` takes it."""
+    """The arguments that tell the cells, as ``voronerf.ops.routed_program`` takes them."""
 
     centres: Tensor | None = None
     child_offsets: Tensor | None = None
