@@ -26,11 +26,10 @@ from voronerf.router.grouping import parts_of
 from voronerf.router.layout import AS_TENSOR, as_plain, tensors_of
 from voronerf.router.lower import Lowering, NotAStep
 from voronerf.router.transforms import outside
-from voronerf.router.watch import Inputs, Watch
+from voronerf.router.watch import HOOKS, Inputs, Watch
 
 _OP = "VoronoiRouter"
 _ROWS = (37, 31)  # samples of a trace; one of them divides no width
-_HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 
 
 class CellProgram(NamedTuple):
@@ -255,7 +254,7 @@ def _describes(kind: type[nn.Module]) -> bool:
 
 
 def _is_plain(part: nn.Module) -> bool:
-    return "parametrizations" not in part._modules and not any(vars(part)[key] for key in _HOOKS)
+    return "parametrizations" not in part._modules and not any(vars(part)[key] for key in HOOKS)
 
 
 @functools.lru_cache(maxsize=64)

@@ -24,7 +24,7 @@ NUMBERS = (torch.float64, torch.float32, torch.int64)
 """Dtypes of inputs: a number rounds nothing, decides no dtype beside integers, and may be an index."""
 
 _OWN = frozenset(vars(nn.Module())) - {"training"}
-_HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 _MISSING: Any = object()
 
 
@@ -73,7 +73,7 @@ class Watch:
             part, source = parts[place], (place, name)
             if source in inputs.sources or name in part._parameters:
                 continue
-            if name in _HOOKS:
+            if name in HOOKS:
                 watch._hooks.append(vars(part)[name])
                 watch._counts.append(len(vars(part)[name]))
             elif name == "_modules":
