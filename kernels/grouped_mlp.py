@@ -43,7 +43,7 @@ from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import ACTIVATIONS, DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops.grouped_linear.activation import activate
 from voronerf.ops.grouped_linear.reference import check_offsets
-from voronerf.ops.grouped_mlp.reference import cells_of, check_direction_index
+from voronerf.ops.grouped_program.reference import cells_of
 
 ROWS, WIDTH, THREADS = 64, 16, 128
 """Wider columns would be emptier: heads have 1 to 4 outputs. Each thread has 4 x 2 sums of a tile and a column; with
@@ -284,56 +284,67 @@ def _products(plan: str, device: torch.device) -> Any:
     return filled(Products(), first=first, source=source, activation=activation)
 
 
-def grouped_mlp(
-    positions: Tensor,
+def layers_of_cells(
+    inputs: Sequence[Tensor],
     offsets: Tensor,
     weights: Sequence[Tensor],
     biases: Sequence[Tensor | None],
-    *,
     layers: MLP,
-    directions: Tensor | None = None,
-    direction_index: Tensor | None = None,
-    features: Tensor | None = None,
+    ray_index: Tensor | None,
+    features: Tensor | None,
+    dtype: torch.dtype,
 ) -> Tensor:
-    """Every sample through the network of its cell; see ``voronerf.ops.grouped_mlp``."""
-    device = positions.device.type
-    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else weights[0].dtype
-    if device == "cpu" and not torch.compiler.is_compiling():
-        check_offsets("grouped_mlp", offsets, positions.shape[0])
-    check_direction_index("grouped_mlp", directions, direction_index)
-    with torch.autocast(device, enabled=False):
-        cell = cells_of(offsets, positions)
-        if features is not None and layers.grid is not None:
-            where = hash_encode(positions, features, layers.grid, cell if features.dim() == 3 else None)
-        else:
-            where = _encoded(positions, layers.encoding(POSITIONS))
-        read = {POSITIONS: where, DIRECTIONS: positions[:, :0]}
-        if directions is not None and layers.uses_directions:
-            seen = _encoded(directions, layers.encoding(DIRECTIONS))
-            read[DIRECTIONS] = seen if direction_index is None else seen.index_select(0, direction_index)
-        widths = {name: len(range(part.shape[1])) for name, part in (*read.items(), *enumerate(weights))}  # no symbols
-        tiles, place, inside = _tiles(offsets, cell)
-        x = torch.cat([_padded(part.to(dtype).float()) for part in read.values()], dim=1)
-        x = x.new_zeros(len(tiles) * ROWS, x.shape[1]).index_copy(0, place, x)
-        blocks, rows = [], []
-        for layer, weight, bias in zip(layers.layers, weights, biases):
-            blocks.append(_blocks(weight.to(dtype), [widths[name] for name in layer.inputs]))
-            bias = weight.new_zeros(weight.shape[:2]) if bias is None else bias
-            rows.append(_padded(bias.to(dtype).float()).unflatten(1, (-1, WIDTH)))
-        plan = _plan(layers.text, tuple(widths.values()))
-        sums = _run(x, torch.cat(blocks, dim=1), torch.cat(rows, dim=1), tiles, plan).index_select(0, place)
-        found = []
-        for output in layers.outputs:
-            found.append(activate(layers.layers[output].activation, sums[:, : widths[output]]))
-            sums = sums[:, widths[output] + -widths[output] % WIDTH :]
-        return torch.where(inside[:, None], torch.cat(found, dim=1), 0).to(dtype)
+    """The outputs, float32 [n, layers.out_features], of a layer table on rows that are sorted by cell.
+
+    Args:
+        inputs: positions [n, p] and, if a layer reads them, directions, [n, q] or [r, q] by the ``ray_index``.
+        offsets: int32 [k + 1].
+        weights: [k, o, i] for each layer.
+        biases: [k, o] or None for each layer.
+        layers: the table; its widths are those of the weights.
+        ray_index: int32 [n], or None.
+        features: the table of the hash grid, [e, f] or [k, e, f], or None.
+        dtype: what operands of products are rounded to.
+    """
+    positions, cell = inputs[0], cells_of(offsets, inputs[0])
+    of_positions, of_directions = _encodings(layers.text)
+    if features is not None and layers.grid is not None:
+        where = hash_encode(positions, features, layers.grid, cell if features.dim() == 3 else None)
+    else:
+        where = _encoded(positions, of_positions)
+    read = {POSITIONS: where, DIRECTIONS: positions[:, :0]}
+    if len(inputs) > 1:
+        seen = _encoded(inputs[1], of_directions)
+        read[DIRECTIONS] = seen if ray_index is None else seen.index_select(0, ray_index)
+    widths = {name: len(range(part.shape[1])) for name, part in (*read.items(), *enumerate(weights))}  # no symbols
+    tiles, place, inside = _tiles(offsets, cell)
+    x = torch.cat([_padded(part.to(dtype).float()) for part in read.values()], dim=1)
+    x = x.new_zeros(len(tiles) * ROWS, x.shape[1]).index_copy(0, place, x)
+    blocks, rows = [], []
+    for layer, weight, bias in zip(layers.layers, weights, biases):
+        blocks.append(_blocks(weight.to(dtype), [widths[name] for name in layer.inputs]))
+        bias = weight.new_zeros(weight.shape[:2]) if bias is None else bias
+        rows.append(_padded(bias.to(dtype).float()).unflatten(1, (-1, WIDTH)))
+    plan = _plan(layers.text, tuple(widths.values()))
+    sums = _run(x, torch.cat(blocks, dim=1), torch.cat(rows, dim=1), tiles, plan).index_select(0, place)
+    found = []
+    for output in layers.outputs:
+        found.append(activate(layers.layers[output].activation, sums[:, : widths[output]]))
+        sums = sums[:, widths[output] + -widths[output] % WIDTH :]
+    return torch.where(inside[:, None], torch.cat(found, dim=1), 0)
 
 
 def grouped_linear(
     x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor | None = None, activation: str = "none"
 ) -> Tensor:
     """A network of one layer, whose width is that of the weights; see ``voronerf.ops.grouped_linear``."""
-    return grouped_mlp(x, offsets, [weight], [bias], layers=_LINEAR[activation])
+    kind, dtype = x.device.type, x.dtype
+    if torch.is_autocast_enabled(kind) and dtype != torch.float64:
+        dtype = torch.get_autocast_dtype(kind)
+    if kind == "cpu" and not torch.compiler.is_compiling():
+        check_offsets("grouped_linear", offsets, x.shape[0])
+    with torch.autocast(kind, enabled=False):
+        return layers_of_cells([x], offsets, [weight], [bias], _LINEAR[activation], None, None, dtype).to(dtype)
 
 
 def _tiles(offsets: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -361,6 +372,12 @@ def _blocks(weight: Tensor, widths: Sequence[int]) -> Tensor:
 
 def _padded(x: Tensor) -> Tensor:
     return F.pad(x, (0, -x.shape[-1] % WIDTH))
+
+
+@constant_result
+def _encodings(text: str) -> tuple[tuple[str, int] | None, ...]:
+    """The encodings of positions and directions of a table, by their names and sizes."""
+    return tuple(MLP.parse(text).encoding(source) for source in (POSITIONS, DIRECTIONS))
 
 
 _ENCODINGS: dict[str, Callable[[Tensor, int], Tensor]] = {

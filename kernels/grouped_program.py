@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from voronerf.kernels.grouped_mlp import grouped_mlp
+from voronerf.kernels.grouped_mlp import layers_of_cells
+from voronerf.ops._core.compiler import constant_result
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import (
     ACTIVATIONS,
@@ -26,8 +26,9 @@ from voronerf.ops._core.layers import (
     Layer,
 )
 from voronerf.ops._core.program import HASH, VALUE, Builder, Columns, Program, Step
+from voronerf.ops.grouped_program.given import Given
+from voronerf.ops.grouped_program.reference import check_rows, of_rows, parsed
 from voronerf.ops.grouped_program.reference import grouped_program as in_torch
-from voronerf.ops.grouped_program.reference import of_rows
 
 
 class Chain(NamedTuple):
@@ -35,6 +36,7 @@ class Chain(NamedTuple):
 
     Attributes:
         layers: the table, whose outputs are those of every layer that something else than a layer reads.
+        reads: the inputs that it reads, positions and then directions.
         weights: the number of each layer's weight among the parameters of the program.
         biases: of its bias, or None.
         features: of the table of the hash grid, or None.
@@ -42,55 +44,58 @@ class Chain(NamedTuple):
     """
 
     layers: MLP
+    reads: tuple[int, ...]
     weights: tuple[int, ...]
     biases: tuple[int | None, ...]
     features: int | None
     behind: str
 
 
-def grouped_program(
-    inputs: Sequence[Tensor],
-    parameters: Sequence[Tensor],
-    offsets: Tensor,
-    order: Tensor | None,
-    ray_index: Tensor | None,
-    text: str,
-) -> list[Tensor]:
+def grouped_program(given: Given, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
     """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
+    text, inputs, parameters, ray_index, dtype, _ = given
     chain, k = chain_of(text), offsets.shape[0] - 1
     if chain is None:
-        return in_torch(inputs, parameters, offsets, order, ray_index, text)
-    rows, rays = list(inputs), Program.parse(text).rays
-    features = None if chain.features is None else parameters[chain.features]
-    if features is not None and features.shape[0] == 1:  # which all cells share
-        features = features[0]
-    if order is not None:
-        rows = [x if i in rays else x.index_select(0, order) for i, x in enumerate(inputs)]
-        ray_index = None if ray_index is None else ray_index.index_select(0, order)
-    raw = grouped_mlp(
-        rows[0],
-        offsets,
-        [parameters[i].expand(k, -1, -1) for i in chain.weights],
-        [None if i is None else parameters[i].expand(k, -1) for i in chain.biases],
-        layers=chain.layers,
-        directions=rows[1] if chain.layers.uses_directions else None,
-        direction_index=ray_index if chain.layers.uses_directions else None,
-        features=features,
-    )
-    row = torch.arange(raw.shape[0], device=raw.device)
-    inside = ((row >= offsets[0]) & (row < offsets[-1]))[:, None]
-    results = [torch.where(inside, result, 0) for result in of_rows([raw.to(inputs[0].dtype)], chain.behind)]
-    if order is None:
-        return results
-    return [torch.zeros_like(result).index_copy(0, order.long(), result) for result in results]
+        return in_torch(given, offsets, order)
+    check_rows(given, offsets, order)
+    with torch.autocast(inputs[0].device.type, enabled=False):
+        if order is not None:
+            rays = parsed(text).rays
+            inputs = [x if i in rays else x.index_select(0, order) for i, x in enumerate(inputs)]
+            ray_index = None if ray_index is None else ray_index.index_select(0, order)
+        features = None if chain.features is None else parameters[chain.features]
+        if features is not None and features.shape[0] == 1:  # which all cells share
+            features = features[0]
+        raw = layers_of_cells(
+            [inputs[i] for i in chain.reads],
+            offsets,
+            [parameters[i].expand(k, -1, -1) for i in chain.weights],
+            [None if i is None else parameters[i].expand(k, -1) for i in chain.biases],
+            chain.layers,
+            ray_index,
+            features,
+            dtype,
+        )
+        row = torch.arange(raw.shape[0], device=raw.device)
+        inside = ((row >= offsets[0]) & (row < offsets[-1]))[:, None]
+        results = [torch.where(inside, result, 0).to(dtype) for result in of_rows([raw], chain.behind)]
+        if order is None:
+            return results
+        return [torch.zeros_like(result).index_copy(0, order.long(), result) for result in results]
+
+
+@constant_result  # torch.compile looks through a cache
+def chain_of(text: str) -> Chain | None:
+    """A program, given by its text, as a chain; None where it is none."""
+    return _chain_of(text)
 
 
 @functools.lru_cache(maxsize=256)
-def chain_of(text: str) -> Chain | None:
-    """A program, given by its text, as a chain; None where it is none."""
+def _chain_of(text: str) -> Chain | None:
     program = Program.parse(text)
     try:
-        return None if program.sums or program.by_ray else _Reader(program).chain()
+        of_rows_alone = not (program.sums or program.by_ray or 0 in program.rays)
+        return _Reader(program).chain() if of_rows_alone else None
     except LookupError:
         return None
 
@@ -140,8 +145,10 @@ class _Reader:
             values[step.out] = b.emit(step.op, step.width, [*map(taken, step.operands)], step.numbers, step.name)
         outputs = tuple(int(self.sources[value]) for value in places)
         features = [int(step.numbers[1]) for step in self.encodings.values() if step.name == HASH]
+        layers = MLP(tuple(self.layers), outputs, **self._encoded())
         return Chain(
-            MLP(tuple(self.layers), outputs, **self._encoded()),
+            layers,
+            (0, 1) if layers.uses_directions else (0,),
             tuple(layer.weight for layer in self.made),
             tuple(layer.bias for layer in self.made),
             features[0] if features else None,

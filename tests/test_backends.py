@@ -26,7 +26,8 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
 @pytest.mark.parametrize("op", backends.ops())
 def test_reference_is_there_for_every_op(op: str) -> None:
     function = resolve(op, backend="reference", device=CPU, dtype=torch.float64)
-    assert function.__name__ == op
+    shared = {"grouped_mlp": "grouped_program", "routed_mlp": "routed_program"}
+    assert function.__name__ == shared.get(op, op)
 
 
 def test_unknown_names_list_the_choices() -> None:
@@ -271,7 +272,7 @@ def test_what_auto_takes_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.warp
 def test_what_warp_has_no_kernel_of_runs_as_plain_torch_with_its_operations_on_warp() -> None:
     run = backends.resolve_composed("routed_mlp", backend="warp", device=CPU, dtype=torch.float32)
-    assert run.func.__module__ == "voronerf.ops.routed_mlp.reference" and run.keywords == {"backend": "warp"}
+    assert run.func.__module__ == "voronerf.ops.routed_program.reference" and run.keywords == {"backend": "warp"}
     assert resolve("adam", backend="warp", device=CPU, dtype=torch.float32).__module__ == "voronerf.ops.adam.reference"
     assert "warp" not in backends.implemented("adam")
 

@@ -18,8 +18,8 @@ from torch import Tensor
 from ops.case import BACKWARD, Contender, NotApplicable
 from ops.networks import Batch, with_gradients
 from voronerf import ops
+from voronerf.ops._core.encodings import ENCODINGS
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS
-from voronerf.ops.grouped_mlp.reference import encode_directions, encode_positions
 
 PIECE = 4096
 """Rows of a piece whose activations stay in cache."""
@@ -34,11 +34,17 @@ class Encoded:
 
     def __init__(self, batch: Batch, dtype: torch.dtype) -> None:
         sets = batch.positions[:2]
-        self.positions = [encode_positions(x, batch.net).to(dtype) for x in sets]
+        self.positions = [encoded(x, batch.net, POSITIONS).to(dtype) for x in sets]
         self.directions: Tensor | None = None
         if batch.directions is not None:
-            encoded = encode_directions(batch.directions, batch.net).to(dtype)
-            self.directions = encoded[batch.direction_index]
+            seen = encoded(batch.directions, batch.net, DIRECTIONS).to(dtype)
+            self.directions = seen[batch.direction_index]
+
+
+def encoded(x: Tensor, net: MLP, source: str) -> Tensor:
+    """Positions or directions as a layer table encodes them."""
+    encoding = net.encoding(source)
+    return x if encoding is None else ENCODINGS[encoding[0]].formula(x, encoding[1])
 
 
 def evaluate(net: MLP, x: Any, d: Any, weights: Sequence[Any], biases: Sequence[Any], linear: Linear) -> list[Any]:

@@ -16,7 +16,6 @@ from ops.case import BACKWARD, generator, relative_error, rotation, uniform_poin
 from voronerf import ops
 from voronerf.nerf.fields import NeRF
 from voronerf.ops._core.layers import MLP, POSITIONS, Layer
-from voronerf.ops.grouped_mlp import reference as specification
 
 RAY = 64
 """Consecutive samples of one view direction."""
@@ -255,7 +254,7 @@ def _exact(batch: Batch, cells: Tensor | None) -> list[Tensor]:
     if batch.direction == BACKWARD:
         for tensor in (*weights, *biases):
             tensor.requires_grad_()
-    out = specification.grouped_mlp(
+    out = ops.grouped_mlp(
         batch.positions[0][rows].double(),
         offsets,
         weights,
@@ -263,7 +262,7 @@ def _exact(batch: Batch, cells: Tensor | None) -> list[Tensor]:
         layers=batch.net,
         directions=None if batch.directions is None else batch.directions.double(),
         direction_index=None if batch.direction_index is None else batch.direction_index[rows],
-        linear=ops.grouped_linear,
+        backend="reference",
     )
     if batch.direction != BACKWARD:
         return [out[back]]

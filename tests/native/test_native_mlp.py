@@ -343,10 +343,3 @@ def test_an_index_of_no_ray_is_refused() -> None:
         for backend in ("native", "reference"):
             with pytest.raises(ValueError, match=rf"^grouped_mlp: direction_index must be 0 to 3, got {bad_index}$"):
                 grouped_mlp(**{**given, "direction_index": index}, backend=backend)
-
-
-def test_a_layer_without_features_is_refused() -> None:
-    native = pytest.importorskip("voronerf.ops.grouped_mlp.native")
-    offsets, weight = torch.tensor([0, 5], dtype=torch.int32), torch.zeros(1, 2, 0)
-    with pytest.raises(ValueError, match="Program: steps must be of values"):
-        native.grouped_mlp(torch.zeros(5, 0), offsets, [weight], [None], layers=chain(2, 0, out=2))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 
 import torch
 from torch.nn.functional import linear, softplus
 
-from voronerf.ops.grouped_mlp import reference
+from voronerf.ops._core.encodings import ENCODINGS, wide
+from voronerf.ops._core.layers import DIRECTIONS, POSITIONS
+from voronerf.ops.grouped_program.reference import cells_of
+from voronerf.ops.hash_encode.reference import hash_encode
 
 ACTIVATIONS = {
     "none": lambda z: z,
@@ -27,4 +29,22 @@ def grouped_linear(x, offsets, weight, bias=None, *, activation="none"):
     return y
 
 
-grouped_mlp = functools.partial(reference.grouped_mlp, linear=grouped_linear)
+def encoded(x, layers, source):
+    encoding = layers.encoding(source)
+    return x if encoding is None else ENCODINGS[encoding[0]].formula(wide(x), encoding[1])
+
+
+def grouped_mlp(positions, offsets, weights, biases, *, layers, directions=None, direction_index=None, features=None):
+    if layers.grid is None:
+        where = encoded(positions, layers, POSITIONS)
+    else:
+        cells = cells_of(offsets, positions) if features.dim() == 3 else None
+        where = hash_encode(positions, features, layers.grid, cells=cells)
+    sources = {POSITIONS: where.to(weights[0].dtype)}
+    if layers.uses_directions:
+        seen = encoded(directions, layers, DIRECTIONS).to(weights[0].dtype)
+        sources[DIRECTIONS] = seen if direction_index is None else seen[direction_index]
+    for index, (layer, weight, bias) in enumerate(zip(layers.layers, weights, biases)):
+        x = torch.cat([sources[source] for source in layer.inputs], dim=1)
+        sources[index] = grouped_linear(x, offsets, weight, bias, activation=layer.activation)
+    return torch.cat([sources[index] for index in layers.outputs], dim=1)

@@ -20,7 +20,7 @@ class ByPrograms(torch.autograd.Function):
         count = len(Program.parse(text).inputs)
         given = [tensor.detach() for tensor in tensors]
         return tuple(
-            reference.grouped_program(given[:count], given[count:], offsets, order, ray_index, text),
+            reference.evaluate(given[:count], given[count:], offsets, order, ray_index, text),
         )
 
     @staticmethod

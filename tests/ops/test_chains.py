@@ -93,6 +93,15 @@ def test_what_is_no_chain_runs_all_the_same(change):
     torch.testing.assert_close(*both)
 
 
+def test_positions_of_rays_are_no_chain():
+    b = Builder()
+    program = b.program([b.linear(b.input(3, ray=True), b.parameter(2, 3), 2)])
+    rays, weight, index = torch.rand(2, 3), torch.randn(1, 2, 3), torch.tensor([1, 0, 1, 1, 0]).int()
+    given = {"program": program, "ray_index": index, "backend": "warp"}
+    (out,) = grouped_program([rays], [weight], offsets_of([5]), **given)
+    torch.testing.assert_close(out, rays[index] @ weight[0].T)
+
+
 def test_an_activation_of_a_part_of_a_layer():
     """It is a step behind the layers, of the part alone."""
     b = Builder()

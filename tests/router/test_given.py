@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from voronerf import MLP, Layer, NeRF, VoronoiRouter
+from voronerf import MLP, Layer, NeRF, VoronoiRouter, frequency_encode
 from voronerf.router import CellProgram, layered_program
 
 K, N = 5, 60
@@ -136,15 +136,43 @@ def test_parameters_of_other_dtypes(dtype: torch.dtype) -> None:
     agree(router, torch.rand(N, 3, dtype=dtype), **wide)
 
 
-def test_a_parameter_of_the_activation_learns() -> None:
-    class Scaled(Said):
+class Scaled(Said):
+    """An activation with a parameter."""
+
+    def __init__(self) -> None:
+        super().__init__(None)
+        self.scale = nn.Parameter(torch.tensor(2.0))
+
+        self.act = self.scaled
+
+    def scaled(self, raw: Tensor) -> Tensor:
+        return raw.sigmoid() * self.scale
+
+
+def test_each_cell_may_have_its_parameter_of_the_activation() -> None:
+    router, x = make(Scaled()), torch.rand(N, 3)
+    found = router(x)
+    assert router.explain().startswith("forward: grouped") and len(router.module.scale.unique()) == K
+    torch.testing.assert_close(found, *loop(router, x))
+
+
+def test_wide_positions_are_encoded_as_they_are() -> None:
+    class Far(Said):
         def __init__(self) -> None:
-            super().__init__(None)
-            self.scale = nn.Parameter(torch.tensor(2.0))
+            super().__init__(torch.sigmoid)
+            self.first = nn.Linear(39, 6)
 
-        def activate(self, raw: Tensor) -> Tensor:
-            return raw.sigmoid() * self.scale
+        def program(self) -> CellProgram:
+            table = MLP(TABLE.layers, TABLE.outputs, position_octaves=6)
+            return layered_program(table, [self.first, self.second], self.activate)
 
+        def forward(self, positions: Tensor) -> Any:
+            return super().forward(frequency_encode(positions, 6).float())
+
+    agree(make(Far()), 100 * torch.rand(N, 3, dtype=torch.float64))
+
+
+def test_a_parameter_of_the_activation_learns() -> None:
     router, x = make(Scaled(), share=["scale"]), torch.rand(N, 3)
     before = router(x)
     before.sum().backward()

@@ -398,14 +398,15 @@ class Fused:
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in rows) else torch.float32
         half = torch.is_autocast_enabled(grouping.device.type) or any(x.dtype in HALF for x in rows)
         parameters = [recordable(taken.of_values(values).to(dtype)) for taken in run.parameters]
-        outputs = grouped_program(
-            [x.to(dtype) for x in rows],
-            parameters,
-            grouping.offsets,
-            program=run.program,
-            order=order,
-            backend=grouping.backend,
-        )
+        with torch.autocast(grouping.device.type, enabled=False):  # rounded below, as in known calls
+            outputs = grouped_program(
+                [x.to(dtype) for x in rows],
+                parameters,
+                grouping.offsets,
+                program=run.program,
+                order=order,
+                backend=grouping.backend,
+            )
         for of, tensor in zip(run.outputs, outputs, strict=True):
             if isinstance(of, fx.Node):
                 shape, at, m = of.meta["layout"]

@@ -22,7 +22,7 @@ from voronerf.ops._core.unchanged import Never, unchanged
 from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.routed_program import routed_program
 from voronerf.router.double import Double
-from voronerf.router.grouping import parts_of
+from voronerf.router.grouping import cell_parameters, parts_of
 from voronerf.router.layout import AS_TENSOR, as_plain, tensors_of
 from voronerf.router.lower import Lowering, NotAStep
 from voronerf.router.transforms import outside
@@ -149,6 +149,9 @@ class Given:
             self._known = f"{name} does more than its program says"
             if _describes(kind) and "forward" not in vars(field) and all(map(_is_plain, parts)):
                 self._known = _checked(name, cast(Any, field).program())
+                read = {id(p if p._base is None else p._base) for p in self._known.parameters}
+                if any(id(p) not in read for p in cell_parameters(field)):
+                    self._known = f"{name} has parameters of cells that its program does not read"
             if isinstance(self._known, CellProgram):
                 self._by_ray = _by_ray(self._known.program.text, self._known.reads)
             self._unchanged = guard = unchanged()
@@ -203,18 +206,12 @@ class Given:
             check_shape(_OP, "directions", directions, ("n", 3), {"n": positions.shape[0]})
         else:
             program = cast(Program, self._by_ray)
-        kind, own, k = positions.device.type, known.parameters[0].dtype, router.num_cells
-        wide = torch.promote_types(own, torch.float32)
-        rows = [(positions, directions)[number].to(wide) for number in known.reads]
-        parameters = [p.to(wide) for p in known.parameters]
+        k, parameters = router.num_cells, known.parameters
         if all(p.dim() == len(shape) for p, shape in zip(parameters, program.parameters)):  # all cells share all
-            parameters[0] = parameters[0].expand(k, *parameters[0].shape)
+            parameters = [parameters[0].expand(k, *parameters[0].shape), *parameters[1:]]
+        rows = [(positions, directions)[number] for number in known.reads]
         places = router.places(positions, router._positions(args, kwargs, coords))
-        half = own is not wide and not torch.is_autocast_enabled(kind)  # products as of these parameters
-        with torch.autocast(kind, own) if half else contextlib.nullcontext():
-            results, _ = routed_program(
-                program, rows, parameters, ray_index=ray_index, **places, backend=router.backend
-            )
+        results, _ = routed_program(program, rows, parameters, ray_index=ray_index, **places, backend=router.backend)
         if known.activate is not None:
             return known.activate(*results)
         results = [out.reshape(-1, *shape) for out, shape in zip(results, known.shapes)]

@@ -22,7 +22,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -47,6 +47,7 @@ class Implementation:
     devices: tuple[str, ...] = ()  # device types it runs on; empty means any
     dtypes: tuple[torch.dtype, ...] = ()  # dtypes of the op's first tensor it takes; empty means any
     file: str | None = None  # the op whose module has the function; None for its own
+    function: str | None = None  # the op whose implementation it is, where it has none of its own
     plain: bool = False  # whether it is the reference, which serves where the backend needs no kernel of its own
 
 
@@ -90,12 +91,16 @@ def declare(
     native: Implementation | None = None,
     warp: Implementation | None = None,
     reference: Implementation = Implementation(),
+    runs: str | None = None,
 ) -> str:
     """Puts the row of an op into the table, and returns its name. None: the op has no such implementation.
 
     An implementation is the function of the op's name in a module of the op's name, unless ``file`` says another:
     ``voronerf.ops.<op>.reference``, ``voronerf.ops.<op>.native`` or ``voronerf.kernels.<op>``, imported on first use.
+    ``runs``: the op whose implementations this one runs, and which has the same row.
     """
+    if runs is not None:
+        reference, native, warp = (replace(_TABLE[runs, backend], function=runs) for backend in BACKENDS)
     for backend, implementation in zip(BACKENDS, (reference, native, warp), strict=True):
         if implementation is not None:
             _TABLE[op, backend] = implementation
@@ -350,7 +355,8 @@ def _choose_once(op: str, backend: str, device_type: str, index: int | None, dty
             raise BackendUnavailable(f"{op}: backend {backend!r} is not available: {reason}")
     module = _MODULES["reference" if _TABLE[op, backend].plain else backend]
     found = _TABLE[op, "reference" if _TABLE[op, backend].plain else backend]
-    _FUNCTIONS[op, backend] = getattr(importlib.import_module(module.format(found.file or op)), op)
+    name = found.function or op
+    _FUNCTIONS[op, backend] = getattr(importlib.import_module(module.format(found.file or name)), name)
     return backend
 
 

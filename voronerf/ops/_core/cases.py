@@ -110,7 +110,6 @@ class Case:
         alternatives: name -> the same result by other means, from the same arguments, for the benchmark.
         differentiable: whether the op has gradients.
         in_place: whether it writes into its arguments.
-        compiles: whether it compiles as one graph where it is made of torch's operations.
         comparable: whether all backends give the same tensors.
         call: the public function, if it has another name than the op.
         traced: whether torch can trace it, on every backend.
@@ -126,7 +125,6 @@ class Case:
     alternatives: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     differentiable: bool = False
     in_place: bool = False
-    compiles: bool = True
     comparable: bool = True
     call: str = ""
     traced: bool = True

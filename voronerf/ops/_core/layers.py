@@ -283,7 +283,7 @@ def _program(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: 
 
 
 @constant_result
-def program_text(text: str, p: int, q: int, widths: tuple[int, ...], biased: tuple[bool, ...], ray: bool) -> str:
+def program_text(text: str, p: int, q: int, widths: tuple[int, ...] | None, biased: tuple[bool, ...], ray: bool) -> str:
     """The text of :meth:`MLP.program` of the table whose text this is; ``torch.compile`` takes it as it finds it."""
     return _program(text, p, q, widths, biased, ray).text
 

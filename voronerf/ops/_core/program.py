@@ -789,6 +789,33 @@ def _of_product(
         b.add_scatter(arriving.sums[parameter], x, g, size, parameter, along)
 
 
+class Ahead(NamedTuple):
+    """An encoding that is computed before a program runs: of ``width`` columns of an input from ``start`` on."""
+
+    input: int
+    start: int
+    width: int
+    name: str
+    size: int
+
+
+@functools.lru_cache(maxsize=64)
+def encoded_ahead(program: Program, chosen: tuple[bool, ...]) -> tuple[Program, tuple[Ahead, ...]]:
+    """The same with further inputs in the place of encodings, but for hash grids, of those inputs that are chosen."""
+    ahead, steps, inputs, rays = list[Ahead](), list[Step](), list(program.inputs), list(program.rays)
+    read = {step.out: int(step.numbers[0]) for step in program.steps if step.op == "input"}
+    for step in program.steps:
+        number = read.get(step.operands[0].index, -1) if step.op == "encode" and step.name != HASH else -1
+        if number >= 0 and chosen[number] and not step.numbers[2]:
+            _, _, start, width, _ = step.operands[0]
+            ahead.append(Ahead(number, start, width, step.name, int(step.numbers[0])))
+            step = Step("input", step.out, step.width, (), (len(inputs),))
+            rays += [len(inputs)] if number in program.rays else []
+            inputs.append(step.width)
+        steps.append(step)
+    return replace(program, inputs=tuple(inputs), steps=tuple(steps), rays=tuple(rays)), tuple(ahead)
+
+
 def pruned(program: Program) -> Program:
     """The same without steps whose values are not used."""
     needed = {columns.index for columns in program.outputs if columns.of == VALUE}

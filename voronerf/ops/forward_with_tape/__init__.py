@@ -8,7 +8,7 @@ from typing import Any
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops.forward_with_tape.reference import Tape
-from voronerf.ops.routed_program import check_routed_program
+from voronerf.ops.routed_program import routed_of
 
 _OP = backends.declare("forward_with_tape", native=Implementation(EVERYWHERE, FLOATS), warp=PLAIN)
 _NEEDED = ("program", "inputs", "parameters")
@@ -49,7 +49,7 @@ def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> T
         raise ValueError(f"{_OP}: network must hold program, inputs and parameters, got {came}")
     if not all(isinstance(name, str) for name in network):
         raise TypeError(f"{_OP}: network must hold arguments by name, got {list(network)!r:.100}")
-    network = check_routed_program(_OP, True, **network)
-    first = network["inputs"][0]
-    tape: Tape = backends.resolve_composed(_OP, backend=backend, device=first.device, dtype=first.dtype)(network)
+    routed = routed_of(_OP, network)
+    first = routed.inputs[0]
+    tape: Tape = backends.resolve_composed(_OP, backend=backend, device=first.device, dtype=first.dtype)(routed)
     return tape

@@ -7,9 +7,8 @@ themselves, where autograd would do no more: its own operations would keep a ste
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,31 +16,30 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.derivatives import learnt, with_gradients
 from voronerf.ops.forward_with_tape.reference import Graph, Tape
-from voronerf.ops.grouped_program.native import How, Rows, run, run_gradient
-from voronerf.ops.routed_program import of_samples
-from voronerf.ops.routed_program.native import find, prepared, run_routed
+from voronerf.ops.grouped_program.native import How, Network, Rows, run, run_gradient
+from voronerf.ops.routed_program import Routed, of_samples
+from voronerf.ops.routed_program.native import find, of_cells, routed_program
 from voronerf.ops.routed_program.reference import cells_of, first_rows
 
 
-def forward_with_tape(network: Mapping[str, Any]) -> Tape:
+def forward_with_tape(routed: Routed) -> Tape:
     """The outputs and their tape, once differentiable; see ``voronerf.ops.forward_with_tape``."""
-    given = dict(network)
-    frozen = given.pop("frozen", None)
-    recorded = torch.is_grad_enabled()
-    with torch.no_grad():
-        taken, where = prepared(**given)
-        first, k = taken.inputs[0], cells_of(taken.parameters)
-        plain = all(tensor.dtype is torch.float32 for tensor in taken.given)
-        if recorded and plain and not torch.is_autocast_enabled(first.device.type):
-            cells, order, offsets = find(first, where, k, taken.how.caller)
+    where, frozen = routed.where, routed.where.frozen
+    leaves, first = [*routed.inputs, *routed.parameters], routed.inputs[0]
+    plain = all(tensor.dtype is torch.float32 for tensor in leaves)
+    if torch.is_grad_enabled() and plain and not torch.is_autocast_enabled(first.device.type):
+        with torch.no_grad():
+            taken = Network.of(routed.given("forward_with_tape"))
+            k = cells_of(taken.parameters)
+            cells, order, offsets = find(first, of_cells(where, k), k, taken.how.caller)
             rows, how = taken.rows(offsets, order), taken.how
-            learning = any(tensor.requires_grad for tensor in taken.given)
+            learning = any(tensor.requires_grad for tensor in leaves)
             out, *kept = run(rows, how._replace(keep=True) if learning else how)
             count = None if native.on_cuda(out) else where.rows  # CUDA has left out the others
             if count is not None:
                 (out,), cells = first_rows([out], cells, count)
-            return _Kept(out, rows._replace(kept=kept), how, taken.given, count, cells, frozen)
-    (out,), cells = run_routed(*prepared(**given))
+            return _Kept(out, rows._replace(kept=kept), how, leaves, count, cells, frozen)
+    (out,), cells = routed_program(routed.given("forward_with_tape"), where)
     return Graph(out.detach().float(), out, cells, frozen)
 
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_flag, check_shape
 from voronerf.ops._core.derivatives import learnt, with_gradients
-from voronerf.ops.routed_program import of_samples
-from voronerf.ops.routed_program.reference import routed_program
+from voronerf.ops.routed_program import Routed, of_samples, run
 
 
 class Tape(ABC):
@@ -59,12 +56,11 @@ class Tape(ABC):
     def _backward(self, loss: Tensor, gradient: Tensor, defer: bool) -> Tensor: ...
 
 
-def forward_with_tape(network: Mapping[str, Any], backend: str = "reference") -> Tape:
+def forward_with_tape(routed: Routed, backend: str = "reference") -> Tape:
     """The outputs and their tape; see ``voronerf.ops.forward_with_tape``."""
-    network = dict(network)
-    frozen = network.pop("frozen", None)
-    (out,), cells = routed_program(**network, backend=backend)
-    return Graph(out.detach().float(), out, cells, frozen)
+    where = routed.where._replace(frozen=None)
+    (out,), cells = run(routed.given("forward_with_tape"), where, backend=backend)
+    return Graph(out.detach().float(), out, cells, routed.where.frozen)
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.layers import ACTIVATIONS, MLP, POSITIONS, Layer, program_text
-from voronerf.ops.grouped_program.native import How, Rows, run_program
+from voronerf.ops.grouped_program.native import PRODUCTS, How, Rows, run_program
 
 # Of one layer, whose width is that of its weight.
 _TABLES = {activation: MLP((Layer((POSITIONS,), 1, activation),), (0,)).text for activation in ACTIVATIONS}
-_PRODUCTS = {torch.bfloat16: "bfloat16", torch.float16: "float16"}
 
 
 def grouped_linear(
@@ -29,6 +28,6 @@ def grouped_linear(
     rows = Rows([x.to(dtype).to(stored)], rounded, offsets, None, None)
     o, i = len(range(weight.shape[1])), len(range(weight.shape[2]))  # no symbols
     shape = i, 0, (o,), (bias is not None,), False
-    how = How(program_text(_TABLES[activation], *shape), "grouped_linear", _PRODUCTS.get(dtype, "float32"))
+    how = How(program_text(_TABLES[activation], *shape), "grouped_linear", PRODUCTS.get(dtype, "float32"))
     (out,) = run_program(rows, how)
     return out.to(dtype)

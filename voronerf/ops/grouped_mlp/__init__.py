@@ -7,14 +7,11 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from voronerf.ops._core import backends
-from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
 from voronerf.ops._core.checks import INDEX, Row
 from voronerf.ops._core.layers import MLP
-from voronerf.ops.grouped_mlp.checks import check_network
+from voronerf.ops.grouped_mlp.checks import Layered
 
-_OP = backends.declare(
-    "grouped_mlp", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
-)
+_OP = backends.declare("grouped_mlp", runs="grouped_program")
 _OFFSETS = Row("offsets", INDEX, ("k+1",), empty="must have at least two entries")
 
 
@@ -72,9 +69,7 @@ def grouped_mlp(
         >>> out.shape
         torch.Size([5, 4])
     """
-    read = {"directions": directions, "direction_index": direction_index, "features": features}
-    network = {"positions": positions, "weights": weights, "biases": biases, "layers": layers, **read}
-    check_network(_OP, network, ([_OFFSETS], [offsets]))
-    run = backends.resolve(_OP, backend=backend, device=positions.device, dtype=weights[0].dtype)
-    out: Tensor = run(positions, offsets, weights, biases, layers=layers, **read)
+    network = Layered(positions, weights, biases, layers, directions, direction_index, features)
+    network.check(_OP, ([_OFFSETS], [offsets]))
+    (out,) = network.given(_OP).run(offsets, backend=backend, op=_OP)
     return out

@@ -10,14 +10,13 @@ from torch import Tensor
 
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, Implementation
-from voronerf.ops._core.checks import INDEX, Default, Others, Row, Rows, check_rows, check_tensor
+from voronerf.ops._core.checks import FLOATING, INDEX, Default, Others, Row, Rows, check_rows, check_tensor
 from voronerf.ops._core.program import Program
+from voronerf.ops.grouped_program.given import Given
 
 _OP = backends.declare(
     "grouped_program", native=Implementation(EVERYWHERE, FLOATS), warp=Implementation(EVERYWHERE, FLOATS)
 )
-_HALF = (torch.float16, torch.bfloat16)  # computed in float32
-_TABLES = (torch.float32, torch.bfloat16, torch.float16)  # of hash grids, beside the dtype of the inputs
 
 
 def grouped_program(
@@ -39,9 +38,8 @@ def grouped_program(
     Args:
         inputs: [n, w] floating point for each input of the program, sorted by cell, n < 2**31; at least one. [r, w],
             r < 2**31, for those of ``program.rays``, which have one row for each ray.
-        parameters: [k, o, i] or [k, w] for each parameter of the program, or [1, ...] where all cells share it, the
-            dtype of the inputs. The table [k, e, f] or [1, e, f] of a hash grid may be float32, bfloat16 or float16
-            beside inputs of any dtype.
+        parameters: [k, o, i] or [k, w] for each parameter of the program, or [1, ...] where all cells share it, all of
+            one dtype. The table [k, e, f] or [1, e, f] of a hash grid may be of any.
         offsets: int32 [k + 1], rising; cell c owns rows ``offsets[c]`` to ``offsets[c + 1]``. Rows outside all cells
             give 0. Cells may be empty.
         program: what to do.
@@ -53,9 +51,10 @@ def grouped_program(
             program that is no chain of layers, runs in PyTorch there.
 
     Returns:
-        [n, w] for each output of the program, or [r, w], the sum over the rows of each ray, for those of
-        ``program.by_ray``; then [k, ...] for each of its sums over the rows of a cell, or [1, e, f] for the sum of a
-        table that all cells share. Rows outside all cells add nothing to sums.
+        In the dtype of the parameters (of autocast, where it is on), or without any in that of the first input: [n, w]
+        for each output of the program, or [r, w], the sum over the rows of each ray, for those of ``program.by_ray``;
+        then [k, ...] for each of its sums over the rows of a cell, or [1, e, f] for the sum of a table that all cells
+        share. Rows outside all cells add nothing to sums.
 
     Raises:
         ValueError: on the CPU offsets that fall or exceed n, an order outside 0 to n - 1, and a ray_index outside 0 to
@@ -78,13 +77,7 @@ def grouped_program(
     cells: Others = ([_OFFSETS], [offsets])
     sorting: Others = ((), ()) if order is None else ([_ORDER], [order])
     check_program(_OP, program, inputs, parameters, ray_index, cells, sorting)
-    dtype = inputs[0].dtype
-    run = backends.resolve(_OP, backend=backend, device=inputs[0].device, dtype=dtype)
-    if dtype in _HALF:
-        inputs = [x.float() for x in inputs]
-        parameters = [p if _among(i, program.tables) else p.float() for i, p in enumerate(parameters)]
-    results: list[Tensor] = run(inputs, parameters, offsets, order, ray_index, program.text)
-    return [tensor.to(dtype) for tensor in results] if dtype in _HALF else results
+    return Given.of(_OP, program.text, inputs, parameters, ray_index).run(offsets, order, backend=backend)
 
 
 def check_program(
@@ -121,7 +114,11 @@ def check_program(
     check_tensor(op, "inputs[0]", inputs[0])
     rays = () if ray_index is None else (ray_index,)
     tensors = [*first[1], *inputs, *parameters, *rays, *last[1]]
-    sizes = check_rows(op, _rows, tensors, program, inputs[0].dtype, tuple(first[0]), tuple(last[0]))
+    layers = [p for i, p in enumerate(parameters) if not _among(i, program.tables)]
+    if layers:
+        check_tensor(op, "parameters", layers[0])
+    dtype = layers[0].dtype if layers else None
+    sizes = check_rows(op, _rows, tensors, program, dtype, tuple(first[0]), tuple(last[0]))
     if ray_index is not None and not sizes["r"] and sizes["n"]:
         at = next(i for i in range(len(inputs)) if _among(i, program.rays))
         found = list(inputs[at].shape)
@@ -133,15 +130,15 @@ _OFFSETS = Row("offsets", INDEX, ("k+1",), empty="must be of at least one cell")
 _ORDER = Row("order", INDEX, ("n",))
 
 
-def _rows(program: Program, dtype: torch.dtype, first: Sequence[Row], last: Sequence[Row]) -> Rows:
-    """The rules for the tensors of a program: inputs, parameters and the index of rays, between others."""
+def _rows(program: Program, dtype: torch.dtype | None, first: Sequence[Row], last: Sequence[Row]) -> Rows:
+    """The rules for the tensors of a program, of layers of a dtype: inputs, parameters and the index of rays, between
+    others."""
     rows: list[Row | Default] = [*first]
     for i, width in enumerate(program.inputs):
-        letter = "r" if _among(i, program.rays) else "n"
-        rows.append(Row(f"inputs[{i}]", backends.COORDINATES if i == 0 else (dtype,), (letter, width)))
+        rows.append(Row(f"inputs[{i}]", FLOATING, ("r" if _among(i, program.rays) else "n", width)))
     for i, shape in enumerate(program.parameters):
-        known = (dtype, *(_TABLES if _among(i, program.tables) else ()))
-        rows.append(Row(f"parameters[{i}]", tuple(dict.fromkeys(known)), ("1|k", *shape)))
+        known = FLOATING if dtype not in FLOATING or _among(i, program.tables) else (dtype,)
+        rows.append(Row(f"parameters[{i}]", known, ("1|k", *shape)))
     if program.rays:
         rows.append(Row("ray_index", INDEX, ("n",)))
     return [*rows, Default("k", 1), *last]

@@ -19,8 +19,9 @@ from voronerf.ops._core.custom_op import custom_op
 from voronerf.ops._core.derivatives import asked_for
 from voronerf.ops._core.program import Program, gradient
 from voronerf.ops._core.rows import new_empty, rows_of
+from voronerf.ops.grouped_program.given import Given, index_name
 from voronerf.ops.grouped_program.lowering import Lowered, compiled_runs, lower
-from voronerf.ops.grouped_program.reference import grouped_program as in_torch
+from voronerf.ops.grouped_program.reference import evaluate
 
 
 class Rows(NamedTuple):
@@ -62,21 +63,63 @@ class How(NamedTuple):
     gradients: int = -1
 
 
-def grouped_program(
-    inputs: Sequence[Tensor],
-    parameters: Sequence[Tensor],
-    offsets: Tensor,
-    order: Tensor | None,
-    ray_index: Tensor | None,
-    text: str,
-) -> list[Tensor]:
+class Network(NamedTuple):
+    """A program with its tensors as the op takes them, of the caller's.
+
+    Samples are read and results written as they are stored where all are bfloat16; else, and parameters always, a cell
+    having few of them, they are cast to float32 on the way in and back on the way out. Where the results are bfloat16,
+    products take bfloat16 operands where the processor multiplies them faster (AVX512-BF16, AMX), and float32 ones
+    elsewhere; sums are float32 always.
+
+    Attributes:
+        inputs: in float32, or all in the bfloat16 of the results.
+        parameters: in float32, but for tables of hash grids.
+        ray_index: int32 [n] where some inputs have one row for each ray, or None.
+        how: it runs.
+        dtype: of the results.
+    """
+
+    inputs: Sequence[Tensor]
+    parameters: Sequence[Tensor]
+    ray_index: Tensor | None
+    how: How
+    dtype: torch.dtype
+
+    @staticmethod
+    def of(given: Given) -> Network:
+        """As the public functions take it."""
+        text, inputs, parameters, index, dtype, caller = given
+        tables = _tables(text)  # of which positions are read in float32
+        stored = dtype is torch.bfloat16 and not tables and all(x.dtype is dtype for x in inputs)
+        rows = inputs if stored else [x if x.dtype is torch.float32 else x.float() for x in inputs]
+        kept = [
+            p if p.dtype is torch.float32 or (any(i == table for table in tables) and p.dtype in _NAMES) else p.float()
+            for i, p in enumerate(parameters)
+        ]
+        return Network(rows, kept, index, How(text, caller, PRODUCTS.get(dtype, "float32")), dtype)
+
+    def rows(self, offsets: Tensor, order: Tensor | None = None) -> Rows:
+        """What the program runs on, for rows of cells by offsets [k + 1] and an order."""
+        return Rows(self.inputs, self.parameters, offsets, order, self.ray_index)
+
+    def run(self, offsets: Tensor, order: Tensor | None = None) -> list[Tensor]:
+        """The results, [n, w] each and sums."""
+        found = run_program(self.rows(offsets, order), self.how)
+        return [out if out.dtype is self.dtype else out.to(self.dtype) for out in found]
+
+
+PRODUCTS = {torch.bfloat16: "bfloat16", torch.float16: "float16"}
+"""What products take for results of a dtype; float32 for any other."""
+
+
+def grouped_program(given: Given, offsets: Tensor, order: Tensor | None) -> list[Tensor]:
     """A program on the rows of each cell; see ``voronerf.ops.grouped_program``."""
-    return run_program(Rows(inputs, parameters, offsets, order, ray_index), How(text))
+    return Network.of(given).run(offsets, order)
 
 
 def run_program(rows: Rows, how: How) -> list[Tensor]:
     """The outputs and sums of a program, with gradients of every order."""
-    if torch.is_grad_enabled() and _looks_up(how.text):
+    if torch.is_grad_enabled() and _tables(how.text):
         how = how._replace(keep=any(t.requires_grad for t in (*rows.inputs, *rows.parameters)))
     found: list[Tensor] = run(rows, how)
     return found[: _results(how.text)] if how.keep else found
@@ -90,9 +133,9 @@ def _results(text: str) -> int:
 
 
 @constant_result
-def _looks_up(text: str) -> bool:
-    """Whether a program has hash grids."""
-    return bool(Program.parse(text).grids)
+def _tables(text: str) -> tuple[int, ...]:
+    """The parameters that are tables of hash grids."""
+    return Program.parse(text).tables
 
 
 class _Call(NamedTuple):
@@ -138,7 +181,7 @@ def _made(rows: Rows, how: How) -> list[Tensor]:
     if not compiled_runs(program.text):
         found = _memory(_Call(rows, how))
         inputs = [x.float() for x in rows.inputs]
-        made = in_torch(inputs, rows.parameters, rows.offsets, rows.order, rows.ray_index, program.text)
+        made = evaluate(inputs, rows.parameters, rows.offsets, rows.order, rows.ray_index, program.text)
         for to, result in zip(found, made, strict=True):
             to.copy_(result)
         return found
@@ -275,7 +318,7 @@ def program_inputs(
         ready=ready,
         gradients=gradients,
         caller=caller,
-        ray_name="direction_index" if caller.endswith("_mlp") else "ray_index",
+        ray_name=index_name(caller),
     )
 
 

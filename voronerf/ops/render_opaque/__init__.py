@@ -13,7 +13,7 @@ from voronerf.ops._core.checks import check_count
 from voronerf.ops._core.declare import declare
 from voronerf.ops.formulas import RaysSeen
 from voronerf.ops.render_loss.reference import scaled
-from voronerf.ops.routed_program import check_routed_program
+from voronerf.ops.routed_program import routed_of
 
 #: Names of the arguments of `routed_program` that a network has; the others are of samples, or of the backward pass.
 NETWORK = ("program", "parameters", "centres", "child_offsets", "child", "depth")
@@ -33,11 +33,10 @@ def _prepare(given: Any) -> Any:
     origins, reads = given.origins, bool(getattr(network["program"], "rays", ()))
     index = torch.arange(len(origins), dtype=torch.int32, device=origins.device) if reads else None
     inputs = [origins, given.directions] if reads else [origins]
-    checked = check_routed_program(op, True, **network, inputs=inputs, ray_index=index)
-    checked.pop("frozen")
-    if (width := checked["program"].outputs[0].width) != 4:
+    routed = routed_of(op, {**network, "inputs": inputs, "ray_index": index})
+    if (width := routed.program.outputs[0].width) != 4:
         raise ValueError(f"{op}: program must put out 4 numbers, colour and density, got {width}")
-    return scaled(op, given._replace(network=checked))
+    return scaled(op, given._replace(network=routed))
 
 
 @declare(

@@ -14,11 +14,10 @@ from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 from voronerf.ops.formulas import RaysSeen
 from voronerf.ops.grouped_program.lowering import lower
-from voronerf.ops.grouped_program.native import program_inputs
+from voronerf.ops.grouped_program.native import Network, program_inputs
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
 from voronerf.ops.render_opaque import reference
-from voronerf.ops.routed_program.native import prepared
 from voronerf.ops.routed_program.reference import cells_of
 
 _OP = declared("render_opaque")
@@ -33,17 +32,17 @@ _outputs = _OP.outputs(native.compiled.SeeOutputs)
 def render_opaque(*flat: Any) -> RaysSeen:
     """Every ray up to the first surface, in float32; see ``voronerf.ops.render_opaque``."""
     given = _OP.Inputs._make(flat)
-    network = given.network
+    routed = given.network
     none = given.near.new_empty(0, dtype=torch.int32)  # of samples that are not there yet
-    taken, _ = prepared(**network | {"ray_index": None if network["ray_index"] is None else none})
-    centres, k = network["centres"], cells_of(taken.parameters)
-    plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in (*taken.given, centres))
+    taken = Network.of(routed._replace(ray_index=None if routed.ray_index is None else none).given("render_opaque"))
+    (centres, child_offsets, child, depth, *_), k = routed.where, cells_of(taken.parameters)
+    tensors = (*routed.inputs, *routed.parameters, centres)
+    plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in tensors)
     if not plain or torch.is_autocast_enabled("cpu"):
         composed: RaysSeen = partial(reference.render_opaque, backend="native")(*given)
         return composed
     rows = taken.rows(torch.zeros(k + 1, dtype=torch.int32))
     lowered = lower(taken.how.text)
-    child_offsets, child, depth = network["child_offsets"], network["child"], network["depth"]
     if k == 1:
         centres = child_offsets = child = None
     if child_offsets is not None:

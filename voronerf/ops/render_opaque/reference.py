@@ -11,7 +11,7 @@ from voronerf.ops._core.declare import declared
 from voronerf.ops.composite import composite
 from voronerf.ops.formulas import RaysSeen, Wave, activate, walk
 from voronerf.ops.march_rays import march_rays
-from voronerf.ops.routed_program.reference import routed_program
+from voronerf.ops.routed_program import run
 
 
 @torch.no_grad()
@@ -21,19 +21,18 @@ def render_opaque(*flat: Any, backend: str = "reference") -> RaysSeen:
     ``backend`` is that of the operations it is made of.
     """
     given = declared("render_opaque").Inputs._make(flat)
-    network, wave = given.network, given.wave
-    (origins, *seen), centres = network["inputs"], network["centres"]
-    fixed = {name: value for name, value in network.items() if name not in ("inputs", "coords", "ray_index")}
+    routed, wave = given.network, given.wave
+    (origins, *seen), where = routed.inputs, routed.where
     space: dict[str, Any] = {"spacing": given.spacing, "most": wave, "contraction": given.contraction}
 
     def look(live: Tensor, start: Tensor | None) -> Wave:
         of_rays = given.origins[live], given.directions[live], given.near[live], given.far[live]
         march = march_rays(*of_rays, given.occupied, given.box, given.samples, start=start, **space, backend=backend)
         positions = march.positions.to(origins.dtype)
-        coords = None if centres is None else positions.to(centres.dtype)
-        taken: dict[str, Any] = {**fixed, "coords": coords, "backend": backend}
+        coords = None if where.centres is None else positions.to(where.centres.dtype)
         inputs, index = [positions, *(x[live] for x in seen)], march.ray_index if seen else None
-        (raw,), _ = routed_program(inputs=inputs, ray_index=index, **taken)
+        network = routed._replace(inputs=inputs, ray_index=index).given("render_opaque")
+        (raw,), _ = run(network, where._replace(coords=coords), backend=backend)
         colours, density = activate(raw.to(given.near.dtype), given.density_scale, given.activated)
         packed: dict[str, Any] = {"ray_offsets": march.ray_offsets, "backend": backend}
         along = composite(density, colours, march.depths, march.deltas, **packed)

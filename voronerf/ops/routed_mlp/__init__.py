@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from voronerf.ops._core import backends
-from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops._core.layers import MLP
-from voronerf.ops.grouped_mlp.checks import check_routed
-from voronerf.ops.routed_program import hold, of_samples
+from voronerf.ops.grouped_mlp.checks import Layered
+from voronerf.ops.routed_program import run
+from voronerf.ops.routed_program.where import Where
 
-_OP = backends.declare("routed_mlp", native=Implementation(EVERYWHERE, FLOATS), warp=PLAIN)
+_OP = backends.declare("routed_mlp", runs="routed_program")
 
 
 def routed_mlp(
@@ -89,25 +89,8 @@ def routed_mlp(
         >>> out.flatten().round(decimals=4)  # in the order of the positions
         tensor([90.0000,  0.1000, 80.0000])
     """
-    network = check_routed(
-        _OP,
-        positions,
-        weights,
-        biases,
-        layers=layers,
-        centres=centres,
-        child_offsets=child_offsets,
-        child=child,
-        depth=depth,
-        cells=cells,
-        coords=coords,
-        directions=directions,
-        direction_index=direction_index,
-        features=features,
-        frozen=frozen,
-        rows=rows,
-    )
-    run = backends.resolve_composed(_OP, backend=backend, device=positions.device, dtype=weights[0].dtype)
-    frozen = network.pop("frozen")
-    out, found = run(**network)
-    return (out if frozen is None else hold(out, of_samples(frozen, found))), found
+    where = Where(centres, child_offsets, child, depth, cells, coords, rows, frozen)
+    network = Layered(positions, weights, biases, layers, directions, direction_index, features)
+    where = where.at(_OP, positions, network.check(_OP, last=where.to_check(_OP)))
+    (out,), found = run(network.given(_OP), where, backend=backend, op=_OP)
+    return out, found

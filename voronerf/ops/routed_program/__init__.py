@@ -3,8 +3,8 @@ diagrams, w columns."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,9 +12,9 @@ from torch import Tensor
 from voronerf.ops._core import backends
 from voronerf.ops._core.backends import EVERYWHERE, FLOATS, PLAIN, Implementation
 from voronerf.ops._core.program import Program
-from voronerf.ops.grouped_mlp.checks import PLACES, check_places, rows_of_places, with_coords
 from voronerf.ops.grouped_program import check_program
-from voronerf.ops.routed_program.reference import with_cells
+from voronerf.ops.grouped_program.given import Given
+from voronerf.ops.routed_program.where import Where
 
 _OP = backends.declare("routed_program", native=Implementation(EVERYWHERE, FLOATS), warp=PLAIN)
 
@@ -57,7 +57,7 @@ def routed_program(
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
-        [n, w] for each output, in the dtype of the inputs (of autocast, where it is on); and cells int32 [n].
+        [n, w] for each output, in the dtype that ``grouped_program`` gives; and cells int32 [n].
 
     Raises:
         ValueError: a program with sums, or of rays alone; what ``grouped_program`` and ``routed_mlp`` refuse.
@@ -74,49 +74,72 @@ def routed_program(
         >>> out.flatten(), cells
         (tensor([90.0000,  0.1000]), tensor([1, 0], dtype=torch.int32))
     """
-    network = check_routed_program(
-        _OP,
-        False,
-        program,
-        inputs,
-        parameters,
-        ray_index=ray_index,
-        centres=centres,
-        child_offsets=child_offsets,
-        child=child,
-        depth=depth,
-        cells=cells,
-        coords=coords,
-        frozen=frozen,
-        rows=rows,
-    )
-    run = backends.resolve_composed(_OP, backend=backend, device=inputs[0].device, dtype=inputs[0].dtype)
-    frozen = network.pop("frozen")
-    outputs, found = run(**network)
-    if frozen is not None:
-        held = of_samples(frozen, found)
+    where = Where(centres, child_offsets, child, depth, cells, coords, rows, frozen)
+    routed = check_routed_program(_OP, False, program, inputs, parameters, ray_index, where)
+    return run(routed.given(_OP), routed.where, backend=backend, op=_OP)
+
+
+def run(given: Given, where: Where, *, backend: str, op: str = _OP) -> tuple[list[Tensor], Tensor]:
+    """The outputs of a program on the samples of cells, in the order of the samples, and the cells."""
+    device = given.inputs[0].device
+    implementation = backends.resolve_composed(op, backend=backend, device=device, dtype=given.dtype)
+    outputs, found = implementation(given, where)
+    if where.frozen is not None:
+        held = of_samples(where.frozen, found)
         outputs = [hold(out, held) for out in outputs]
     return outputs, found
 
 
+class Routed(NamedTuple):
+    """A program, its tensors as they were given, and what tells the cells, all of them checked."""
+
+    program: Program
+    inputs: Sequence[Tensor]
+    parameters: Sequence[Tensor]
+    ray_index: Tensor | None
+    where: Where
+
+    def given(self, caller: str) -> Given:
+        """The program and its tensors, parameters with a dimension of cells."""
+        parameters = with_cells(self.program, self.parameters)
+        return Given.of(caller, self.program.text, self.inputs, parameters, self.ray_index)
+
+
+def routed_of(op: str, network: Mapping[str, Any]) -> Routed:
+    """The arguments of `routed_program` by name, but for the backend, checked; of a program with one output."""
+    places = {name: network[name] for name in Where._fields if name in network}
+    rest = {name: given for name, given in network.items() if name not in places}
+    if unknown := rest.keys() - set(Routed._fields):
+        raise TypeError(f"{op}: unknown arguments {', '.join(sorted(unknown))}")
+    return check_routed_program(op, True, **{"ray_index": None, **rest, "where": Where(**places)})
+
+
 def check_routed_program(
-    op: str, alone: bool, /, program: Program, inputs: Sequence[Tensor], parameters: Sequence[Tensor], **given: Any
-) -> dict[str, Any]:
-    """Arguments of `routed_program` but for the backend, checked; what is compared has one dtype. ``alone``: whether
-    there may be one output alone."""
-    network = {**PLACES, "ray_index": None, **given}
-    if len(network) > len(PLACES) + 1:
-        raise TypeError(f"{op}: unknown arguments {', '.join(network.keys() - PLACES.keys() - {'ray_index'})}")
+    op: str,
+    alone: bool,
+    program: Program,
+    inputs: Sequence[Tensor],
+    parameters: Sequence[Tensor],
+    ray_index: Tensor | None,
+    where: Where,
+) -> Routed:
+    """The arguments of `routed_program`, checked; ``alone``: whether there may be one output alone."""
     known = isinstance(program, Program) and isinstance(parameters, Sequence)
     known = known and all(isinstance(p, Tensor) for p in parameters)
     shaped = with_cells(program, parameters) if known else parameters  # the others are refused
-    sizes = check_program(op, program, inputs, shaped, network["ray_index"], last=rows_of_places(op, network))
+    sizes = check_program(op, program, inputs, shaped, ray_index, last=where.to_check(op))
     several = alone and len(program.outputs) != 1
     if several or not program.outputs or program.sums or program.by_ray or 0 in program.rays:
         rule = "one output [n, w]" if alone else "outputs [n, w]"
         raise ValueError(f"{op}: program must have {rule} and inputs[0] [n, w], got others")
-    check_places(op, network, sizes, program.inputs[0])
-    return {"program": program, "inputs": inputs, "parameters": parameters, **with_coords(inputs[0], network)}
+    return Routed(program, inputs, parameters, ray_index, where.at(op, inputs[0], sizes))
+
+
+def with_cells(program: Program, parameters: Sequence[Tensor]) -> Sequence[Tensor]:
+    """Parameters [1, ...] in the place of those that have no dimension of cells, since all cells share them."""
+    shapes = program.parameters
+    shaped = [p.unsqueeze(0) if p.dim() == len(shape) else p for p, shape in zip(parameters, shapes)]
+    return [*shaped, *parameters[len(shapes) :]]
 
 
 def of_samples(frozen: Tensor, cells: Tensor) -> Tensor:

@@ -48,5 +48,4 @@ CASE = Case(
         "parameters must be 3 tensors (inputs at least one), got 0": {"parameters": []},
     },
     differentiable=True,
-    compiles=False,
 )

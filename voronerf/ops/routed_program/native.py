@@ -17,52 +17,27 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.checks import check_same_device, of_one_dtype
 from voronerf.ops._core.custom_op import custom_op, is_watched
-from voronerf.ops._core.program import Program
 from voronerf.ops._core.rows import new_empty, rows_of
 from voronerf.ops.cell_sort import cell_sort
 from voronerf.ops.cell_sort.native import sort
-from voronerf.ops.grouped_mlp.network import Network, half_products
-from voronerf.ops.grouped_program.native import How, Rows, run_program
+from voronerf.ops.grouped_program.given import Given
+from voronerf.ops.grouped_program.native import How, Network, Rows, run_program
 from voronerf.ops.locate_cell.native import find as find_leaves
 from voronerf.ops.nearest_centre import nearest_centre
 from voronerf.ops.nearest_centre.native import find as find_nearest
 from voronerf.ops.routed_program import hold, of_samples
-from voronerf.ops.routed_program.reference import Where, cells_of, first_rows, with_cells
+from voronerf.ops.routed_program.reference import cells_of, first_rows
+from voronerf.ops.routed_program.where import Where
 
 
-def routed_program(
-    program: Program, inputs: Sequence[Tensor], parameters: Sequence[Tensor], **given: Any
-) -> tuple[list[Tensor], Tensor]:
+def routed_program(given: Given, where: Where) -> tuple[list[Tensor], Tensor]:
     """Outputs in the order of the samples, and the cells; see ``voronerf.ops.routed_program``."""
-    return run_routed(*prepared(program, inputs, parameters, **given))
-
-
-def run_routed(network: Network, where: Where) -> tuple[list[Tensor], Tensor]:
-    """A network on samples in any order."""
-    route = find(network.inputs[0], where, cells_of(network.parameters), network.how.caller)
+    network, where = Network.of(given), of_cells(where, cells_of(given.parameters))
+    route = find(network.inputs[0], where, cells_of(given.parameters), given.caller)
     outputs = network.run(route.offsets, route.order)
     if where.rows is None or native.on_cuda(route.offsets):  # CUDA has left out the others
         return outputs, route.cells
     return first_rows(outputs, route.cells, where.rows)
-
-
-def prepared(
-    program: Program,
-    inputs: Sequence[Tensor],
-    parameters: Sequence[Tensor],
-    *,
-    ray_index: Tensor | None = None,
-    **places: Any,
-) -> tuple[Network, Where]:
-    """A program with its tensors, and what tells the cells; with neither cells nor centres there is one cell."""
-    kind = inputs[0].device.type
-    dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else inputs[0].dtype
-    shaped, tables = with_cells(program, parameters), program.tables
-    kept = [p if p.dtype is torch.float32 or i in tables else p.float() for i, p in enumerate(shaped)]
-    rows = [x if x.dtype is torch.float32 else x.float() for x in inputs]
-    how = How(program.text, caller="routed_program", products=half_products(dtype))
-    network = Network(rows, kept, ray_index, how, dtype, [*inputs, *parameters])
-    return network, of_cells(Where(**places), cells_of(kept))
 
 
 def of_cells(where: Where, k: int) -> Where:
@@ -105,7 +80,7 @@ class Route(NamedTuple):
 
 def find(positions: Tensor, where: Where, k: int, caller: str) -> Route:
     """The cells of samples, and their order by cell; None where there is one cell. ``caller``: the op of errors."""
-    centres, child_offsets, child, depth, known, coords, rows = where
+    centres, child_offsets, child, depth, known, coords, rows, _ = where
     if coords is not None and centres is not None and child is None and rows is None and not _is_seen(positions):
         return _in_two_calls(coords, centres, k)
     if coords is not None and coords.requires_grad:

@@ -6,61 +6,32 @@ n samples, r rays, k cells, m centres of all diagrams together, g diagrams, w co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from voronerf.ops._core import backends
 from voronerf.ops._core.checks import check_range
-from voronerf.ops._core.program import Program
 from voronerf.ops.cell_sort import cell_sort
-from voronerf.ops.grouped_program import grouped_program
+from voronerf.ops.grouped_program.given import Given
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.nearest_centre import nearest_centre
+from voronerf.ops.routed_program.where import Where
 
 
-class Where(NamedTuple):
-    """The arguments that tell the cells, as ``voronerf.ops.routed_program`` takes them."""
-
-    centres: Tensor | None = None
-    child_offsets: Tensor | None = None
-    child: Tensor | None = None
-    depth: int = 1
-    cells: Tensor | None = None
-    coords: Tensor | None = None
-    rows: Tensor | None = None
-
-
-def routed_program(
-    program: Program,
-    inputs: Sequence[Tensor],
-    parameters: Sequence[Tensor],
-    *,
-    ray_index: Tensor | None = None,
-    backend: str = "reference",
-    **where: Any,
-) -> tuple[list[Tensor], Tensor]:
+def routed_program(given: Given, where: Where, backend: str = "reference") -> tuple[list[Tensor], Tensor]:
     """Outputs in the order of the samples, and the cells; see ``voronerf.ops.routed_program``.
 
     ``backend`` is that of the operations it is made of.
     """
-    places, parameters = Where(**where), with_cells(program, parameters)
-    k, n, device = cells_of(parameters), inputs[0].shape[0], inputs[0].device
-    cells, order = find_cells("routed_program", places, k, backend), None
+    k, n, device = cells_of(given.parameters), given.inputs[0].shape[0], given.inputs[0].device
+    cells, order = find_cells(given.caller, where, k, backend), None
     if cells is None:
         cells = torch.zeros(n, dtype=torch.int32, device=device)
         offsets = torch.tensor([0, n], dtype=torch.int32, device=device)
     else:
         order, offsets = cell_sort(cells, k, backend=backend)
-    rest: dict[str, Any] = {"program": program, "order": order, "ray_index": ray_index, "backend": backend}
-    return first_rows(grouped_program(inputs, parameters, offsets, **rest), cells, places.rows)
-
-
-def with_cells(program: Program, parameters: Sequence[Tensor]) -> Sequence[Tensor]:
-    """Parameters [1, ...] in the place of those that have no dimension of cells, since all cells share them."""
-    shapes = program.parameters
-    shaped = [p.unsqueeze(0) if p.dim() == len(shape) else p for p, shape in zip(parameters, shapes)]
-    return [*shaped, *parameters[len(shapes) :]]
+    return first_rows(given.run(offsets, order, backend=backend), cells, where.rows)
 
 
 def cells_of(parameters: Sequence[Tensor]) -> int:
@@ -70,7 +41,7 @@ def cells_of(parameters: Sequence[Tensor]) -> int:
 
 def find_cells(op: str, where: Where, k: int, backend: str) -> Tensor | None:
     """int32 [n], the cells of samples; None where there is one."""
-    centres, child_offsets, child, depth, cells, coords, _ = where
+    centres, child_offsets, child, depth, cells, coords, *_ = where
     if cells is None and k == 1:
         return None
     if cells is None:
@@ -89,3 +60,8 @@ def first_rows(outputs: Sequence[Tensor], cells: Tensor, rows: Tensor | None) ->
         return list(outputs), cells
     beyond = torch.arange(cells.shape[0], device=cells.device) >= rows
     return [out.masked_fill(beyond[:, None], 0) for out in outputs], cells.masked_fill(beyond, -1)
+
+
+# A compiler that traces this finds only the implementations that are loaded before.
+for _op in ("nearest_centre", "locate_cell", "cell_sort", "grouped_program"):
+    backends.chosen(_op, torch.device("cpu"), torch.float32, backend="reference")

@@ -1,0 +1,75 @@
+"""What tells the cells of samples: centres, the tables of a tree, or the cells themselves.
+
+n samples, k cells, m centres of all diagrams together, g diagrams.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.ops._core.checks import FLOATING, INDEX, Others, Row, check_integer, of_one_dtype
+
+_ROWS = {
+    "cells": Row("cells", INDEX, ("n",)),
+    "centres": Row("centres", FLOATING, ("k", 3)),
+    "child_offsets": Row("child_offsets", INDEX, ("g+1",)),
+    "child": Row("child", INDEX, ("m",)),
+    "frozen": Row("frozen", (torch.bool,), ("k",)),
+    "rows": Row("rows", INDEX, (1,)),
+    "coords": Row("coords", FLOATING, ("n", 3)),
+}
+_ROWS_OF_A_TREE = {**_ROWS, "centres": Row("centres", FLOATING, ("m", 3))}
+
+
+class Where(NamedTuple):
+    """The arguments that tell the cells, which of these are frozen and how many samples count, as
+    ``voronerf.ops.routed_mlp`` takes them."""
+
+    centres: Tensor | None = None
+    child_offsets: Tensor | None = None
+    child: Tensor | None = None
+    depth: int = 1
+    cells: Tensor | None = None
+    coords: Tensor | None = None
+    rows: Tensor | None = None
+    frozen: Tensor | None = None
+
+    def to_check(self, op: str) -> Others:
+        """The rows of the tensors, and these, once it is clear that they may come together."""
+        if self.centres is None:
+            for name, given in (("child_offsets", self.child_offsets), ("child", self.child)):
+                if given is not None:
+                    raise ValueError(f"{op}: {name} must come with centres, got no centres")
+            if self.coords is not None:
+                raise ValueError(f"{op}: coords must come with centres, got none to compare them with")
+        else:
+            if self.cells is not None:
+                raise ValueError(f"{op}: centres must be None where cells are given, got both")
+            if (self.child_offsets is None) != (self.child is None):
+                missing = "child_offsets" if self.child_offsets is None else "child"
+                raise ValueError(f"{op}: child_offsets and child must come together, got no {missing}")
+            check_integer(op, "depth", self.depth, 1)
+            if self.child is None and self.depth != 1:
+                raise ValueError(f"{op}: depth must be 1 for a flat diagram, got {self.depth}")
+        rows: dict[str, Row] = _ROWS if self.child is None else _ROWS_OF_A_TREE
+        there = [name for name in rows if getattr(self, name) is not None]
+        return [rows[name] for name in there], [getattr(self, name) for name in there]
+
+    def at(self, op: str, positions: Tensor, sizes: dict[str, int]) -> Where:
+        """The same with the locations of samples at positions [n, p], in the dtype of the centres they are compared
+        with; ``sizes``: what the letters stand for, once the tensors are checked."""
+        if self.centres is None:
+            if self.cells is None and sizes["k"] != 1:
+                raise ValueError(f"{op}: centres or cells must be given for {sizes['k']} cells, got neither")
+            return self
+        if self.child is not None and (sizes["m"] < 1 or sizes["g"] < 1):
+            count = f"{sizes['m']} centres in {sizes['g']} diagrams"
+            raise ValueError(f"{op}: centres must hold at least one centre of one diagram, got {count}")
+        p = positions.shape[1]
+        if self.coords is None and p < 3:
+            raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {p}")
+        coords, centres = of_one_dtype(positions[:, :3] if self.coords is None else self.coords, self.centres)
+        return self._replace(coords=coords, centres=centres)
