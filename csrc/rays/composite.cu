@@ -145,12 +145,8 @@ __global__ void __launch_bounds__(kThreads)
   for (int64_t ray = threadIdx.x; colour != nullptr && ray < r; ray += kThreads) {
     sum += static_cast<double>(left[ray]) * static_cast<double>(colour[ray * c + k]);
   }
-  sums[threadIdx.x] = sum;
-  for (unsigned half = kThreads / 2; half > 0; half /= 2) {
-    __syncthreads();
-    if (threadIdx.x < half) sums[threadIdx.x] += sums[threadIdx.x + half];
-  }
-  if (threadIdx.x == 0) background[k] = static_cast<float>(sums[0]);
+  sum = sum_of_block<kThreads>(sum, sums);
+  if (threadIdx.x == 0) background[k] = static_cast<float>(sum);
 }
 
 __global__ void __launch_bounds__(kThreads)

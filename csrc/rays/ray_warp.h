@@ -30,9 +30,10 @@ __device__ inline float sum_of_lanes(float x) {
 }
 
 // Sum over this lane and those before it (after it, backwards).
-__device__ inline float running_sum(float x, int lane) {
+template <typename T>
+__device__ T running_sum(T x, int lane) {
   for (int step = 1; step < 32; step *= 2) {
-    const float other = __shfl_up_sync(kAllLanes, x, step);
+    const T other = __shfl_up_sync(kAllLanes, x, step);
     if (lane >= step) x += other;
   }
   return x;
@@ -44,6 +45,17 @@ __device__ inline float running_sum_back(float x, int lane) {
     if (lane + step < 32) x += other;
   }
   return x;
+}
+
+// Sum over the threads of a block, of all of which `sums` has room for one; for the first thread.
+template <int kThreads>
+__device__ double sum_of_block(double sum, double* sums) {
+  sums[threadIdx.x] = sum;
+  for (unsigned half = kThreads / 2; half > 0; half /= 2) {
+    __syncthreads();
+    if (threadIdx.x < half) sums[threadIdx.x] += sums[threadIdx.x + half];
+  }
+  return sums[threadIdx.x];
 }
 
 // Optical depth in front of each lane's sample; the carry moves to the end of the chunk.

@@ -139,12 +139,8 @@ __global__ void __launch_bounds__(kThreads)
   VN_SHARED(sums, double[kThreads]);
   double sum = 0.0;
   for (int64_t ray = threadIdx.x; ray < r; ray += kThreads) sum += static_cast<double>(ray_loss(error[ray], robust));
-  sums[threadIdx.x] = sum;
-  for (unsigned half = kThreads / 2; half > 0; half /= 2) {
-    __syncthreads();
-    if (threadIdx.x < half) sums[threadIdx.x] += sums[threadIdx.x + half];
-  }
-  if (threadIdx.x == 0) *loss = static_cast<float>(sums[0] / (3.0 * static_cast<double>(r)));
+  sum = sum_of_block<kThreads>(sum, sums);
+  if (threadIdx.x == 0) *loss = static_cast<float>(sum / (3.0 * static_cast<double>(r)));
 }
 
 }  // namespace

@@ -3,6 +3,7 @@
 // uniform's rank, counted by walking over the ray's uniforms (count^2 / 32 steps a lane, from cache), which needs no
 // scratch memory and leaves equal ones in their order.
 #include "common/cuda_wrappers.h"
+#include "rays/ray_warp.h"
 #include "rays/resample.h"
 
 namespace voronerf {
@@ -35,11 +36,7 @@ __global__ void __launch_bounds__(kThreads)
   for (int64_t start = 0; start < s; start += 32) {
     const int64_t i = start + lane;
     const double mass = i < s ? mass_of(weight[i]) : 0.0;
-    double running = mass;
-    for (int step = 1; step < 32; step *= 2) {
-      const double other = __shfl_up_sync(kAllLanes, running, step);
-      if (lane >= step) running += other;
-    }
+    const double running = running_sum(mass, lane);
     if (i < s) upper[i] = total + running;
     const unsigned massive = __ballot_sync(kAllLanes, mass > 0.0);
     if (massive != 0u) last = start + 31 - __clz(static_cast<int>(massive));
