@@ -15,6 +15,7 @@ import warp as wp
 from voronerf.kernels._launch import array, filled, launch
 from voronerf.ops._core.checks import MAX_COUNT
 from voronerf.ops._core.declare import declared
+from voronerf.ops.formulas import SPACINGS
 from voronerf.ops.march_rays.reference import March, fake, memory
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -23,40 +24,20 @@ _FIRST, _SECOND, _GOLDEN = (wp.constant(wp.uint32(number)) for number in (0x7FEB
 
 
 @wp.func
-def _depth(near: wp.float32, far: wp.float32, fraction: wp.float32, disparity: wp.bool) -> wp.float32:
+def _depth(near: wp.float32, far: wp.float32, fraction: wp.float32, spacing: wp.int32) -> wp.float32:
     depth = near + (far - near) * fraction
-    if disparity:
+    if spacing == 1:  # disparity
         inverse = far * (1.0 - fraction) + near * fraction
         depth = near * far / wp.max(inverse, 1.17549435e-38)
     return depth
 
 
 @wp.func
-def _edge(near: wp.float32, far: wp.float32, stratum: wp.int32, samples: wp.int32, disparity: wp.bool) -> wp.float32:
+def _edge(near: wp.float32, far: wp.float32, stratum: wp.int32, samples: wp.int32, spacing: wp.int32) -> wp.float32:
     edge = far
     if stratum < samples:
-        edge = _depth(near, far, wp.float32(stratum) / wp.float32(samples), disparity)
+        edge = _depth(near, far, wp.float32(stratum) / wp.float32(samples), spacing)
     return edge
-
-
-@wp.func
-def _sample(
-    near: wp.float32,
-    far: wp.float32,
-    stratum: wp.int32,
-    inside: wp.float32,
-    samples: wp.int32,
-    disparity: wp.bool,
-    first: wp.float32,
-    last: wp.float32,
-) -> wp.float32:
-    at = _depth(near, far, (wp.float32(stratum) + inside) / wp.float32(samples), disparity)
-    # Not min and max, which would turn NaN into a number.
-    if at < first:
-        at = first
-    if at > last:
-        at = last
-    return at
 
 
 @wp.func
@@ -136,7 +117,7 @@ class Given:
     started: wp.bool
     space: wp.array2d(dtype=wp.float32)
     samples: wp.int32
-    disparity: wp.bool
+    spacing: wp.int32
     most: wp.int32
 
 
@@ -173,14 +154,19 @@ def _march_kernel(given: Given, counting: wp.bool, offsets: wp.array(dtype=wp.in
     found = wp.int32(0)
     going = end > begin and stratum < given.samples
     while going:
-        first = _edge(begin, end, stratum, given.samples, given.disparity)
-        last = _edge(begin, end, stratum + 1, given.samples, given.disparity)
+        first = _edge(begin, end, stratum, given.samples, given.spacing)
+        last = _edge(begin, end, stratum + 1, given.samples, given.spacing)
         inside = wp.float32(0.5)
         if given.jittered:
             inside = given.uniforms[ray, stratum]
         if given.hashed:
             inside = _hashed(key, stratum)
-        at = _sample(begin, end, stratum, inside, given.samples, given.disparity, first, last)
+        at = _depth(begin, end, (wp.float32(stratum) + inside) / wp.float32(given.samples), given.spacing)
+        # Not min and max, which would turn NaN into a number.
+        if at < first:
+            at = first
+        if at > last:
+            at = last
         point = _point(origin, direction, at, given.space)
         x = _cell(point[0], given.box[0, 0], given.box[1, 0], given.occupied.shape[0])
         y = _cell(point[1], given.box[0, 1], given.box[1, 1], given.occupied.shape[1])
@@ -248,5 +234,5 @@ def _inputs(rays: Any) -> Any:
     )
     rest = ("origins", "directions", "near", "far", "occupied", "box", "samples")
     most = rays.samples if rays.most is None else rays.most
-    filled(given, disparity=rays.spacing == "disparity", most=most)
+    filled(given, spacing=SPACINGS.index(rays.spacing), most=most)
     return filled(given, **{name: getattr(rays, name) for name in rest})

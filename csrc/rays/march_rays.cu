@@ -8,6 +8,7 @@
 
 #include "common/cuda_wrappers.h"
 #include "rays/march_rays_math.h"
+#include "rays/ray_warp.h"
 
 namespace voronerf {
 
@@ -20,12 +21,15 @@ static_assert(kMarchWord == 32, "a word of the mask is the votes of a warp");
 
 __device__ __forceinline__ uint32_t lanes_below(int lane) { return (1u << lane) - 1u; }
 
-__device__ __forceinline__ float sample_of(const MarchInputs& in, const MarchRay& ray, uint32_t key, int64_t i,
-                                           int64_t stratum, float* point, float& length) {
-  const float first = march_edge(ray, stratum, in.disparity), last = march_edge(ray, stratum + 1, in.disparity);
-  const float at = march_sample(ray, stratum, march_inside(in, key, i, stratum), first, last, in.disparity);
+VN_HD float sample_of(const MarchInputs& in, const MarchRay& ray, uint32_t key, int64_t i, int64_t stratum,
+                      float* point, float& length) {
+  const float at = march_by_rule(in.spacing, [&](auto rule) {
+    using Rule = decltype(rule);
+    const float first = march_edge<Rule>(ray, stratum), last = march_edge<Rule>(ray, stratum + 1);
+    length = last - first;
+    return march_sample<Rule>(ray, stratum, march_inside(in, key, i, stratum), first, last);
+  });
   march_point(in, march_where(in), in.origins + 3 * i, in.directions + 3 * i, at, point);
-  length = last - first;
   return at;
 }
 
@@ -70,18 +74,10 @@ __global__ void __launch_bounds__(kScanThreads) march_scan_kernel(int32_t* offse
   if (threadIdx.x == 0) offsets[0] = 0;
   for (int64_t first = 1; first <= r; first += kScanThreads) {
     const int64_t i = first + threadIdx.x;
-    int32_t sum = i <= r ? offsets[i] : 0;
-    for (int step = 1; step < 32; step *= 2) {
-      const int32_t other = __shfl_up_sync(kAllLanes, sum, step);
-      if (lane >= step) sum += other;
-    }
+    const int32_t sum = running_sum(i <= r ? offsets[i] : 0, lane);
     if (lane == 31) sums[warp] = sum;
     __syncthreads();
-    int32_t of_warps = sums[lane];
-    for (int step = 1; step < 32; step *= 2) {
-      const int32_t other = __shfl_up_sync(kAllLanes, of_warps, step);
-      if (lane >= step) of_warps += other;
-    }
+    const int32_t of_warps = running_sum(sums[lane], lane);
     const int32_t lower = __shfl_sync(kAllLanes, of_warps, warp == 0 ? 0 : warp - 1);
     const int32_t total = before + (warp == 0 ? 0 : lower) + sum;
     if (i <= r) offsets[i] = total < capacity ? total : static_cast<int32_t>(capacity);

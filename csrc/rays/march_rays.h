@@ -19,6 +19,9 @@ struct MarchSpace {
   const float* perspective;  // [5,3], centre, right, up, ahead and (near, a, b)
 };
 
+// Rules of depths, each a struct of march_rays_math.h.
+enum class MarchSpacing : int { linear = 0, disparity };
+
 struct MarchInputs {
   const float *origins, *directions;  // [r,3]
   const float *near, *far;            // [r]
@@ -30,7 +33,7 @@ struct MarchInputs {
   RowCount r;
   int64_t s;
   int64_t x, y, z;
-  bool disparity;
+  MarchSpacing spacing;
   int64_t most;  // samples of a ray
   MarchSpace space;
 };

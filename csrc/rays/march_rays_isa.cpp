@@ -21,14 +21,20 @@ typedef int32_t Ints __attribute__((vector_size(4 * kLanes)));
 constexpr int64_t kUnit = 16;      // samples that are filled in together
 constexpr int64_t kTogether = 32;  // rays that leap together: of 16, each vector waits for the one before
 
+// The space of the grid as a type.
+template <MarchWhere W>
+struct Space {
+  static constexpr MarchWhere kWhere = W;
+};
+
 // Cells of 32 strata from `first`, -1 outside the box.
-template <MarchWhere W, bool Disparity>
+template <MarchWhere W, typename Rule>
 VN_INLINE void cells_of(const MarchInputs& in, const MarchRay& ray, const float* origin, const float* direction,
                         const float* scale, const float* uniforms, int64_t first, int32_t* cells) {
   float edges[kMarchWord + 1];
-  for (int64_t j = 0; j <= kMarchWord; ++j) edges[j] = march_edge(ray, first + j, Disparity);
+  for (int64_t j = 0; j <= kMarchWord; ++j) edges[j] = march_edge<Rule>(ray, first + j);
   for (int64_t j = 0; j < kMarchWord; ++j) {
-    const float at = march_sample(ray, first + j, uniforms[j], edges[j], edges[j + 1], Disparity);
+    const float at = march_sample<Rule>(ray, first + j, uniforms[j], edges[j], edges[j + 1]);
     float point[3];
     march_point(in, W, origin, direction, at, point);
     cells[j] = march_cell(in, scale, point);
@@ -37,7 +43,7 @@ VN_INLINE void cells_of(const MarchInputs& in, const MarchRay& ray, const float*
 
 VN_INLINE int bits_of(uint32_t word) { return __builtin_popcount(word); }
 
-template <MarchWhere W, bool Disparity>
+template <MarchWhere W, typename Rule>
 void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
   float scale[3];
@@ -60,7 +66,7 @@ void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin
         for (int64_t j = 0; j < kMarchWord; ++j) uniforms[j] = 0.5f;
         if (in.uniforms != nullptr) __builtin_memcpy(uniforms, in.uniforms + i * in.s + first, sizeof(float) * there);
       }
-      cells_of<W, Disparity>(in, ray, in.origins + 3 * i, in.directions + 3 * i, scale, uniforms, first, cells);
+      cells_of<W, Rule>(in, ray, in.origins + 3 * i, in.directions + 3 * i, scale, uniforms, first, cells);
       uint32_t word = 0;
       for (int64_t j = 0; j < kMarchWord; ++j) {
         // Without a branch, which nothing could predict.
@@ -80,9 +86,10 @@ void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin
 
 // Whether the middles of strata lie between their edges whatever is rounded, and whether a depth tells its stratum:
 // strata are wide against the digits of their depths.
-VN_INLINE bool wide(const MarchRay& ray, bool disparity) {
+template <typename Rule>
+VN_INLINE bool wide(const MarchRay& ray) {
   const float largest = __builtin_fmaxf(__builtin_fabsf(ray.near), __builtin_fabsf(ray.far));
-  return (!disparity || ray.near > 0.0f) && ray.far - ray.near >= 1e-5f * ray.count * largest;
+  return Rule::has_inverse(ray) && ray.far - ray.near >= 1e-5f * ray.count * largest;
 }
 
 // Cells that a ray's point passes in the grid, at most, while the ray goes on by 1: for all of the way to `kMarchRoom`
@@ -141,7 +148,7 @@ struct Walk {
       share[kTogether];
 };
 
-template <bool Disparity>
+template <typename Rule>
 VN_INLINE void enter(const MarchInputs& in, float width, int64_t i, int64_t j, Walk& walk) {
   const MarchRay ray = march_ray(in, i);
   float away = 0.0f, square = 0.0f;
@@ -153,14 +160,14 @@ VN_INLINE void enter(const MarchInputs& in, float width, int64_t i, int64_t j, W
   walk.ray[j] = static_cast<int32_t>(i), walk.found[j] = 0;
   walk.stratum[j] = in.start == nullptr || in.start[i] < 0 ? 0 : in.start[i];
   walk.near[j] = ray.near, walk.far[j] = ray.far, walk.length[j] = __builtin_sqrtf(square);
-  // What may be rounded of a place, in cells; and strata in a unit of 1 - near / depth, or of depth - near.
+  // What may be rounded of a place, in cells; and strata in a unit of progress.
   walk.slack[j] = 1e-3f + 1e-6f * (away + __builtin_fabsf(ray.far) * walk.length[j]) / width;
-  walk.share[j] = (Disparity ? ray.far : 1.0f) / (ray.far - ray.near) * ray.count;
+  walk.share[j] = Rule::rate(ray) * ray.count;
 }
 
 // Middles of strata of the rays of [begin, end) whose count is kToWalk, from empty cell to empty cell: a ray goes on by
 // as much as no occupied cell can be near. A lane whose ray has ended takes the next one.
-template <MarchWhere W, bool Disparity>
+template <MarchWhere W, typename Rule>
 VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* scale, uint32_t* mask, int32_t* counts,
                     int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
@@ -181,10 +188,10 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
       if (walk.ray[j] >= 0) counts[walk.ray[j]] = walk.found[j];
       while (next_ray < end && counts[next_ray] != kToWalk) ++next_ray;
       if (next_ray < end) {
-        enter<Disparity>(in, width, next_ray++, j, walk);
+        enter<Rule>(in, width, next_ray++, j, walk);
         continue;
       }
-      enter<Disparity>(in, width, begin, j, walk);  // anything: it is not looked at
+      enter<Rule>(in, width, begin, j, walk);  // anything: it is not looked at
       walk.ray[j] = -1, walk.stratum[j] = strata;
       there &= ~(1u << j);
     }
@@ -195,7 +202,7 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
       const float o[3] = {walk.from[0][j], walk.from[1][j], walk.from[2][j]};
       const float d[3] = {walk.along[0][j], walk.along[1][j], walk.along[2][j]};
       const MarchRay ray{walk.near[j], walk.far[j], any.count, any.share};
-      const float at = march_depth(ray, march_fraction(ray, static_cast<float>(walk.stratum[j]) + 0.5f), Disparity);
+      const float at = Rule::depth(ray, march_fraction(ray, static_cast<float>(walk.stratum[j]) + 0.5f));
       float point[3];
       march_point(in, W, o, d, at, point);
       cells[j] = march_cell(in, scale, point);
@@ -218,8 +225,8 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
     for (int64_t j = 0; j < kTogether; ++j) {
       const float cellwise = static_cast<float>(rooms[j] - 1) + free[j];
       const float to = depth[j] + (cellwise < 0.0f ? 0.0f : cellwise) / pace[j];
-      const float share = Disparity ? 1.0f - walk.near[j] / to : to - walk.near[j];
-      const float whole = share * walk.share[j] + before, ahead = whole < count ? whole : count;
+      const float whole = Rule::progress(walk.near[j], to) * walk.share[j] + before;
+      const float ahead = whole < count ? whole : count;
       const int32_t far = static_cast<int32_t>(whole >= 0.0f ? ahead : 0.0f), one = walk.stratum[j] + 1;
       next[j] = far < one ? one : far;
     }
@@ -239,7 +246,7 @@ VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* sca
   }
 }
 
-template <MarchWhere W, bool Disparity>
+template <MarchWhere W, typename Rule>
 VN_INLINE void count_by_leaps(const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts,
                               int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
@@ -247,18 +254,18 @@ VN_INLINE void count_by_leaps(const MarchInputs& in, const uint8_t* room, uint32
   march_scale(in, scale);
   for (int64_t i = begin; i < end; ++i) {
     const bool ended = in.start != nullptr && in.start[i] >= in.s;
-    if (ended || !wide(march_ray(in, i), Disparity)) {
-      count<W, Disparity>(in, mask, counts, i, i + 1);
+    if (ended || !wide<Rule>(march_ray(in, i))) {
+      count<W, Rule>(in, mask, counts, i, i + 1);
       continue;
     }
     for (int64_t w = i * words; w < (i + 1) * words; ++w) mask[w] = 0;
     counts[i] = kToWalk;
   }
-  leap<W, Disparity>(in, room, scale, mask, counts, begin, end);
+  leap<W, Rule>(in, room, scale, mask, counts, begin, end);
 }
 
 // Samples in `strata`, at most kUnit of one ray, to rows from `row`.
-template <MarchWhere W, bool Disparity>
+template <MarchWhere W, typename Rule>
 __attribute__((noinline)) void fill_unit(const MarchInputs& in, const MarchRay& ray, uint32_t key, int64_t i,
                                          const int32_t* strata, int64_t many, int64_t row, int32_t* ray_index,
                                          float* depths, float* deltas, float* positions) {
@@ -271,8 +278,8 @@ __attribute__((noinline)) void fill_unit(const MarchInputs& in, const MarchRay& 
     for (int64_t j = 0; in.uniforms != nullptr && j < many; ++j) inside[j] = in.uniforms[i * in.s + strata[j]];
   }
   for (int64_t j = 0; j < kUnit; ++j) {
-    const float first = march_edge(ray, strata[j], Disparity), last = march_edge(ray, strata[j] + 1, Disparity);
-    at[j] = march_sample(ray, strata[j], inside[j], first, last, Disparity);
+    const float first = march_edge<Rule>(ray, strata[j]), last = march_edge<Rule>(ray, strata[j] + 1);
+    at[j] = march_sample<Rule>(ray, strata[j], inside[j], first, last);
     length[j] = last - first;
     float point[3];
     march_point(in, W, origin, direction, at[j], point);
@@ -286,7 +293,7 @@ __attribute__((noinline)) void fill_unit(const MarchInputs& in, const MarchRay& 
   }
 }
 
-template <MarchWhere W, bool Disparity>
+template <MarchWhere W, typename Rule>
 VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
                     float* depths, float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
   const int64_t words = march_words(in.s);
@@ -307,7 +314,7 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
           break;
         }
         if (waiting == kUnit) {
-          fill_unit<W, Disparity>(in, ray, key, i, strata, kUnit, row, ray_index, depths, deltas, positions);
+          fill_unit<W, Rule>(in, ray, key, i, strata, kUnit, row, ray_index, depths, deltas, positions);
           row += kUnit;
           waiting = 0;
         }
@@ -316,54 +323,41 @@ VN_INLINE void fill(const MarchInputs& in, const uint32_t* mask, const int32_t* 
       }
     }
     if (waiting > 0) {
-      fill_unit<W, Disparity>(in, ray, key, i, strata, waiting, row, ray_index, depths, deltas, positions);
+      fill_unit<W, Rule>(in, ray, key, i, strata, waiting, row, ray_index, depths, deltas, positions);
     }
     stop[i] = static_cast<int32_t>(next);
   }
 }
 
-template <MarchWhere W>
-VN_INLINE void count_in(const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts, int64_t begin,
-                        int64_t end) {
-  if (room != nullptr) {
-    return in.disparity ? count_by_leaps<W, true>(in, room, mask, counts, begin, end)
-                        : count_by_leaps<W, false>(in, room, mask, counts, begin, end);
-  }
-  return in.disparity ? count<W, true>(in, mask, counts, begin, end) : count<W, false>(in, mask, counts, begin, end);
-}
-
-template <MarchWhere W>
-VN_INLINE void fill_in(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
-                       float* depths, float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
-  if (in.disparity) {
-    fill<W, true>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
-  } else {
-    fill<W, false>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
-  }
+// Calls `run` with the space of the grid and the rule of depths.
+template <typename Run>
+VN_INLINE void specialised(const MarchInputs& in, const Run& run) {
+  march_by_rule(in.spacing, [&](auto rule) {
+    const MarchWhere where = march_where(in);
+    if (where == MarchWhere::kSphere) return run(Space<MarchWhere::kSphere>(), rule);
+    if (where == MarchWhere::kPerspective) return run(Space<MarchWhere::kPerspective>(), rule);
+    return run(Space<MarchWhere::kWorld>(), rule);
+  });
 }
 
 }  // namespace
 
 void march_count(const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts, int64_t begin,
                  int64_t end) {
-  if (in.space.sphere != nullptr) {
-    count_in<MarchWhere::kSphere>(in, room, mask, counts, begin, end);
-  } else if (in.space.perspective != nullptr) {
-    count_in<MarchWhere::kPerspective>(in, room, mask, counts, begin, end);
-  } else {
-    count_in<MarchWhere::kWorld>(in, room, mask, counts, begin, end);
-  }
+  specialised(in, [&](auto space, auto rule) {
+    if (room != nullptr) {
+      count_by_leaps<space.kWhere, decltype(rule)>(in, room, mask, counts, begin, end);
+    } else {
+      count<space.kWhere, decltype(rule)>(in, mask, counts, begin, end);
+    }
+  });
 }
 
 void march_fill(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index, float* depths,
                 float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
-  if (in.space.sphere != nullptr) {
-    fill_in<MarchWhere::kSphere>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
-  } else if (in.space.perspective != nullptr) {
-    fill_in<MarchWhere::kPerspective>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
-  } else {
-    fill_in<MarchWhere::kWorld>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
-  }
+  specialised(in, [&](auto space, auto rule) {
+    fill<space.kWhere, decltype(rule)>(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
+  });
 }
 
 }  // namespace VN_ISA_NAMESPACE

@@ -38,19 +38,42 @@ VN_HD float march_fraction(const MarchRay& ray, float strata) {
   return ray.share > 0.0f ? march_product(strata, ray.share) : strata / ray.count;
 }
 
-VN_HD float march_depth(const MarchRay& ray, float fraction, bool disparity) {
-  if (!disparity) return ray.near + march_product(ray.far - ray.near, fraction);
-  const float inverse = march_product(ray.far, 1.0f - fraction) + march_product(ray.near, fraction);
-  return march_product(ray.near, ray.far) / (inverse < 1.17549435e-38f ? 1.17549435e-38f : inverse);
+// A rule of depths: the depth at a fraction of the way, and its inverse, the fraction at a depth, which is `progress`
+// times `rate` where there is one.
+struct MarchLinear {
+  VN_HD float depth(const MarchRay& ray, float fraction) {
+    return ray.near + march_product(ray.far - ray.near, fraction);
+  }
+  VN_HD float progress(float near, float depth) { return depth - near; }
+  VN_HD float rate(const MarchRay& ray) { return 1.0f / (ray.far - ray.near); }
+  VN_HD bool has_inverse(const MarchRay&) { return true; }
+};
+
+struct MarchDisparity {
+  VN_HD float depth(const MarchRay& ray, float fraction) {
+    const float inverse = march_product(ray.far, 1.0f - fraction) + march_product(ray.near, fraction);
+    return march_product(ray.near, ray.far) / (inverse < 1.17549435e-38f ? 1.17549435e-38f : inverse);
+  }
+  VN_HD float progress(float near, float depth) { return 1.0f - near / depth; }
+  VN_HD float rate(const MarchRay& ray) { return ray.far / (ray.far - ray.near); }
+  VN_HD bool has_inverse(const MarchRay& ray) { return ray.near > 0.0f; }
+};
+
+// Calls `run` with the rule.
+template <typename Run>
+VN_HD auto march_by_rule(MarchSpacing spacing, const Run& run) {
+  return spacing == MarchSpacing::disparity ? run(MarchDisparity()) : run(MarchLinear());
 }
 
-VN_HD float march_edge(const MarchRay& ray, int64_t i, bool disparity) {
+template <typename Rule>
+VN_HD float march_edge(const MarchRay& ray, int64_t i) {
   const float number = static_cast<float>(i);
-  return number < ray.count ? march_depth(ray, march_fraction(ray, number), disparity) : ray.far;
+  return number < ray.count ? Rule::depth(ray, march_fraction(ray, number)) : ray.far;
 }
 
-VN_HD float march_sample(const MarchRay& ray, int64_t i, float inside, float first, float last, bool disparity) {
-  const float at = march_depth(ray, march_fraction(ray, static_cast<float>(i) + inside), disparity);
+template <typename Rule>
+VN_HD float march_sample(const MarchRay& ray, int64_t i, float inside, float first, float last) {
+  const float at = Rule::depth(ray, march_fraction(ray, static_cast<float>(i) + inside));
   const float above = at < first ? first : at;
   return above > last ? last : above;
 }

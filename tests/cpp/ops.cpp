@@ -207,9 +207,10 @@ void march(Isa isa) {
   const int32_t seed = static_cast<int32_t>(below(1000));
   Array<uint8_t> occupied(x * y * z);
   for (uint8_t& cell : occupied) cell = static_cast<uint8_t>(below(2));
-  const bool hashed = uniforms.empty() && below(2) == 0, disparity = below(2) == 0, contracted = below(2) == 0;
+  const bool hashed = uniforms.empty() && below(2) == 0, contracted = below(2) == 0;
+  const auto spacing = static_cast<voronerf::MarchSpacing>(below(2));
   const voronerf::MarchInputs in{origins.data(), directions.data(), near.data(), far.data(), occupied.data(), box,
-                                 or_null(uniforms), hashed ? &seed : nullptr, nullptr, r, s, x, y, z, disparity,
+                                 or_null(uniforms), hashed ? &seed : nullptr, nullptr, r, s, x, y, z, spacing,
                                  1 + below(s), {contracted ? sphere : nullptr, nullptr}};
   Array<float> depths[2];
   for (int i = 0; i < 2; ++i) {

@@ -10,6 +10,7 @@ from torch import Tensor
 from voronerf.nerf import Contraction, Perspective
 from voronerf.nerf.sampling import stratified_depths
 from voronerf.ops import march_rays
+from voronerf.ops.formulas import SPACINGS
 
 SPHERE = Contraction(torch.tensor([0.1, -0.2, 0.3]), radius=0.7)
 AXES = torch.linalg.qr(torch.tensor([[1.0, 0.2, 0.1], [-0.3, 1.0, 0.2], [0.1, -0.2, 1.0]])).Q
@@ -46,7 +47,7 @@ def same(found, expected):
 
 def test_a_full_grid_gives_stratified_samples(device, backend):
     given = case(9) | {"occupied": torch.ones(3, 2, 4, dtype=torch.bool), "box": torch.tensor([[-9.0] * 3, [9.0] * 3])}
-    for spacing in ("linear", "disparity"):
+    for spacing in SPACINGS:
         found = march(given, 33, device, backend, spacing=spacing)
         depths, deltas, _ = stratified_depths(given["near"], given["far"], 33, jitter=False, spacing=spacing)
         torch.testing.assert_close(found.depths.reshape(9, 33), depths)
@@ -113,7 +114,7 @@ def test_equals_the_reference_to_the_last_bit(device, backend, rest, r, samples)
 
 
 @pytest.mark.parametrize("rest", [{}, {"contraction": SPHERE.numbers}, {"contraction": AHEAD.numbers}])
-@pytest.mark.parametrize("spacing", ["linear", "disparity"])
+@pytest.mark.parametrize("spacing", SPACINGS)
 def test_many_rays_of_a_picture_equal_the_reference(device, backend, rest, spacing):
     need("march_rays", backend, device, torch.float32)
     rest = rest | {"spacing": spacing}
@@ -177,7 +178,6 @@ def test_refuses_what_makes_no_sense():
     refuses = refusals(march_rays, **case(4), samples=8)
     refuses("occupied must have at least one cell, got [2, 0, 2]", occupied=torch.ones(2, 0, 2, dtype=torch.bool))
     refuses("samples must be at least 1, got 0", samples=0)
-    refuses("samples must be at most 65535, got 65536", samples=65_536)
     seed = torch.zeros(1, dtype=torch.int32)
     refuses("seed must be None where uniforms are given, got both", uniforms=torch.zeros(4, 8), seed=seed)
     refuses("most must be at least 1, got 0", most=0)
@@ -185,4 +185,3 @@ def test_refuses_what_makes_no_sense():
     refuses("contraction must be a tensor, got str", contraction="sphere")
     refuses("contraction must have shape [4], got [3]", contraction=torch.zeros(3))
     refuses("contraction must have shape [5, 3], got [2, 3]", contraction=torch.zeros(2, 3))
-    refuses("spacing must be one of linear, disparity, got 'log'", spacing="log")

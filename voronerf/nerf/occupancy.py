@@ -21,6 +21,7 @@ from voronerf.nerf.cameras import Rays
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.field import Field
 from voronerf.nerf.radiance import radiance_of
+from voronerf.nerf.sampling import random_uniforms
 from voronerf.ops._core.checks import check_range
 from voronerf.ops.draw_points import draw_points
 from voronerf.ops.formulas import voxels_of
@@ -204,16 +205,11 @@ class OccupancyGrid:
         """
         if not 0 <= decay <= 1:
             raise ValueError(f"OccupancyGrid.update: decay must lie in 0..1, got {decay}")
-        device = self.box.device
         if voxels is None:
-            voxels = torch.arange(self.occupied.numel(), device=device)
+            voxels = torch.arange(self.occupied.numel(), device=self.box.device)
         check_range("OccupancyGrid.update", "voxels", voxels, self.occupied.numel())
-        drawn_on = device if generator is None else generator.device
         # All points before the first is entered: `decay` is of the densities from before.
-        points = [
-            self.points(part, torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device))
-            for part in voxels.split(CHUNK)
-        ]
+        points = [self.points(part, random_uniforms(len(part), 3, self.box, generator)) for part in voxels.split(CHUNK)]
         densities = [_density_of(field, part) for part in points]
         if densities:
             self._enter(torch.cat(points), torch.cat(densities), decay=decay, hidden=0.0, backend=backend)
@@ -282,12 +278,11 @@ class OccupancyGrid:
         """
         beside = torch.nn.functional.avg_pool3d(self.occupied[None].float(), 3, 1, 1, divisor_override=1)[0]
         holes = ((beside >= HOLE_NEIGHBOURS) & ~self.occupied).view(-1).nonzero()[:, 0]
-        least, device = HOLE_DENSITY * self.threshold, self.box.device
-        drawn_on = device if generator is None else generator.device
+        least = HOLE_DENSITY * self.threshold
         for _ in range(HOLE_POINTS):
             dense = [holes[:0]]
             for part in holes.split(CHUNK):
-                points = self.points(part, torch.rand(len(part), 3, generator=generator, device=drawn_on).to(device))
+                points = self.points(part, random_uniforms(len(part), 3, self.box, generator))
                 density = density_of(field, points)
                 if self.contraction is not None:
                     density = density * self.contraction.stretch(points)

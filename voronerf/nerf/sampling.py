@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from voronerf.ops.formulas import SPACINGS, depth_of
 from voronerf.ops.resample import resample
 
-SPACINGS = ("linear", "disparity")
 #: Added to the weights of all intervals before drawing from them (mip-NeRF, equation 18).
 PADDING = 0.01
 
@@ -59,11 +59,7 @@ def stratified_depths(
 
     steps = torch.arange(samples + 1, device=near.device, dtype=near.dtype) / samples
     edges = _spaced(near[:, None], far[:, None], steps[None, :], spacing)
-    if jitter:
-        device = near.device if generator is None else generator.device
-        inside = torch.rand(len(near), samples, device=device, dtype=near.dtype, generator=generator).to(near.device)
-    else:
-        inside = torch.full((1, samples), 0.5, device=near.device, dtype=near.dtype)
+    inside = random_uniforms(len(near), samples, near, generator) if jitter else near.new_full((1, samples), 0.5)
     fractions = (torch.arange(samples, device=near.device, dtype=near.dtype) + inside) / samples
     depths = _spaced(near[:, None], far[:, None], fractions, spacing)
     # rounding may put a sample a last bit outside its stratum
@@ -96,11 +92,16 @@ def stratified_edges(
     edges = stratified_depths(near, far, samples, jitter=False, spacing=spacing)[2]
     if not jitter:
         return edges
-    device = near.device if generator is None else generator.device
-    shift = torch.rand(len(near), samples - 1, device=device, dtype=near.dtype, generator=generator).to(near.device)
+    shift = random_uniforms(len(near), samples - 1, near, generator)
     steps = (torch.arange(1, samples, device=near.device, dtype=near.dtype) - 0.5 + shift) / samples
     inner = _spaced(near[:, None], far[:, None], steps, spacing)
     return torch.cat((edges[:, :1], inner, edges[:, -1:]), dim=1)
+
+
+def random_uniforms(rows: int, columns: int, like: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Random numbers [rows, columns] in 0..1, drawn on the device of the generator, and moved to that of `like`."""
+    device = like.device if generator is None else generator.device
+    return torch.rand(rows, columns, device=device, dtype=like.dtype, generator=generator).to(like.device)
 
 
 def strata_uniforms(
@@ -112,8 +113,7 @@ def strata_uniforms(
     """
     if not jitter:
         return None
-    device = like.device if generator is None else generator.device
-    drawn = torch.rand(rays, count, device=device, dtype=like.dtype, generator=generator).to(like.device)
+    drawn = random_uniforms(rays, count, like, generator)
     return (torch.arange(count, device=like.device, dtype=like.dtype) + drawn) / count
 
 
@@ -159,6 +159,4 @@ def _spaced(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor
     """Distance at a fraction of the way, exact at both ends."""
     if spacing == "linear":
         return torch.lerp(near, far, fraction)
-    # 1 / lerp(1 / near, 1 / far), without the two roundings of the reciprocals, and without 0 / 0 where near is 0
-    disparity = far * (1 - fraction) + near * fraction
-    return torch.where(fraction < 1, near * far / disparity.clamp_min(torch.finfo(near.dtype).tiny), far)
+    return torch.where(fraction < 1, depth_of(near, far, fraction, spacing), far)

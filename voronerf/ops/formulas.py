@@ -22,6 +22,21 @@ def in_pieces(run: Callable[..., Tensor], rows: int, *tensors: Tensor) -> Tensor
     return torch.cat([run(*piece) for piece in zip(*(tensor.split(max(1, rows)) for tensor in tensors))])
 
 
+# Depths ---------------------------------------------------------------------------------------------------------------
+
+SPACINGS = ("linear", "disparity")
+"""How strata of a ray are spaced."""
+
+
+def depth_of(near: Tensor, far: Tensor, fraction: Tensor, spacing: str) -> Tensor:
+    """The distance at a fraction of the way, in equal steps of distance or of 1 / distance."""
+    if spacing == "linear":
+        return near + (far - near) * fraction
+    # 1 / lerp(1 / near, 1 / far), without the two roundings of the reciprocals, and without 0 / 0 where near is 0
+    inverse = far * (1 - fraction) + near * fraction
+    return near * far / inverse.clamp_min(torch.finfo(near.dtype).tiny)
+
+
 # Boxes ----------------------------------------------------------------------------------------------------------------
 
 

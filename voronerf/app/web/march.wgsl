@@ -45,7 +45,7 @@ fn turned(angle: vec4f) -> vec4f {
 
 // Where a ray is at a share of its way, in equal steps of distance or of 1 / distance.
 fn depth_of(near: f32, far: f32, share: f32) -> f32 {
-  if (!DISPARITY) { return near + (far - near) * share; }
+  if (SPACING == 0u) { return near + (far - near) * share; }
   return near * far / max(far * (1.0 - share) + near * share, 1.17549435e-38);
 }
 

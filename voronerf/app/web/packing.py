@@ -30,6 +30,7 @@ from voronerf.nerf.cameras import Cameras, focus_point
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.radiance import Radiance, radiance_of
 from voronerf.nerf.samplers import FINE_WAVE, OPAQUE, Occupancy
+from voronerf.ops.formulas import SPACINGS
 
 #: Bytes of a part: WebGPU lets every shader read so many at once.
 LARGEST = 2**27
@@ -182,7 +183,7 @@ def _constants(run: Run, sampler: Occupancy, levels: int, table: int) -> dict[st
         "STRATA": sampler.picture_samples,
         "WAVE": FINE_WAVE,
         "OPAQUE": OPAQUE,
-        "DISPARITY": sampler.space.spacing == "disparity",
+        "SPACING": SPACINGS.index(sampler.space.spacing),
         "NEAR": float(scene.near),
         "FAR": float(scene.far),
         "BOXED": scene.box is not None,

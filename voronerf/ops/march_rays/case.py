@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from voronerf.ops._core.cases import Arguments, Case, Draw
+from voronerf.ops.formulas import SPACINGS
 
 
 def _make(draw: Draw, n: int) -> Arguments:
@@ -24,7 +25,7 @@ def _make(draw: Draw, n: int) -> Arguments:
         call |= {"start": draw.integers(0, 3, n), "most": draw.number("most", 5, 1, 9)}
         call["capacity"] = draw.number("capacity", 40, 1, 200)
     sphere, frustum = draw.uniform(4, dtype=dtype) + 0.1, draw.uniform(5, 3, dtype=dtype) + 0.1
-    spacing = draw.among("spacing", "linear", "disparity")
+    spacing = draw.among("spacing", *SPACINGS)
     return {**call, "contraction": draw.among("contraction", None, sphere, frustum), "spacing": spacing}
 
 
@@ -32,7 +33,7 @@ CASE = Case(
     _make,
     {"": {}, "by a seed": {"jitter": "seed", "spacing": "disparity"}},
     refused={
-        "samples must be at most 65535, got 70000": {"samples": 70_000, "uniforms": None},
+        "samples must be at most 65535, got 65536": {"samples": 65_536, "uniforms": None},
         "spacing must be one of linear, disparity, got 'x'": {"spacing": "x"},
     },
 )

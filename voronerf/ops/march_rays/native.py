@@ -29,7 +29,6 @@ def space_of(given: Any) -> native.compiled.MarchSpace:
 _OP = declared("march_rays")
 INPUTS: dict[str, Any] = {
     "s": "samples",
-    "disparity": lambda given: given.spacing == "disparity",
     "most": lambda given: given.samples if given.most is None else given.most,
     "space": space_of,
 }

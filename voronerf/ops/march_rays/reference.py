@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from voronerf.ops._core.rows import new_empty, rows_of
+from voronerf.ops.formulas import depth_of
 
 
 class March(NamedTuple):
@@ -60,33 +61,19 @@ def fake(given: Any) -> March:
 @torch.no_grad()
 def march_rays(*given: Any) -> March:
     """One sample for each stratum that falls in an occupied cell; see ``voronerf.ops.march_rays``."""
-    (
-        origins,
-        directions,
-        near,
-        far,
-        occupied,
-        box,
-        samples,
-        uniforms,
-        seed,
-        spacing,
-        start,
-        most,
-        capacity,
-        contraction,
-    ) = given
-    disparity, most = spacing == "disparity", samples if most is None else most
+    origins, directions, near, far, occupied, box, samples, *options = given
+    uniforms, seed, spacing, start, most, capacity, contraction = options
+    most = samples if most is None else most
     r, device = len(near), near.device
     stratum = torch.arange(samples + 1, device=device)
     # Divisions are by tensors: one by a number may be done as a product with its reciprocal, and round otherwise.
     count = near.new_full((), samples)
-    edges = _depth(near[:, None], far[:, None], stratum.to(near.dtype) / count, disparity)
+    edges = depth_of(near[:, None], far[:, None], stratum.to(near.dtype) / count, spacing)
     edges = torch.where(stratum < samples, edges, far[:, None])
     if seed is not None:
         uniforms = hashed_uniforms(seed, r, samples).to(near.dtype)
     inside = near.new_full((), 0.5) if uniforms is None else uniforms
-    at = _depth(near[:, None], far[:, None], (stratum[:-1].to(near.dtype) + inside) / count, disparity)
+    at = depth_of(near[:, None], far[:, None], (stratum[:-1].to(near.dtype) + inside) / count, spacing)
     at = torch.minimum(torch.maximum(at, edges[:, :-1]), edges[:, 1:])
 
     taken = far[:, None] > near[:, None]
@@ -163,11 +150,3 @@ def contracted(points: list[Tensor], contraction: Tensor | None) -> list[Tensor]
     right, up, ahead = (x * axis[0] + y * axis[1] + z * axis[2] for axis in contraction[1:4])
     depth = torch.maximum(ahead, near / 2)
     return [right / (depth * across), up / (depth * down), 1 - 2 * near / depth]
-
-
-def _depth(near: Tensor, far: Tensor, fraction: Tensor, disparity: bool) -> Tensor:
-    """Distance at a fraction of the way, in equal steps of distance or of 1 / distance."""
-    if not disparity:
-        return near + (far - near) * fraction
-    inverse = far * (1 - fraction) + near * fraction
-    return near * far / inverse.clamp_min(torch.finfo(near.dtype).tiny)

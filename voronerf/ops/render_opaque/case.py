@@ -7,6 +7,7 @@ import torch
 from voronerf.ops._core.cases import Arguments, Case, Draw
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
+from voronerf.ops.formulas import SPACINGS
 
 _GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
 
@@ -32,7 +33,7 @@ def _make(draw: Draw, n: int) -> Arguments:
     call |= {"occupied": draw.uniform(*sides) < 0.6, "box": torch.tensor([[-1.0] * 3, [1.0] * 3])}
     call |= {"activated": True} if activated else {"density_scale": 5.0}
     call |= {"wave": draw.number("wave", 5, 1, 9), "opaque": draw.among("opaque", 0.02, 0.0, 0.5)}
-    call["spacing"] = draw.among("spacing", "linear", "disparity")
+    call["spacing"] = draw.among("spacing", *SPACINGS)
     sphere = draw.uniform(4) + 0.1
     call["contraction"] = draw.among("contraction", None, sphere, draw.uniform(5, 3) + 0.1)
     call["background"] = draw.among("background", None, draw.uniform(3), draw.uniform(n, 3))
