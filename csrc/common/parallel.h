@@ -113,4 +113,11 @@ void parallel_for(int64_t count, int64_t run, int threads, const Body& body) {
   if (failure) std::rethrow_exception(failure);
 }
 
+// body(begin, end) for blocks of `block` items.
+template <typename Body>
+void parallel_blocks(int64_t count, int64_t block, int threads, const Body& body) {
+  parallel_for((count + block - 1) / block, 1, threads,
+               [&](int64_t i) { body(i * block, std::min(count, (i + 1) * block)); });
+}
+
 }  // namespace voronerf

@@ -14,16 +14,6 @@ namespace {
 
 constexpr int kRays = 32;  // of a task
 
-void ray_forward(Isa isa, const CompositeInputs& in, const CompositeOutputs& out, int64_t ray, int64_t begin,
-                 int64_t end) {
-  VN_FOR_ISA(isa, composite_ray(in, out, ray, begin, end))
-}
-
-void ray_backward(Isa isa, const CompositeInputs& in, const CompositeGradients& gradients, int64_t ray, int64_t begin,
-                  int64_t end) {
-  VN_FOR_ISA(isa, composite_ray_backward(in, gradients, ray, begin, end))
-}
-
 void check(const CompositeInputs& in) {
   if (in.offsets != nullptr) check_ray_offsets("composite", in.offsets, in.r, in.m);
 }
@@ -69,8 +59,9 @@ void background_backward(const CompositeInputs& in, const CompositeGradients& gr
 void composite_cpu(const CompositeInputs& in, const CompositeOutputs& out, Isa isa, int threads) {
   check(in);
   zero_strays(in, 1, out.weights);
-  for_each_ray(in, threads,
-               [&](int64_t ray, int64_t begin, int64_t end) { ray_forward(isa, in, out, ray, begin, end); });
+  for_each_ray(in, threads, [&](int64_t ray, int64_t begin, int64_t end) {
+    VN_FOR_ISA(isa, composite_ray(in, out, ray, begin, end))
+  });
 }
 
 void composite_backward_cpu(const CompositeInputs& in, const CompositeGradients& gradients, Isa isa, int threads) {
@@ -78,8 +69,9 @@ void composite_backward_cpu(const CompositeInputs& in, const CompositeGradients&
   float* const of_samples[] = {gradients.sigma, gradients.depths, gradients.deltas};
   for (float* values : of_samples) zero_strays(in, 1, values);
   zero_strays(in, in.c, gradients.rgb);
-  for_each_ray(in, threads,
-               [&](int64_t ray, int64_t begin, int64_t end) { ray_backward(isa, in, gradients, ray, begin, end); });
+  for_each_ray(in, threads, [&](int64_t ray, int64_t begin, int64_t end) {
+    VN_FOR_ISA(isa, composite_ray_backward(in, gradients, ray, begin, end))
+  });
   background_backward(in, gradients);
 }
 

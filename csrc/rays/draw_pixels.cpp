@@ -14,8 +14,7 @@ constexpr int64_t kPixels = 64;  // of a task
 }  // namespace
 
 void draw_pixels_cpu(const DrawPixelsInputs& in, int64_t* pixels, float* uniforms, float* distances, int threads) {
-  parallel_for((in.b + kPixels - 1) / kPixels, 1, threads, [&](int64_t block) {
-    const int64_t begin = block * kPixels, end = std::min<int64_t>(in.b, begin + kPixels);
+  parallel_blocks(in.b, kPixels, threads, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       const uint32_t key = hash_key(*in.seed, i);
       if (i < in.several) {

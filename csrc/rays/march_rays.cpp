@@ -6,7 +6,6 @@
 #include <cstdlib>
 #include <memory>
 
-#include "common/common.h"
 #include "common/parallel.h"
 #include "rays/march_rays_isa.h"
 #include "rays/march_rooms.h"
@@ -16,11 +15,6 @@ namespace voronerf {
 namespace {
 
 constexpr int64_t kRays = 32;  // of a task
-
-void count_block(Isa isa, const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts, int64_t begin,
-                 int64_t end) {
-  VN_FOR_ISA(isa, march_count(in, room, mask, counts, begin, end))
-}
 
 // The numbers in `to`, where those in `from`, which lie `away`, are not less: the larger of both is what they count as.
 void spread(const uint8_t* from, uint8_t* to, int64_t cells, uint8_t away) {
@@ -36,25 +30,14 @@ void spread_around(const uint8_t* from, uint8_t* to, int64_t i, int64_t size, in
   }
 }
 
-void fill_block(Isa isa, const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, int32_t* ray_index,
-                float* depths, float* deltas, float* positions, int32_t* stop, int64_t begin, int64_t end) {
-  VN_FOR_ISA(isa, march_fill(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end))
-}
-
-template <typename Run>
-void for_each_block(int64_t r, int threads, const Run& run) {
-  parallel_for(ceil_div(r, kRays), 1, threads, [&](int64_t b) { run(b * kRays, std::min(r, (b + 1) * kRays)); });
-}
-
 }  // namespace
 
-bool march_leaps(const MarchInputs& in) {
-  return in.uniforms == nullptr && in.seed == nullptr && in.r * in.s >= 4 * in.x * in.y * in.z;
-}
-
-const uint8_t* march_rooms(const MarchInputs& in, uint8_t* memory, int threads) {
-  const int64_t slice = in.y * in.z;
-  uint8_t *one = memory, *other = memory + in.x * slice;
+std::unique_ptr<uint8_t[]> march_rooms(const MarchInputs& in, int threads) {
+  const int64_t slice = in.y * in.z, cells = in.x * slice;
+  if (in.uniforms != nullptr || in.seed != nullptr || in.r * in.s < 4 * cells) return nullptr;
+  const std::unique_ptr<uint8_t[]> memory(new uint8_t[cells]);
+  std::unique_ptr<uint8_t[]> rooms(new uint8_t[cells]);
+  uint8_t *one = memory.get(), *other = rooms.get();
   parallel_for(in.x, 1, threads, [&](int64_t x) {
     uint8_t *own = one + x * slice, *to = other + x * slice;
     for (int64_t i = 0; i < slice; ++i) own[i] = to[i] = in.occupied[x * slice + i] != 0 ? 0 : kMarchRoom;
@@ -67,19 +50,15 @@ const uint8_t* march_rooms(const MarchInputs& in, uint8_t* memory, int threads) 
     for (int64_t y = 0; y < in.y; ++y) spread_around(to, own, y, in.y, in.z);
   });
   parallel_for(in.x, 1, threads, [&](int64_t x) { spread_around(one, other, x, in.x, slice); });
-  return other;
+  return rooms;
 }
 
 void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offsets, int64_t* total, int64_t capacity,
                           Isa isa, int threads) {
-  std::unique_ptr<uint8_t[]> memory;
-  const uint8_t* room = nullptr;
-  if (march_leaps(in)) {
-    memory.reset(new uint8_t[2 * in.x * in.y * in.z]);
-    room = march_rooms(in, memory.get(), threads);
-  }
-  for_each_block(in.r, threads,
-                 [&](int64_t begin, int64_t end) { count_block(isa, in, room, mask, offsets + 1, begin, end); });
+  const std::unique_ptr<uint8_t[]> rooms = march_rooms(in, threads);
+  parallel_blocks(in.r, kRays, threads, [&](int64_t begin, int64_t end) {
+    VN_FOR_ISA(isa, march_count(in, rooms.get(), mask, offsets + 1, begin, end))
+  });
   *total = 0;
   offsets[0] = 0;
   for (int64_t i = 1; i <= in.r; ++i) {
@@ -91,8 +70,8 @@ void march_rays_count_cpu(const MarchInputs& in, uint32_t* mask, int32_t* offset
 void march_rays_fill_cpu(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets, RowCount rows,
                          int32_t* ray_index, float* depths, float* deltas, float* positions, int32_t* stop, Isa isa,
                          int threads) {
-  for_each_block(in.r, threads, [&](int64_t begin, int64_t end) {
-    fill_block(isa, in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end);
+  parallel_blocks(in.r, kRays, threads, [&](int64_t begin, int64_t end) {
+    VN_FOR_ISA(isa, march_fill(in, mask, offsets, ray_index, depths, deltas, positions, stop, begin, end))
   });
   std::fill(ray_index + offsets[in.r], ray_index + rows, 0);
   std::fill(depths + offsets[in.r], depths + rows, 0.0f);

@@ -2,7 +2,6 @@
 // for all of its own before it computes with the first.
 #include "rays/pixel_rays.h"
 
-#include <algorithm>
 #include <atomic>
 
 #include "common/parallel.h"
@@ -17,10 +16,9 @@ constexpr int64_t kRays = 32;  // of a task
 }  // namespace
 
 bool pixel_rays_cpu(const PixelRaysInputs& in, const PixelRaysOutputs& out, int threads) {
-  const int64_t all = in.c * in.h * in.w, blocks = (in.b + kRays - 1) / kRays;
+  const int64_t all = in.c * in.h * in.w;
   std::atomic<bool> fine{true};
-  parallel_for(blocks, 1, threads, [&](int64_t block) {
-    const int64_t begin = block * kRays, end = std::min<int64_t>(in.b, begin + kRays);
+  parallel_blocks(in.b, kRays, threads, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
       if (in.pixels[i] < 0 || in.pixels[i] >= all) {
         fine.store(false, std::memory_order_relaxed);

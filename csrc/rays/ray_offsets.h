@@ -1,4 +1,4 @@
-// The check of where the samples of rays begin.
+// Where the samples of rays begin: the check, and what the samples of a ray let through.
 #pragma once
 
 #include <cstdint>
@@ -18,6 +18,14 @@ inline void check_ray_offsets(const std::string& op, const int32_t* offsets, int
     }
     before = offsets[i];
   }
+}
+
+// What no sample of a ray has taken of the light.
+template <typename In>
+double light_left(const In& in, int64_t ray) {
+  double left = 1.0;
+  for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) left -= static_cast<double>(in.weights[i]);
+  return left;
 }
 
 }  // namespace voronerf

@@ -17,23 +17,6 @@ void rays_of(Isa isa, const RenderLossInputs& in, const RenderLossOutputs& out, 
   VN_FOR_ISA(isa, render_loss_rays(in, out, begin, end))
 }
 
-void sums_of(Isa isa, const RenderLossInputs& in, const float* depths, const int32_t* ray_index, float* density,
-             float* sums, int64_t begin, int64_t end) {
-  VN_FOR_ISA(isa, run_sums_block(in, depths, ray_index, density, sums, begin, end))
-}
-
-void gradients_of(Isa isa, const RenderLossInputs& in, const float* answers, float* gradient, float* weights,
-                  float* importance, int64_t begin, int64_t end) {
-  VN_FOR_ISA(isa, run_gradients_block(in, answers, gradient, weights, importance, begin, end))
-}
-
-// block(begin, end) for blocks of rays, shared out to threads.
-template <typename Block>
-void each_block(int64_t rays, int threads, const Block& block) {
-  parallel_for((rays + kRenderLossRays - 1) / kRenderLossRays, 1, threads,
-               [&](int64_t i) { block(i * kRenderLossRays, std::min(rays, (i + 1) * kRenderLossRays)); });
-}
-
 void strays_of(Isa isa, const RenderLossInputs& in, const RenderLossOutputs& out, int64_t begin, int64_t end) {
   VN_FOR_ISA(isa, render_loss_strays(in, out, begin, end))
 }
@@ -44,7 +27,7 @@ void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, I
   check_ray_offsets("render_loss", in.offsets, in.r, in.m);
   strays_of(isa, in, out, 0, in.offsets[0]);
   strays_of(isa, in, out, in.offsets[in.r], in.m);
-  each_block(in.r, threads, [&](int64_t begin, int64_t end) {
+  parallel_blocks(in.r, kRenderLossRays, threads, [&](int64_t begin, int64_t end) {
     const int64_t middle = std::clamp(in.r - 3 * in.triples, begin, end);
     rays_of(isa, in, out, begin, middle);
     rays_of(isa, in, out, middle, end);
@@ -56,14 +39,15 @@ void render_loss_cpu(const RenderLossInputs& in, const RenderLossOutputs& out, I
 
 void run_sums_cpu(const RenderLossInputs& in, const float* depths, const int32_t* ray_index, float* density,
                   float* sums, Isa isa, int threads) {
-  each_block(in.r, threads,
-             [&](int64_t begin, int64_t end) { sums_of(isa, in, depths, ray_index, density, sums, begin, end); });
+  parallel_blocks(in.r, kRenderLossRays, threads, [&](int64_t begin, int64_t end) {
+    VN_FOR_ISA(isa, run_sums_block(in, depths, ray_index, density, sums, begin, end))
+  });
 }
 
 void run_gradients_cpu(const RenderLossInputs& in, const float* answers, float* gradient, float* weights,
                        float* importance, Isa isa, int threads) {
-  each_block(in.r, threads, [&](int64_t begin, int64_t end) {
-    gradients_of(isa, in, answers, gradient, weights, importance, begin, end);
+  parallel_blocks(in.r, kRenderLossRays, threads, [&](int64_t begin, int64_t end) {
+    VN_FOR_ISA(isa, run_gradients_block(in, answers, gradient, weights, importance, begin, end))
   });
 }
 

@@ -31,14 +31,7 @@ VN_INLINE void forward(const RenderLossInputs& in, const RenderLossOutputs& out,
                        int64_t first, int64_t count, bool together, Chunk& chunk, Sums& sums) {
   activate(in, first, count, chunk);
   if (out.density != nullptr) put(out.density + first, chunk.density, count);
-  each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t end) {
-    double front = sums.front[ray];
-    for (int64_t i = begin; i < end; ++i) {
-      chunk.front[i] = static_cast<float>(front);
-      front += static_cast<double>(chunk.optical[i]);
-    }
-    sums.front[ray] = front;
-  });
+  pass(in, from, to, first, count, sums.front, chunk);
   weigh(count, chunk);
   if (out.weights != nullptr) put(out.weights + first, chunk.weights, count);
   for (int64_t i = 0; i < count; i += kLanes) {

@@ -237,17 +237,15 @@ class Pool {
 bool render_opaque_cpu(const Program& program, const ProgramInputs& network, const MarchInputs& march,
                        const SeeCells& cells, const SeeRule& rule, const SeeOutputs& out, Isa isa, int threads) {
   if (march.r == 0) return true;
-  std::unique_ptr<uint8_t[]> memory;
-  const uint8_t* room = nullptr;
-  if (march_leaps(march)) {
-    memory.reset(new uint8_t[2 * march.x * march.y * march.z]);
-    room = march_rooms(march, memory.get(), threads);
-  }
+  const std::unique_ptr<uint8_t[]> rooms = march_rooms(march, threads);
   const ProgramRows rows(program, network, isa);
   const std::vector<ProgramInput>& inputs = program.table.inputs;
   const Workspace workspace(rows.workspace() * std::max(threads, 1));
-  const Call call{
-      network, rows, march, room, cells, rule, out, inputs.size() > 1 ? inputs[1].width : 0, isa, std::max(threads, 1)};
+  const Call call{network, rows,
+                  march,   rooms.get(),
+                  cells,   rule,
+                  out,     inputs.size() > 1 ? inputs[1].width : 0,
+                  isa,     std::max(threads, 1)};
   const int team = static_cast<int>(std::min<int64_t>(threads, ceil_div<int64_t>(march.r, kRun)));
   Items items(march.r, kRun, team);
   std::vector<std::unique_ptr<Pool>> pools;  // made here, as nothing may be thrown in a team

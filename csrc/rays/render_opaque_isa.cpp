@@ -14,14 +14,7 @@ void see_wave(const SeenWave& in, int64_t r) {
     for (int64_t first = in.offsets[from]; first < end; first += kChunk) {
       const int64_t count = end - first < kChunk ? end - first : kChunk;
       activate(in, first, count, chunk);
-      each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t stop) {
-        double front = in.front[from + ray];
-        for (int64_t i = begin; i < stop; ++i) {
-          chunk.front[i] = static_cast<float>(front);
-          front += static_cast<double>(chunk.optical[i]);
-        }
-        in.front[from + ray] = front;
-      });
+      pass(in, from, to, first, count, in.front + from, chunk);
       weigh(count, chunk);
       each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t stop) {
         const int64_t number = in.number[from + ray];

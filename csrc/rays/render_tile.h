@@ -82,6 +82,19 @@ VN_INLINE void each_ray(const In& in, int64_t from, int64_t to, int64_t first, i
   }
 }
 
+// Optical depths in front of samples; those of the rays so far, `front`, go on.
+template <typename In>
+VN_INLINE void pass(const In& in, int64_t from, int64_t to, int64_t first, int64_t count, double* front, Chunk& chunk) {
+  each_ray(in, from, to, first, count, [&](int64_t ray, int64_t begin, int64_t end) {
+    double before = front[ray];
+    for (int64_t i = begin; i < end; ++i) {
+      chunk.front[i] = static_cast<float>(before);
+      before += static_cast<double>(chunk.optical[i]);
+    }
+    front[ray] = before;
+  });
+}
+
 // `run(from, to)` for rays whose samples fill a chunk at most, or one longer ray.
 template <typename In, typename Run>
 VN_INLINE void each_chunk(const In& in, int64_t begin, int64_t end, const Run& run) {

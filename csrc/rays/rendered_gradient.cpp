@@ -13,12 +13,6 @@ namespace voronerf {
 
 namespace {
 
-double light_left(const RenderedGradient& in, int64_t ray) {
-  double left = 1.0;
-  for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) left -= static_cast<double>(in.weights[i]);
-  return left;
-}
-
 float sigmoid(float x) { return 1.0f / (1.0f + std::exp(-x)); }
 
 float entry(const float* values, int64_t i) { return values == nullptr ? 0.0f : values[i]; }

@@ -6,7 +6,6 @@
 #include <algorithm>
 #include <cmath>
 
-#include "common/common.h"
 #include "common/parallel.h"
 
 namespace voronerf {
@@ -61,8 +60,8 @@ void resample_ray(const float* weights, const float* edges, const float* uniform
 void resample_cpu(const float* weights, const float* edges, const float* uniforms, float* depths, int64_t r, int64_t s,
                   int64_t count, int threads) {
   const int64_t rays = std::max<int64_t>(kBlock / (s + count), 1);
-  parallel_for(ceil_div(r, rays), 1, threads, [&](int64_t b) {
-    for (int64_t i = b * rays, end = std::min(r, i + rays); i < end; ++i) {
+  parallel_blocks(r, rays, threads, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
       resample_ray(weights + i * s, edges + i * (s + 1), uniforms == nullptr ? nullptr : uniforms + i * count,
                    depths + i * count, s, count);
     }

@@ -12,12 +12,6 @@ namespace voronerf {
 
 namespace {
 
-double light_left(const SmoothDepth& in, int64_t ray) {
-  double left = 1.0;
-  for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) left -= static_cast<double>(in.weights[i]);
-  return left;
-}
-
 float disparity_of(const SmoothDepth& in, int64_t ray) {
   double sum = light_left(in, ray) / static_cast<double>(in.far[ray]);
   for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) {

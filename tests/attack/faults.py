@@ -103,9 +103,9 @@ FAULTS = (
     _kernel(
         "render_loss",
         "the optical depth in front is forgotten between blocks of 128",
-        "rays/render_loss_isa.cpp",
-        "double front = sums.front[ray];",
-        "double front = together ? sums.front[ray] : 0.0;",
+        "rays/render_tile.h",
+        "double before = front[ray];",
+        "double before = first == in.offsets[from] ? front[ray] : 0.0;",
     ),
     _kernel(
         "render_loss",
