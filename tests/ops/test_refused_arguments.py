@@ -60,14 +60,6 @@ def test_ops_that_differentiate_inside_take_inference_tensors(op, inside):
         assert torch.allclose(part, other, atol=1e-5)
 
 
-@pytest.mark.op("composite")
-def test_offsets_that_fall_are_refused_by_every_backend(backend):
-    given = [torch.rand(6), torch.rand(6, 3), torch.rand(6), torch.rand(6)]
-    for offsets in ([0, 4, 2], [0, 3, 7], [-1, 3, 6]):
-        message = "composite: ray_offsets must rise from 0 or more to at most the number of samples, 6"
-        refuses(message, ops.composite, *given, ray_offsets=torch.tensor(offsets).int(), backend=backend)
-
-
 @pytest.mark.op("hash_encode")
 def test_cells_without_a_table_are_refused_by_every_backend(backend):
     call = {**cases()["hash_encode"].make(Draw(0), 7)}

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from op_cases import offsets_of, refused
+from op_cases import offsets_of
 from tolerances import assert_as_exact
 
 from voronerf.ops import RenderLoss, composite, render_loss
@@ -225,24 +225,3 @@ def test_the_gradient_has_a_gradient(device, backend, activated):
         elif chosen == "reference":
             plain = second
     assert_as_exact(second, plain, exact)
-
-
-def test_bad_arguments():
-    raw, deltas, offsets, target, background = rays([4, 2], torch.float32)
-    rest = {"background": background, "density_scale": SCALE}
-    with refused(ValueError, "render_loss: raw must have shape [m, 4], got [6, 3]"):
-        render_loss(raw[:, :3], deltas, offsets, target, **rest)
-    with refused(ValueError, "render_loss: deltas must have shape [m] with m = 6, got [5]"):
-        render_loss(raw, deltas[:5], offsets, target, **rest)
-    with refused(TypeError, "render_loss: target must have dtype float32, got float64"):
-        render_loss(raw, deltas, offsets, target.double(), **rest)
-    with refused(ValueError, "render_loss: density_scale must be positive, got 0.0"):
-        render_loss(raw, deltas, offsets, target, density_scale=0.0)
-    with refused(ValueError, "render_loss: hidden must lie in [0, 1), got 1.0"):
-        render_loss(raw, deltas, offsets, target, hidden=1.0, **rest)
-    with refused(ValueError, "render_loss: triples must be at most a third of the 2 rays, got 1"):
-        render_loss(raw, deltas, offsets, target, triples=1, **rest)
-    with refused(ValueError, "render_loss: density_scale must be given unless the values are activated, got None"):
-        render_loss(raw, deltas, offsets, target)
-    with refused(ValueError, "render_loss: density_scale must not be given for activated values, got 1.0"):
-        render_loss(raw, deltas, offsets, target, density_scale=1.0, activated=True)

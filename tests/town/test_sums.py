@@ -35,7 +35,7 @@ def test_partial_sums_are_one_composite(ranks):
         own = (owner == rank).reshape(-1)
         given = torch.zeros(rays * samples, 3), index, depths.reshape(-1), deltas.reshape(-1)
         numbers = torch.where(torch.arange(ranks) == rank, 0, -1)
-        mine = own_samples(*given, owner.reshape(-1), numbers, bent=False, hidden=False)
+        mine = own_samples(*given, owner.reshape(-1), numbers, bent=False)
         found.append(sum_runs(mine, parts[1].reshape(-1, 3)[own], parts[0].reshape(-1)[own]))
     ray, start = torch.cat([runs.ray for runs in found]), torch.cat([runs.start for runs in found])
     order = along_rays(ray, start)
@@ -98,8 +98,7 @@ def test_a_gap_that_another_rank_may_fill_ends_a_run():
     given = torch.zeros(4, 3), torch.zeros(4, dtype=torch.int32), depths, deltas
     cells, own = torch.tensor([0, 1, 2, 2]), torch.arange(3)
     assert own_samples(*given, cells, own, bent=False).run_offsets.tolist() == [0, 2, 4]
-    assert own_samples(*given, cells, own, bent=False, hidden=False).run_offsets.tolist() == [0, 4]
-    assert own_samples(*given, cells, own * 0 - 1, bent=False, hidden=False).run_offsets.tolist() == [0]
+    assert own_samples(*given, cells, own * 0 - 1, bent=False).run_offsets.tolist() == [0]
 
 
 @pytest.mark.parametrize("backend", ["native", "reference"])

@@ -7,6 +7,7 @@ units along unit directions, densities per unit length.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -59,17 +60,16 @@ class Samples(NamedTuple):
         if self.rows is None:
             return self
         known = int(self.rows)
-        parts = (values[:known] for values in (self.inputs, self.ray_index, self.depths, self.deltas))
-        inputs, index, depths, deltas = parts
-        return Samples(inputs, index, self.ray_offsets, depths, deltas)
+        return self._taken(lambda values: values[:known], self.ray_offsets)
 
     def part(self, rows: Tensor) -> Samples:
         """Some of the samples, bool [m]; all rays stay."""
         kept = torch.nn.functional.pad(rows.cumsum(0, dtype=torch.int32), (1, 0))
         chosen = rows.nonzero()[:, 0]
-        packed = (values.index_select(0, chosen) for values in (self.inputs, self.ray_index, self.depths, self.deltas))
-        inputs, index, depths, deltas = packed
-        return Samples(inputs, index, kept.index_select(0, self.ray_offsets), depths, deltas)
+        return self._taken(lambda values: values.index_select(0, chosen), kept.index_select(0, self.ray_offsets))
+
+    def _taken(self, take: Callable[[Tensor], Tensor], offsets: Tensor) -> Samples:
+        return Samples(take(self.inputs), take(self.ray_index), offsets, take(self.depths), take(self.deltas))
 
     def by_ray(self, values: Tensor) -> Tensor:
         """Values [m, ...] as [r, s, ...], where all rays have as many samples; else as they are."""

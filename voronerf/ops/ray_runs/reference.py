@@ -7,14 +7,13 @@ colour of run`` (NeRF, equation 3, in pieces; Li et al. 2024, NeRF-XL).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from voronerf.ops.composite.reference import Composite, composite, kept, optical_depth
-from voronerf.ops.formulas import Composed, activate, along_rays, compose
+from voronerf.ops.composite.reference import composite, kept, optical_depth
+from voronerf.ops.formulas import activate, along_rays, compose
 from voronerf.ops.render_loss.reference import robust_error
 
 
@@ -58,7 +57,6 @@ class Runs(NamedTuple):
     Attributes:
         colour: [q, c], as if nothing were in front.
         optical: [q], the optical depth.
-        depth: [q], the sum of weight times depth.
         ray: int64 [q].
         start: [q], the depth of the first sample.
         weights: [m], contributions of the samples, as if nothing were in front of their run.
@@ -66,7 +64,6 @@ class Runs(NamedTuple):
 
     colour: Tensor
     optical: Tensor
-    depth: Tensor
     ray: Tensor
     start: Tensor
     weights: Tensor
@@ -80,36 +77,28 @@ def own_samples(
     cells: Tensor,
     own: Tensor,
     bent: bool,
-    *,
-    hidden: bool = True,
 ) -> OwnSamples:
-    """Keeps the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``.
-
-    With ``hidden`` other ranks may have samples that are not among these. None lies between two neighbouring strata,
-    nor, since a cell is convex, between two samples in one cell.
-    """
+    """Keeps the samples in own cells, and finds their runs; see ``voronerf.ops.own_samples``."""
     numbers = own[cells.long()]
     kept = (numbers >= 0).nonzero()[:, 0]
     ray, at, length, cell = ray_index[kept], depths[kept], deltas[kept], numbers[kept]
-    begins = (kept.diff() != 1) | (ray.diff() != 0)
-    if hidden:
-        near = at.diff() < torch.minimum(length[1:], length[:-1])  # less than the stratum between would be long
-        begins |= ~near if bent else (cell.diff() != 0) & ~near
+    near = at.diff() < torch.minimum(length[1:], length[:-1])  # less than the stratum between would be long
+    begins = (kept.diff() != 1) | (ray.diff() != 0) | (~near if bent else (cell.diff() != 0) & ~near)
     first = 1 + begins.nonzero()[:, 0]
     ends = torch.tensor([len(kept)], device=kept.device)
     offsets = torch.cat((ends.new_zeros(min(len(kept), 1)), first, ends)).to(torch.int32)
     return OwnSamples(positions[kept], ray, at, length, cell, offsets)
 
 
-def sum_runs(samples: OwnSamples, colour: Tensor, density: Tensor, blend: Callable[..., Composite] = composite) -> Runs:
-    """The partial sums of the runs of samples with these colours [m, c] and densities [m]; ``blend`` is `composite`."""
+def sum_runs(samples: OwnSamples, colour: Tensor, density: Tensor) -> Runs:
+    """The partial sums of the runs of samples with these colours [m, c] and densities [m]."""
     offsets = samples.run_offsets
     first = offsets[:-1].long()
     run = torch.repeat_interleave(offsets.diff())
-    found = blend(density, colour, samples.depths, samples.deltas, ray_offsets=offsets)
+    found = composite(density, colour, samples.depths, samples.deltas, ray_offsets=offsets)
     optical = torch.zeros_like(samples.depths[first]).index_add(0, run, optical_depth(density, samples.deltas))
     ray, start = samples.ray_index[first].long(), samples.depths[first]
-    return Runs(found.colour, optical, found.depth.detach(), ray, start, found.weights.detach())
+    return Runs(found.colour, optical, ray, start, found.weights.detach())
 
 
 def run_sums(raw: Tensor, samples: OwnSamples, density_scale: float) -> tuple[Tensor, Tensor]:
@@ -137,13 +126,9 @@ def compose_runs(
     error = off.square().sum(-1)
     slope = robust / (error + robust**2).sqrt() if robust else torch.ones_like(error)
     slopes, loss = off * (2 / (3 * rays) * slope)[:, None], robust_error(error, robust).sum() / (3 * rays)
-    return answer(order, whole, whole.behind(part, ray, slopes, behind), slopes[ray], error[ray]), loss
-
-
-def answer(order: Tensor, whole: Composed, behind: Tensor, slopes: Tensor, error: Tensor) -> Tensor:
-    """What runs must be told [q, c + 3], from what is known of them along their rays, in the order of their sums."""
-    told = torch.cat((slopes, behind[:, None], whole.before[:, None], error[:, None]), 1)
-    return torch.empty_like(told).index_copy(0, order, told)
+    taken = whole.behind(part, ray, slopes, behind)
+    told = torch.cat((slopes[ray], torch.stack((taken, whole.before, error[ray]), 1)), 1)
+    return torch.empty_like(told).index_copy(0, order, told), loss
 
 
 @torch.inference_mode(False)

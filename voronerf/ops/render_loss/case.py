@@ -42,6 +42,8 @@ _BOTH: dict[str, Any] = {
     "refused": {
         "density_scale must be given unless the values are activated, got None": {"density_scale": None},
         "density_scale must not be given for activated values, got 3.0": {"activated": True},
+        "density_scale must be positive, got 0.0": {"density_scale": 0.0},
+        "hidden must lie in [0, 1), got 1.0": {"hidden": 1.0},
         "triples must be at most a third of the 9 rays, got 4": {"triples": 4},
     },
 }
