@@ -1,10 +1,16 @@
-// The encodings on CUDA. Forward, a thread an element of the result: each is written once, side by side, and computing
-// sine and cosine apart costs less than passing one of them through shared memory. Backward, a thread a feature of a
-// point; it computes its sines and cosines again, and its gradients, a row of 4 (1 + 2 L) d bytes apart, share their
-// cache lines with the neighbouring threads'.
+// The encodings on CUDA. Octaves: forward a thread an element of the result, each written once, side by side, because
+// computing sine and cosine apart costs less than passing one of them through shared memory; backward a thread a
+// feature of a point, which computes its sines and cosines again and shares the cache lines of its gradients with the
+// neighbouring threads. By the formula of a row: a thread a row; rows pass through shared memory, so that neighbouring
+// threads read and write neighbouring numbers, and a column more than a row has keeps them off each other's banks.
+#include <algorithm>
+
 #include "common/cuda_wrappers.h"
 #include "encoding/encode.h"
 #include "encoding/encode_math.h"
+#include "network/cuda/words_device.h"
+// behind the words
+#include "encoding/encodings.h"
 
 namespace voronerf {
 
@@ -13,6 +19,7 @@ namespace {
 constexpr int kThreads = 256;
 constexpr int kRows = 64;             // of a block, forward
 constexpr int64_t kBlocks = 1 << 16;  // of a grid, whose threads then take several elements
+constexpr int kFormulaThreads = 128;
 
 __global__ void __launch_bounds__(kThreads)
     encode_kernel(const float* __restrict__ x, const float* __restrict__ variances, float* __restrict__ out, int64_t n,
@@ -55,29 +62,96 @@ __global__ void __launch_bounds__(kThreads)
       of_x += scale * blur * (g[0] * cosine - g[d] * sine);
       if (variances != nullptr) of_variance += -0.5f * scale * scale * blur * (g[0] * sine + g[d] * cosine);
     }
-    grad_x[i] = of_x;
-    if (variances != nullptr) grad_variances[i] = of_variance;
+    if (grad_x != nullptr) grad_x[i] = of_x;
+    if (grad_variances != nullptr) grad_variances[i] = of_variance;
   }
 }
 
-unsigned blocks_of(int64_t size) {
-  const int64_t blocks = ceil_div<int64_t>(size, kThreads);
-  return static_cast<unsigned>(blocks < kBlocks ? blocks : kBlocks);
+template <typename Formula>
+__global__ void __launch_bounds__(kFormulaThreads)
+    formula_kernel(const float* __restrict__ x, float* __restrict__ out, int64_t n, int d, int size, int width) {
+  constexpr int kRow = Formula::kMost + 1;
+  VN_SHARED(rows, float[kFormulaThreads * kRow]);
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kFormulaThreads, row = first + threadIdx.x;
+  const int count = n - first < kFormulaThreads ? static_cast<int>(n - first) : kFormulaThreads;
+  if (row < n) {
+    Formula::values([&](int i) { return x[d * row + i]; }, d, size,
+                    [&](int c, float value) { rows[threadIdx.x * kRow + c] = value; });
+  }
+  __syncthreads();
+  for (int i = threadIdx.x; i < count * width; i += kFormulaThreads) {
+    out[first * width + i] = rows[i / width * kRow + i % width];
+  }
+}
+
+template <typename Formula>
+__global__ void __launch_bounds__(kFormulaThreads)
+    formula_backward_kernel(const float* __restrict__ gradient, const float* __restrict__ x, float* __restrict__ grad_x,
+                            int64_t n, int d, int size, int width) {
+  constexpr int kRow = Formula::kMost + 1;
+  VN_SHARED(rows, float[kFormulaThreads * kRow]);
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kFormulaThreads, row = first + threadIdx.x;
+  const int count = n - first < kFormulaThreads ? static_cast<int>(n - first) : kFormulaThreads;
+  for (int i = threadIdx.x; i < count * width; i += kFormulaThreads) {
+    rows[i / width * kRow + i % width] = gradient[first * width + i];
+  }
+  __syncthreads();
+  if (row >= n) return;
+  Formula::gradient([&](int i) { return x[d * row + i]; }, d, size, [&](int c) { return rows[threadIdx.x * kRow + c]; },
+                    [&](int i, float found) { grad_x[d * row + i] = found; });
+}
+
+unsigned blocks_of(int64_t size, int threads) { return static_cast<unsigned>(ceil_div<int64_t>(size, threads)); }
+
+// The kernels of encodings.h.
+template <bool kBlurred>
+struct Octaves {
+  static void values(const Encoding& in, float* out, void* stream) {
+    VN_LAUNCH(encode_kernel, blocks_of(in.n, kRows), kThreads, 0, stream, in.x, in.variances, out, in.n, in.d, in.size,
+              in.include_input ? 1 : 0);
+  }
+  static void gradient(const Encoding& in, const float* gradient, float* grad_x, float* grad_variances, void* stream) {
+    VN_LAUNCH(encode_backward_kernel, std::min<int64_t>(blocks_of(in.n * in.d, kThreads), kBlocks), kThreads, 0, stream,
+              gradient, in.x, in.variances, grad_x, grad_variances, in.n, in.d, in.size, in.include_input ? 1 : 0);
+  }
+};
+template <typename Formula>
+struct ByRow {
+  static void values(const Encoding& in, float* out, void* stream) {
+    VN_LAUNCH(formula_kernel<Formula>, blocks_of(in.n, kFormulaThreads), kFormulaThreads, 0, stream, in.x, out, in.n,
+              in.d, in.size, in.width);
+  }
+  static void gradient(const Encoding& in, const float* gradient, float* grad_x, float*, void* stream) {
+    VN_LAUNCH(formula_backward_kernel<Formula>, blocks_of(in.n, kFormulaThreads), kFormulaThreads, 0, stream, gradient,
+              in.x, grad_x, in.n, in.d, in.size, in.width);
+  }
+};
+
+template <typename Run>
+void with_kernel(const Encoding& in, const Run& run) {
+  using namespace device;  // the formulas
+  switch (in.encoding) {
+#define VN_CASE(NAME, ...)    \
+  case ProgramEncoding::NAME: \
+    return run(__VA_ARGS__());
+    VN_ENCODINGS(VN_CASE)
+#undef VN_CASE
+    case ProgramEncoding::hash:
+      return;
+  }
 }
 
 }  // namespace
 
 void encode_cuda(const Encoding& in, float* out, void* stream) {
   if (in.n * in.width == 0) return;
-  VN_LAUNCH(encode_kernel, static_cast<unsigned>(ceil_div<int64_t>(in.n, kRows)), kThreads, 0, stream, in.x,
-            in.variances, out, in.n, static_cast<int>(in.d), static_cast<int>(in.octaves), in.include_input ? 1 : 0);
+  with_kernel(in, [&](auto kernel) { kernel.values(in, out, stream); });
 }
 
 void encode_backward_cuda(const Encoding& in, const float* gradient, float* grad_x, float* grad_variances,
                           void* stream) {
   if (in.n * in.d == 0) return;
-  VN_LAUNCH(encode_backward_kernel, blocks_of(in.n * in.d), kThreads, 0, stream, gradient, in.x, in.variances, grad_x,
-            grad_variances, in.n, static_cast<int>(in.d), static_cast<int>(in.octaves), in.include_input ? 1 : 0);
+  with_kernel(in, [&](auto kernel) { kernel.gradient(in, gradient, grad_x, grad_variances, stream); });
 }
 
 }  // namespace voronerf

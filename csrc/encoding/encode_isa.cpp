@@ -1,9 +1,10 @@
 // The CPU kernels of the encodings, once for each instruction set.
 //
-// Tiles of rows are encoded in cache, in rows of whole vectors (frequency_encode_tile.h), and copied to where they
-// belong. Backward, a tile is encoded again: its sines and cosines are each other's derivatives, and computing them
-// costs less than reading back what is twenty times as large as the input.
+// Tiles of rows are encoded where they belong if rows are whole vectors, else in cache, and copied from there.
+// Backward, sines and cosines are computed again: they are each other's derivatives, and computing them costs less than
+// reading back what is twenty times as large as the input.
 #define VN_HALF 0
+#include "encoding/by_row_tile.h"
 #include "encoding/encode.h"
 #include "encoding/frequency_encode_tile.h"
 
@@ -11,68 +12,131 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-struct Workspace {
-  float *table, *staged, *variances, *value;
+// The rows in hand, and the workspace of the thread.
+struct Tile {
+  const Encoding& in;
+  const int64_t stride;  // of rows encoded in cache
+  float *const table, *const encoded, *const staged, *const staged_variances;
+  const float *x, *variances;  // [rows][d]
+  int64_t rows;
+  bool by_row = false;  // the kernel is
+  bool in_place;        // x and gradients are read there: so many rows follow that vectors may reach beyond the last
+
+  Tile(const Encoding& in, float* workspace, int64_t stride)
+      : in(in),
+        stride(stride),
+        table(workspace),
+        encoded(table + 3 * stride),
+        staged(encoded + kEncodeRows * stride),
+        staged_variances(staged + kEncodeRows * in.d + kEncodeLanes) {}
+
+  Columns columns() const { return {in.d, in.size, in.include_input}; }
+
+  void take(int64_t first, int64_t end) {
+    rows = smaller(end - first, kEncodeRows);
+    in_place = by_row && in.n - first >= kEncodeRows + kEncodeLanes;
+    x = in.x + first * in.d;
+    variances = in.variances == nullptr ? nullptr : in.variances + first * in.d;
+    if (in_place) return;
+    stage(x, staged);
+    if (variances != nullptr) stage(variances, staged_variances);
+  }
+  void stage(const float*& from, float* to) const {
+    __builtin_memcpy(to, from, sizeof(float) * rows * in.d);
+    __builtin_memset(to + rows * in.d, 0, sizeof(float) * ((kEncodeRows - rows) * in.d + kEncodeLanes));
+    from = to;
+  }
+
+  // run(kernel) for the one of the encoding.
+  template <typename Run>
+  void with_kernel(const Run& run) const {
+    switch (in.encoding) {
+#define VN_CASE(NAME, ...)    \
+  case ProgramEncoding::NAME: \
+    return run(__VA_ARGS__());
+      VN_ENCODINGS(VN_CASE)
+#undef VN_CASE
+      case ProgramEncoding::hash:
+        return;
+    }
+  }
+
+  // What a kernel needs for all rows.
+  template <typename Formula>
+  void prepare(ByRow<Formula>) {
+    by_row = true;
+  }
+  template <bool kBlurred>
+  void prepare(Octaves<kBlurred>) {
+    encode_table(table, stride, columns());
+  }
+
+  // Encodings, to rows of `stride` floats. Formulas are inlined for points, whose strides are then constants.
+  template <typename Formula>
+  __attribute__((flatten)) void values(ByRow<Formula>, float* out) const {
+    if (in.d == 3) return ByRow<Formula>::values(x, 3, 3, in.size, rows, out, stride);
+    ByRow<Formula>::values(x, in.d, in.d, in.size, rows, out, stride);
+  }
+  template <bool kBlurred>
+  void values(Octaves<kBlurred>, float* out) const {
+    encode(x, in.d, table, rows, columns(), out, stride);
+    if (kBlurred) blur(variances, in.d, table, rows, out, stride);
+  }
+
+  // Gradients g [rows][width] to those of x and of the variances, [rows][d].
+  template <typename Formula>
+  __attribute__((flatten)) void gradient(ByRow<Formula>, const float* g, float* of_x, float*) const {
+    int64_t g_stride = in.width;
+    if (!in_place) {
+      for (int64_t row = 0; row < rows; ++row) copy_row(g + row * g_stride, g_stride, encoded + row * stride);
+      g = encoded, g_stride = stride;
+    }
+    if (in.d == 3) return ByRow<Formula>::gradient(x, 3, 3, in.size, g, g_stride, rows, of_x, 3);
+    ByRow<Formula>::gradient(x, in.d, in.d, in.size, g, g_stride, rows, of_x, in.d);
+  }
+  template <bool kBlurred>
+  void gradient(Octaves<kBlurred> kernel, const float* g, float* of_x, float* of_variances) const {
+    values(kernel, encoded);
+    for (int64_t row = 0; row < rows; ++row, g += in.width) {
+      const float* const value = encoded + row * stride;
+      if (of_x != nullptr) encode_row_backward(value, g, table, stride, columns(), of_x + row * in.d);
+      if (kBlurred && of_variances != nullptr) {
+        blur_row_backward(value, g, table, stride, columns(), of_variances + row * in.d);
+      }
+    }
+  }
 };
-
-VN_INLINE Columns columns_of(const Encoding& in) { return {in.d, in.octaves, in.include_input}; }
-
-VN_INLINE Workspace carve(const Encoding& in, float* workspace, int64_t stride) {
-  const int64_t staged = kEncodeRows * in.d + kEncodeLanes;
-  Workspace parts;
-  parts.table = workspace;
-  parts.value = parts.table + 3 * stride;
-  parts.staged = parts.value + kEncodeRows * stride;
-  parts.variances = parts.staged + staged;
-  // The encoder loads a whole vector from every row.
-  for (int64_t i = 0; i < staged; ++i) parts.staged[i] = parts.variances[i] = 0.0f;
-  encode_table(parts.table, stride, columns_of(in));
-  return parts;
-}
-
-// Encodings of `rows` rows from `first`.
-VN_INLINE void fill(const Encoding& in, const Workspace& parts, int64_t stride, int64_t first, int64_t rows) {
-  __builtin_memcpy(parts.staged, in.x + first * in.d, sizeof(float) * rows * in.d);
-  encode(parts.staged, in.d, parts.table, rows, columns_of(in), parts.value, stride);
-  if (in.variances == nullptr) return;
-  __builtin_memcpy(parts.variances, in.variances + first * in.d, sizeof(float) * rows * in.d);
-  blur(parts.variances, in.d, parts.table, rows, parts.value, stride);
-}
 
 }  // namespace
 
 void encode_rows(const Encoding& in, float* out, float* workspace, int64_t stride, int64_t begin, int64_t end) {
-  const Workspace parts = carve(in, workspace, stride);
-  for (int64_t first = begin; first < end; first += kEncodeRows) {
-    const int64_t rows = end - first < kEncodeRows ? end - first : kEncodeRows;
-    fill(in, parts, stride, first, rows);
-    for (int64_t row = 0; row < rows; ++row) {
-      float* to = out + (first + row) * in.width;
-      const float* value = parts.value + row * stride;
-      // The last vector may write some of the one before again; single floats would take longer than all others.
-      if (in.width < kLanes) {
-        __builtin_memcpy(to, value, sizeof(float) * in.width);
-        continue;
-      }
-      for (int64_t column = 0; column + kLanes < in.width; column += kLanes) store(to + column, load(value + column));
-      store(to + in.width - kLanes, load(value + in.width - kLanes));
+  Tile tile(in, workspace, stride);
+  tile.with_kernel([&, width = int64_t{in.width}](auto kernel) {
+    tile.prepare(kernel);
+    for (int64_t first = begin; first < end; first += kEncodeRows) {
+      tile.take(first, end);
+      float* const to = out + first * width;
+      const bool there = width == stride && tile.rows == kEncodeRows;
+      tile.values(kernel, there ? to : tile.encoded);
+      if (there) continue;
+      const float* const encoded = tile.encoded;
+      for (int64_t row = 0, rows = tile.rows; row < rows; ++row)
+        copy_row(encoded + row * stride, width, to + row * width);
     }
-  }
+  });
 }
 
 void encode_rows_backward(const Encoding& in, const float* gradient, float* grad_x, float* grad_variances,
                           float* workspace, int64_t stride, int64_t begin, int64_t end) {
-  const Workspace parts = carve(in, workspace, stride);
-  for (int64_t first = begin; first < end; first += kEncodeRows) {
-    const int64_t rows = end - first < kEncodeRows ? end - first : kEncodeRows;
-    fill(in, parts, stride, first, rows);
-    for (int64_t row = 0; row < rows; ++row) {
-      const float *value = parts.value + row * stride, *from = gradient + (first + row) * in.width;
-      encode_row_backward(value, from, parts.table, stride, columns_of(in), grad_x + (first + row) * in.d);
-      if (in.variances == nullptr) continue;
-      blur_row_backward(value, from, parts.table, stride, columns_of(in), grad_variances + (first + row) * in.d);
+  Tile tile(in, workspace, stride);
+  tile.with_kernel([&](auto kernel) {
+    tile.prepare(kernel);
+    for (int64_t first = begin; first < end; first += kEncodeRows) {
+      tile.take(first, end);
+      const auto rows = [&](float* of) { return of == nullptr ? nullptr : of + first * in.d; };
+      tile.gradient(kernel, gradient + first * in.width, rows(grad_x), rows(grad_variances));
     }
-  }
+  });
 }
 
 }  // namespace VN_ISA_NAMESPACE

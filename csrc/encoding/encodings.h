@@ -1,10 +1,11 @@
-// The encodings of programs without parameters: DO(name, kernel), a row each. Python knows them by their names
+// The encodings without parameters: DO(name, kernel), a row each. Python knows them by their names
 // (ENCODINGS in voronerf/ops/_core/encodings.py). A kernel is of
 //
 //   ByRow<Formula>      a formula of one row: of a vector of rows on the CPU, of one row of a thread on CUDA
 //   Octaves<kBlurred>   sines and cosines, of a table that is packed; kBlurred: by the variances beside x
 //
-// in by_row_tile.h and frequency_encode_tile.h on the CPU, in program_cuda_encoding.h on CUDA.
+// in by_row_tile.h and frequency_encode_tile.h on the CPU; on CUDA in program_cuda_encoding.h, and in encode.cu for the
+// ops that are encodings.
 //
 // A formula is a struct in a header of its own, in F32 and the words of network/functions.h: it is there where they are
 // (VN_WORDS), on both devices; who wants the names alone has none. of(i) is a column of x, g(c) the gradient to a

@@ -186,10 +186,10 @@ FAULTS = (
     ),
     _kernel(
         "frequency_encode",
-        "the last tile is lost on several threads",
+        "ranges of rows behind the first lose the last",
         "encoding/encode.cpp",
-        "const int64_t rows = ceil_div(tiles, ranges) * kEncodeRows;",
-        "const int64_t rows = tiles / ranges * kEncodeRows;",
+        "std::min(in.n, (i + 1) * rows));",
+        "std::min(in.n, (i + 1) * rows - (i > 0)));",
     ),
     _kernel(
         "hash_encode",
@@ -207,10 +207,10 @@ FAULTS = (
     ),
     _kernel(
         "spherical_harmonics",
-        "blocks of 1,024 lose the last direction",
-        "encoding/spherical_harmonics.cpp",
-        "std::min(kBlock, n - i * kBlock)",
-        "std::min(kBlock - (i > 0), n - i * kBlock)",
+        "a last tile that is not whole loses its last direction",
+        "encoding/encode_isa.cpp",
+        "rows = tile.rows; row < rows",
+        "rows = tile.rows - (first > begin); row < rows",
     ),
     _kernel(
         "grouped_program",

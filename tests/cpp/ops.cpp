@@ -11,7 +11,6 @@
 #include "common/parallel.h"
 #include "encoding/adam.h"
 #include "encoding/encode.h"
-#include "encoding/spherical_harmonics.h"
 #include "geometry/cell_sort.h"
 #include "geometry/locate_cell.h"
 #include "geometry/nearest_centre.h"
@@ -146,54 +145,38 @@ void composite(Isa isa) {
 }
 
 void encode(Isa isa) {
-  const bool integrated = below(3) == 0, include = !integrated && below(2) == 0;
-  const int64_t n = below(3) == 0 ? below(3) : below(200), d = integrated ? 3 : below(9), octaves = below(12);
-  const int64_t width = d * (2 * octaves + (include ? 1 : 0));
+  using voronerf::ProgramEncoding;
+  const int kind = below(4);
+  const bool integrated = kind == 0, harmonics = kind == 1, include = kind == 2;
+  const int64_t n = below(3) == 0 ? below(3) : below(harmonics ? 3000 : 200);
+  const int d = integrated || harmonics ? 3 : below(9), size = harmonics ? 1 + below(4) : below(12);
+  const int width = harmonics ? size * size : d * (2 * size + (include ? 1 : 0));
   const Array<float> x = uniform<float>(n * d);
   Array<float> variances = uniform<float>(integrated ? n * d : 0);
   for (float& variance : variances) variance = std::fabs(variance);
   const Array<float> gradient = uniform<float>(n * width);
-  const voronerf::Encoding in{x.data(), integrated ? variances.data() : nullptr, n, d, octaves, include, width};
+  const ProgramEncoding encoding = integrated  ? ProgramEncoding::integrated
+                                   : harmonics ? ProgramEncoding::spherical
+                                               : ProgramEncoding::frequency;
+  const voronerf::Encoding in{encoding, n, width, x.data(), integrated ? variances.data() : nullptr, d, size, include};
   Array<float> results[2][3];
   for (int i = 0; i < 2; ++i) {
     const int threads = 1 + 2 * i;
     results[i][0] = poisoned(n * width);
     results[i][1] = poisoned(n * d);
     results[i][2] = poisoned(variances.size());
-    Array<float> workspace = poisoned(voronerf::encode_workspace(d, octaves, threads));
-    voronerf::encode_cpu(in, results[i][0].data(), workspace.data(), isa, threads);
-    workspace = poisoned(voronerf::encode_workspace(d, octaves, threads));
+    voronerf::encode_cpu(in, results[i][0].data(), isa, threads);
     voronerf::encode_backward_cpu(in, gradient.data(), results[i][1].data(),
-                                  integrated ? results[i][2].data() : nullptr, workspace.data(), isa, threads);
+                                  integrated ? results[i][2].data() : nullptr, isa, threads);
   }
   for (int j = 0; j < 3; ++j) {
     same(results[0][j], results[1][j], "encode");
     like_portable(results[0][j], "encode");
     for (const float value : results[0][j]) {
       if (!wild && !std::isfinite(value)) {
-        fail("encode: result " + std::to_string(j) + " is not finite for d = " + std::to_string(d) +
-             ", octaves = " + std::to_string(octaves) + (include ? ", input included" : ""));
+        fail("encode: result " + std::to_string(j) + " of kind " + std::to_string(kind) +
+             " is not finite for d = " + std::to_string(d) + ", size = " + std::to_string(size));
       }
-    }
-  }
-}
-
-void harmonics(Isa isa) {
-  const int64_t n = below(3) == 0 ? below(3) : below(3000), degree = 1 + below(4), width = degree * degree;
-  const Array<float> directions = uniform<float>(3 * n), gradient = uniform<float>(n * width);
-  Array<float> results[2][2];
-  for (int i = 0; i < 2; ++i) {
-    results[i][0] = poisoned(n * width);
-    results[i][1] = poisoned(3 * n);
-    voronerf::spherical_harmonics_cpu(directions.data(), results[i][0].data(), n, degree, isa, 1 + 2 * i);
-    voronerf::spherical_harmonics_backward_cpu(directions.data(), gradient.data(), results[i][1].data(), n, degree, isa,
-                                               1 + 2 * i);
-  }
-  for (int j = 0; j < 2; ++j) {
-    same(results[0][j], results[1][j], "spherical_harmonics");
-    like_portable(results[0][j], "spherical_harmonics");
-    for (const float value : results[0][j]) {
-      if (!wild && !std::isfinite(value)) fail("spherical_harmonics: a result is not finite");
     }
   }
 }
@@ -320,7 +303,6 @@ int main(int count, char** arguments) {
         if (i % 4 == 0) locate<double>(isa);
         composite(isa);
         encode(isa);
-        harmonics(isa);
         march(isa);
         loss(isa);
         adam(isa);

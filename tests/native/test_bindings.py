@@ -45,9 +45,9 @@ def test_what_does_not_fit_a_signature_is_refused() -> None:
             compiled.nearest_centre(points, wrong, cells, 4, 4, cpu)
     with pytest.raises(TypeError, match="incompatible function arguments"):  # a result that is not contiguous
         compiled.nearest_centre(points, points, torch.empty(8, dtype=torch.int32)[::2], 4, 4, cpu)
-    sizes = {"n": 4, "d": 3, "octaves": 1, "include_input": True, "width": 9}
+    sizes = {"encoding": "frequency", "n": 4, "d": 3, "size": 1, "include_input": True, "width": 9}
     with pytest.raises(TypeError, match=r"^Encoding: x is no const float32\*$"):
-        compiled.encode(compiled.Encoding(points.double(), None, **sizes), torch.empty(4, 9), torch.empty(999), cpu)
+        compiled.encode(compiled.Encoding(x=points.double(), variances=None, **sizes), torch.empty(4, 9), cpu)
     refuses("unexpected keyword argument 'y'", compiled.Encoding, y=points, variances=None, **sizes, error=TypeError)
 
 

@@ -150,7 +150,7 @@ def test_a_number_of_rows_that_is_no_count_is_refused():
     assert recording.obstacle.startswith("new memory of 6 rows is not counted, in test_step.py:")
     with Recording() as recording:
         spherical_harmonics(recording.take(points), 2)
-    assert recording.obstacle == "spherical_harmonics takes no number of rows that is counted"
+    assert recording.obstacle == "encode takes no number of rows that is counted"
 
 
 def test_torch_entry_by_entry_is_computed_again():
