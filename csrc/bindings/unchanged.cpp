@@ -47,8 +47,7 @@ bool each(PyObject* container, Look&& look) {
   return true;
 }
 
-py::object value_of(PyObject* owner, bool dictionary, PyObject* name) {
-  if (dictionary) return py::reinterpret_borrow<py::object>(PyDict_GetItemWithError(owner, name));
+py::object attribute_of(PyObject* owner, PyObject* name) {
   auto value = py::reinterpret_steal<py::object>(PyObject_GetAttr(owner, name));
   PyErr_Clear();
   return value;
@@ -118,20 +117,18 @@ void Unchanged::contents(const py::object& container, const std::vector<std::str
 }
 
 void Unchanged::entries(const py::dict& dictionary, const std::vector<std::string>& names) {
-  add_named(dictionary, true, names);
+  for (const std::string& name : names) {
+    const py::object key = interned(name);
+    PyObject* const value = PyDict_GetItemWithError(dictionary.ptr(), key.ptr());
+    entries_.push_back({dictionary, key, py::reinterpret_borrow<py::object>(value)});
+  }
 }
 
 void Unchanged::attributes(const py::object& object, const std::vector<std::string>& names) {
-  add_named(object, false, names);
-}
-
-void Unchanged::add_named(const py::object& owner, bool dictionary, const std::vector<std::string>& names) {
-  Named noted{owner, dictionary, {}};
   for (const std::string& name : names) {
     const py::object key = interned(name);
-    noted.values.emplace_back(key, value_of(owner.ptr(), dictionary, key.ptr()));
+    attributes_.push_back({object, key, attribute_of(object.ptr(), key.ptr())});
   }
-  named_.push_back(std::move(noted));
 }
 
 void Unchanged::answer(const py::object& function) { answers_.emplace_back(function, function()); }
@@ -143,12 +140,17 @@ void Unchanged::add(const py::object& tensor, bool layout) {
 
 void Unchanged::kind(const py::dict& dictionary, const std::string& name) {
   const py::object key = interned(name);
-  if (!value_of(dictionary.ptr(), true, key.ptr())) throw py::key_error(name);
-  kinds_.push_back({dictionary, key, Seen(value_of(dictionary.ptr(), true, key.ptr()).ptr(), false, true)});
+  PyObject* const tensor = PyDict_GetItemWithError(dictionary.ptr(), key.ptr());
+  if (tensor == nullptr) throw py::key_error(name);
+  kinds_.push_back({dictionary, key, Seen(tensor, false, true)});
 }
 
 bool Unchanged::holds() const {
   for (const Container& noted : containers_) {
+    if (noted.values.empty() && PyDict_Check(noted.container.ptr())) {  // as nearly all dictionaries of hooks are
+      if (PyDict_GET_SIZE(noted.container.ptr()) != 0) return false;
+      continue;
+    }
     size_t i = 0;
     const bool all = each(noted.container.ptr(), [&](PyObject* key, PyObject* value) {
       if (key != nullptr && (i == noted.values.size() || !is_same(noted.values[i++].ptr(), key))) return false;
@@ -158,10 +160,11 @@ bool Unchanged::holds() const {
     });
     if (!all || i != noted.values.size()) return false;
   }
-  for (const Named& noted : named_) {
-    for (const auto& [name, was] : noted.values) {
-      if (!is_same(was.ptr(), value_of(noted.owner.ptr(), noted.dictionary, name.ptr()).ptr())) return false;
-    }
+  for (const Named& noted : entries_) {
+    if (!is_same(noted.value.ptr(), PyDict_GetItemWithError(noted.owner.ptr(), noted.name.ptr()))) return false;
+  }
+  for (const Named& noted : attributes_) {
+    if (!is_same(noted.value.ptr(), attribute_of(noted.owner.ptr(), noted.name.ptr()).ptr())) return false;
   }
   for (const auto& [function, was] : answers_) {
     if (!is_same(was.ptr(), function().ptr())) return false;
@@ -180,9 +183,8 @@ int Unchanged::each_held(const Visit& visit) const {
     held.push_back(noted.container.ptr());
     for (const py::object& value : noted.values) held.push_back(value.ptr());
   }
-  for (const Named& noted : named_) {
-    held.push_back(noted.owner.ptr());
-    for (const auto& [name, value] : noted.values) held.push_back(value.ptr());
+  for (const std::vector<Named>* named : {&entries_, &attributes_}) {
+    for (const Named& noted : *named) held.insert(held.end(), {noted.owner.ptr(), noted.value.ptr()});
   }
   for (const auto& [function, answer] : answers_) held.insert(held.end(), {function.ptr(), answer.ptr()});
   for (const Tensor& noted : tensors_) held.insert(held.end(), {noted.tensor.ptr(), noted.storage.ptr()});

@@ -55,9 +55,7 @@ class Unchanged {
     std::vector<py::object> values;  // of a dictionary with their keys; null for any
   };
   struct Named {
-    py::object owner;
-    bool dictionary;
-    std::vector<std::pair<py::object, py::object>> values;  // by name; null for none
+    py::object owner, name, value;  // null for none
   };
   struct Tensor {
     py::object tensor, storage;
@@ -69,11 +67,10 @@ class Unchanged {
     Seen seen;
   };
   void add(const py::object& tensor, bool layout);
-  void add_named(const py::object& owner, bool dictionary, const std::vector<std::string>& names);
 
   std::vector<std::pair<py::object, py::object>> answers_;  // by function
   std::vector<Container> containers_;
-  std::vector<Named> named_;
+  std::vector<Named> entries_, attributes_;
   std::vector<Tensor> tensors_;
   std::set<std::pair<PyObject*, bool>> known_;  // of these
   std::vector<Kind> kinds_;
