@@ -59,10 +59,13 @@ def grouped_program(given: Given, offsets: Tensor, order: Tensor | None) -> list
         return in_torch(given, offsets, order)
     check_rows(given, offsets, order)
     with torch.autocast(inputs[0].device.type, enabled=False):
+        rays = parsed(text).rays
         if order is not None:
-            rays = parsed(text).rays
             inputs = [x if i in rays else x.index_select(0, order) for i, x in enumerate(inputs)]
             ray_index = None if ray_index is None else ray_index.index_select(0, order)
+        row = torch.arange(len(inputs[0]), device=offsets.device)
+        inside = ((row >= offsets[0]) & (row < offsets[-1]))[:, None]
+        inputs = [x if i in rays else torch.where(inside, x, 0) for i, x in enumerate(inputs)]
         features = None if chain.features is None else parameters[chain.features]
         if features is not None and features.shape[0] == 1:  # which all cells share
             features = features[0]
@@ -76,15 +79,13 @@ def grouped_program(given: Given, offsets: Tensor, order: Tensor | None) -> list
             features,
             dtype,
         )
-        row = torch.arange(raw.shape[0], device=raw.device)
-        inside = ((row >= offsets[0]) & (row < offsets[-1]))[:, None]
         results = [torch.where(inside, result, 0).to(dtype) for result in of_rows([raw], chain.behind)]
         if order is None:
             return results
         return [torch.zeros_like(result).index_copy(0, order.long(), result) for result in results]
 
 
-@constant_result  # torch.compile looks through a cache
+@constant_result  # of a function: torch.compile would look through the cache, and trace what is behind it
 def chain_of(text: str) -> Chain | None:
     """A program, given by its text, as a chain; None where it is none."""
     return _chain_of(text)
@@ -94,8 +95,8 @@ def chain_of(text: str) -> Chain | None:
 def _chain_of(text: str) -> Chain | None:
     program = Program.parse(text)
     try:
-        of_rows_alone = not (program.sums or program.by_ray or 0 in program.rays)
-        return _Reader(program).chain() if of_rows_alone else None
+        is_plain = not (program.sums or program.by_ray or 0 in program.rays)
+        return _Reader(program).chain() if is_plain else None
     except LookupError:
         return None
 

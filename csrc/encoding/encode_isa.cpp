@@ -19,7 +19,7 @@ struct Tile {
   float *const table, *const encoded, *const staged, *const staged_variances;
   const float *x, *variances;  // [rows][d]
   int64_t rows;
-  bool by_row = false;  // the kernel is
+  bool by_row = false;  // whether the kernel is of the formula of a row
   bool in_place;        // x and gradients are read there: so many rows follow that vectors may reach beyond the last
 
   Tile(const Encoding& in, float* workspace, int64_t stride)

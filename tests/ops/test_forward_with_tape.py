@@ -10,6 +10,7 @@ from op_cases import refused
 
 from voronerf import MLP, HashGrid, Layer
 from voronerf.ops import forward_with_tape, routed_mlp
+from voronerf.ops._core.backends import BackendUnavailable
 
 pytestmark = pytest.mark.op("forward_with_tape")
 
@@ -223,6 +224,7 @@ def test_refuses_what_makes_no_sense(device, backend):
         (ValueError, "network must hold program, inputs and parameters, got no program", {"program": ...}),
         (TypeError, "inputs must be a list, got Tensor", {"inputs": torch.ones(3)}),
         (TypeError, "unknown arguments op", {"op": 1}),
+        (TypeError, "unknown arguments where", {"where": 1}),
         (TypeError, "network must hold arguments by name, got ...", {3: 1}),
     ],
 )
@@ -230,3 +232,14 @@ def test_a_network_of_other_entries_is_refused(error, message, change, backend):
     given = {name: value for name, value in {**as_program(network("cpu")), **change}.items() if value is not ...}
     with refused(error, f"forward_with_tape: {message}"):
         forward_with_tape(given, backend=backend)
+
+
+@pytest.mark.native
+def test_the_dtype_of_the_parameters_decides_who_runs():
+    given = as_program(network("cpu"))
+    wide = {**given, "inputs": [x.double() for x in given["inputs"]]}
+    torch.testing.assert_close(forward_with_tape(wide, backend="native").raw, forward_with_tape(given).raw)
+    exact = {**given, "parameters": [p.detach().double() for p in given["parameters"]]}
+    assert torch.equal(forward_with_tape(exact).raw, forward_with_tape(exact, backend="reference").raw)
+    with pytest.raises(BackendUnavailable, match=r"forward_with_tape takes .* not float64"):
+        forward_with_tape(exact, backend="native")

@@ -134,6 +134,34 @@ def test_second_derivatives(device, backend, own):
         assert (a.double() - b).norm() <= 1e-4 * b.norm()
 
 
+@own_tables
+@pytest.mark.op("grouped_mlp")
+def test_is_part_of_a_graph(device, backend, own):
+    torch.compiler.reset()
+    offsets, (weights, biases, features) = offsets_of(COUNTS, device), network(GRIDS["plain"], own, device)
+    x, rays, index = inputs(sum(COUNTS), device)
+    given = {"directions": rays, "direction_index": index, "layers": table_of(GRIDS["plain"]), "backend": backend}
+
+    def run(x, features):
+        return grouped_mlp(x, offsets, weights, biases, features=features, **given)
+
+    compiled = torch.compile(run, fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(x, features), run(x, features))
+
+
+@own_tables
+@pytest.mark.op("grouped_mlp")
+def test_rows_of_no_cell_teach_nothing_whatever_they_hold(device, backend, own):
+    weights, biases, features = network(GRIDS["plain"], own, device)
+    x, rays, index = inputs(9, device)
+    x[0], x[8] = torch.nan, torch.inf
+    leaves = [leaf.requires_grad_() for leaf in (x, features, *weights)]
+    given = {"directions": rays, "direction_index": index, "layers": table_of(GRIDS["plain"]), "backend": backend}
+    out = grouped_mlp(x, offsets_of([3, 0, 2, 2], device) + 1, weights, biases, features=features, **given)
+    found = torch.autograd.grad(out.square().sum(), leaves)
+    assert out.isfinite().all() and all(slope.isfinite().all() for slope in found)
+
+
 def test_errors():
     grid, offsets = GRIDS["plain"], offsets_of(COUNTS)
     weights, biases, features = network(grid, False)

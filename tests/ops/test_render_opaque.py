@@ -122,3 +122,6 @@ def test_what_is_of_the_samples_is_refused():
     program = {"program": layers.program(3, 0, None, (False,)), "parameters": [torch.zeros(1, 3, 3)]}
     with refused(ValueError, "render_opaque: program must put out 4 numbers, colour and density, got 3"):
         render_opaque(**{**given, "network": program})
+    wide = {**given["network"], "parameters": [p.double() for p in given["network"]["parameters"]]}
+    with refused(TypeError, "render_opaque: parameters must have dtype float32 or one of 16 bits, got float64"):
+        render_opaque(**{**given, "network": wide})

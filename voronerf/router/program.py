@@ -39,7 +39,8 @@ class CellProgram(NamedTuple):
         program: Its outputs are the tensors that the call returns, in their order, [n, w] each.
         reads: Of each input of the program, the number of the argument of the call whose rows it is.
         shapes: Of each tensor that the call returns, for one sample.
-        parameters: [k, ...], or without k where all cells share it: the module's own, or made of them.
+        parameters: [k, ...], or without k where all cells share it: the module's own, or views of these; of a module
+            that was traced also made of them.
         activate: Turns the outputs into what the call returns; None where they are that.
 
     Examples:
@@ -151,7 +152,7 @@ class Given:
                 self._known = _checked(name, cast(Any, field).program())
                 read = {id(p if p._base is None else p._base) for p in self._known.parameters}
                 if any(id(p) not in read for p in cell_parameters(field)):
-                    self._known = f"{name} has parameters of cells that its program does not read"
+                    self._known = f"{name} has parameters of cells that are none of its program"
             if isinstance(self._known, CellProgram):
                 self._by_ray = _by_ray(self._known.program.text, self._known.reads)
             self._unchanged = guard = unchanged()

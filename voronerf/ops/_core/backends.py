@@ -46,8 +46,8 @@ class Implementation:
 
     devices: tuple[str, ...] = ()  # device types it runs on; empty means any
     dtypes: tuple[torch.dtype, ...] = ()  # dtypes of the op's first tensor it takes; empty means any
-    file: str | None = None  # the op whose module has the function; None for its own
-    function: str | None = None  # the op whose implementation it is, where it has none of its own
+    file: str | None = None  # the module that has the function, by its op; None for that of the function's name
+    function: str | None = None  # the name of the function; None for that of the op
     plain: bool = False  # whether it is the reference, which serves where the backend needs no kernel of its own
 
 
@@ -97,7 +97,7 @@ def declare(
 
     An implementation is the function of the op's name in a module of the op's name, unless ``file`` says another:
     ``voronerf.ops.<op>.reference``, ``voronerf.ops.<op>.native`` or ``voronerf.kernels.<op>``, imported on first use.
-    ``runs``: the op whose implementations this one runs, and which has the same row.
+    ``runs``: another op, whose row and implementations this one takes over.
     """
     if runs is not None:
         reference, native, warp = (replace(_TABLE[runs, backend], function=runs) for backend in BACKENDS)

@@ -50,6 +50,8 @@ def forward_with_tape(network: Mapping[str, Any], *, backend: str = "auto") -> T
     if not all(isinstance(name, str) for name in network):
         raise TypeError(f"{_OP}: network must hold arguments by name, got {list(network)!r:.100}")
     routed = routed_of(_OP, network)
-    first = routed.inputs[0]
-    tape: Tape = backends.resolve_composed(_OP, backend=backend, device=first.device, dtype=first.dtype)(routed)
+    given, leaves = routed.given(_OP), [*routed.inputs, *routed.parameters]
+    device = leaves[0].device
+    run = backends.resolve_composed(_OP, backend=backend, device=device, dtype=given.dtype)
+    tape: Tape = run(given, routed.where, leaves)
     return tape

@@ -16,31 +16,32 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.derivatives import learnt, with_gradients
 from voronerf.ops.forward_with_tape.reference import Graph, Tape
+from voronerf.ops.grouped_program.given import Given
 from voronerf.ops.grouped_program.native import How, Network, Rows, run, run_gradient
-from voronerf.ops.routed_program import Routed, of_samples
+from voronerf.ops.routed_program import of_samples
 from voronerf.ops.routed_program.native import find, of_cells, routed_program
 from voronerf.ops.routed_program.reference import cells_of, first_rows
+from voronerf.ops.routed_program.where import Where
 
 
-def forward_with_tape(routed: Routed) -> Tape:
-    """The outputs and their tape, once differentiable; see ``voronerf.ops.forward_with_tape``."""
-    where, frozen = routed.where, routed.where.frozen
-    leaves, first = [*routed.inputs, *routed.parameters], routed.inputs[0]
-    plain = all(tensor.dtype is torch.float32 for tensor in leaves)
+def forward_with_tape(given: Given, where: Where, leaves: Sequence[Tensor]) -> Tape:
+    """The outputs and their tape, once differentiable; see ``voronerf.ops.forward_with_tape``. ``leaves``: inputs and
+    parameters as the caller has them."""
+    first, plain = leaves[0], all(tensor.dtype is torch.float32 for tensor in leaves)
     if torch.is_grad_enabled() and plain and not torch.is_autocast_enabled(first.device.type):
         with torch.no_grad():
-            taken = Network.of(routed.given("forward_with_tape"))
+            taken = Network.of(given)
             k = cells_of(taken.parameters)
-            cells, order, offsets = find(first, of_cells(where, k), k, taken.how.caller)
+            cells, order, offsets = find(first, of_cells(where, k), k, given.caller)
             rows, how = taken.rows(offsets, order), taken.how
             learning = any(tensor.requires_grad for tensor in leaves)
             out, *kept = run(rows, how._replace(keep=True) if learning else how)
             count = None if native.on_cuda(out) else where.rows  # CUDA has left out the others
             if count is not None:
                 (out,), cells = first_rows([out], cells, count)
-            return _Kept(out, rows._replace(kept=kept), how, leaves, count, cells, frozen)
-    (out,), cells = routed_program(routed.given("forward_with_tape"), where)
-    return Graph(out.detach().float(), out, cells, frozen)
+            return _Kept(out, rows._replace(kept=kept), how, leaves, count, cells, where.frozen)
+    (out,), cells = routed_program(given, where)
+    return Graph(out.detach().float(), out, cells, where.frozen)
 
 
 @dataclass(eq=False)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
 
 from voronerf.ops._core.checks import check_flag, check_shape
 from voronerf.ops._core.derivatives import learnt, with_gradients
-from voronerf.ops.routed_program import Routed, of_samples, run
+from voronerf.ops.grouped_program.given import Given
+from voronerf.ops.routed_program import of_samples, run
+from voronerf.ops.routed_program.where import Where
 
 
 class Tape(ABC):
@@ -56,11 +59,10 @@ class Tape(ABC):
     def _backward(self, loss: Tensor, gradient: Tensor, defer: bool) -> Tensor: ...
 
 
-def forward_with_tape(routed: Routed, backend: str = "reference") -> Tape:
+def forward_with_tape(given: Given, where: Where, leaves: Sequence[Tensor], backend: str = "reference") -> Tape:
     """The outputs and their tape; see ``voronerf.ops.forward_with_tape``."""
-    where = routed.where._replace(frozen=None)
-    (out,), cells = run(routed.given("forward_with_tape"), where, backend=backend)
-    return Graph(out.detach().float(), out, cells, routed.where.frozen)
+    (out,), cells = run(given, where._replace(frozen=None), backend=backend)
+    return Graph(out.detach().float(), out, cells, where.frozen)
 
 
 @dataclass(frozen=True)

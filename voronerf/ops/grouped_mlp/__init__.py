@@ -32,8 +32,8 @@ def grouped_mlp(
     Equivalent to ``frequency_encode`` (or ``integrated_encode``) where ``layers`` has octaves, ``hash_encode`` where it
     has a grid, or ``spherical_harmonics`` of the directions where it has a degree, followed by one ``grouped_linear``
     for each layer on the concatenation of its sources. Gradients of every order to positions, directions, features,
-    weights and biases. Encodings are computed in float32 at least, and rounded to the dtype of the weights.
-    Under ``torch.autocast``, layers run in its dtype.
+    weights and biases. Of weights in 16 bits, and under ``torch.autocast``, operands of products are rounded, and the
+    result; all else is float32 at least.
 
     Args:
         positions: [n, p] floating point, sorted by cell, n < 2**31; raw if the table has octaves, else already encoded.

@@ -131,8 +131,8 @@ _ORDER = Row("order", INDEX, ("n",))
 
 
 def _rows(program: Program, dtype: torch.dtype | None, first: Sequence[Row], last: Sequence[Row]) -> Rows:
-    """The rules for the tensors of a program, of layers of a dtype: inputs, parameters and the index of rays, between
-    others."""
+    """The rules for the tensors of a program, between others: inputs, parameters, the index of rays. ``dtype``: of all
+    parameters but tables, None without any."""
     rows: list[Row | Default] = [*first]
     for i, width in enumerate(program.inputs):
         rows.append(Row(f"inputs[{i}]", FLOATING, ("r" if _among(i, program.rays) else "n", width)))

@@ -68,6 +68,13 @@ def parsed(text: str) -> Program:
     return Program.parse(text)
 
 
+@constant_result
+def _grid(text: str) -> HashGrid:
+    grid = HashGrid.parse(text)
+    assert grid.rows  # which a compiler finds, but does not compute
+    return grid
+
+
 def check_rows(given: Given, offsets: Tensor, order: Tensor | None) -> None:
     """Raises ValueError for offsets, an order or an index of rays that name no row; on the CPU, as it reads them."""
     if offsets.device.type != "cpu" or torch.compiler.is_compiling():
@@ -107,7 +114,7 @@ class _Run:
         self.products = products or inputs[0].dtype
         self.cells = cells_of(offsets, inputs[0]) if program.grids else offsets  # int32 [n]
         self.tables = {i: parameters[i].to(inputs[0].dtype) for i in program.tables}
-        self.grids = [HashGrid.parse(text) for text in program.grids]
+        self.grids = [_grid(text) for text in program.grids]
         self.parameters = [p.expand(self.k, *p.shape[1:]) for p in parameters]
         self.values: dict[int, Tensor] = {}
         counts = program.cells_of_sums(parameters, self.k) if program.sums else []

@@ -34,6 +34,8 @@ def _prepare(given: Any) -> Any:
     index = torch.arange(len(origins), dtype=torch.int32, device=origins.device) if reads else None
     inputs = [origins, given.directions] if reads else [origins]
     routed = routed_of(op, {**network, "inputs": inputs, "ray_index": index})
+    if (dtype := routed.given(op).dtype) is torch.float64 and origins.dtype is not dtype:
+        raise TypeError(f"{op}: parameters must have dtype {str(origins.dtype)[6:]} or one of 16 bits, got float64")
     if (width := routed.program.outputs[0].width) != 4:
         raise ValueError(f"{op}: program must put out 4 numbers, colour and density, got {width}")
     return scaled(op, given._replace(network=routed))

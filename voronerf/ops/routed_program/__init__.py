@@ -109,7 +109,7 @@ def routed_of(op: str, network: Mapping[str, Any]) -> Routed:
     """The arguments of `routed_program` by name, but for the backend, checked; of a program with one output."""
     places = {name: network[name] for name in Where._fields if name in network}
     rest = {name: given for name, given in network.items() if name not in places}
-    if unknown := rest.keys() - set(Routed._fields):
+    if unknown := rest.keys() - {"program", "inputs", "parameters", "ray_index"}:
         raise TypeError(f"{op}: unknown arguments {', '.join(sorted(unknown))}")
     return check_routed_program(op, True, **{"ray_index": None, **rest, "where": Where(**places)})
 
