@@ -52,7 +52,7 @@ LISTS = {"@checked": CHECKED, "@racing": RACING}
 """Several cases by one name."""
 STEP: dict[str, Any] = {"width": 16, "samples": (8,), "rays": 16, "cells": (), "split_at": ()}
 LITTLE: dict[str, dict[str, Any]] = {
-    "large": {"n": 300},
+    "large": {"n": 150},
     "captured": {"n": 16, "replays": 1},
     "trainings": {"count": 1, **STEP},
     "rows": {"n": 128, "fewer": 64, "seconds": 0.1},
