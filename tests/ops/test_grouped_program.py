@@ -264,7 +264,7 @@ def test_instruction_sets(isa: str) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_types(dtype: torch.dtype) -> None:
-    """What float32 gives for the rounded arguments, but for what products round."""
+    """The results are those of float32 for the rounded arguments, but for the rounding of products."""
     program = random_program(3)
     rows, parameters, offsets = arguments(program, [40, 9], dtype)
     wide = [[t.float() for t in part] for part in (rows, parameters)]

@@ -38,7 +38,7 @@ class Given(NamedTuple):
     def of(
         caller: str, text: str, inputs: Sequence[Tensor], parameters: Sequence[Tensor], ray_index: Tensor | None
     ) -> Given:
-        """Of a program by its text. Float64 inputs are encoded here where the results are of another dtype."""
+        """Takes a program by its text, and encodes float64 inputs where the results have another dtype."""
         dtype, kind = inputs[0].dtype, inputs[0].device.type
         if (first := _first_layer(text)) is not None:
             dtype = parameters[first].dtype

@@ -87,7 +87,7 @@ class Network(NamedTuple):
 
     @staticmethod
     def of(given: Given) -> Network:
-        """As the public functions take it."""
+        """Casts the tensors that the public functions take."""
         text, inputs, parameters, index, dtype, caller = given
         tables = _tables(text)  # of which positions are read in float32
         stored = dtype is torch.bfloat16 and not tables and all(x.dtype is dtype for x in inputs)
@@ -99,7 +99,7 @@ class Network(NamedTuple):
         return Network(rows, kept, index, How(text, caller, PRODUCTS.get(dtype, "float32")), dtype)
 
     def rows(self, offsets: Tensor, order: Tensor | None = None) -> Rows:
-        """What the program runs on, for rows of cells by offsets [k + 1] and an order."""
+        """The tensors of the program, for rows of cells by offsets [k + 1] and an order."""
         return Rows(self.inputs, self.parameters, offsets, order, self.ray_index)
 
     def run(self, offsets: Tensor, order: Tensor | None = None) -> list[Tensor]:
@@ -109,7 +109,7 @@ class Network(NamedTuple):
 
 
 PRODUCTS = {torch.bfloat16: "bfloat16", torch.float16: "float16"}
-"""What products take for results of a dtype; float32 for any other."""
+"""Operands of products by the dtype of the results; float32 for any other."""
 
 
 def grouped_program(given: Given, offsets: Tensor, order: Tensor | None) -> list[Tensor]:

@@ -1,4 +1,4 @@
-"""What tells the cells of samples: centres, the tables of a tree, or the cells themselves.
+"""The arguments that tell the cells of samples: centres, the tables of a tree, or the cells themselves.
 
 n samples, k cells, m centres of all diagrams together, g diagrams.
 """
