@@ -274,6 +274,23 @@ def test_half_types(dtype: torch.dtype) -> None:
         assert agree(ours, exact.to(dtype))
 
 
+@pytest.mark.parametrize("backend", ["reference", "native"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("width", [1, 2, 33])
+def test_one_column_in_the_place_of_all_is_put_out(width: int, dtype: torch.dtype, backend: str) -> None:
+    """As an output, and as the gradient of a sum over all columns."""
+    b = Builder()
+    x = b.input(width)
+    program = b.program([x.part(width - 1, 1)._replace(width=width, spread=True), b.total(x, width)])
+    rows = torch.rand(60, width).to(dtype).requires_grad_()
+    spread, total = grouped_program([rows], [], offsets_of([7, 53]), program=program, backend=backend)
+    assert torch.equal(spread, rows[:, -1:].expand(-1, width))
+    torch.testing.assert_close(total, rows.sum(1, keepdim=True))
+    weight = torch.rand(60, 1).to(dtype)
+    (slope,) = torch.autograd.grad(total, rows, weight)
+    assert torch.equal(slope, weight.expand(-1, width))
+
+
 def test_refuses_what_is_no_program() -> None:
     """The other rules are in the op's case."""
     with pytest.raises(TypeError, match="grouped_program: program must be a Program, got str"):

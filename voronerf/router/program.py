@@ -135,13 +135,13 @@ class Given:
 
     @staticmethod
     def of(field: nn.Module) -> Given | None:
-        """That of a field that has the method, without arguments."""
+        """Makes one for a field that has the method, without arguments; None for any other."""
         method = getattr(type(field), "program", None)
         needed = [None] * 2 if not callable(method) else list(inspect.signature(method).parameters)
         return Given() if len(needed) == 1 else None
 
     def look(self, field: nn.Module) -> CellProgram | str:
-        """What the layers of a field put out, and its activation; or why that is not known."""
+        """The program of a field's layers, with its activation; or why that is not known."""
         if torch.compiler.is_compiling():  # then what was found holds
             return self._known
         if field is not self._field or not self._unchanged.holds():
@@ -224,7 +224,7 @@ _NAMES = ("positions", "directions", "ray_index")
 
 
 def _checked(name: str, found: Any) -> CellProgram:
-    """What a method ``program`` has given; raises TypeError or ValueError for what cannot be run."""
+    """Checks what a method ``program`` has given; raises TypeError or ValueError where it cannot be run."""
     if not isinstance(found, CellProgram):
         raise TypeError(f"{_OP}: program of {name} must give a CellProgram, got {type(found).__name__}")
     if found.reads not in ((0,), (0, 1)) or not found.parameters:

@@ -247,11 +247,15 @@ struct ProgramTile {
     for (int64_t row = 0; row < rows; ++row) {
       const float* values = x.data + row * x.stride;
       const int64_t to = (summed == nullptr ? place(row) : begin + row) * all + step.depth;
-      float* into = (summed == nullptr ? static_cast<float*>(call.outputs[step.number]) : summed) + to;
+      if (half && summed == nullptr) {
+        uint16_t* const into = static_cast<uint16_t*>(call.outputs[step.number]) + to;
+        round_row(values, x.spread ? 1 : width, into);
+        for (int64_t c = 1; x.spread && c < width; ++c) into[c] = into[0];
+        continue;
+      }
+      float* const into = (summed == nullptr ? static_cast<float*>(call.outputs[step.number]) : summed) + to;
       if (x.spread) {
         for (int64_t c = 0; c < width; ++c) into[c] = *values;
-      } else if (half && summed == nullptr) {
-        round_row(values, width, static_cast<uint16_t*>(call.outputs[step.number]) + to);
       } else {
         copy_row(values, width, into);
       }
