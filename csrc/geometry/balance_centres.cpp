@@ -16,7 +16,7 @@ constexpr int64_t kSerial = 1 << 20;  // pairs of sample and centre below which 
 
 void weigh(const BalanceInputs& in, const float* centres, double* weights, int32_t* cells, Isa isa, int threads) {
   const int team = in.m * in.k < kSerial ? 1 : threads;
-  nearest_centre_cpu<float>(in.samples, centres, cells, in.m, in.k, isa, team);
+  nearest_centre_cpu<float>(in.samples, centres, nullptr, cells, in.m, in.k, 3, 0, isa, team);
   std::fill_n(weights, in.k, 0.0);
   for (int64_t i = 0; i < in.m; ++i) weights[cells[i]] += in.masses[i];
 }

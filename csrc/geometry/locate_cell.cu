@@ -24,11 +24,11 @@ __device__ int32_t nearest_in_diagram(const float* point, const float* centres, 
       cell = j;
     }
   }
-  return nearest_is_certain(best, second) ? cell : nearest_by_definition(point, centres, k);
+  return nearest_is_certain(best, second) ? cell : nearest_by_definition<3>(point, centres, k);
 }
 
 __device__ int32_t nearest_in_diagram(const double* point, const double* centres, int32_t k) {
-  return nearest_by_definition(point, centres, k);
+  return nearest_by_definition<3>(point, centres, k);
 }
 
 template <typename T>

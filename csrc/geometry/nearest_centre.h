@@ -1,22 +1,32 @@
-// Nearest centre: points [n,3], centres [k,3] -> cells [n]. Exact, ties to the lowest index, non-finite points to cell
-// 0 (nearest_centre_math.h). k >= 1; n = 0 is legal.
+// Nearest centre: points [n,d], centres [k,d] -> cells [n], d = 1 to 4. Exact, ties to the lowest index, non-finite
+// points to cell 0 (nearest_centre_math.h). k >= 1; n = 0 is legal.
+//
+// index: of these centres (centre_index.h), with `words` entries, or null. Without one the CPU makes one for the call
+// where that pays. False where d or `words` is wrong.
 #pragma once
 
 #include <cstdint>
 
 #include "common/isa.h"
 #include "common/row_count.h"
+#include "geometry/centre_index.h"
 
 namespace voronerf {
 
 template <typename T>
-void nearest_centre_cpu(const T* points, const T* centres, int32_t* cells, RowCount n, int64_t k, Isa isa, int threads);
+bool nearest_centre_cpu(const T* points, const T* centres, const int32_t* index, int32_t* cells, RowCount n, int64_t k,
+                        int64_t d, int64_t words, Isa isa, int threads);
 // rows: [1], how many points count, the others get -1; null for all.
 template <typename T>
-void nearest_centre_cuda(const T* points, const T* centres, const int32_t* rows, int32_t* cells, int64_t n, int64_t k,
-                         void* stream);
+bool nearest_centre_cuda(const T* points, const T* centres, const int32_t* index, const int32_t* rows, int32_t* cells,
+                         int64_t n, int64_t k, int64_t d, int64_t words, void* stream);
 
-// The same on the calling thread.
+// By an index, on the calling thread.
+template <typename T>
+void search_index_serial(const T* points, const int32_t* index, int32_t* cells, int64_t n,
+                         const CentreIndexShape& shape, int d, Isa isa);
+
+// By all of the centres, in three coordinates, on the calling thread.
 template <typename T>
 void nearest_centre_serial(const T* points, const T* centres, int32_t* cells, int64_t n, int64_t k, Isa isa);
 

@@ -80,7 +80,7 @@ VN_INLINE void tile(const float* points, const float* centres, int bits_taken, i
     unsigned uncertain = ~bits(less(add(best[u], margin), second[u])) & ((1u << kLanes) - 1u);
     for (; uncertain != 0; uncertain &= uncertain - 1) {
       const int lane = __builtin_ctz(uncertain);
-      out[lane] = nearest_by_definition(points + 3 * (kLanes * u + lane), centres, k);
+      out[lane] = nearest_by_definition<3>(points + 3 * (kLanes * u + lane), centres, k);
     }
   }
 }
@@ -115,7 +115,7 @@ void nearest_centre(const double* points, const double* centres, int32_t* cells,
       y[r / kDoubles][r % kDoubles] = points[3 * (i + r) + 1];
       z[r / kDoubles][r % kDoubles] = points[3 * (i + r) + 2];
     }
-    for (int u = 0; u < kVectors; ++u) best[u] = F64{} + 1.7976931348623157e308;
+    for (int u = 0; u < kVectors; ++u) best[u] = F64{} + kLargest;
     for (int64_t j = 0; j < k; ++j) {
       const double* c = centres + 3 * j;
       for (int u = 0; u < kVectors; ++u) {

@@ -1,7 +1,7 @@
 // Arithmetic of nearest_centre, shared by its CPU and CUDA kernels.
 //
-// The answer is defined in float64: the lowest index that minimises |x - c|^2, evaluated as (dx^2 + dy^2) + dz^2 with
-// every operation rounded on its own (no contraction to fma), so that all backends agree to the last bit.
+// The answer is defined in float64: the lowest index that minimises |x - c|^2, evaluated as (dx^2 + dy^2) + dz^2 (and
+// so on) with every operation rounded on its own (no contraction to fma), so that all backends agree to the last bit.
 //
 // Float32 input is screened in float32 and decided in float64 only where float32 cannot. Let u = 2^-24 and D the
 // squared distance. A difference, a product and two sums round, so float32 finds D up to g D, where g = 5u + O(u^2)
@@ -23,6 +23,7 @@ namespace voronerf {
 
 constexpr float kMargin = 2e-6f;
 constexpr float kFloor = 1e-36f;
+constexpr double kLargest = 1.7976931348623157e308;
 
 // kMargin for values whose lowest bits are an index.
 VN_HD float nearest_margin(int index_bits) { return kMargin + 2.5f * static_cast<float>(1 << index_bits) / 8388608.0f; }
@@ -30,31 +31,32 @@ VN_HD float nearest_margin(int index_bits) { return kMargin + 2.5f * static_cast
 // Whether float32 decides: `second` is the smallest computed value except that of the best index.
 VN_HD bool nearest_is_certain(float best, float second) { return best + (kMargin * best + kFloor) < second; }
 
-// The defining value for one centre (c points to its three coordinates). On the host -ffp-contract=off keeps the
-// roundings.
-template <typename T>
-VN_HD double squared_distance(double x, double y, double z, const T* c) {
-  const double dx = x - static_cast<double>(c[0]);
-  const double dy = y - static_cast<double>(c[1]);
-  const double dz = z - static_cast<double>(c[2]);
+// sum + d * d, each rounded. On the host -ffp-contract=off keeps the roundings.
+VN_HD double add_square(double sum, double d) {
 #ifdef __CUDA_ARCH__
-  return __dadd_rn(__dadd_rn(__dmul_rn(dx, dx), __dmul_rn(dy, dy)), __dmul_rn(dz, dz));
+  return __dadd_rn(sum, __dmul_rn(d, d));
 #else
-  return dx * dx + dy * dy + dz * dz;
+  return sum + d * d;
 #endif
+}
+
+// The defining value for one centre, whose D coordinates lie so far apart.
+template <int D, typename T>
+VN_HD double squared_distance(const double* point, const T* centre, int apart = 1) {
+  double sum = 0.0;
+  for (int axis = 0; axis < D; ++axis) sum = add_square(sum, point[axis] - static_cast<double>(centre[axis * apart]));
+  return sum;
 }
 
 // The definition: strict comparison keeps the lowest of equals; NaN and infinity win over nothing, so that a non-finite
 // point gets cell 0.
-template <typename T>
+template <int D, typename T>
 VN_HD int32_t nearest_by_definition(const T* point, const T* centres, int64_t k) {
-  const double x = static_cast<double>(point[0]);
-  const double y = static_cast<double>(point[1]);
-  const double z = static_cast<double>(point[2]);
-  double best = 1.7976931348623157e308;
+  double at[D], best = kLargest;
+  for (int axis = 0; axis < D; ++axis) at[axis] = static_cast<double>(point[axis]);
   int32_t cell = 0;
   for (int64_t j = 0; j < k; ++j) {
-    const double v = squared_distance(x, y, z, centres + 3 * j);
+    const double v = squared_distance<D>(at, centres + D * j);
     if (v < best) {
       best = v;
       cell = static_cast<int32_t>(j);

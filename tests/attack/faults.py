@@ -73,6 +73,20 @@ FAULTS = (
         "second[u] = min(as_float(next[u]), second[u]);",
     ),
     _kernel(
+        "nearest_centre",
+        "an index gives any of the nearest centres",
+        "geometry/centre_index_isa.cpp",
+        "if (v < best || (v == best && numbers[i] < cell)) {",
+        "if (v < best) {",
+    ),
+    _kernel(
+        "nearest_centre",
+        "an index leaves out boxes as far as the best",
+        "geometry/centre_index_isa.cpp",
+        "if (!(left[nearest] <= best)) continue;",
+        "if (!(left[nearest] < best)) continue;",
+    ),
+    _kernel(
         "locate_cell",
         "points of a block behind the first take the groups of its last",
         "geometry/tree_descent.h",

@@ -25,17 +25,24 @@ using voronerf::Isa;
 
 template <typename T>
 void search(Isa isa) {
-  const int64_t counts[] = {1, 2, 16, 17, 255, 256, 257, 300 + below(300)};
-  const int64_t n = some_rows(), k = counts[below(8)];
-  const Array<T> points = below(2) == 0 ? uniform<T>(3 * n) : lattice<T>(3 * n);
+  const int64_t counts[] = {1, 2, 16, 17, 255, 256, 257, 300 + below(300), 2048 + below(3000)};
+  const int64_t n = some_rows(), k = counts[below(9)], d = 1 + below(4);
+  const Array<T> points = below(2) == 0 ? uniform<T>(d * n) : lattice<T>(d * n);
   const bool was_wild = wild;
   wild = false;  // centres are finite
-  const Array<T> centres = below(2) == 0 ? uniform<T>(3 * k) : lattice<T>(3 * k);
+  const Array<T> centres = below(2) == 0 ? uniform<T>(d * k) : lattice<T>(d * k);
   wild = was_wild;
-  Array<int32_t> found(n, -7), again(n, -7);
-  voronerf::nearest_centre_cpu(points.data(), centres.data(), found.data(), n, k, isa, 1);
-  voronerf::nearest_centre_cpu(points.data(), centres.data(), again.data(), n, k, isa, 3);
+  const int axes = static_cast<int>(d);
+  const int64_t words = voronerf::centre_index_words(k, axes, sizeof(T));
+  Array<int32_t> found(n, -7), again(n, -7), index(words, -7), same_index(words, -7);
+  voronerf::index_centres_cpu(centres.data(), index.data(), k, axes, 1);
+  voronerf::index_centres_cpu(centres.data(), same_index.data(), k, axes, 3);
+  same(index, same_index, "index_centres");
+  voronerf::nearest_centre_cpu(points.data(), centres.data(), nullptr, found.data(), n, k, d, 0, isa, 1);
+  voronerf::nearest_centre_cpu(points.data(), centres.data(), nullptr, again.data(), n, k, d, 0, isa, 3);
   same(found, again, "nearest_centre");
+  voronerf::nearest_centre_cpu(points.data(), centres.data(), index.data(), again.data(), n, k, d, words, isa, 1);
+  same(found, again, "nearest_centre by an index");
   within(found, k, "nearest_centre");
   like_portable(found, "nearest_centre");
 }

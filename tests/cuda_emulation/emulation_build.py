@@ -28,7 +28,7 @@ PLAIN = {"emulation.cpp", "emulated_products.cpp", "python.cpp"}
 """Files with nothing to watch."""
 FAST = {"emulation.cpp", "emulated_products.cpp"}
 """The scheduler and the products among these, where a launch spends most of its time."""
-SHARED = ("cell_sort_plan.cpp",)
+SHARED = ("cell_sort_plan.cpp", "centre_index.cpp")
 """What the launchers need of the C++ beside them."""
 REPLACED = {"radix_sort.cu"}
 """What consists of the CUDA toolkit's headers: a file of the same name in this folder stands in."""

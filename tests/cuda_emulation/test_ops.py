@@ -11,6 +11,7 @@ from helpers import same
 
 import voronerf
 from voronerf import VoronoiDiagram
+from voronerf.ops import index_centres
 from voronerf.ops._core.layers import MLP, POSITIONS, Layer
 from voronerf.ops.cell_sort.native import WAYS
 from voronerf.ops.cell_sort.native import sort as sort_cells
@@ -35,9 +36,15 @@ def test_look_ups(dtype):
         # Integers: many ties, which go to the lowest index.
         points, centres = (torch.randint(-3, 4, (count, 3)).to(dtype) for count in (n, k))
         assert torch.equal(*both(voronerf.nearest_centre, points, centres))
+        assert torch.equal(*both(voronerf.nearest_centre, points, centres, index=index_centres(centres)))
     odd = torch.tensor([[torch.nan, 0, 0], [torch.inf, 0, 0], [1e30, 0, 0], [1, 1, 1]], dtype=dtype)
     centres = torch.tensor([[5.0, 0, 0], [1, 1, 1]], dtype=dtype)
-    assert voronerf.nearest_centre(odd, centres, backend="native").tolist() == [0, 0, 0, 1]
+    for index in (None, index_centres(centres)):
+        assert voronerf.nearest_centre(odd, centres, index=index, backend="native").tolist() == [0, 0, 0, 1]
+    for d, k in ((1, 400), (2, 3), (4, 700)):
+        points, centres = torch.rand(130, d, dtype=dtype), torch.rand(k, d, dtype=dtype)
+        assert torch.equal(*both(voronerf.nearest_centre, points, centres))
+        assert torch.equal(*both(voronerf.nearest_centre, points, centres, index=index_centres(centres)))
     diagram = VoronoiDiagram(torch.rand(4, 3, dtype=dtype))
     diagram, _ = diagram.refine({1: torch.rand(3, 3, dtype=dtype), 3: torch.rand(2, 3, dtype=dtype)})
     tables = diagram.centres, diagram.child_offsets, diagram.child

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -33,6 +36,27 @@ def test_locate(d: int, dtype: torch.dtype, k: int, generator: torch.Generator) 
     assert diagram.locate(points[:0]).shape == (0, 23)
     points[0, 0] = float("nan")
     assert diagram.locate(points)[0, 0] == 0
+
+
+@pytest.mark.parametrize("d", DIMENSIONS)
+def test_many_cells_have_an_index(d: int, generator: torch.Generator) -> None:
+    diagram = VoronoiDiagram(torch.rand(2500, d, generator=generator))
+    points = torch.rand(200, d, generator=generator)
+
+    def is_right(one: VoronoiDiagram) -> bool:
+        return torch.equal(one.locate(points).long(), nearest(points, one.centres))
+
+    assert is_right(diagram)
+    index = diagram.index()
+    assert diagram.index() is index  # kept
+    assert is_right(copy.deepcopy(diagram)) and is_right(pickle.loads(pickle.dumps(diagram)))
+    with torch.no_grad():
+        diagram.centres.neg_()  # in place: the index is of what was there
+    assert is_right(diagram)
+    other = VoronoiDiagram(torch.rand(3000, d, generator=generator))
+    diagram.load_state_dict(other.state_dict())
+    assert is_right(diagram) and torch.equal(diagram.locate(points), other.locate(points))
+    assert VoronoiDiagram(other.centres[:100]).index() is None
 
 
 @pytest.mark.parametrize("d", DIMENSIONS)

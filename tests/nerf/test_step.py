@@ -9,7 +9,7 @@ import pytest
 import torch
 from step_training import BOX, Scaled, Training, same
 
-from voronerf import OccupancyGrid
+from voronerf import OccupancyGrid, VoronoiDiagram
 from voronerf.nerf import PlannedSplit, SplitStrategy, replayed
 from voronerf.ops import cell_sort, nearest_centre, spherical_harmonics
 from voronerf.ops._core.recording import Recording
@@ -285,6 +285,26 @@ def test_what_moves_is_followed():
         found.append(steps)
     for name, steps in found[0].items():
         assert same(steps, found[1][name]), name
+
+
+def test_centres_that_have_an_index_are_followed():
+    """Changed in place, moved to other memory, and of another diagram."""
+    found = []
+    for as_it_is in (False, True):
+        training, steps = Training(cells=2100), []
+        for change in (
+            lambda t: None,
+            lambda t: t.router.diagram.centres.mul_(0.7),
+            MOVES["centres"],
+            lambda t: setattr(t.router, "diagram", VoronoiDiagram(t.router.diagram.centres.flip(0) + 0.1)),
+        ):
+            training.train(1, as_it_is=as_it_is)
+            training.step(64, 2, at=1023)
+            change(training)
+            steps += training.train(2, as_it_is=as_it_is)
+        found.append([*steps, *training.router.parameters()])
+        assert as_it_is or "recorded and replayed" in training.step.explain()
+    assert same(*found)
 
 
 def test_recordings_that_are_never_replayed_are_made_less_often():

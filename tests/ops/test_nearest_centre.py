@@ -4,7 +4,7 @@ import pytest
 import torch
 from op_cases import FLOATS, HALVES, need, refusals
 
-from voronerf.ops import nearest_centre
+from voronerf.ops import index_centres, nearest_centre
 from voronerf.ops._core.backends import BackendUnavailable
 
 pytestmark = pytest.mark.op("nearest_centre")
@@ -66,9 +66,65 @@ def test_is_not_differentiable(device, backend):
     assert not nearest_centre(points, centres, backend=backend).requires_grad
 
 
+def some_centres(kind, k, d, dtype):
+    """k centres: anywhere, on a lattice with many at one place, most of them close together, or all at one place."""
+    found = torch.randn(k, d, dtype=torch.float64)
+    if kind == "lattice":
+        found = torch.randint(-4, 5, (k, d)).double()
+    if kind == "heavy-tailed":
+        found = found * torch.rand(k, 1, dtype=torch.float64).pow(-2)
+    return (found * (kind != "one place")).to(dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("d", [1, 2, 3, 4])
+@pytest.mark.parametrize("kind", ["normal", "lattice", "heavy-tailed", "one place"])
+def test_an_index_finds_the_same_centres(device, backend, kind, d, dtype):
+    for k in (1, 16, 17, 33, 300, 4097):
+        centres = some_centres(kind, k, d, dtype)
+        points = torch.cat([some_centres(kind, 150, d, dtype), torch.randint(-9, 10, (150, d)).to(dtype) / 2, centres[:9]])
+        points[7], points[70, 0], points[71, 0], points[72] = 1e30, torch.nan, -torch.inf, 1e-42
+        expected = nearest_centre(points, centres, backend="reference")
+        for index in (None, index_centres(centres.to(device))):
+            given = points.to(device), centres.to(device)
+            assert torch.equal(nearest_centre(*given, index=index, backend=backend).cpu(), expected), (k, index is None)
+
+
+def test_many_centres_and_points_without_an_index(device, backend):
+    """The call makes one for itself, on the CPU."""
+    points, centres = torch.rand(1500, 3), torch.rand(3000, 3)
+    found = nearest_centre(points.to(device), centres.to(device), backend=backend)
+    assert torch.equal(found.cpu(), nearest_centre(points, centres, backend="reference"))
+
+
+def test_an_index_of_centres_that_are_no_numbers_harms_nothing():
+    centres = torch.rand(500, 3)
+    centres[::3] = torch.nan
+    centres[1::9, 1] = torch.inf
+    found = nearest_centre(torch.rand(99, 3), centres, index=index_centres(centres))
+    assert centres[found.long()].isfinite().all()
+
+
 def test_errors():
     points, centres = torch.rand(4, 3), torch.rand(2, 3)
     refuses = refusals(nearest_centre, points=points, centres=centres)
     refuses("centres must hold at least one centre, got none", centres=centres[:0])
+    many = {"points": torch.rand(4, 5), "centres": torch.rand(2, 5)}
+    for backend in ("reference", "auto"):
+        refuses("centres must have shape [k, d], d = 1 to 4, got [2, 5]", **many, backend=backend)
+    if (other := index_centres(torch.rand(20, 3))) is not None:
+        refuses("index must be of these centres, int32 [64], got [224]", index=other)
+        double = {"points": points.double(), "centres": centres.double()}
+        refuses("index must be of these centres, int32 [112], got [64]", index=other[:64], **double)
+    for kind, given, message in (
+        (ValueError, torch.rand(0, 3), "index_centres: centres must hold at least one centre, got none"),
+        (ValueError, torch.rand(3), "index_centres: centres must have shape"),
+        (ValueError, torch.rand(3, 5), "index_centres: centres must have shape"),
+        (TypeError, torch.ones(3, 3, dtype=torch.int64), "index_centres: centres must have dtype"),
+        (TypeError, [1.0], "index_centres: centres must be a tensor, got list"),
+    ):
+        with pytest.raises(kind) as caught:
+            index_centres(given)
+        assert str(caught.value).startswith(message)
     with pytest.raises((ValueError, BackendUnavailable), match="nearest_centre: backend"):
         nearest_centre(points, centres, backend="fastest")

@@ -142,7 +142,7 @@ def balance(
     masses = importance.detach().to("cpu", torch.float64)
 
     def weigh(centres: Tensor) -> Tensor:
-        return cell_weights(nearest_cell(samples, centres, backend=backend), masses, k)
+        return cell_weights(ops.nearest_centre(samples, centres, backend=backend), masses, k)
 
     chosen = first_centres(samples, masses, k, centres, generator)
     before = after = weigh(chosen)
@@ -253,7 +253,7 @@ def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "a
     precise, energy = samples.double(), float("inf")
     weighted = [masses * axis for axis in precise.unbind(1)]
     for _ in range(_STEPS):
-        cells = nearest_cell(samples, centres, backend=backend)
+        cells = ops.nearest_centre(samples, centres, backend=backend)
         costs = masses * (precise - centres.double()[cells]).square().sum(1)
         before, energy = energy, float(costs.sum())
         mass = torch.bincount(cells, weights=masses, minlength=k)
@@ -295,10 +295,3 @@ def in_space(points: Tensor) -> Tensor:
 def in_torch(op: str, points: Tensor) -> Callable[..., Any]:
     """The reference of an operation, which takes points of any number of coordinates."""
     return backends.resolve(op, backend="reference", device=points.device, dtype=points.dtype)
-
-
-def nearest_cell(points: Tensor, centres: Tensor, *, backend: str = "auto") -> Tensor:
-    """int32 [n], the nearest of centres [k, d] for points [n, d]."""
-    if points.shape[1] > 3:
-        return in_torch("nearest_centre", points)(points, centres)
-    return ops.nearest_centre(in_space(points), in_space(centres), backend=backend)

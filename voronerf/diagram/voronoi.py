@@ -20,9 +20,11 @@ import torch
 from torch import Tensor, nn
 
 from voronerf import ops
-from voronerf.diagram.balance import balance, in_space, in_torch, nearest_cell
+from voronerf.diagram.balance import balance, in_space, in_torch
 from voronerf.diagram.drawing import draw_cell
 
+MANY_CELLS = 2048
+"""Cells of a flat diagram from which it pays to keep an index."""
 _DECIDE = 20_000  # samples that place the centres of `from_points`
 
 
@@ -61,11 +63,10 @@ class VoronoiDiagram(nn.Module):
     child: Tensor
     depth: int
     num_cells: int
+    _indexed: tuple[Tensor, int, Tensor | None] | None = None
 
     def __init__(self, centres: Tensor) -> None:
         """Makes a flat diagram. A single centre is allowed: one cell, all of space.
-
-        Cells of 1 to 3 coordinates are found by the operations, those of 4 in PyTorch, in float64, much slower.
 
         Args:
             centres: floating [k, d], k >= 1, d = 1 to 4, finite; copied to float32.
@@ -204,7 +205,8 @@ class VoronoiDiagram(nn.Module):
         dtype = torch.float64 if flat.dtype == torch.float64 else torch.float32
         flat, centres = flat.to(dtype), self.centres.to(dtype)
         if self.depth == 1:
-            cells = nearest_cell(flat, centres, backend=backend)
+            index = self.index() if dtype == torch.float32 else None
+            cells = ops.nearest_centre(flat, centres, index=index, backend=backend)
         elif centres.shape[1] > 3:
             locate = in_torch("locate_cell", flat)
             cells = locate(flat, centres, self.child_offsets, self.child, self.depth)
@@ -212,6 +214,20 @@ class VoronoiDiagram(nn.Module):
             tree = in_space(centres), self.child_offsets, self.child
             cells = ops.locate_cell(in_space(flat), *tree, depth=self.depth, backend=backend)
         return cells.reshape(points.shape[:-1])
+
+    def index(self) -> Tensor | None:
+        """The index of a flat diagram of `MANY_CELLS` (`voronerf.ops.index_centres`), which is kept for later calls.
+
+        It is made anew where centres have been changed in place.
+        """
+        centres = self.centres
+        few = self.depth > 1 or self.num_cells < MANY_CELLS
+        if few or centres.is_inference() or torch.compiler.is_compiling():
+            return None
+        kept = self._indexed
+        if kept is None or kept[0].data_ptr() != centres.data_ptr() or kept[1] != centres._version:
+            kept = self._indexed = centres.detach(), centres._version, ops.index_centres(centres)
+        return kept[2]
 
     def sample_cell(
         self, points: Tensor, *, temperature: float, generator: torch.Generator | None = None, backend: str = "auto"
@@ -350,6 +366,9 @@ class VoronoiDiagram(nn.Module):
         if not points.is_floating_point():
             raise TypeError(f"{op}: points must be floating-point, got {points.dtype}")
         return points.detach().reshape(-1, d)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_indexed": None}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "VoronoiDiagram":
         kept = self.centres

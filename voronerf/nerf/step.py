@@ -548,6 +548,8 @@ class TrainingStep:
         dictionaries += [*map(vars, known.router.module.modules()), optimizer.state, *optimizer.state.values()]
         for members in dictionaries:
             guard.contents(members)
+        if known.router.diagram.index() is not None:  # it is made anew where centres change in place
+            guard.attributes(known.router.diagram.centres, ["_version"])
         guard.contents(vars(optimizer), ["steps_done"])
         learning = list[nn.Parameter]()
         for group in optimizer.param_groups:

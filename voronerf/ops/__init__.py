@@ -30,7 +30,7 @@ from voronerf.ops.integrated_encode import integrated_encode
 from voronerf.ops.keep_heaviest import keep_heaviest
 from voronerf.ops.locate_cell import locate_cell
 from voronerf.ops.march_rays import March, march_rays
-from voronerf.ops.nearest_centre import nearest_centre
+from voronerf.ops.nearest_centre import index_centres, nearest_centre
 from voronerf.ops.observe_occupancy import observe_occupancy
 from voronerf.ops.pixel_rays import PixelRays, pixel_rays
 from voronerf.ops.ray_runs import compose_runs, own_samples, run_gradients, run_sums
@@ -75,6 +75,7 @@ __all__ = [
     "grouped_mlp",
     "grouped_program",
     "hash_encode",
+    "index_centres",
     "integrated_encode",
     "keep_heaviest",
     "locate_cell",

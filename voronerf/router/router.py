@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.diagram import VoronoiDiagram
+from voronerf.diagram.voronoi import MANY_CELLS
 from voronerf.diagram.subdivision import finer_diagram
 from voronerf.ops._core.backends import BACKENDS
 from voronerf.ops._core.compiler import not_compiled
@@ -570,7 +571,8 @@ class VoronoiRouter(nn.Module):
         if drawn or d != 3:
             return {"frozen": frozen, "cells": self.assign(coords.detach() if drawn else coords)}
         if diagram.depth == 1:
-            return {"frozen": frozen, "centres": centres, "coords": coords}
+            flat = {"frozen": frozen, "centres": centres, "coords": coords}
+            return {**flat, "index": diagram.index()} if k >= MANY_CELLS else flat
         tables = {"child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
         return {"frozen": frozen, "centres": centres, "coords": coords, **tables}
 

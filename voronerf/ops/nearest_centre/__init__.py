@@ -1,12 +1,16 @@
-"""Which cell of a Voronoi diagram a point lies in. n points, k centres."""
+"""Which cell of a Voronoi diagram a point lies in. n points, k centres, d coordinates."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
+import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
+from voronerf.ops._core import backends
 from voronerf.ops._core.backends import COORDINATES, EVERYWHERE, Implementation
+from voronerf.ops._core.checks import FLOATING, Checked
 from voronerf.ops._core.declare import declare
 
 
@@ -17,9 +21,10 @@ from voronerf.ops._core.declare import declare
     compared=["points", "centres"],
 )
 def nearest_centre(
-    points: Annotated[Tensor, "floating [n, 3]"],
-    centres: Annotated[Tensor, "floating [k, 3]"],
+    points: Annotated[Tensor, "floating [n, d]"],
+    centres: Annotated[Tensor, "floating [k, d]"],
     *,
+    index: Annotated[Tensor | None, "int32 [w]"] = None,
     backend: str = "auto",
 ) -> Annotated[Tensor, "int32 [n]"]:
     """Index of the nearest centre of every point: ``argmin_c |x - v_c|``.
@@ -28,11 +33,17 @@ def nearest_centre(
     cell 0. Not differentiable.
 
     Args:
-        points: n < 2**31. float16 and bfloat16 are compared in float32.
+        points: n < 2**31, d = 1 to 4. float16 and bfloat16 are compared in float32.
         centres: finite, k >= 1.
+        index: of these centres, as `index_centres` makes it, with which the time grows by log k; the cells are the same.
+            Without one, the CPU makes one for a call in which that pays: from 2,048 centres and 1,024 points on. Plain
+            PyTorch and Warp do without.
 
     Returns:
         cells int32 [n], in 0 to k - 1.
+
+    Raises:
+        ValueError: d above 4, or an index of another number or type of centres.
 
     Examples:
         >>> import torch
@@ -42,3 +53,50 @@ def nearest_centre(
         >>> nearest_centre(points, centres)
         tensor([0, 1, 0], dtype=torch.int32)
     """
+
+
+def index_centres(centres: Tensor) -> Tensor | None:
+    """An index of centres, for `nearest_centre`: a tree of boxes that hold 16 others, or up to 16 centres.
+
+    It is worth its memory, 18 to 36 bytes a centre in three coordinates, from some thousand centres on, where they stay
+    for several calls. Making it takes about 0.1 us a centre of one core, on a GPU as well: it is copied there.
+
+    Args:
+        centres: floating [k, d], d = 1 to 4, finite.
+
+    Returns:
+        int32 [w], on the device of the centres; None without the compiled module.
+
+    Raises:
+        TypeError: not a floating-point tensor.
+        ValueError: another shape, or no centre.
+
+    Examples:
+        >>> import torch
+        >>> from voronerf.ops import index_centres, nearest_centre
+        >>> points, centres = torch.rand(10, 3), torch.rand(5000, 3)
+        >>> index = index_centres(centres)
+        >>> bool((nearest_centre(points, centres, index=index) == nearest_centre(points, centres)).all())
+        True
+    """
+    given = Checked("index_centres")
+    given.tensor("centres", centres, FLOATING, "k", "d")
+    check_sizes("index_centres", centres)
+    native = backends.compiled()
+    if native is None:
+        return None
+    with _disable_current_modes():  # a recorded step has nothing to do with it
+        taken = centres.detach().to("cpu", torch.promote_types(centres.dtype, torch.float32)).contiguous()
+        k, d = taken.shape
+        index = torch.empty(native.compiled.centre_index_words(k, d, taken.itemsize), dtype=torch.int32)
+        native.compiled.index_centres(taken, index, k, d, native.cpu().threads)
+        return index.to(centres.device)
+
+
+def check_sizes(op: str, centres: Tensor) -> None:
+    """Raises ValueError for no centre, or one of too many coordinates."""
+    k, d = centres.shape
+    if not 1 <= d <= 4:
+        raise ValueError(f"{op}: centres must have shape [k, d], d = 1 to 4, got {list(centres.shape)}")
+    if k < 1:
+        raise ValueError(f"{op}: centres must hold at least one centre, got none")

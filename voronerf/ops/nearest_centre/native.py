@@ -1,4 +1,4 @@
-"""``nearest_centre`` of the compiled module. n points, k centres."""
+"""``nearest_centre`` of the compiled module. n points, k centres, d coordinates."""
 
 from __future__ import annotations
 
@@ -7,20 +7,42 @@ from torch import Tensor
 from voronerf.ops._core import native
 from voronerf.ops._core.declare import declared
 from voronerf.ops._core.rows import rows_of
+from voronerf.ops.nearest_centre import check_sizes
+
+
+def _check(centres: Tensor, index: Tensor | None) -> None:
+    """Raises what the compiled function has refused."""
+    check_sizes("nearest_centre", centres)
+    if index is not None:
+        check_index("nearest_centre", centres, index)
+
+
+def check_index(op: str, centres: Tensor, index: Tensor) -> None:
+    """Raises ValueError for an index that is none of so many centres."""
+    words = native.compiled.centre_index_words(*centres.shape, centres.itemsize)
+    if len(index) != words:
+        raise ValueError(f"{op}: index must be of these centres, int32 [{words}], got {list(index.shape)}")
+
 
 nearest_centre = declared("nearest_centre").compiled_op(
     "",
     "nearest_centre",
-    *("points", "centres", "result", "n", "k"),
-    on_cuda=lambda given, cells, _: find(cells, given.points, given.centres),
+    *("points", "centres", "index", "result", "n", "k", "d", "w"),
+    on_cuda=lambda given, cells, _: find(cells, given.points, given.centres, index=given.index),
+    fault=lambda given: _check(given.centres, given.index),
 )
 
 
-def find(cells: Tensor, points: Tensor, centres: Tensor, rows: Tensor | None = None) -> None:
+def find(
+    cells: Tensor, points: Tensor, centres: Tensor, rows: Tensor | None = None, index: Tensor | None = None
+) -> None:
     """Fills ``cells``, int32 [n]; coordinates are of one dtype. On CUDA with -1 from ``rows`` on."""
     compiled, machine = native.compiled, native.machine(points)
-    n, k = rows_of(points), centres.shape[0]
+    (k, d), words = centres.shape, 0 if index is None else len(index)
+    sizes = rows_of(points), k, d, words, machine
     if isinstance(machine, compiled.Cuda):
-        compiled.nearest_centre(points, centres, rows, cells, n, k, machine)
+        fits = compiled.nearest_centre(points, centres, index, rows, cells, *sizes)
     else:
-        compiled.nearest_centre(points, centres, cells, n, k, machine)
+        fits = compiled.nearest_centre(points, centres, index, cells, *sizes)
+    if not fits:
+        _check(centres, index)

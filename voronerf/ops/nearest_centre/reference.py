@@ -6,13 +6,15 @@ import torch
 from torch import Tensor
 
 from voronerf.ops.formulas import in_pieces
+from voronerf.ops.nearest_centre import check_sizes
 
 _PIECE = 1 << 17
 """Distances evaluated at a time: 1 MiB of float64, what a core's second-level cache holds."""
 
 
-def nearest_centre(points: Tensor, centres: Tensor) -> Tensor:
+def nearest_centre(points: Tensor, centres: Tensor, index: Tensor | None = None) -> Tensor:
     """Index of the nearest centre of every point; see ``voronerf.ops.nearest_centre``."""
+    check_sizes("nearest_centre", centres)
     run = lambda points: distances(points, centres).argmin(dim=1).to(torch.int32)  # noqa: E731
     return in_pieces(run, _PIECE // centres.shape[0], points)
 

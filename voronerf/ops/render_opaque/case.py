@@ -8,6 +8,7 @@ from voronerf.ops._core.cases import Arguments, Case, Draw
 from voronerf.ops._core.grids import HashGrid
 from voronerf.ops._core.layers import DIRECTIONS, MLP, POSITIONS, Layer
 from voronerf.ops.formulas import SPACINGS
+from voronerf.ops.nearest_centre import index_centres
 
 _GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
 
@@ -22,6 +23,8 @@ def _make(draw: Draw, n: int) -> Arguments:
     table = MLP((Layer((POSITIONS,), 6, "relu"), *ends), (1, 2), **encoding)
     network: Arguments = {"program": table.program(3, 3, None, (True, False, True), True)}
     network["centres"] = draw.uniform(k, 3) - 0.5
+    if draw.among("indexed", False, True):
+        network["index"] = index_centres(network["centres"])
     weights = [draw.normal(k, o, i) for o, i in table.weight_shapes(3, 3)]
     network["parameters"] = [*weights, draw.normal(k, 6), (4 if activated else 1) + draw.normal(k, 1)]
     if hashed:
@@ -42,7 +45,7 @@ def _make(draw: Draw, n: int) -> Arguments:
 
 CASE = Case(
     _make,
-    {"": {}, "activated": {"activated": True}},
+    {"": {}, "activated": {"activated": True}, "by an index": {"indexed": True, "cells": 40}},
     refused={
         "network must hold program and parameters, got 3": {"network": 3},
         "network must hold program and parameters, got program": {"network": {"program": None}},

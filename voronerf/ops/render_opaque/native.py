@@ -17,6 +17,7 @@ from voronerf.ops.grouped_program.lowering import lower
 from voronerf.ops.grouped_program.native import Network, program_inputs
 from voronerf.ops.locate_cell.native import check_tree, too_shallow
 from voronerf.ops.march_rays.native import INPUTS
+from voronerf.ops.nearest_centre.native import check_index
 from voronerf.ops.render_opaque import reference
 from voronerf.ops.routed_program.reference import cells_of
 
@@ -35,7 +36,7 @@ def render_opaque(*flat: Any) -> RaysSeen:
     routed = given.network
     none = given.near.new_empty(0, dtype=torch.int32)  # of samples that are not there yet
     taken = Network.of(routed._replace(ray_index=None if routed.ray_index is None else none).given("render_opaque"))
-    (centres, child_offsets, child, depth, *_), k = routed.where, cells_of(taken.parameters)
+    (centres, child_offsets, child, depth, *_, index), k = routed.where, cells_of(taken.parameters)
     tensors = (*routed.inputs, *routed.parameters, centres)
     plain = all(tensor is None or tensor.dtype == torch.float32 for tensor in tensors)
     if not plain or torch.is_autocast_enabled("cpu"):
@@ -44,9 +45,11 @@ def render_opaque(*flat: Any) -> RaysSeen:
     rows = taken.rows(torch.zeros(k + 1, dtype=torch.int32))
     lowered = lower(taken.how.text)
     if k == 1:
-        centres = child_offsets = child = None
+        centres = child_offsets = child = index = None
     if child_offsets is not None:
         check_tree(child_offsets, child, len(centres), "render_opaque")
+    if index is not None:
+        check_index("render_opaque", centres, index)
     found: RaysSeen = _OP.allocate(given)
     outputs, compiled = _outputs(found), native.compiled
     sound = compiled.render_opaque(
@@ -57,6 +60,7 @@ def render_opaque(*flat: Any) -> RaysSeen:
             centres=centres,
             child_offsets=child_offsets,
             child=child,
+            index=index,
             m=0 if centres is None else len(centres),
             depth=depth,
         ),

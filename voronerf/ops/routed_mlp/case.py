@@ -7,21 +7,30 @@ import torch
 from voronerf.ops._core.cases import Arguments, Case, Draw
 from voronerf.ops.grouped_mlp.case import GAUSSIANS, network
 from voronerf.ops.locate_cell.case import tree
+from voronerf.ops.nearest_centre import index_centres
 
 
 def _make(draw: Draw, n: int) -> Arguments:
-    by = draw.among("by", "centres", "tree", "cells", "one cell")
+    by = draw.among("by", "centres", "tree", "an index", "cells", "one cell")
     if by == "tree":
         tables, k = tree(draw)
         return {**network(draw, n, k), **tables}
     k = 1 if by == "one cell" else draw.among("k", 2, 1, 9)
-    where = {"centres": draw.uniform(k, 3)} if by == "centres" else {"cells": draw.integers(0, k, n)}
+    where = {"cells": draw.integers(0, k, n)} if by == "cells" else {"centres": draw.uniform(k, 3)}
+    if by == "an index":
+        where["index"] = index_centres(where["centres"])
     return {**network(draw, n, k), **({} if by == "one cell" else where)}
 
 
 CASE = Case(
     _make,
-    {"": {}, "nested": {"by": "tree"}, "one cell": {"by": "one cell", **GAUSSIANS}, "of cells": {"by": "cells"}},
+    {
+        "": {},
+        "nested": {"by": "tree"},
+        "by an index": {"by": "an index", "k": 40},
+        "one cell": {"by": "one cell", **GAUSSIANS},
+        "of cells": {"by": "cells"},
+    },
     refused={"centres must have shape [k, 3] with k = 2, got [1, 3]": {"centres": torch.zeros(1, 3)}},
     differentiable=True,
 )

@@ -7,6 +7,7 @@ import torch
 from voronerf.ops._core.cases import Arguments, Case, Draw
 from voronerf.ops._core.program import Builder, Program
 from voronerf.ops.locate_cell.case import tree
+from voronerf.ops.nearest_centre import index_centres
 
 
 def two_outputs(rays: bool) -> Program:
@@ -18,10 +19,14 @@ def two_outputs(rays: bool) -> Program:
 
 
 def _make(draw: Draw, n: int) -> Arguments:
-    by, rays = draw.among("by", "centres", "tree", "cells", "one cell"), draw.among("rays", False, True)
+    by, rays = draw.among("by", "centres", "tree", "an index", "cells", "one cell"), draw.among("rays", False, True)
     where, k = tree(draw) if by == "tree" else ({}, 1 if by == "one cell" else draw.among("k", 2, 1, 9))
-    if by in ("centres", "cells"):
-        where = {"centres": draw.uniform(k, 3)} if by == "centres" else {"cells": draw.integers(0, k, n)}
+    if by in ("centres", "an index"):
+        where = {"centres": draw.uniform(k, 3)}
+    if by == "an index":
+        where["index"] = index_centres(where["centres"])
+    if by == "cells":
+        where = {"cells": draw.integers(0, k, n)}
     program, dtype, r = two_outputs(rays), draw.dtype(), draw.number("r", 4, 1, 9)
     parameters = [draw.normal(k, *shape, dtype=dtype) / 2 for shape in program.parameters]
     if draw.among("shared", False, True):
@@ -40,10 +45,12 @@ CASE = Case(
     {
         "": {},
         "nested, of rays": {"by": "tree", "rays": True},
+        "by an index": {"by": "an index", "k": 40},
         "one cell": {"by": "one cell"},
         "of cells, with shared ones": {"by": "cells", "shared": True},
     },
     refused={
+        "index must come with centres, got none that it is of": {"centres": None, "index": torch.zeros(1).int()},
         "centres must have shape [k, 3] with k = 2, got [1, 3]": {"centres": torch.zeros(1, 3)},
         "parameters must be 3 tensors (inputs at least one), got 0": {"parameters": []},
     },

@@ -53,15 +53,15 @@ def run_known(
 ) -> list[Tensor]:
     """The outputs for float32 inputs and parameters [k, ...] or [1, ...] that a router has checked before."""
     first, centres = inputs[0], places.get("centres")
-    if centres is not None and len(places) == 2 and centres.is_cpu and not _is_seen(first):  # without a tree
-        cells, order, offsets = _in_two_calls(places["coords"], centres, k)
+    if centres is not None and "child" not in places and centres.is_cpu and not _is_seen(first):
+        cells, order, offsets = _in_two_calls(places["coords"], centres, places.get("index"), k)
     else:
         if centres is not None and centres.device != first.device:
             check_same_device("VoronoiRouter", samples=first, centres=centres)
         where = Where(**places)
         if where.coords is not None and centres is not None:
             coords, centres = of_one_dtype(where.coords, centres)
-            where = where._replace(coords=coords, centres=centres)
+            where = where._replace(coords=coords, centres=centres, index=where.index if centres is where.centres else None)
         cells, order, offsets = find(first, of_cells(where, k), k, how.caller)
     outputs = run_program(Rows(inputs, parameters, offsets, order, None), how)
     if frozen is not None:
@@ -80,14 +80,14 @@ class Route(NamedTuple):
 
 def find(positions: Tensor, where: Where, k: int, caller: str) -> Route:
     """The cells of samples, and their order by cell; None where there is one cell. ``caller``: the op of errors."""
-    centres, child_offsets, child, depth, known, coords, rows, _ = where
+    centres, child_offsets, child, depth, known, coords, rows, _, index = where
     if coords is not None and centres is not None and child is None and rows is None and not _is_seen(positions):
-        return _in_two_calls(coords, centres, k)
+        return _in_two_calls(coords, centres, index, k)
     if coords is not None and coords.requires_grad:
         coords = coords.detach()
     if positions.requires_grad:
         positions = positions.detach()
-    places = centres, child_offsets, child, depth, known, coords, rows
+    places = centres, child_offsets, child, depth, known, coords, rows, index
     cells, order, offsets = locate_and_sort(positions, *places, k, caller)
     return Route(cells if known is None else known, order if order.numel() else None, offsets)
 
@@ -97,9 +97,9 @@ def _is_seen(positions: Tensor) -> bool:
     return not positions.is_cpu or torch.compiler.is_compiling() or is_watched()
 
 
-def _in_two_calls(coords: Tensor, centres: Tensor, k: int) -> Route:
+def _in_two_calls(coords: Tensor, centres: Tensor, index: Tensor | None, k: int) -> Route:
     """Cells of a flat diagram: calls that the compiled module makes by itself take less time than one op in Python."""
-    cells = nearest_centre(coords, centres, backend="native")
+    cells = nearest_centre(coords, centres, index=index, backend="native")
     order, offsets = cell_sort(cells, k, backend="native")
     return Route(cells, order if order.numel() else None, offsets)
 
@@ -115,6 +115,7 @@ class _Samples(NamedTuple):
     cells: Tensor | None
     coords: Tensor | None
     rows: Tensor | None
+    index: Tensor | None
     k: int
     caller: str
 
@@ -130,7 +131,7 @@ def _memory(given: _Samples) -> tuple[Tensor, Tensor, Tensor]:
 @custom_op("routed_program_native", _memory)
 def locate_and_sort(given: _Samples, results: tuple[Tensor, Tensor, Tensor]) -> None:
     """Where samples are, and their order by cell."""
-    positions, centres, child_offsets, child, depth, cells, coords, rows, _, caller = given
+    positions, centres, child_offsets, child, depth, cells, coords, rows, index, _, caller = given
     found, order, offsets = results
     if cells is None and centres is None:  # one cell
         n = rows_of(positions)
@@ -146,7 +147,7 @@ def locate_and_sort(given: _Samples, results: tuple[Tensor, Tensor, Tensor]) -> 
         return
     if coords is not None and centres is not None:
         if child_offsets is None or child is None:
-            find_nearest(found, coords, centres, rows)
+            find_nearest(found, coords, centres, rows, index)
         else:
             find_leaves(found, coords, centres, (child_offsets, child, depth), caller, rows)
     sort(found if cells is None else cells, order, offsets, caller)

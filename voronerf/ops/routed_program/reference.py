@@ -41,13 +41,13 @@ def cells_of(parameters: Sequence[Tensor]) -> int:
 
 def find_cells(op: str, where: Where, k: int, backend: str) -> Tensor | None:
     """int32 [n], the cells of samples; None where there is one."""
-    centres, child_offsets, child, depth, cells, coords, *_ = where
+    centres, child_offsets, child, depth, cells, coords, *_, index = where
     if cells is None and k == 1:
         return None
     if cells is None:
         assert coords is not None and centres is not None
         if child_offsets is None or child is None:
-            cells = nearest_centre(coords, centres, backend=backend)
+            cells = nearest_centre(coords, centres, index=index, backend=backend)
         else:
             cells = locate_cell(coords, centres, child_offsets, child, depth=depth, backend=backend)
     check_range(op, "cells", cells, k)

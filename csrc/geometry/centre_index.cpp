@@ -1,0 +1,174 @@
+// Building an index: splits from the root on, each a selection of the middle. Ranges of one size stand side by side, so
+// a range's place tells all about it, and whole subtrees go over threads.
+#include "geometry/centre_index.h"
+
+#include <algorithm>
+#include <limits>
+#include <memory>
+
+#include "common/parallel.h"
+
+namespace voronerf {
+
+namespace {
+
+constexpr int kSharedBits = 4;  // splits before subtrees go over threads
+constexpr int kSample = 31;     // of a range, by which the next pivot is chosen
+constexpr int kFew = 200;       // for which a sample costs more than it gives
+
+template <typename T, int D>
+struct Centre {
+  T at[D];
+  int32_t number;
+};
+
+template <typename T>
+struct Pivot {
+  T value;
+  int32_t number;
+};
+
+// Whether a centre is before the pivot, ties by their numbers; without a branch.
+template <typename T, int D>
+bool is_before(const Centre<T, D>& centre, int axis, const Pivot<T>& pivot) {
+  const T value = centre.at[axis];
+  return (value < pivot.value) | ((value == pivot.value) & (centre.number < pivot.number));
+}
+
+// Moves centres before and behind the middle to its sides, as Floyd and Rivest's selection does ("Expected time bounds
+// for selection", 1975): a pivot from a sample, at the middle's place in it.
+template <typename T, int D>
+void select_middle(Centre<T, D>* centres, int64_t begin, int64_t end, int64_t middle, int axis) {
+  while (end - begin > kFew) {
+    Pivot<T> sample[kSample];
+    for (int i = 0; i < kSample; ++i) {
+      const Centre<T, D>& taken = centres[begin + (end - begin - 1) * i / (kSample - 1)];
+      sample[i] = {taken.at[axis], taken.number};
+    }
+    std::sort(sample, sample + kSample, [](const Pivot<T>& a, const Pivot<T>& b) {
+      return (a.value < b.value) | ((a.value == b.value) & (a.number < b.number));
+    });
+    const int64_t wanted = (middle - begin) * kSample / (end - begin);
+    const Pivot<T> pivot = sample[std::clamp<int64_t>(wanted, 1, kSample - 2)];
+    int64_t filled = begin;
+    for (int64_t i = begin; i < end; ++i) {
+      const Centre<T, D> moved = centres[i];
+      const bool before = is_before(moved, axis, pivot);
+      centres[i] = centres[filled];
+      centres[filled] = moved;
+      filled += before;
+    }
+    (filled <= middle ? begin : end) = filled;
+  }
+  std::nth_element(centres + begin, centres + middle, centres + end, [axis](const auto& a, const auto& b) {
+    return a.at[axis] < b.at[axis] || (a.at[axis] == b.at[axis] && a.number < b.number);
+  });
+}
+
+template <typename T, int D>
+class Builder {
+ public:
+  Builder(const T* given, int32_t* index, int64_t k)
+      : shape_(centre_index_shape(k, D, sizeof(T))), index_(index), centres_(new Centre<T, D>[k]) {
+    for (int64_t i = 0; i < k; ++i) {
+      for (int axis = 0; axis < D; ++axis) {
+        const T value = given[D * i + axis];  // what is not a number has no order, and is near to nothing
+        centres_[i].at[axis] = value == value ? value : std::numeric_limits<T>::infinity();
+      }
+      centres_[i].number = static_cast<int32_t>(i);
+    }
+    // Boxes of no children, beyond all bounds.
+    T* const root = values(0, 0, shape_.node_words);
+    for (int i = 0; i < D * kWide && shape_.levels > 0; ++i) {
+      root[2 * kWide * (i / kWide) + i % kWide] = std::numeric_limits<T>::infinity();
+      root[2 * kWide * (i / kWide) + kWide + i % kWide] = -std::numeric_limits<T>::infinity();
+    }
+  }
+
+  void build(int threads) {
+    const int shared = std::min(shape_.bits, kSharedBits);
+    split(0, 0, shared);
+    if (shared == shape_.bits) return;
+    parallel_for(int64_t{1} << shared, 1, threads, [&](int64_t i) { split(shared, i, shape_.bits); });
+  }
+
+ private:
+  int64_t first(int depth, int64_t i) const { return shape_.k * (i << (shape_.bits - depth)) >> shape_.bits; }
+  T* values(int level, int64_t i, int words) const {
+    return reinterpret_cast<T*>(index_ + shape_.level_word[level] + i * words);
+  }
+
+  // The range with number i of those that `depth` splits make: its own splits until there are `until`.
+  void split(int depth, int64_t i, int until) {
+    const int64_t begin = first(depth, i), end = first(depth, i + 1);
+    const int root = root_bits(shape_.bits);
+    if (depth == until && until < shape_.bits) return;
+    T low[D], high[D];
+    for (int axis = 0; axis < D; ++axis) {
+      low[axis] = std::numeric_limits<T>::infinity();
+      high[axis] = -low[axis];
+    }
+    for (int64_t c = begin; c < end; ++c) {
+      for (int axis = 0; axis < D; ++axis) {
+        const T value = centres_[c].at[axis];
+        low[axis] = value < low[axis] ? value : low[axis];
+        high[axis] = value > high[axis] ? value : high[axis];
+      }
+    }
+    if (depth > 0 && (depth - root) % 4 == 0) {
+      const int level = (depth - root) / 4, bits = level == 0 ? root : 4;
+      T* const node = values(level, i >> bits, shape_.node_words) + (i & ((1 << bits) - 1));
+      for (int axis = 0; axis < D; ++axis) {
+        node[2 * kWide * axis] = low[axis];
+        node[2 * kWide * axis + kWide] = high[axis];
+      }
+    }
+    if (depth == shape_.bits) return fill_leaf(i, begin, end);
+    int longest = 0;
+    for (int axis = 1; axis < D; ++axis) {
+      if (high[axis] - low[axis] > high[longest] - low[longest]) longest = axis;
+    }
+    select_middle(centres_.get(), begin, end, first(depth + 1, 2 * i + 1), longest);
+    split(depth + 1, 2 * i, until);
+    split(depth + 1, 2 * i + 1, until);
+  }
+
+  void fill_leaf(int64_t i, int64_t begin, int64_t end) const {
+    T* const leaf = values(shape_.levels, i, shape_.leaf_words);
+    auto* const numbers = reinterpret_cast<int32_t*>(leaf + D * kWide);
+    for (int j = 0; j < kWide; ++j) {
+      const bool is_there = begin + j < end;
+      for (int axis = 0; axis < D; ++axis) {
+        leaf[axis * kWide + j] = is_there ? centres_[begin + j].at[axis] : std::numeric_limits<T>::infinity();
+      }
+      numbers[j] = is_there ? centres_[begin + j].number : std::numeric_limits<int32_t>::max();
+    }
+  }
+
+  const CentreIndexShape shape_;
+  int32_t* const index_;
+  const std::unique_ptr<Centre<T, D>[]> centres_;
+};
+
+}  // namespace
+
+int64_t centre_index_words(int64_t k, int d, int bytes) { return centre_index_shape(k, d, bytes).words; }
+
+template <typename T>
+void index_centres_cpu(const T* centres, int32_t* index, int64_t k, int d, int threads) {
+  switch (d) {
+    case 1:
+      return Builder<T, 1>(centres, index, k).build(threads);
+    case 2:
+      return Builder<T, 2>(centres, index, k).build(threads);
+    case 3:
+      return Builder<T, 3>(centres, index, k).build(threads);
+    default:
+      return Builder<T, 4>(centres, index, k).build(threads);
+  }
+}
+
+template void index_centres_cpu(const float*, int32_t*, int64_t, int, int);
+template void index_centres_cpu(const double*, int32_t*, int64_t, int, int);
+
+}  // namespace voronerf
