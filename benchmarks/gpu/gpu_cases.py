@@ -10,7 +10,7 @@ from typing import Any
 
 CHECKED = (
     *("adam", "composite packed", "march_rays", "draw_pixels", "grouped_mlp hashed", "routed_mlp nested"),
-    *("spherical_harmonics", "hash_encode features=8", "locate_cell", "nearest_centre k=700", "observe_occupancy"),
+    *("spherical_harmonics", "hash_encode features=8", "locate_cell", "nearest_centre k=700", "nearest_centre k=700, indexed=True", "observe_occupancy"),
     *("pixel_rays", "render_loss", "resample", "cell_sort 5000 3 by counting", "cell_sort 20000 4096 by automatic"),
     *("grouped_mlp wide tf32", "grouped_mlp skips bfloat16 forward", "unaligned views"),
     "grouped_mlp of a hash grid for each cell bfloat16",
@@ -19,7 +19,7 @@ CHECKED = (
 RACING = (
     *("cell_sort 5000 3 by counting", "cell_sort 4200 1022 by counting", "composite packed", "march_rays", "resample"),
     *("render_loss", "grouped_mlp branched bfloat16", "grouped_mlp wide tf32", "grouped_mlp broad float32"),
-    *("routed_mlp", "nearest_centre k=700", "spherical_harmonics", "adam"),
+    *("routed_mlp", "nearest_centre k=700", "nearest_centre k=700, indexed=True", "spherical_harmonics", "adam"),
 )
 """Small cases for racecheck and synccheck: every kernel whose threads share memory."""
 

@@ -152,11 +152,12 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
         # What every layer reads and writes: nothing stays on the chip between them.
         return run, {"bfloat16": cost(NETS["w64d4"]).forward * m, "copy": 2.0 * m * sum(map(sum, shapes))}
 
-    def find(k: int) -> tuple[Run, Work]:
+    def find(k: int, m: int, indexed: bool) -> tuple[Run, Work]:
         centres = torch.rand(k, 3, device=where)
-        sets = itertools.cycle([torch.rand(n, 3, device=where) for _ in range(SETS)])
-        work = {"float32": 8.0 * k * n, "copy": 16.0 * n}
-        return lambda: voronerf.nearest_centre(next(sets), centres, backend="native"), work
+        index = voronerf.ops.index_centres(centres) if indexed else None
+        sets = itertools.cycle([torch.rand(m, 3, device=where) for _ in range(SETS)])
+        work = {"copy": 16.0 * m} if indexed else {"float32": 8.0 * k * m, "copy": 16.0 * m}
+        return lambda: voronerf.nearest_centre(next(sets), centres, index=index, backend="native"), work
 
     def sort(k: int, way: str) -> tuple[Run, Work]:
         sets = [torch.randint(0, k, (n,), dtype=torch.int32, device=where) for _ in range(4 * SETS)]
@@ -184,7 +185,10 @@ def rows(device: str, journal: Journal, n: int = 1 << 22, fewer: int = 1 << 18, 
     row(f"w64d4 bfloat16 k=16 n={n} by torch.bmm", functools.partial(products, 16, n, False))
     for k in (512, 16):
         # For 2 points and 4 centres a warp issues 101 instructions in the loop, and some 60 for a point around it.
-        row(f"nearest_centre k={k} n={n}", functools.partial(find, k), {"issue": (k * 101 / 8 + 60) * n / 32})
+        row(f"nearest_centre k={k} n={n}", functools.partial(find, k, n, False), {"issue": (k * 101 / 8 + 60) * n / 32})
+    for k in (4096, 65_536):
+        row(f"nearest_centre k={k} n={fewer}", functools.partial(find, k, fewer, False))
+        row(f"nearest_centre k={k} n={fewer} by index", functools.partial(find, k, fewer, True))
     # By counting, cells are read twice and rows written; by radix, keys of 2 bytes and rows are written first, keys are
     # read for counts, and both are moved once for each 8 bits.
     for k, way, moved in ((16, "counting", 12), (16, "radix", 24), (4096, "radix", 36)):
