@@ -1,4 +1,4 @@
-"""Cases of nearest_centre, locate_cell and cell_sort. n points, k cells."""
+"""Cases of nearest_centre, locate_cell and cell_sort. n points, k cells, d coordinates."""
 
 from __future__ import annotations
 
@@ -18,6 +18,12 @@ CHUNK = 1 << 19
 """Distances that torch and numpy hold at a time: 2 MiB, what makes them fastest."""
 CHECKED = 1 << 14
 """Points whose answer is compared with float64."""
+PAIRS = 1 << 28
+"""Of point and centre, that are compared with float64 at most."""
+FEW = 4096
+"""Centres up to which all of them are an alternative."""
+MANY = 10_000
+"""Points of the rows with many centres."""
 FLOPS = 8
 """Of one squared distance: three differences, three products, two sums."""
 ALL = ("native", "reference", "warp")
@@ -31,7 +37,12 @@ def cases() -> list[Case]:
     found = []
     for k in (1, 16, 64, 256, 512, 4096):
         found.append(_nearest(n, k, single, backends=ALL if k == 16 else ("native",), quick=k == 16))
-    found += [_nearest(count, 16, single) for count in (1 << 10, 1 << 14, 1 << 20)]
+    found += [_nearest(count, 16, single) for count in (1, 16, 256, 1 << 10, 1 << 14, 1 << 20)]
+    for k in (256, 1024, 4096, 1 << 14, 1 << 16, 1_000_000):
+        for kind in KINDS:
+            found += [_nearest(MANY, k, single, kind=kind, way=way) for way in (KEPT, MADE)]
+    found += [_nearest(MANY, 4096, single, d=d, way=KEPT) for d in (1, 2, 4)]
+    found += [_nearest(count, 4096, single, way=KEPT) for count in (1, 16, 256)]
     found.append(_nearest(n, 16, torch.float64))
     for count, shape, quick in ((n, (16, 16), True), (n, (64, 64), False), (1 << 10, (16, 16), False)):
         name = "x".join(str(k) for k in shape)
@@ -62,46 +73,60 @@ def _nearest(
     k: int,
     dtype: torch.dtype,
     *,
+    d: int = 3,
+    kind: str = "",
+    way: str = "",
     backends: tuple[str, ...] = ("native",),
     quick: bool = False,
 ) -> Case:
-    name = f"n={n} k={k}"
-    work = functools.partial(_nearest_work, n, k, dtype)
+    name = " ".join([f"n={n} k={k}", *[f"d={d}"] * (d != 3), *filter(None, (kind, way))])
+    work = functools.partial(_nearest_work, n, k, dtype, d, kind, way)
     return Case("nearest_centre", name, dtype, FORWARD, n, k, work, backends, quick)
 
 
-def _nearest_work(n: int, k: int, dtype: torch.dtype, device: torch.device) -> Work:
-    points = [uniform_points(n, seed, device, dtype) for seed in range(rotation(12 * n))]
-    centres = uniform_points(k, 1000, device, dtype)
+def _nearest_work(n: int, k: int, dtype: torch.dtype, d: int, kind: str, way: str, device: torch.device) -> Work:
+    def draw(count: int, seed: int) -> Tensor:
+        uniform = torch.cat([uniform_points(count, seed + 100_000 * part, device, dtype) for part in range(2)], 1)
+        return KINDS.get(kind, torch.clone)(uniform[:, :d]).contiguous()
+
+    points, centres = [draw(n, seed) for seed in range(rotation(4 * d * n))], draw(k, 1000)
 
     def ours(backend: str) -> Contender:
-        return Contender(lambda call: ops.nearest_centre(points[call % len(points)], centres, backend=backend))
+        index = ops.index_centres(centres) if way == KEPT else None
+        return Contender(lambda call: ops.nearest_centre(points[call % len(points)], centres, index=index, backend=backend))
 
     def using(make: Callable[[Tensor], Lookup]) -> Callable[[], Contender]:
         def set_up() -> Contender:
-            find = make(centres)
-            return Contender(lambda call: find(points[call % len(points)]), lambda found: torch.as_tensor(found).int())
+            kept = make(centres)
+
+            def find(call: int) -> Any:
+                return (make(centres) if way == MADE else kept)(points[call % len(points)])
+
+            return Contender(find, lambda found: torch.as_tensor(np.asarray(found).astype(np.int32)))
 
         return set_up
 
+    bound = "float32" if dtype == torch.float32 and not way else ""  # of all pairs, where there is no index
+    known = {**LOOKUPS, **(TREES if way else {}), **({"torch searchsorted": _sorted_lookup} if d == 1 else {})}
     return Work(
         ours,
-        {name: using(maker) for name, maker in LOOKUPS.items()},
+        {name: using(maker) for name, maker in known.items() if k <= FEW or name in TREES},
         lambda cells: _wrong_cells(points[0], centres, cells),
         tolerance=0.01 * min(n, CHECKED),  # the expanded square misplaces some points
-        amount=float(FLOPS) * n * k,
-        bound="float32" if dtype == torch.float32 else "",
+        amount=float(FLOPS) * n * k if bound else float(n),
+        bound=bound,
     )
 
 
 def _wrong_cells(points: Tensor, centres: Tensor, cells: Tensor) -> float:
     """The number of ``CHECKED`` points whose centre is farther than another, in float64."""
-    step = max(1, points.shape[0] // CHECKED)
+    step = max(1, points.shape[0] // max(1, min(CHECKED, PAIRS // centres.shape[0])))
     points, chosen = points[::step].double().cpu(), cells[::step].long().cpu()
     if int(chosen.min()) < 0 or int(chosen.max()) >= centres.shape[0]:
         return float("inf")
     wrong = 0
-    for piece, choice in zip(points.split(1024), chosen.split(1024)):
+    rows = max(1, min(1024, (1 << 24) // centres.shape[0]))
+    for piece, choice in zip(points.split(rows), chosen.split(rows)):
         squared = (piece[:, None] - centres.double().cpu()).square().sum(2)
         wrong += int((squared.gather(1, choice[:, None])[:, 0] > squared.amin(1)).sum())
     return float(wrong)
@@ -142,9 +167,47 @@ def _tree_lookup(centres: Tensor) -> Lookup:
     return lambda points: tree.query(points.numpy(), workers=torch.get_num_threads())[1]
 
 
+def _fast_tree_lookup(centres: Tensor) -> Lookup:
+    tree = optional("pykdtree.kdtree").KDTree(_host(centres).numpy())
+    return lambda points: tree.query(points.numpy())[1]
+
+
+def _flat_lookup(centres: Tensor) -> Lookup:
+    """All distances, by a library for these."""
+    index = optional("faiss").IndexFlatL2(centres.shape[1])
+    index.add(_host(centres).numpy())
+    return lambda points: index.search(points.numpy(), 1)[1][:, 0]
+
+
+def _sorted_lookup(centres: Tensor) -> Lookup:
+    """Of one coordinate: between which middles of neighbours a point lies."""
+    ascending, order = centres[:, 0].sort(stable=True)
+    middles = ((ascending[1:].double() + ascending[:-1].double()) / 2).float()
+    return lambda points: order[torch.searchsorted(middles, points[:, 0])]
+
+
+def _on_a_sphere(points: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(points - 0.5, dim=1)
+
+
+def _heavy_tailed(points: Tensor) -> Tensor:
+    """A ten-thousandth of the points is a thousand times as far away as most."""
+    return (points - 0.5) * points[:, :1].clamp(min=1e-6).pow(-0.8)
+
+
+KINDS: dict[str, Callable[[Tensor], Tensor]] = {
+    "uniform": torch.clone,
+    "on a sphere": _on_a_sphere,
+    "heavy-tailed": _heavy_tailed,
+}
+"""Where points and centres lie, of uniform numbers."""
+KEPT, MADE = "kept", "made"
+"""An index or a tree is made once for all calls, or in each of them."""
+TREES: dict[str, Callable[[Tensor], Lookup]] = {"scipy cKDTree": _tree_lookup, "pykdtree": _fast_tree_lookup}
 LOOKUPS: dict[str, Callable[[Tensor], Lookup]] = {
     "torch addmm + argmin": _torch_lookup,
     "numpy": _numpy_lookup,
+    "faiss": _flat_lookup,
     "scipy cKDTree": _tree_lookup,
 }
 

@@ -52,6 +52,7 @@ AVX2_ROWS = (("w64d4", BASE, 16, FULL, FORWARD), ("w64d4", BASE, 16, FULL, BACKW
 ROUTE_ROWS: tuple[tuple[str, int, int, torch.dtype, str], ...] = (
     *[("w64d4", n, 16, FULL, FORWARD) for n in (BASE, 1 << 10, 1 << 14, 1 << 20)],
     *[("w64d4", n, 16, FULL, BACKWARD) for n in (BASE, 1 << 10)],
+    *[("w64d4", n, 16, FULL, direction) for n in (1, 16, 256) for direction in (FORWARD, BACKWARD)],
     *[("w64d4", BASE, 16, HALF, direction) for direction in (FORWARD, BACKWARD)],
     *[("mlp32", BASE, 256, dtype, direction) for dtype in (FULL, HALF) for direction in (FORWARD, BACKWARD)],
     ("mlp32", BASE, 4096, FULL, FORWARD),

@@ -1,7 +1,8 @@
 """Cases of routed_mlp, the whole route: positions in any order to outputs in the same order. n samples, k cells.
 
 The alternatives are written in torch: look up the cell by the fastest way that is installed, then either sort and loop
-over the cells, or loop over boolean masks, as Mega-NeRF does. All of them encode the positions themselves.
+over the cells, or loop over boolean masks, as Mega-NeRF does; or give each of few samples a copy of its cell's
+parameters. All of them encode the positions themselves.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ from ops.cases_lookup import LOOKUPS
 from ops.networks import NETS, Batch, cost, make_batch, network_error, with_gradients
 from voronerf import ops
 from voronerf.ops._core.layers import MLP
+
+FEW = 1 << 10
+"""Samples up to which each may have parameters of its own."""
 
 
 def route_work(
@@ -50,6 +54,8 @@ def route_work(
             rows = f", {piece} rows" if piece else ""
             alternatives[f"torch sort + loop{rows}{suffix}"] = functools.partial(sorted_loop, batch, find, kind, piece)
         alternatives[f"torch masks{suffix}"] = functools.partial(masked_loop, batch, find, kind)
+        if n <= FEW:
+            alternatives[f"torch gather + bmm{suffix}"] = functools.partial(gathered, batch, find, kind)
     cells = ops.nearest_centre(batch.positions[0], centres)
     return Work(
         functools.partial(ours, batch, centres),
@@ -176,6 +182,27 @@ def masked_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Co
             yield mask, own.network(net, cell, encoded, _of_rows(batch, directions, mask))
 
     return _contender(batch, parts, own, dtype)
+
+
+def gathered(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Contender:
+    """Each sample with a copy of its cell's parameters, which pays for few."""
+    lookup, net, training = find(), batch.net, batch.direction == BACKWARD
+    leaves = [tensor.detach().to(dtype).requires_grad_(training) for tensor in batch.parameters]
+
+    def linear(x: Tensor, weight: Tensor, bias: Tensor, activation: str) -> Tensor:
+        y = torch.baddbmm(bias[:, :, None], weight, x[:, :, None])[:, :, 0]
+        return y.relu_() if activation == "relu" else y
+
+    def forward(call: int) -> Tensor:
+        points, directions = batch.positions[call % len(batch.positions)], encoded_directions(batch, dtype)
+        cells = torch.as_tensor(lookup(points)).long()
+        own, count = [leaf[cells] for leaf in leaves], len(batch.weights)
+        x, d = torch_encode(points, net.position_octaves or 0, dtype), directions
+        if d is not None and batch.direction_index is not None:
+            d = d[batch.direction_index]
+        return join(evaluate(net, x, d, own[:count], own[count:], linear))
+
+    return Contender(with_gradients(batch, forward, leaves))
 
 
 def _contender(
