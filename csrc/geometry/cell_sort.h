@@ -1,7 +1,7 @@
 // Stable sort by cell: cells [n] -> order [n], offsets [k+1].
 //
-// By counting, the rows are cut into chunks, each with its own histogram in the workspace; a chunk has more rows than
-// there are cells, so the histograms stay a fraction of n.
+// By counting, the rows are cut into chunks, each with its own histogram; a chunk has more rows than there are cells,
+// so the histograms stay a fraction of n.
 #pragma once
 
 #include <cstdint>
@@ -10,9 +10,6 @@
 #include "common/row_count.h"
 
 namespace voronerf {
-
-inline int64_t cell_sort_chunk_rows(int64_t k) { return 4 * k < 2048 ? 2048 : 4 * k; }
-inline int64_t cell_sort_chunks(int64_t n, int64_t k) { return ceil_div(n, cell_sort_chunk_rows(k)); }
 
 // False if a cell lies outside 0..k-1; `order` and `offsets` are then undefined.
 bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, RowCount n, int64_t k, int threads);

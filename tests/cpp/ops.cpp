@@ -84,8 +84,8 @@ void locate(Isa isa) {
 }
 
 void sort() {
-  const int64_t counts[] = {1, 2, 255, 256, 5000};
-  const int64_t n = below(3) == 0 ? 70000 + below(9) : some_rows(), k = counts[below(5)];
+  const int64_t counts[] = {1, 2, 255, 256, 5000, 100000};
+  const int64_t n = below(3) == 0 ? 70000 + below(9) : some_rows(), k = counts[below(6)];
   Array<int32_t> cells(n);
   for (int32_t& cell : cells) cell = static_cast<int32_t>(below(2) == 0 ? k - 1 : below(k));
   const bool broken = n > 0 && below(4) == 0;

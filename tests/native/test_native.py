@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
@@ -114,9 +115,18 @@ def test_nearest_of_mixed_and_half_types_and_strided_tensors(isa: str) -> None:
         chosen(points, centres.to(dtype))
 
 
-@pytest.mark.parametrize("k", [1, 2, 3, 255, 256, 257, 5000])
-@pytest.mark.parametrize("n", [0, 1, 2, 33, 2047, 2048, 2049, 50_001])
-def test_sort(n: int, k: int) -> None:
+@pytest.fixture(params=[1, 2, 3])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+# By digits up to k / 64 rows; up to 4096 cells with two chunks a thread; of many rows with prefetches.
+@pytest.mark.parametrize("k", [1, 2, 3, 255, 256, 257, 4096, 4097, 5000, 100_000])
+@pytest.mark.parametrize("n", [0, 1, 2, 33, 64, 1562, 1563, 2047, 2048, 2049, 8191, 8192, 50_001, 131_329])
+def test_sort(threads: int, n: int, k: int) -> None:
     # Half of the cells stay empty, one holds half of the rows.
     cells = torch.randint(0, max(1, k // 2), (n,), dtype=torch.int32)
     cells[torch.rand(n) < 0.5] = k - 1
@@ -127,13 +137,25 @@ def test_sort(n: int, k: int) -> None:
     assert (order.dtype, offsets.dtype) == (torch.int32, torch.int32)
 
 
-@pytest.mark.parametrize("bad", [-1, 7, 2**31 - 1, -(2**31)])
-@pytest.mark.parametrize("row", [0, 4000, 9999])
-def test_sort_refuses_cells_out_of_range(bad: int, row: int) -> None:
-    cells = torch.randint(0, 7, (10_000,), dtype=torch.int32)
-    cells[row] = bad
-    with pytest.raises(ValueError, match=rf"cell_sort: cells must lie in 0 to 6, got values from .*{bad}"):
-        cell_sort(cells, 7, backend="native")
+@pytest.mark.parametrize("k", [1, 2**20, 2**20 + 1, 2**22 + 5, 2**24])
+def test_sort_of_few_rows_in_many_cells(k: int) -> None:
+    cells = torch.tensor([k - 1, 0, k // 2, k // 2, 0, k - 1, k // 3], dtype=torch.int32)
+    order, offsets = cell_sort(cells, k, backend="native")
+    assert order.tolist() == (list(range(7)) if k == 1 else [1, 4, 6, 2, 3, 0, 5])
+    keys = cells[order.long()]
+    assert offsets[0] == 0 and offsets[-1] == 7 and int(offsets.diff().count_nonzero()) == len(set(cells.tolist()))
+    assert torch.equal(offsets[keys.long()], torch.searchsorted(keys, keys, out_int32=True))
+
+
+@pytest.mark.parametrize("bad", [-1, "k", 2**31 - 1, -(2**31)])
+@pytest.mark.parametrize(("n", "k"), [(10_000, 7), (10_000, 5000), (20, 5000)])
+def test_sort_refuses_cells_out_of_range(threads: int, n: int, k: int, bad: int | str) -> None:
+    value = k if bad == "k" else int(bad)
+    for row in (0, 2 * n // 5, n // 2, n - 1):
+        cells = torch.randint(0, k, (n,), dtype=torch.int32)
+        cells[row] = value
+        with pytest.raises(ValueError, match=rf"cell_sort: cells must lie in 0 to {k - 1}, got values from .*{value}"):
+            cell_sort(cells, k, backend="native")
 
 
 def random_tree(sizes: tuple[int, ...], uneven: bool = True) -> dict[str, Tensor | int]:
