@@ -45,7 +45,7 @@ from ops.case import Case, Contender, NotApplicable, Work, dtype_name
 from voronerf.app.files import write_text
 from voronerf.ops._core import backends
 
-OPTIONAL = {"scipy": "scipy", "warp": "warp-lang"}
+OPTIONAL = {"scipy": "scipy", "warp": "warp-lang", "numba": "numba"}
 """Packages that are used where they are installed, and what to install."""
 LIMITS = {"ours": 0.8, "alternative": 0.5}
 QUICK_LIMITS = {"ours": 0.3, "alternative": 0.15}

@@ -24,6 +24,8 @@ FEW = 4096
 """Centres up to which all of them are an alternative."""
 MANY = 10_000
 """Points of the rows with many centres."""
+DIAGRAM = 4096
+"""Cells up to which samples are sorted by the cells of a diagram; by random cells beyond."""
 FLOPS = 8
 """Of one squared distance: three differences, three products, two sums."""
 ALL = ("native", "reference", "warp")
@@ -65,6 +67,10 @@ def cases() -> list[Case]:
         work = functools.partial(_sort_work, count, k)
         name = f"n={count} k={k}"
         found.append(Case("cell_sort", name, torch.int32, FORWARD, count, k, work, ALL if base else ("native",), base))
+    for count, k in ((10**6, 256), (10**5, 10**6), (1000, 10**6)):
+        work = functools.partial(_sort_work, count, k)
+        name = f"n={count} k={k} threads=1"
+        found.append(Case("cell_sort", name, torch.int32, FORWARD, count, k, work, ("native",), threads=1))
     return found
 
 
@@ -284,9 +290,12 @@ def _locate_work(n: int, shape: tuple[int, int], device: torch.device) -> Work:
 
 
 def _sort_work(n: int, k: int, device: torch.device) -> Work:
-    centres = uniform_points(k, 1000, device)
     sets = rotation(4 * n)
-    cells = [ops.nearest_centre(uniform_points(n, seed, device), centres) for seed in range(sets)]
+    if k <= DIAGRAM:
+        centres = uniform_points(k, 1000, device)
+        cells = [ops.nearest_centre(uniform_points(n, seed, device), centres) for seed in range(sets)]
+    else:
+        cells = [torch.randint(k, (n,), generator=generator(seed)).int().to(device) for seed in range(sets)]
 
     def ours(backend: str) -> Contender:
         return Contender(lambda call: ops.cell_sort(cells[call % sets], k, backend=backend))
@@ -303,9 +312,11 @@ def _sort_work(n: int, k: int, device: torch.device) -> Work:
 
         return set_up
 
+    narrow = "int16" if k < 1 << 15 else "int32"
+
     def numpy_sort() -> Contender:
         arrays = [_host(tensor).numpy() for tensor in cells]
-        dtype = np.int16 if k < 1 << 15 else np.int32
+        dtype = np.dtype(narrow)
         bounds = np.arange(k, dtype=dtype)
 
         def run(call: int) -> tuple[np.ndarray, np.ndarray]:
@@ -315,6 +326,12 @@ def _sort_work(n: int, k: int, device: torch.device) -> Work:
 
         return Contender(run)
 
+    def numba_sort() -> Contender:
+        arrays = [_host(tensor).numpy() for tensor in cells]
+        sort = optional("numba").njit(_counting_sort)
+        sort(arrays[0], k)  # compiles
+        return Contender(lambda call: sort(arrays[call % sets], k))
+
     def error(result: tuple[Any, Any]) -> float:
         """Number of entries that differ from numpy's stable sort."""
         expected = cells[0].cpu().numpy().argsort(kind="stable")
@@ -322,10 +339,24 @@ def _sort_work(n: int, k: int, device: torch.device) -> Work:
         first = cells[0].cpu().numpy()[expected].searchsorted(np.arange(k))
         return float((order != expected).sum() + (offsets[:k] != first).sum())
 
-    types = ((torch.uint8, 256), (torch.int16, 1 << 15))
-    alternatives: dict[str, Callable[[], Contender]] = {
-        f"torch sort {str(dtype).removeprefix('torch.')}": torch_sort(dtype) for dtype, most in types if k <= most
-    }
+    alternatives: dict[str, Callable[[], Contender]] = {f"torch sort {narrow}": torch_sort(getattr(torch, narrow))}
+    if k <= 256:
+        alternatives["torch sort uint8"] = torch_sort(torch.uint8)
     # At the least: read every cell once, write the order and the offsets.
     amount = 8.0 * n + 4 * (k + 1)
-    return Work(ours, {**alternatives, "numpy argsort int16": numpy_sort}, error, 0.0, amount, "copy")
+    alternatives |= {f"numpy argsort {narrow}": numpy_sort, "Numba counting sort": numba_sort}
+    return Work(ours, alternatives, error, 0.0, amount, "copy")
+
+
+def _counting_sort(cells: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """As one would write it; Numba compiles it."""
+    offsets = np.zeros(k + 1, np.int32)
+    for cell in cells:
+        offsets[cell + 1] += 1
+    for c in range(k):
+        offsets[c + 1] += offsets[c]
+    places, order = offsets[:-1].copy(), np.empty(len(cells), np.int32)
+    for i in range(len(cells)):
+        order[places[cells[i]]] = i
+        places[cells[i]] += 1
+    return order, offsets
