@@ -7,12 +7,12 @@
 #include <algorithm>
 #include <atomic>
 #include <memory>
-#include <utility>
 #include <vector>
 
 #include "common/common.h"
 #include "common/flush_denormals.h"
 #include "common/parallel.h"
+#include "geometry/cell_sort.h"
 #include "geometry/locate_cell.h"
 #include "geometry/nearest_centre.h"
 #include "network/cpu/program_rows.h"
@@ -173,14 +173,7 @@ class Pool {
                                 cells.m, cells.depth, call_.isa, 1)) {
       return false;
     }
-    // A counting sort: offsets are where the next row of each cell goes, and then where the last one went.
-    std::fill(cell_offsets_.begin(), cell_offsets_.end(), 0);
-    for (int64_t i = 0; i < in.n; ++i) ++cell_offsets_[cell[i]];
-    int32_t before = 0;
-    for (int32_t& offset : cell_offsets_) before += std::exchange(offset, before);
-    for (int64_t i = 0; i < in.n; ++i) order[cell_offsets_[cell[i]]++] = static_cast<int32_t>(i);
-    std::copy_backward(cell_offsets_.begin(), cell_offsets_.end() - 1, cell_offsets_.end());
-    cell_offsets_[0] = 0;
+    cell_sort_cpu(cell, order, cell_offsets_.data(), in.n, in.k, 1);
     in.order = order;
     return true;
   }
