@@ -2,8 +2,8 @@
 // has one possible place in a stable order, so neither the chunks nor the threads can change the result.
 //
 // The last chunk counts in `offsets`, and its scatter leaves them as they should be: a single chunk takes no memory. A
-// thread has two chunks if their counters fit into the first-level cache, and scatters their rows turn about: one that
-// follows a row of the same cell waits seven cycles for its counter (sorted rows take 1.5 ns each, not 2.7).
+// thread has two chunks if their counters fit into the first-level cache, and scatters their rows in turn: a row behind
+// one of the same cell waits seven cycles for the counter (sorted rows take 1.5 ns each, not 2.7).
 #include "geometry/cell_sort.h"
 
 #include <algorithm>
@@ -77,8 +77,7 @@ bool cell_sort_cpu(const int32_t* cells, int32_t* order, int32_t* offsets, RowCo
   const std::unique_ptr<int32_t[]> memory(new int32_t[static_cast<size_t>((chunks - 1) * stride)]);
   const auto counters = [&](int64_t chunk) { return chunk < chunks - 1 ? memory.get() + chunk * stride : offsets + 1; };
   const auto start = [&](int64_t chunk) { return std::min<int64_t>(n, chunk * rows); };
-  // take(row, counters) for the rows of a part, one of either chunk in turn; the second chunk has no more than the
-  // first.
+  // take(row, counters) for the rows of a part, of both chunks in turn; the second chunk has no more rows.
   const auto walk = [&](int64_t part, const auto& take) {
     const int64_t chunk = sides * part, middle = start(chunk + 1), half = middle - start(chunk);
     int32_t *const first = counters(chunk), *const second = counters(chunk + sides - 1);
