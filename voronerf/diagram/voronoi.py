@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from voronerf import ops
 from voronerf.diagram.balance import balance, in_space, in_torch
 from voronerf.diagram.drawing import draw_cell
+from voronerf.ops._core.checks import check_integer
 
 MANY_CELLS = 2048
 """Cells of a flat diagram from which it pays to keep an index."""
@@ -156,6 +157,26 @@ class VoronoiDiagram(nn.Module):
         if missing:
             raise ValueError(f"VoronoiDiagram: state must hold {', '.join(missing)}, got {len(state)} other entries")
         return cls._from_tables(*(state[prefix + name].detach().clone() for name in names))
+
+    @classmethod
+    def without_centres(cls, k: int) -> "VoronoiDiagram":
+        """A diagram of k cells that have no place in space, `centres` [k, 0]: labels say what belongs to a cell.
+
+        Args:
+            k: cells, at least 1.
+
+        Raises:
+            ValueError: k is below 1.
+            TypeError: k is not an integer.
+
+        Examples:
+            >>> from voronerf import VoronoiDiagram
+            >>> VoronoiDiagram.without_centres(8)
+            VoronoiDiagram(cells=8, depth=1)
+        """
+        check_integer("VoronoiDiagram.without_centres", "k", k, 1)
+        leaves = -1 - torch.arange(k, dtype=torch.int32)
+        return cls._from_tables(torch.empty(k, 0), torch.tensor([0, k], dtype=torch.int32), leaves)
 
     @property
     def leaf_rows(self) -> Tensor:
@@ -361,6 +382,8 @@ class VoronoiDiagram(nn.Module):
 
     def _flatten(self, op: str, points: Tensor) -> Tensor:
         d = self.centres.shape[1]
+        if d == 0:
+            raise ValueError(f"{op}: a diagram without centres has no places, its cells are told by labels")
         if points.dim() == 0 or points.shape[-1] != d:
             raise ValueError(f"{op}: points must have shape [..., {d}], got {list(points.shape)}")
         if not points.is_floating_point():
@@ -386,12 +409,12 @@ class VoronoiDiagram(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
-def _check_centres(centres: Tensor) -> None:
-    """Raises ValueError or TypeError unless centres are floating and finite, [any number, 1 to 4]."""
+def _check_centres(centres: Tensor, least: int = 1) -> None:
+    """Raises ValueError or TypeError unless centres are floating and finite, [any number, `least` to 4]."""
     if not isinstance(centres, Tensor) or not centres.is_floating_point():
         got = centres.dtype if isinstance(centres, Tensor) else type(centres).__name__
         raise TypeError(f"VoronoiDiagram: centres must be a floating-point tensor, got {got}")
-    if centres.dim() != 2 or not 1 <= centres.shape[1] <= 4:
+    if centres.dim() != 2 or not least <= centres.shape[1] <= 4:
         raise ValueError(f"VoronoiDiagram: centres must have shape [k, d], d = 1 to 4, got {list(centres.shape)}")
     if not bool(torch.isfinite(centres).all()):
         raise ValueError("VoronoiDiagram: centres must be finite, got NaN or infinity")
@@ -403,7 +426,7 @@ def _check_tree(centres: Tensor, child_offsets: Tensor, child: Tensor) -> tuple[
     def refuse(rule: str) -> ValueError:
         return ValueError(f"VoronoiDiagram: tables of a tree must {rule}")
 
-    _check_centres(centres)
+    _check_centres(centres, 0)
     m = centres.shape[0]
     if any(table.dtype != torch.int32 or table.dim() != 1 for table in (child_offsets, child)):
         raise refuse("hold child_offsets and child as int32 vectors")

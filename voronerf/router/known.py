@@ -18,6 +18,7 @@ from voronerf.ops._core import backends
 from voronerf.ops._core.checks import MAX_COUNT
 from voronerf.router.fused import HALF, Fused, Whole
 from voronerf.router.grouping import Grouping
+from voronerf.router.labels import Labels
 from voronerf.router.layout import SAMPLE, Call, rebuild, tensors_of
 from voronerf.router.plan import CallPlan
 
@@ -29,6 +30,7 @@ def kind_of(method: str, training: bool, args: Sequence[Any], kwargs: dict[str, 
     kind: list[Any] = [method, training, torch.is_grad_enabled(), *kwargs]
     device = None
     for value in (*args, *kwargs.values(), coords):
+        value = value.cells if type(value) is Labels else value
         of = type(value)
         if of is Tensor or of is nn.Parameter or (isinstance(value, Tensor) and torch.compiler.is_exporting()):
             device = value.device
@@ -95,9 +97,9 @@ class KnownCall:
         chosen = backends.chosen("grouped_program", device, torch.float32, backend=grouping.backend)
         return KnownCall(plan, fused, whole, call, grouping) if chosen == "native" else None
 
-    def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
-        """The results of a call of a router, None where it is unlike the others after all; coords [..., d] are those
-        that it was given."""
+    def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None) -> Any:
+        """The results of a call of a router, None where it is unlike the others after all; coords are those
+        that it was given, or labels."""
         arguments = (*args, *kwargs.values()) if kwargs else args
         compiles = torch.compiler.is_compiling()
         if coords is None and type(router.coords) is str:  # as when the kind was found

@@ -20,7 +20,7 @@ from voronerf.router.double import Double, Forbidden
 from voronerf.router.fused import Fused
 from voronerf.router.grouped import Grouped, Loop, NoRandomness, Ungroupable, Way
 from voronerf.router.grouping import Grouping, cell_parameters
-from voronerf.router.layout import RAY, Call, Results, as_plain, map_tensors, tensors_of
+from voronerf.router.layout import BROADCAST, RAY, Call, Results, as_plain, map_tensors, tensors_of
 from voronerf.router.trace import Unfusable, rows_for
 from voronerf.router.watch import Inputs
 
@@ -279,6 +279,8 @@ def _of_few(call: Call, few: tuple[int, ...]) -> list[list[Tensor]]:
     tensors: list[Tensor] = []
 
     def first(tensor: Tensor, kind: str) -> Tensor:
+        if kind == BROADCAST:
+            tensor = tensor.expand(*call.layout.lead, *tensor.shape[len(few) :])
         tensors.append(tensor.detach()[tuple(slice(size) for size in (few[:-1] if kind == RAY else few))])
         return tensors[-1]
 

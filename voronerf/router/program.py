@@ -23,6 +23,7 @@ from voronerf.ops.grouped_program import grouped_program
 from voronerf.ops.routed_program import routed_program
 from voronerf.router.double import Double
 from voronerf.router.grouping import cell_parameters, parts_of
+from voronerf.router.labels import Labels
 from voronerf.router.layout import AS_TENSOR, as_plain, tensors_of
 from voronerf.router.lower import Lowering, NotAStep
 from voronerf.router.transforms import outside
@@ -187,8 +188,8 @@ class Given:
         steps, shapes = self._steps
         return CellProgram(_with_steps(known.program.text, steps.text), known.reads, shapes, known.parameters)
 
-    def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
-        """The results of a call; coords [..., d] are those that it was given. None where the program is not known."""
+    def run(self, router: Any, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None) -> Any:
+        """The results of a call; coords are those that it was given, or labels. None where the program is not known."""
         known = self.look(router.module)
         if isinstance(known, str) or len(args) > len(_NAMES) or kwargs.keys() - set(_NAMES):
             return None

@@ -35,6 +35,7 @@ from voronerf.router.cells import (
 from voronerf.router.dispatch import Dispatch
 from voronerf.router.grouping import Assigned, Grouping
 from voronerf.router.known import KnownCall, kind_of
+from voronerf.router.labels import Labels
 from voronerf.router.layout import Call, Layout, accepted_names, argument_names, doubt_of, find_positions, first_tensor
 from voronerf.router.optimizers import (
     FrozenRows,
@@ -61,7 +62,7 @@ Coordinates = Literal["first1", "first2", "first3", "first4"] | slice | Callable
 
 
 class VoronoiRouter(nn.Module):
-    """k copies of a module, one for each cell of a Voronoi diagram; the copy of its cell evaluates each sample.
+    """k copies of a module, one for each cell of a Voronoi diagram or label; each sample is evaluated by that of its cell.
 
     ``router(...)`` takes the arguments of the module's ``forward`` and returns what it returns, in the same order and
     with the same leading dimensions. Every cell starts as a copy of the module (the inheritance of Adaptive Voronoi
@@ -81,6 +82,12 @@ class VoronoiRouter(nn.Module):
 
     A module that mixes samples (BatchNorm, attention across samples) is refused.
 
+    With a number of networks in the place of a diagram, cells have no places: every call says the cell of each sample,
+    ``router(x, cells=labels)``, such as its speaker, station, object or image. A router with a diagram takes ``cells=``
+    too, instead of looking for them. Labels have the leading shape of the samples, ``[n]`` beside ``[n, f]``. A row of
+    ``[images, pixels, f]`` beside labels ``[images]`` is one sample, which the module sees whole. ``x[:, None]`` beside
+    labels ``[n, m]`` gives each of n rows to m networks, results ``[n, m, ...]``.
+
     Arguments are per sample ``[..., f]``; per ray ``[rays, f]`` beside ``[rays, samples, f]``; numbers, flags, None and
     tensors of one element, which are passed on; and objects that hold tensors, such as nerfstudio's ``RaySamples``.
     Tensors of a subclass are taken as plain ones; a module that gives other results for those is refused.
@@ -88,7 +95,7 @@ class VoronoiRouter(nn.Module):
     Args:
         module: Any ``nn.Module`` that treats samples one by one; it is copied and never changed.
         diagram: A VoronoiDiagram (:meth:`VoronoiDiagram.from_points` places its centres), or centres [k, d], in the
-            coordinates of the positions.
+            coordinates of the positions; or k, the number of networks that labels choose from.
         coords: Where the positions are: ``"first3"``, the first three features of the first tensor (``"first2"`` for
             d = 2 and so on); a slice of its features; or a function of the call's arguments that returns positions
             [..., d]. They can be given at the call instead, ``router(x, coords=positions)``, unless the module itself
@@ -118,7 +125,7 @@ class VoronoiRouter(nn.Module):
     Raises:
         TypeError: For a module that mixes samples, or that cannot be one network for each cell.
         ValueError: For bad centres, coords, methods or layout, an unknown assignment, or a temperature that is not
-            positive.
+            positive; for less than one network; for coords or a stochastic assignment without centres.
 
     Examples:
         >>> import torch
@@ -134,13 +141,16 @@ class VoronoiRouter(nn.Module):
         [(16, 64, 3), (16, 64), (16, 4, 64), (16, 4)]
         >>> print(router.explain())
         forward: fused
+        >>> speakers = VoronoiRouter(torch.nn.Linear(8, 2), 100, fuse=True)  # one network for each of 100 speakers
+        >>> speakers(torch.rand(5, 8), cells=torch.tensor([3, 99, 3, 0, 7])).shape
+        torch.Size([5, 2])
     """
 
     @torch.inference_mode(False)  # in which parameters could never be trained
     def __init__(
         self,
         module: nn.Module,
-        diagram: VoronoiDiagram | Tensor,
+        diagram: VoronoiDiagram | Tensor | int,
         *,
         coords: Coordinates | None = None,
         per_ray: Sequence[str | int] | None = None,
@@ -160,7 +170,9 @@ class VoronoiRouter(nn.Module):
         lists = {"per_ray": per_ray, "shared": shared, "methods": methods, "share": share}
         _check_options(module, lists, **options, backend=backend)
         super().__init__()
-        cells = copy.deepcopy(diagram) if isinstance(diagram, VoronoiDiagram) else VoronoiDiagram(diagram)
+        cells = _diagram_of(diagram)
+        if cells.centres.shape[1] == 0:
+            _refuse_places(coords, assignment)
         first = next(module.parameters(), None)
         self.diagram = cells if first is None or first.is_meta else cells.to(first.device)
         self.module: nn.Module = clone_module(module)
@@ -170,7 +182,7 @@ class VoronoiRouter(nn.Module):
         self._doubts: list[Untrained | FrozenRows] = [Untrained(self.module)]  # asked in the first training calls
         self.assignment, self.temperature = assignment, temperature
         given = Given.of(self.module)
-        if coords is None and given is not None:
+        if coords is None and given is not None and cells.centres.shape[1]:
             coords = cast(Coordinates, f"first{cells.centres.shape[1]}")
         self.backend, self.coords, self.fuse, self.way, self.layout = backend, coords, fuse, way, layout
         self.per_ray = None if per_ray is None else tuple(per_ray)
@@ -187,13 +199,13 @@ class VoronoiRouter(nn.Module):
 
     @classmethod
     def from_modules(
-        cls, modules: Sequence[nn.Module], diagram: VoronoiDiagram | Tensor, **options: Any
+        cls, modules: Sequence[nn.Module], diagram: VoronoiDiagram | Tensor | int | None = None, **options: Any
     ) -> VoronoiRouter:
-        """One module for each cell, in the order of the centres, as Mega-NeRF trains them.
+        """One module for each cell, in the order of the centres, as Mega-NeRF trains them, or of the labels.
 
         Args:
             modules: k modules of one architecture.
-            diagram: A VoronoiDiagram of k cells, or centres [k, d].
+            diagram: A VoronoiDiagram of k cells, or centres [k, d]; None for cells that labels tell.
             **options: Those of the constructor.
 
         Raises:
@@ -202,7 +214,7 @@ class VoronoiRouter(nn.Module):
         modules, rule = list(modules), "VoronoiRouter.from_modules: modules must hold a module for each"
         if not modules:
             raise ValueError(f"{rule} cell, got none")
-        router = cls(modules[0], diagram, **options)
+        router = cls(modules[0], len(modules) if diagram is None else diagram, **options)
         if len(modules) != router.num_cells:
             raise ValueError(f"{rule} of {router.num_cells} cells, got {len(modules)}")
         for index, module in enumerate(modules):
@@ -383,7 +395,8 @@ class VoronoiRouter(nn.Module):
 
         Args:
             diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children that
-                :func:`voronerf.split_diagram` gives each cell that has enough samples.
+                :func:`voronerf.split_diagram` gives each cell that has enough samples. Without centres, for new
+                labels, :meth:`VoronoiDiagram.without_centres`, with ``parents``.
             parents: int64 [new cells], the present cell that each new cell lies in; None for the cell that holds the
                 new centre.
             optimizer: The optimiser that holds this router's parameters.
@@ -413,6 +426,11 @@ class VoronoiRouter(nn.Module):
         split = {"backend": self.backend, "generator": self.generator, **split}
         check_optimizer(optimizer, self.module, "subdivide")
         k = self.num_cells
+        if not self._d and (isinstance(diagram, int) or parents is None):
+            raise ValueError(
+                "VoronoiRouter.subdivide: diagram must be VoronoiDiagram.without_centres(k) for a router without "
+                "centres, with parents, the present label of each new one"
+            )
         finer, parents = finer_diagram(self.diagram, diagram, parents, points, weights, split)
         # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
         new = torch.bincount(parents, minlength=k)[parents] > 1
@@ -504,7 +522,7 @@ class VoronoiRouter(nn.Module):
             )
         return self.diagram.locate(positions, backend=self.backend)
 
-    def forward(self, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
+    def forward(self, *args: Any, coords: Tensor | None = None, cells: Tensor | None = None, **kwargs: Any) -> Any:
         """Evaluates each sample in its cell; results are in the order of the samples.
 
         Args:
@@ -512,6 +530,10 @@ class VoronoiRouter(nn.Module):
                 directions, unit vectors [n, 3] or [r, 3] together with ray_index, int32 [n], the row of ``directions``
                 that belongs to each sample.
             coords: Positions [..., d] in scene units that decide the cells, instead of the router's own rule.
+            cells: int32 or int64 [...], the cell of each sample, 0 to k - 1, instead of positions. On a GPU the check
+                of the values waits for the device. Compiled and captured graphs leave it to the operations, which
+                raise on the CPU, and give 0 for other values on a GPU. A module that has an argument ``cells`` of its
+                own gets this one, as it gets ``coords``.
             **kwargs: Those of the module's ``forward``.
 
         Returns:
@@ -519,10 +541,10 @@ class VoronoiRouter(nn.Module):
 
         Raises:
             ValueError: For shapes that disagree, positions that are not given, arguments that are neither per sample
-                nor per ray or could be both, or missing directions.
-            TypeError: For a module that mixes samples.
+                nor per ray or could be both, or missing directions; for labels out of range, or missing.
+            TypeError: For a module that mixes samples, or labels that are no integers.
         """
-        return self._route("forward", args, kwargs, coords)
+        return self._route("forward", args, kwargs, coords, cells)
 
     @property
     def _d(self) -> int:
@@ -530,8 +552,15 @@ class VoronoiRouter(nn.Module):
         d: int = diagram._buffers["centres"].shape[1]
         return d
 
-    def _positions(self, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Tensor:
-        """The positions [..., d] that decide the cells of a call; coords as given to the call."""
+    def _positions(self, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None) -> Tensor:
+        """The positions [..., d] that decide the cells of a call, or labels, int32 [..., 1]; coords as given to it."""
+        if isinstance(coords, Labels):
+            return coords.cells
+        if not self._d:
+            raise ValueError(
+                "VoronoiRouter: cells must be given to each call of a router without centres: pass cells=labels, "
+                "integers of the leading shape of the samples"
+            )
         positions = find_positions(self.coords if coords is None else coords, args, kwargs, self._d)
         if self._unseen:
             self._look_at(positions, args, kwargs, coords)
@@ -557,7 +586,8 @@ class VoronoiRouter(nn.Module):
 
         Args:
             positions: [n, 3] in scene units, or [n, 6] Gaussians.
-            coords: [..., d], positions that decide the cells; None for those of the samples.
+            coords: [..., d], positions that decide the cells, or labels, int32 [..., 1]; None for the positions of the
+                samples.
         """
         diagram: Any = self._modules["diagram"]
         k, centres, frozen = diagram.num_cells, diagram._buffers["centres"], self._buffers["frozen_cells"]
@@ -565,6 +595,8 @@ class VoronoiRouter(nn.Module):
             self._ask_doubts()
         if k == 1:
             return {"frozen": frozen}
+        if coords is not None and not coords.is_floating_point():
+            return {"frozen": frozen, "cells": coords.flatten()}
         d, drawn = centres.shape[1], self.assignment == "stochastic" and self.training
         if coords is None:
             coords = positions[:, :d] if positions.shape[1] > d else positions
@@ -581,7 +613,8 @@ class VoronoiRouter(nn.Module):
         if self.methods:
             self._ask_doubts()
             return {"frozen": self.frozen_cells, "cells": self._group(method, positions).cells}
-        return self.places(positions if positions.dim() == 2 else positions.flatten(0, -2))
+        flat = positions if positions.dim() == 2 else positions.flatten(0, -2)
+        return self.places(flat, flat)
 
     def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
         """The program of ``forward``; or the reason why it is unknown.
@@ -603,6 +636,8 @@ class VoronoiRouter(nn.Module):
             >>> [step.op for step in known.program.steps], known.shapes
             (['input', 'linear'], ((2,),))
         """
+        if not self._d:
+            return "labels decide the cells"
         if callable(self.coords) or isinstance(self.coords, slice):
             return "other positions than those of the samples decide the cells"
         k, dispatch = self.num_cells, self._dispatch
@@ -672,11 +707,27 @@ class VoronoiRouter(nn.Module):
                 f"call {there}"
             ) from None
 
-    def _routed(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
-        return self._route(method, args, kwargs, coords)
+    def _routed(
+        self, method: str, /, *args: Any, coords: Tensor | None = None, cells: Tensor | None = None, **kwargs: Any
+    ) -> Any:
+        return self._route(method, args, kwargs, coords, cells)
 
-    def _route(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None) -> Any:
+    def _route(
+        self,
+        method: str,
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        coords: Tensor | Labels | None,
+        cells: Tensor | None,
+    ) -> Any:
         """One call of a method of the module; one that is not known breaks a graph of ``torch.compile``."""
+        if cells is not None:
+            if "cells" in argument_names(getattr(self.module, method)):  # the method's own argument
+                kwargs = {**kwargs, "cells": cells}
+            elif coords is not None:
+                raise ValueError("VoronoiRouter: coords must be None where cells are given, got both")
+            else:
+                coords = Labels.of(cells, self.num_cells, self.diagram.centres.device)
         if self._resized and not torch.compiler.is_compiling():
             self._check_wrapper()
         if method == "forward" and self._given is not None:
@@ -712,7 +763,7 @@ class VoronoiRouter(nn.Module):
             )
         self._resized = False
 
-    def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | None = None, **kwargs: Any) -> Any:
+    def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | Labels | None = None, **kwargs: Any) -> Any:
         """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
         refuse_transforms()
         self._ask_doubts()
@@ -742,7 +793,7 @@ class VoronoiRouter(nn.Module):
         return Options(self.fuse, self.way, bool(self.methods), self._names)
 
     def _call(self, method: str, positions: Tensor, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call:
-        """A call of a method for samples at positions [..., d]."""
+        """A call of a method for samples at positions [..., d], or with labels, int32 [..., 1]."""
         known = argument_names(getattr(self.module, method))
         names = [*known[: len(args)], *map(str, range(len(known), len(args)))]
 
@@ -761,17 +812,18 @@ class VoronoiRouter(nn.Module):
 
     def _group(self, method: str, positions: Tensor) -> Grouping:
         """The samples in their cells; other methods that are called with the same positions share it."""
-        drawn, centres = self.assignment == "stochastic" and self.training, self.diagram.centres
+        labelled, centres = not positions.is_floating_point(), self.diagram.centres
+        drawn = self.assignment == "stochastic" and self.training and not labelled
         version = object() if centres.is_inference() else centres._version  # inference tensors have no version
-        key = self.diagram, version, drawn, self.temperature, self.backend
+        key = self.diagram, version, drawn, labelled, self.temperature, self.backend
         kept = bool(self.methods) and not transformed()
         known = self._assigned if kept else None
         if known is not None and known.serves(method, positions, key, drawn):
             return known.grouping
         with outside():
-            flat, k = unwrapped(positions).detach().reshape(-1, self._d), self.num_cells
+            flat, k = unwrapped(positions).detach().flatten(0, -2), self.num_cells
             if flat.shape[0]:
-                cells = None if k == 1 else self.assign(flat)
+                cells = None if k == 1 else flat[:, 0] if labelled else self.assign(flat)
             else:  # the module runs on placeholders, since it may not take an empty batch
                 cells = torch.zeros(2, dtype=torch.int32, device=flat.device)
             grouping = Grouping(cells, flat.shape[0] or 2, k, flat.device, self.backend)
@@ -803,7 +855,24 @@ class VoronoiRouter(nn.Module):
 
     def extra_repr(self) -> str:
         """What ``print(router)`` shows beside the field's modules."""
+        if not self._d:
+            return f"num_cells={self.num_cells}, without centres"
         return f"num_cells={self.num_cells}, depth={self.diagram.depth}, assignment={self.assignment!r}"
+
+
+def _diagram_of(cells: Any) -> VoronoiDiagram:
+    """A diagram of the router's own, of what it was given: a diagram, centres [k, d], or a number of cells."""
+    if isinstance(cells, int) and not isinstance(cells, bool):
+        return VoronoiDiagram.without_centres(cells)
+    return copy.deepcopy(cells) if isinstance(cells, VoronoiDiagram) else VoronoiDiagram(cells)
+
+
+def _refuse_places(coords: Any, assignment: str) -> None:
+    """Raises ValueError for options that speak of positions, where labels tell the cells."""
+    if coords is not None:
+        raise ValueError(f"VoronoiRouter: coords must be None without centres, since labels tell cells, got {coords!r}")
+    if assignment != "nearest":
+        raise ValueError(f"VoronoiRouter: assignment must be 'nearest' without centres, got {assignment!r}")
 
 
 def _check_options(module: nn.Module, lists: dict[str, Any], **options: Any) -> None:

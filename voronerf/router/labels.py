@@ -1,0 +1,50 @@
+"""Labels: the cells of samples, given to a call in the place of positions."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from voronerf.ops._core.checks import check_range
+from voronerf.router.layout import as_plain
+from voronerf.router.transforms import outside, unwrapped
+
+_RULE = "VoronoiRouter: cells must"
+
+
+class Labels(NamedTuple):
+    """The cells of a call's samples, int32 [..., 1], where positions would be [..., d]."""
+
+    cells: Tensor
+
+    @staticmethod
+    def of(cells: Any, k: int, device: torch.device) -> Labels:
+        """Checks the labels of a call; on a GPU this waits until they are computed.
+
+        Compiled and captured graphs do not read them: there the operations refuse other labels on the CPU, and give 0
+        for them on a GPU.
+
+        Args:
+            cells: int32 or int64 [...], one for each sample, 0 to k - 1.
+            k: Networks.
+            device: Of their parameters.
+
+        Raises:
+            TypeError: For what is no such tensor.
+            ValueError: For a tensor without dimensions, on another device, or with other values.
+        """
+        if not isinstance(cells, Tensor) or cells.dtype not in (torch.int32, torch.int64):
+            got = cells.dtype if isinstance(cells, Tensor) else type(cells).__name__
+            raise TypeError(f"{_RULE} be an int32 or int64 tensor, got {got}")
+        if not cells.dim():
+            raise ValueError(f"{_RULE} have the leading shape of the samples, such as [n], got []")
+        if cells.device != device:
+            raise ValueError(f"{_RULE} be on the device of the parameters, {device}, got {cells.device}")
+        if torch.compiler.is_compiling() or (cells.is_cuda and torch.cuda.is_current_stream_capturing()):
+            return Labels(cells.clamp(-1, k).int()[..., None])
+        with outside():
+            inner = unwrapped(cells)
+            check_range("VoronoiRouter", "cells", inner.cpu() if inner.is_cuda else inner, k)
+        return Labels(as_plain(cells).int()[..., None])
