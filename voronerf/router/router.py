@@ -62,7 +62,7 @@ Coordinates = Literal["first1", "first2", "first3", "first4"] | slice | Callable
 
 
 class VoronoiRouter(nn.Module):
-    """k copies of a module, one for each cell of a Voronoi diagram or label; each sample is evaluated by that of its cell.
+    """k copies of a module, one for each cell of a Voronoi diagram or label; that of its cell evaluates each sample.
 
     ``router(...)`` takes the arguments of the module's ``forward`` and returns what it returns, in the same order and
     with the same leading dimensions. Every cell starts as a copy of the module (the inheritance of Adaptive Voronoi

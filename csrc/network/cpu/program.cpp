@@ -59,8 +59,8 @@ void check(const ProgramInputs& in) {
   }
 }
 
-// Parameters of a cell on their way to the cache: of many small cells, each would be waited for. Large ones take so
-// long to run that reading them does not show, and would push out what is in use.
+// Parameters of a cell, and where its sums go, on their way to the cache: of many small cells, each would be waited
+// for. Large ones take so long to run that reading them does not show, and would push out what is in use.
 void fetch(const ProgramCall& call, int64_t cell) {
   constexpr int64_t kLine = 16, kMostFetched = 1 << 15;  // floats
   if (call.code.packed > kMostFetched) return;
@@ -70,6 +70,13 @@ void fetch(const ProgramCall& call, int64_t cell) {
     const int64_t stride = call.strides[pack.parameter];
     const float* from = static_cast<const float*>(call.parameters[pack.parameter]) + cell * stride;
     for (int64_t i = 0; i < stride; i += kLine) __builtin_prefetch(from + i, 0, 2);
+  }
+  for (int32_t s = 0; s < call.code.sum_count; ++s) {
+    const ProgramSum& sum = call.code.sums[s];
+    const bool seen = s > 0 && call.code.sums[s - 1].sum == sum.sum;
+    if (seen || sum.kind == ProgramSumKind::none) continue;
+    const float* to = call.sums[sum.sum] + cell * sum.size;
+    for (int64_t i = 0; i < sum.size; i += kLine) __builtin_prefetch(to + i, 1, 2);
   }
   asm volatile("");  // GCC leaves out calls of a function that does nothing but prefetch
 }
