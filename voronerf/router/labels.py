@@ -15,16 +15,22 @@ _RULE = "VoronoiRouter: cells must"
 
 
 class Labels(NamedTuple):
-    """The cells of a call's samples, int32 [..., 1], where positions would be [..., d]."""
+    """The cells of a call's samples.
+
+    Attributes:
+        cells: int32 [..., 1], where positions would be [..., d].
+        checked: Whether they are known to be 0 to k - 1.
+    """
 
     cells: Tensor
+    checked: bool
 
     @staticmethod
     def of(cells: Any, k: int, device: torch.device) -> Labels:
         """Checks the labels of a call; on a GPU this waits until they are computed.
 
-        Compiled and captured graphs do not read them: there the operations refuse other labels on the CPU, and give 0
-        for them on a GPU.
+        Compiled and captured graphs do not read the labels: there the operations refuse other ones on the CPU, and give
+        0 for them on a GPU.
 
         Args:
             cells: int32 or int64 [...], one for each sample, 0 to k - 1.
@@ -43,8 +49,17 @@ class Labels(NamedTuple):
         if cells.device != device:
             raise ValueError(f"{_RULE} be on the device of the parameters, {device}, got {cells.device}")
         if torch.compiler.is_compiling() or (cells.is_cuda and torch.cuda.is_current_stream_capturing()):
-            return Labels(cells.clamp(-1, k).int()[..., None])
-        with outside():
-            inner = unwrapped(cells)
-            check_range("VoronoiRouter", "cells", inner.cpu() if inner.is_cuda else inner, k)
-        return Labels(as_plain(cells).int()[..., None])
+            return Labels(cells.clamp(-1, k).int()[..., None], False)
+        _check_values(cells, k)
+        return Labels(as_plain(cells).int()[..., None], True)
+
+    def ensure(self, k: int) -> None:
+        """Raises ValueError for labels of a graph that are not 0 to k - 1, where the graph ends before the call."""
+        if not self.checked:
+            _check_values(self.cells, k)
+
+
+def _check_values(cells: Tensor, k: int) -> None:
+    with outside():
+        inner = unwrapped(cells)
+        check_range("VoronoiRouter", "cells", inner.cpu() if inner.is_cuda else inner, k)

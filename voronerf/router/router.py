@@ -767,6 +767,8 @@ class VoronoiRouter(nn.Module):
         """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
         refuse_transforms()
         self._ask_doubts()
+        if isinstance(coords, Labels):
+            coords.ensure(self.num_cells)
         called, like = getattr(self.module, method), kind_of(method, self.module.training, args, kwargs, coords)
         field = method == "forward" and self._given is not None
         if field and (each := each_direction(args, kwargs)) is not None:

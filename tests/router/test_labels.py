@@ -1,0 +1,242 @@
+"""Labels in the place of positions: one network for each speaker, station, object or image."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from router_fields import Heads, Sine, masked_loop, perturb, tensors
+from torch import Tensor, nn
+
+from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
+from voronerf.nerf.radiance import radiance_of
+
+K = 5
+WAYS: dict[str, dict[str, Any]] = {
+    "fused": {"fuse": True, "way": "fused"},
+    "grouped": {"way": "grouped"},
+    "loop": {"way": "loop"},
+}
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(7)
+
+
+def routed(module: nn.Module, way: str = "fused", cells: Any = K, **options: Any) -> VoronoiRouter:
+    return perturb(VoronoiRouter(module, cells, **WAYS[way], **options), torch.Generator().manual_seed(3))
+
+
+def drawn(generator: torch.Generator, *shape: int, dtype: torch.dtype = torch.int64) -> Tensor:
+    """Labels; the last network gets no sample."""
+    return torch.randint(K - 1, shape, generator=generator, dtype=dtype)
+
+
+def gradients(results: list[Tensor], wanted: list[Tensor]) -> list[Tensor]:
+    total = sum((tensor.square().sum() for tensor in results), torch.zeros(()))
+    return list(torch.autograd.grad(total, wanted, allow_unused=True, materialize_grads=True))
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
+def test_every_way_equals_the_loop_with_gradients(way: str, dtype: torch.dtype, generator: torch.Generator) -> None:
+    router = routed(Sine(), way)
+    for n in (40, 23, 1):  # the first call of a kind, a known one, few samples
+        x, cells = torch.rand(n, 3, generator=generator, requires_grad=True), drawn(generator, n, dtype=dtype)
+        expected, modules = masked_loop(router, cells, [x])
+        found = tensors(router(x, cells=cells))
+        torch.testing.assert_close(found, expected)
+        singles = [p for module in modules for p in module.parameters()]
+        *of_cells, of_x = gradients(expected, [*singles, x])
+        count = len(list(router.parameters()))
+        stacked = [torch.stack(of_cells[i::count]) for i in range(count)]
+        torch.testing.assert_close(gradients(found, [*router.parameters(), x]), [*stacked, of_x])
+    assert router.explain() == f"forward: {'cell by cell' if way == 'loop' else way}"
+    assert router(torch.rand(0, 3), cells=torch.zeros(0, dtype=dtype)).shape == (0, 2)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_labels_have_the_leading_shape_of_samples(way: str, generator: torch.Generator) -> None:
+    router, x, cells = routed(Sine(), way), torch.rand(8, 6, 3, generator=generator), drawn(generator, 8, 6)
+    flat = router(x.flatten(0, 1), cells=cells.flatten())
+    torch.testing.assert_close(router(x, cells=cells), flat.reshape(8, 6, 2))
+    members = torch.arange(K).expand(8, K)  # an ensemble: each row for every network
+    expected = torch.stack([router.cell(i)(x[:, 0]) for i in range(K)], 1)
+    torch.testing.assert_close(router(x[:, :1], cells=members), expected)
+
+
+@pytest.mark.parametrize("way", ["grouped", "loop"])
+def test_what_lies_behind_the_shape_of_labels_is_one_sample(way: str, generator: torch.Generator) -> None:
+    class Softmax(nn.Module):  # of all rows of an image
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = nn.Linear(3, 2)
+
+        def forward(self, x: Tensor) -> Tensor:
+            return self.layer(x).softmax(-2)
+
+    router, x, images = routed(Softmax(), way), torch.rand(9, 6, 3, generator=generator), drawn(generator, 9)
+    torch.testing.assert_close(router(x, cells=images), masked_loop(router, images, [x])[0][0])
+
+
+@pytest.mark.parametrize("fuse", [False, True])
+def test_fields_methods_autocast_and_double_precision(fuse: bool, generator: torch.Generator) -> None:
+    x, d, cells = (*(torch.rand(30, 3, generator=generator) for _ in range(2)), drawn(generator, 30))
+    field = routed(NeRF(width=16, depth=2), "fused")
+    torch.testing.assert_close(tensors(field(x, d, cells=cells)), masked_loop(field, cells, [x, d])[0])
+    index = torch.arange(30, dtype=torch.int32)
+    torch.testing.assert_close(field(x, d, index, cells=cells), field(x, d, cells=cells))
+    heads = routed(Heads(), "fused" if fuse else "grouped", methods=["density"])
+    colour, sigma = heads(x, d, cells=cells)
+    torch.testing.assert_close([colour, sigma], masked_loop(heads, cells, [x, d])[0])
+    torch.testing.assert_close(heads.density(x, cells=cells)["sigma"], sigma)
+    torch.testing.assert_close(heads.density(x, cells=0 * cells)["sigma"], heads.cell(0).density(x)["sigma"])
+    router = routed(Sine(), "fused" if fuse else "grouped")
+    with torch.autocast("cpu", torch.bfloat16):
+        half = router(x, cells=cells)
+    assert half.dtype == torch.bfloat16
+    torch.testing.assert_close(half.float(), router(x, cells=cells), atol=0.05, rtol=0.05)
+    router.double()
+    torch.testing.assert_close(router(x.double(), cells=cells), masked_loop(router, cells, [x.double()])[0][0])
+
+
+def test_a_diagram_gives_way_to_labels(generator: torch.Generator) -> None:
+    for way in WAYS:
+        router = routed(Sine(), way, torch.rand(K, 3, generator=generator), coords="first3")
+        x, cells = torch.rand(30, 3, generator=generator), drawn(generator, 30)
+        torch.testing.assert_close(router(x, cells=cells), masked_loop(router, cells, [x])[0][0])
+        torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
+    drawing = routed(Heads(), "grouped", router.diagram, coords="first3", assignment="stochastic", methods=["density"])
+    torch.testing.assert_close(drawing(x, cells=cells), masked_loop(drawing, cells, [x])[0][0])  # none is drawn
+
+
+def test_a_module_with_an_argument_of_this_name_gets_it(generator: torch.Generator) -> None:
+    class Own(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = nn.Linear(3, 2)
+
+        def forward(self, x: Tensor, cells: Tensor) -> Tensor:
+            return self.layer(x) * cells[..., None]
+
+    x, cells = torch.rand(30, 3, generator=generator), drawn(generator, 30)
+    router = routed(Own(), "grouped", torch.rand(K, 3, generator=generator), coords="first3")
+    torch.testing.assert_close(router(x, cells=cells), masked_loop(router, router.diagram.locate(x), [x, cells])[0][0])
+    with pytest.raises(ValueError, match="cells must be given"):
+        routed(Own(), "grouped")(x, cells=cells)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_frozen_networks_learn_nothing(way: str, generator: torch.Generator) -> None:
+    router, x, cells = routed(Sine(), way), torch.rand(40, 3, generator=generator), drawn(generator, 40)
+    before, values = gradients([router(x, cells=cells)], list(router.parameters())), router(x, cells=cells)
+    router.freeze([1, 2])
+    torch.testing.assert_close(router(x, cells=cells), values)
+    for full, kept in zip(before, gradients([router(x, cells=cells)], list(router.parameters())), strict=True):
+        assert not kept[[1, 2]].any()
+        torch.testing.assert_close(kept[[0, 3, 4]], full[[0, 3, 4]])
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_labels_are_checked(way: str) -> None:
+    router, x = routed(Sine(), way), torch.rand(20, 3)
+    router(x, cells=torch.zeros(20, dtype=torch.int64))
+    few = torch.zeros(20, dtype=torch.int64)
+    for cells, kind, message in (
+        (few - 1, ValueError, "cells must lie in 0 to 4, got values from -1 to -1"),
+        (few.int() + K, ValueError, "cells must lie in 0 to 4, got values from 5 to 5"),
+        (
+            few.index_fill(0, torch.tensor([3]), 2**32),
+            ValueError,
+            "cells must lie in 0 to 4, got values from 0 to 42",
+        ),
+        (few.float(), TypeError, "cells must be an int32 or int64 tensor, got torch.float32"),
+        (few.bool(), TypeError, "cells must be an int32 or int64 tensor, got torch.bool"),
+        (3, TypeError, "cells must be an int32 or int64 tensor, got int"),
+        (few[0], ValueError, "cells must have the leading shape of the samples, such as [n], got []"),
+        (few.to("meta"), ValueError, "cells must be on the device of the parameters, cpu, got meta"),
+        (few[:7], ValueError, "x must be per sample [7, ...]"),
+        (None, ValueError, "cells must be given to each call of a router without centres"),
+    ):
+        with pytest.raises(kind, match=re.escape(f"VoronoiRouter: {message}")):
+            router(x, cells=cells)
+    with pytest.raises(ValueError, match="coords must be None where cells are given, got both"):
+        router(x, coords=x, cells=few)
+    with pytest.raises(ValueError, match="cells must be given"):
+        router(x, coords=x)
+
+
+def test_what_needs_centres_is_refused() -> None:
+    net, router = nn.Linear(3, 2), VoronoiRouter(nn.Linear(3, 2), K)
+    for make, kind, message in (
+        (lambda: VoronoiRouter(net, 0), ValueError, "k must be at least 1, got 0"),
+        (lambda: VoronoiRouter(net, True), TypeError, "got bool"),
+        (lambda: VoronoiRouter(net, K, coords="first3"), ValueError, "coords must be None without centres"),
+        (lambda: VoronoiRouter(net, K, assignment="stochastic"), ValueError, "assignment must be 'nearest' without"),
+        (lambda: router.subdivide(2, points=torch.rand(9, 3)), ValueError, "diagram must be VoronoiDiagram.without"),
+        (lambda: router.subdivide(VoronoiDiagram.without_centres(9)), ValueError, "with parents"),
+        (lambda: router.diagram.locate(torch.rand(4, 3)), ValueError, "locate: a diagram without centres"),
+        (lambda: router.diagram.sample_cell(torch.rand(4, 3), temperature=1), ValueError, "sample_cell: a diagram"),
+        (lambda: VoronoiRouter.from_modules([net, net], 3), ValueError, "of 3 cells, got 2"),
+    ):
+        with pytest.raises(kind, match=message):
+            make()
+    field = VoronoiRouter(NeRF(width=16, depth=2), K)
+    assert field.program(torch.rand(2, 3), torch.rand(2, 3)) == radiance_of(field) == "labels decide the cells"
+
+
+def test_states_parts_copies_and_new_labels(tmp_path: Path, generator: torch.Generator) -> None:
+    router, x, cells = routed(Sine()), torch.rand(30, 3, generator=generator), drawn(generator, 30)
+    values = router(x, cells=cells)
+    torch.save(router.state_dict(), tmp_path / "state.pt")
+    other = VoronoiRouter(Sine(), 2, fuse=True)
+    other.load_state_dict(torch.load(tmp_path / "state.pt"))
+    for same in (other, copy.deepcopy(router), pickle.loads(pickle.dumps(router))):
+        assert same.num_cells == K and torch.equal(same(x, cells=cells), values)
+    modules = [router.cell(i) for i in range(K)]
+    torch.testing.assert_close(VoronoiRouter.from_modules(modules)(x, cells=cells), values)
+    part = router.part([1, 3])
+    torch.testing.assert_close(part(x, cells=torch.ones(30, dtype=torch.int64)), router.cell(3)(x))
+    assert part.num_cells == 2 and "num_cells=2, without centres" in repr(part)
+    optimizer = torch.optim.Adam(router.parameters())
+    router(x, cells=cells).square().sum().backward()
+    optimizer.step()
+    router.subdivide(VoronoiDiagram.without_centres(K + 1), torch.tensor([*range(K), 2]), optimizer=optimizer)
+    torch.testing.assert_close(router(x, cells=torch.full((30,), K)), router.cell(2)(x))
+    assert all(state["exp_avg"].shape[0] == K + 1 for state in optimizer.state.values())
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_graphs_of_the_compiler(whole: bool, generator: torch.Generator) -> None:
+    router, x, cells = routed(Sine(), "fused" if whole else "grouped"), torch.rand(40, 3), drawn(generator, 40)
+    expected = router(x, cells=cells)
+    torch._dynamo.reset()  # what it knows of the other case
+
+    def twice(x: Tensor, cells: Tensor) -> Tensor:
+        return 2 * router(x, cells=cells)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        compiled = torch.compile(twice, backend="eager", fullgraph=whole)
+        torch.testing.assert_close(compiled(x, cells), 2 * expected)
+        with pytest.raises(ValueError, match="cells must lie in 0 to 4, got values from 0 to 5"):
+            compiled(x, (0 * cells).index_fill(0, torch.tensor([1]), 2**40))
+
+
+def test_gradients_by_torch_func(generator: torch.Generator) -> None:
+    router, x, cells = routed(Sine()), torch.rand(30, 3, generator=generator), drawn(generator, 30)
+    parameters = dict(router.named_parameters())
+
+    def loss(parameters: dict[str, Tensor], cells: Tensor) -> Tensor:
+        return torch.func.functional_call(router, parameters, (x,), {"cells": cells}).square().sum()
+
+    found = torch.func.grad(loss)(parameters, cells)
+    expected = gradients([router(x, cells=cells)], list(parameters.values()))
+    torch.testing.assert_close(list(found.values()), expected)
