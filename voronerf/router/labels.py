@@ -49,9 +49,9 @@ class Labels(NamedTuple):
         if cells.device != device:
             raise ValueError(f"{_RULE} be on the device of the parameters, {device}, got {cells.device}")
         if torch.compiler.is_compiling() or (cells.is_cuda and torch.cuda.is_current_stream_capturing()):
-            return Labels(cells.clamp(-1, k).int()[..., None], False)
+            return Labels(cells.clamp(-1, k).int().unsqueeze(-1), False)
         _check_values(cells, k)
-        return Labels(as_plain(cells).int()[..., None], True)
+        return Labels(as_plain(cells).int().unsqueeze(-1), True)
 
     def ensure(self, k: int) -> None:
         """Raises ValueError for labels of a graph that are not 0 to k - 1, where the graph ends before the call."""

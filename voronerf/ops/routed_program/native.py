@@ -55,6 +55,9 @@ def run_known(
     first, centres = inputs[0], places.get("centres")
     if centres is not None and "child" not in places and centres.is_cpu and not _is_seen(first):
         cells, order, offsets = _in_two_calls(places["coords"], centres, places.get("index"), k)
+    elif "cells" in places and not _is_seen(first):
+        cells = places["cells"]
+        order, offsets = cell_sort(cells, k, backend="native")
     else:
         if centres is not None and centres.device != first.device:
             check_same_device("VoronoiRouter", samples=first, centres=centres)
