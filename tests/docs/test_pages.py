@@ -11,7 +11,7 @@ import pytest
 from helpers import script
 
 ROOT = Path(__file__).resolve().parents[2]
-RUNNABLE = ("README.md", "docs/quickstart.md", "docs/method.md", "docs/extend.md")
+RUNNABLE = ("README.md", "docs/quickstart.md", "docs/method.md", "docs/extend.md", "docs/groups.md")
 GENERATED = {"docs/scene.html"}  # by `make docs`, docs/scripts/scene.py
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 

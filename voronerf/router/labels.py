@@ -49,7 +49,8 @@ class Labels(NamedTuple):
         if cells.device != device:
             raise ValueError(f"{_RULE} be on the device of the parameters, {device}, got {cells.device}")
         if torch.compiler.is_compiling() or (cells.is_cuda and torch.cuda.is_current_stream_capturing()):
-            return Labels(cells.clamp(-1, k).int().unsqueeze(-1), False)
+            inside = torch.where(cells < k, cells, -1).clamp(min=-1)  # else no cell
+            return Labels(inside.int().unsqueeze(-1), False)
         _check_values(cells, k)
         return Labels(as_plain(cells).int().unsqueeze(-1), True)
 
@@ -61,5 +62,7 @@ class Labels(NamedTuple):
 
 def _check_values(cells: Tensor, k: int) -> None:
     with outside():
-        inner = unwrapped(cells)
-        check_range("VoronoiRouter", "cells", inner.cpu() if inner.is_cuda else inner, k)
+        values = unwrapped(cells)
+        if values.is_cuda and values.numel():
+            values = torch.stack(values.aminmax()).cpu()
+        check_range("VoronoiRouter", "cells", values, k)

@@ -188,6 +188,7 @@ class VoronoiRouter(nn.Module):
         self.per_ray = None if per_ray is None else tuple(per_ray)
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._names = tuple(name for name, _ in self.module.named_parameters())
+        self._own = {name: argument_names(getattr(self.module, name)) for name in ("forward", *self.methods)}
         self._dispatch = Dispatch()
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
         self._unseen = True  # no large batch has shown whether the centres fit the positions
@@ -722,7 +723,10 @@ class VoronoiRouter(nn.Module):
     ) -> Any:
         """One call of a method of the module; one that is not known breaks a graph of ``torch.compile``."""
         if cells is not None:
-            if "cells" in argument_names(getattr(self.module, method)):  # the method's own argument
+            own = self._own.get(method, ())
+            if coords is not None and "coords" in own:
+                kwargs, coords = {**kwargs, "coords": coords}, None
+            if "cells" in own:
                 kwargs = {**kwargs, "cells": cells}
             elif coords is not None:
                 raise ValueError("VoronoiRouter: coords must be None where cells are given, got both")
@@ -748,7 +752,7 @@ class VoronoiRouter(nn.Module):
             )
         compiling = torch.compiler.is_compiling() or "torch._dynamo" in sys.modules
         run = self._route_uncompiled if compiling else self._route_as_it_is
-        return run(method, *args, coords=coords, **kwargs)
+        return run(method, args, kwargs, coords)
 
     def _check_wrapper(self) -> None:
         """Raises RuntimeError in a call of a ``DistributedDataParallel`` that has been made for other sizes."""
@@ -763,7 +767,9 @@ class VoronoiRouter(nn.Module):
             )
         self._resized = False
 
-    def _route_as_it_is(self, method: str, /, *args: Any, coords: Tensor | Labels | None = None, **kwargs: Any) -> Any:
+    def _route_as_it_is(
+        self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | Labels | None
+    ) -> Any:
         """Arranges the arguments, evaluates them, and restores the order and the shape of the results."""
         refuse_transforms()
         self._ask_doubts()
@@ -773,7 +779,8 @@ class VoronoiRouter(nn.Module):
         field = method == "forward" and self._given is not None
         if field and (each := each_direction(args, kwargs)) is not None:
             (args, kwargs), like = each, None
-        if coords is not None and "coords" in (accepted_names([called]) or ()):  # the method's own argument
+        placed = coords is not None and not isinstance(coords, Labels)
+        if placed and "coords" in (accepted_names([called]) or ()):  # the method's own argument
             kwargs, coords, like = {**kwargs, "coords": coords}, None, None
         positions = self._positions(args, kwargs, coords)
         call = self._call(method, positions, args, kwargs)

@@ -1,0 +1,170 @@
+"""One network for each label, on one thread: a router beside ``vmap`` over stacked modules, ``baddbmm`` and a loop.
+
+    python benchmarks/groups.py --json benchmarks/results/groups.json
+
+SIRENs of three layers of 32. Rows are sorted by label, as many for each, so that the others need neither a sort nor
+padding. All compute the same values, which is checked first. A call is forward and backward; the last row is a step
+with Adam on 1,000 images, of which the router is trained further, to the PSNR in the file. Times are medians of the
+processor's time in turns, in milliseconds.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from harness import Stopwatch, measure, metadata, threads
+from torch import Tensor, nn
+from torch.func import functional_call, stack_module_state, vmap
+
+from voronerf import VoronoiRouter
+from voronerf.app.files import json_text, write_text
+
+SIZES = ((64, 8), (64, 1024), (1024, 64), (1024, 256), (4096, 16))
+IMAGES, PIXELS, SIDE = 1000, 256, 32
+Run = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How long, and where results go."""
+
+    seconds: float = 4.0
+    """For each way of a row."""
+    steps: int = 500
+    """Of the training on images."""
+    json: Path | None = None
+    """A file for the results; default: printed only."""
+
+
+class Siren(nn.Module):
+    """Two coordinates in -1 to 1 to a colour."""
+
+    def __init__(self, width: int = 32, frequency: float = 10.0) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList([nn.Linear(i, width) for i in (2, width, width)])
+        self.last, self.frequency = nn.Linear(width, 3), frequency
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[..., 2] -> [..., 3]."""
+        x = x * self.frequency
+        for layer in self.layers:
+            x = torch.sin(layer(x))
+        return self.last(x)
+
+
+def ways(k: int) -> dict[str, tuple[list[nn.Parameter], Run]]:
+    """The parameters of k networks, the same in each way, and what computes [k, rows, 3] of [k, rows, 2]."""
+    modules = [Siren() for _ in range(k)]
+    router = VoronoiRouter.from_modules(modules, fuse=True, way="fused")
+    labels = torch.arange(k)[:, None]
+
+    stacked = {name: nn.Parameter(value.detach()) for name, value in stack_module_state(modules)[0].items()}
+    mapped = vmap(lambda parameters, x: functional_call(modules[0], parameters, (x,)))
+
+    every = [[*module.layers, module.last] for module in modules]
+    weights = [nn.Parameter(torch.stack([layer.weight.detach().t() for layer in place])) for place in zip(*every)]
+    biases = [nn.Parameter(torch.stack([layer.bias.detach()[None] for layer in place])) for place in zip(*every)]
+
+    def by_hand(x: Tensor) -> Tensor:
+        x = x * modules[0].frequency
+        for weight, bias in zip(weights[:-1], biases[:-1]):
+            x = torch.sin(torch.baddbmm(bias, x, weight))
+        return torch.baddbmm(biases[-1], x, weights[-1])
+
+    def loop(x: Tensor) -> Tensor:
+        return torch.stack([module(rows) for module, rows in zip(modules, x)])
+
+    return {
+        "router": (list(router.parameters()), lambda x: router(x, cells=labels.expand(k, x.shape[1]))),
+        "vmap": (list(stacked.values()), lambda x: mapped(stacked, x)),
+        "baddbmm": ([*weights, *biases], by_hand),
+        "loop": ([p for module in modules for p in module.parameters()], loop),
+    }
+
+
+def pictures() -> Tensor:
+    """Colours [IMAGES, SIDE * SIDE, 3]: smooth, with a disc in front."""
+    smooth = nn.functional.interpolate(torch.rand(IMAGES, 3, 6, 6), SIDE, mode="bicubic", align_corners=True)
+    centre, size = torch.rand(IMAGES, 1, 2) * 1.2 - 0.6, 0.2 + 0.3 * torch.rand(IMAGES, 1)
+    inside = (grid() - centre).norm(dim=-1) < size
+    return torch.where(inside[..., None], torch.rand(IMAGES, 1, 3), smooth.flatten(2).mT.clamp(0, 1))
+
+
+def grid() -> Tensor:
+    """Coordinates [SIDE * SIDE, 2] of pixels."""
+    line = torch.linspace(-1, 1, SIDE)
+    return torch.cartesian_prod(line, line)
+
+
+def step(run: Run, parameters: list[nn.Parameter], images: Tensor) -> Callable[[int], None]:
+    """A step of Adam on some pixels of each image, by its number."""
+    optimizer, places = torch.optim.Adam(parameters, lr=1e-2, fused=True), grid()
+
+    def once(number: int) -> None:
+        chosen = torch.randint(SIDE * SIDE, (IMAGES, PIXELS), generator=torch.Generator().manual_seed(number))
+        found, wanted = run(places[chosen]), images.gather(1, chosen[..., None].expand(-1, -1, 3))
+        optimizer.zero_grad()
+        (found - wanted).square().mean((1, 2)).sum().backward()
+        optimizer.step()
+
+    return once
+
+
+def call(run: Run, parameters: list[nn.Parameter], x: Tensor) -> Callable[[int], None]:
+    """Forward and backward."""
+
+    def once(_: int) -> None:
+        run(x).square().sum().backward()
+        for parameter in parameters:
+            parameter.grad = None
+
+    return once
+
+
+def row(options: Options, k: int, rows: int, images: Tensor | None = None) -> dict[str, Any]:
+    """What is measured of k networks with so many rows each; of steps with Adam on images."""
+    contenders, x = ways(k), torch.rand(k, rows, 2) * 2 - 1
+    expected = contenders["loop"][1](x)
+    for _, run in contenders.values():
+        torch.testing.assert_close(run(x), expected, atol=1e-4, rtol=1e-4)
+    runs = {
+        name: call(run, parameters, x) if images is None else step(run, parameters, images)
+        for name, (parameters, run) in contenders.items()
+    }
+    for once in runs.values():
+        once(0)
+    timings = measure(runs, dict.fromkeys(runs, options.seconds), Stopwatch(torch.device("cpu"), time.process_time))
+    found: dict[str, Any] = {f"{name}_ms": round(timing.median_ms, 2) for name, timing in timings.items()}
+    best = min(timing.median_ms for name, timing in timings.items() if name != "router")
+    found |= {"times_as_fast": round(best / timings["router"].median_ms, 2)}
+    if images is not None:
+        for number in range(options.steps):
+            runs["router"](number)
+        with torch.no_grad():
+            error = (contenders["router"][1](grid().expand(k, -1, -1)) - images).square().mean((1, 2))
+        found |= {"steps": options.steps, "psnr": round(float((-10 * error.log10()).mean()), 2)}
+    return {"networks": k, "rows": rows, "step": images is not None, **found}
+
+
+def main(options: Options) -> None:
+    """Prints a line for each row, and writes the results."""
+    torch.manual_seed(0)
+    results = []
+    with threads(1):
+        for k, rows in SIZES:
+            results.append(row(options, k, rows))
+            print(results[-1], flush=True)
+        results.append(row(options, IMAGES, PIXELS, pictures()))
+        print(results[-1], flush=True)
+        if options.json is not None:
+            write_text(options.json, json_text(metadata(benchmark="groups", results=results)))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
