@@ -169,7 +169,7 @@ def test_labels_are_checked(way: str) -> None:
         (3, TypeError, "cells must be an int32 or int64 tensor, got int"),
         (few[0], ValueError, "cells must have the leading shape of the samples, such as [n], got []"),
         (few.to("meta"), ValueError, "cells must be on the device of the parameters, cpu, got meta"),
-        (few[:7], ValueError, "x must be per sample [7, ...]"),
+        (few[:7], ValueError, "cells must have the leading shape of the samples, got [7] beside [8, 3]"),
         (None, ValueError, "cells must be given to each call of a router without centres"),
     ):
         with pytest.raises(kind, match=re.escape(f"VoronoiRouter: {message}")):

@@ -242,7 +242,7 @@ class VoronoiDiagram(nn.Module):
         It is made anew where centres have been changed in place.
         """
         centres = self.centres
-        few = self.depth > 1 or self.num_cells < MANY_CELLS
+        few = self.depth > 1 or self.num_cells < MANY_CELLS or centres.shape[1] == 0
         if few or centres.is_inference() or torch.compiler.is_compiling():
             return None
         kept = self._indexed

@@ -59,6 +59,12 @@ class Labels(NamedTuple):
         if not self.checked:
             _check_values(self.cells, k)
 
+    def check_shape(self, first: Tensor | None) -> None:
+        """Raises ValueError for labels that cannot have the leading shape of the first argument."""
+        if first is not None and any(1 != a != b != 1 for a, b in zip(self.cells.shape[:-1], first.shape)):
+            got = f"{list(self.cells.shape[:-1])} beside {list(first.shape)}"
+            raise ValueError(f"{_RULE} have the leading shape of the samples, got {got}")
+
 
 def _check_values(cells: Tensor, k: int) -> None:
     with outside():

@@ -775,6 +775,7 @@ class VoronoiRouter(nn.Module):
         self._ask_doubts()
         if isinstance(coords, Labels):
             coords.ensure(self.num_cells)
+            coords.check_shape(None if self.shared or self.per_ray else first_tensor(args, kwargs))
         called, like = getattr(self.module, method), kind_of(method, self.module.training, args, kwargs, coords)
         field = method == "forward" and self._given is not None
         if field and (each := each_direction(args, kwargs)) is not None:
