@@ -1,6 +1,7 @@
 // A step reads the whole gradient, and of the other three arrays only the cache lines that have one: most of a large
 // table's lines have none. A line is 16 floats, whatever an entry's number of features. Its update has no branches: an
-// entry of the line without a gradient is written back as it was. Each operation is rounded on its own (the build has
+// entry of the line without a gradient is written back as it was. A rule of all entries goes straight through the
+// arrays, which the processor foresees. Each operation is rounded on its own (the build has
 // contraction off), so that all instruction sets give the same bits.
 #include "encoding/adam_isa.h"
 
@@ -47,13 +48,18 @@ VN_INLINE void update(const AdamStep& rule, const float* gradient, float* parame
 void adam_block(const AdamStep& rule, const float* gradient, float* parameter, float* mean, float* square,
                 int64_t begin, int64_t end) {
   int64_t line = begin;
+  for (; rule.every && line + kLine <= end; line += kLine) {
+    for (int j = 0; j < kLine; j += kLanes) {
+      update(rule, gradient + line + j, parameter + line + j, mean + line + j, square + line + j);
+    }
+  }
   int32_t found[kLines];
   while (line + kLine <= end) {
     const int64_t lines = (end - line) / kLine < kLines ? (end - line) / kLine : kLines;
     int count = 0;
     for (int64_t i = 0; i < lines; ++i) {
       found[count] = static_cast<int32_t>(i * kLine);
-      count += rule.every || any(gradient + line + i * kLine);
+      count += any(gradient + line + i * kLine);
     }
     for (int i = 0; i < count; ++i) {
       if (i + kAhead < count) {
