@@ -59,26 +59,43 @@ void check(const ProgramInputs& in) {
   }
 }
 
-// Parameters of a cell, and where its sums go, on their way to the cache: of many small cells, each would be waited
-// for. Large ones take so long to run that reading them does not show, and would push out what is in use.
-void fetch(const ProgramCall& call, int64_t cell) {
-  constexpr int64_t kLine = 16, kMostFetched = 1 << 15;  // floats
+constexpr int64_t kMostFetched = 1 << 15;  // floats of a cell
+
+// Memory on its way to the cache, of which `code` floats in all are packed or summed: of many small cells, each would
+// be waited for. Large ones take so long to run that it does not show, and would push out what is in use.
+void fetch(const float* from, int64_t floats, bool writes) {
+  constexpr int64_t kLine = 16;  // floats
+  asm volatile("");              // GCC drops the calls of a function that does nothing but prefetch
+  for (int64_t i = 0; i < floats; i += kLine) {
+    if (writes) {
+      __builtin_prefetch(from + i, 1, 2);
+    } else {
+      __builtin_prefetch(from + i, 0, 2);
+    }
+  }
+}
+
+// The parameters of a cell, each once.
+void fetch_parameters(const ProgramCall& call, int64_t cell) {
   if (call.code.packed > kMostFetched) return;
+  uint64_t seen = 0;  // of the parameters, since most are packed twice
   for (int32_t p = 0; p < call.code.pack_count; ++p) {
     const ProgramPack& pack = call.code.packs[p];
-    if (pack.kind == ProgramPackKind::waves) continue;
+    const uint64_t bit = uint64_t{1} << (pack.parameter & 63);
+    if (pack.kind == ProgramPackKind::waves || (seen & bit) != 0) continue;
+    seen |= bit;
     const int64_t stride = call.strides[pack.parameter];
-    const float* from = static_cast<const float*>(call.parameters[pack.parameter]) + cell * stride;
-    for (int64_t i = 0; i < stride; i += kLine) __builtin_prefetch(from + i, 0, 2);
+    fetch(static_cast<const float*>(call.parameters[pack.parameter]) + cell * stride, stride, false);
   }
+}
+
+// The gradients of a cell, which are about to be written.
+void fetch_sums(const ProgramCall& call, int64_t cell) {
+  if (call.code.partial > kMostFetched) return;
   for (int32_t s = 0; s < call.code.sum_count; ++s) {
     const ProgramSum& sum = call.code.sums[s];
-    const bool seen = s > 0 && call.code.sums[s - 1].sum == sum.sum;
-    if (seen || sum.kind == ProgramSumKind::none) continue;
-    const float* to = call.sums[sum.sum] + cell * sum.size;
-    for (int64_t i = 0; i < sum.size; i += kLine) __builtin_prefetch(to + i, 1, 2);
+    if (s == 0 || call.code.sums[s - 1].sum != sum.sum) fetch(call.sums[sum.sum] + cell * sum.size, sum.size, true);
   }
-  asm volatile("");  // GCC leaves out calls of a function that does nothing but prefetch
 }
 
 // Rows of no cell.
@@ -450,10 +467,11 @@ void grouped_program_cpu(const Program& program, const ProgramInputs& given, con
     for_each_task(
         tasks, memory, stride, threads,
         [&](int64_t cell, float* own, bool first) { rows.pack(call, cell, first, own); },
-        [&](int64_t cell) { fetch(call, cell); },
+        [&](int64_t cell) { fetch_parameters(call, cell); },
         [&](const RowTask& task, float* own) {
           const bool alone = task.partial < 0;
           float* const to = alone ? own + own_partial : partial + task.partial * table.partial;
+          if (alone && summed) fetch_sums(call, task.cell);
           rows.run(call, task.cell, task.begin, task.end, own, to);
           if (alone && summed) rows.reduce(call, task.cell, to, 1);
         });
