@@ -85,7 +85,7 @@ def test_one_cell_and_as_many_cells_as_samples(centres):
 def test_samples_at_one_place(centres):
     same = torch.ones(50, 3)
     assert balance(same, torch.ones(50), 1, centres=centres).imbalance_after == 0.0
-    refuses("number of distinct samples, 1, got 2", balance, same, torch.ones(50), 2, centres=centres)
+    refuses("number of distinct points, 1, got 2", balance, same, torch.ones(50), 2, centres=centres)
     two = torch.cat([same, -same])
     result = balance(two, torch.ones(100), 2, centres=centres)
     assert result.after.tolist() == [50.0, 50.0]
@@ -127,7 +127,7 @@ NAN = float("nan")
     ("points", "importance", "k", "options", "error", "message"),
     [
         (POINTS, ONES, 0, {}, ValueError, "k must be at least 1 and steps at least 0, got 0"),
-        (POINTS, ONES, 10, {}, ValueError, "number of distinct samples, 9, got 10"),
+        (POINTS, ONES, 10, {}, ValueError, "number of distinct points, 9, got 10"),
         (torch.zeros(0, 3), torch.zeros(0), 1, {}, ValueError, "positive finite sum"),
         (POINTS, torch.zeros(9), 2, {}, ValueError, "positive finite sum, got 0"),
         (POINTS, ONES * NAN, 2, {}, ValueError, "importance must be finite"),

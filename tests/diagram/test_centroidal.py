@@ -1,11 +1,15 @@
 """Centroidal centres: against a plain loop, weighted, re-seeded, and nested."""
 
+import sys
+
 import pytest
 import torch
 from helpers import seeded
 
 from voronerf.diagram import VoronoiDiagram, balance, split_diagram
 from voronerf.diagram.balance import lloyd
+
+balance_module = sys.modules["voronerf.diagram.balance"]  # the package has a function of that name
 
 
 def blobs(seed=0, m=2000):
@@ -65,6 +69,17 @@ def test_a_cell_without_samples_goes_to_the_sample_that_costs_most():
     assert len({tuple(row) for row in found.tolist()}) == 3 and float(found.max()) <= 12
     found = lloyd(torch.zeros(3, 3), torch.ones(3).double(), torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
     assert torch.equal(found, torch.tensor([[0.0, 0, 0], [5, 0, 0]]))
+
+
+def test_more_centres_than_samples_of_mass_end_at_once(monkeypatch):
+    """Centres that no sample needs would be looked at in all steps."""
+    points, looks = torch.rand(60, 3, generator=seeded(0)), []
+    masses = torch.zeros(60).double()
+    masses[:5] = 1.0
+    find = balance_module.nearest_cell
+    monkeypatch.setattr(balance_module, "nearest_cell", lambda *given, **how: looks.append(1) or find(*given, **how))
+    assert torch.equal(lloyd(points, masses, points[:30]), points[:30])
+    assert len(looks) == 1
 
 
 def test_nested_cells_are_centroidal_among_the_samples_of_their_parent():

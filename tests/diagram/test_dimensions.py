@@ -98,6 +98,18 @@ def test_from_points_draws_of_many_and_takes_any_shape(generator: torch.Generato
     assert VoronoiDiagram.from_points(points, 4, left, generator=generator).centres[:, 0].max() < 0.1
 
 
+def test_from_points_takes_as_many_cells_as_distinct_points(generator: torch.Generator) -> None:
+    points = torch.rand(120_000, 3, generator=generator)
+    diagram = VoronoiDiagram.from_points(points, 25_000, centres="random", generator=generator)
+    assert diagram.centres.unique(dim=0).shape == (25_000, 3)
+    rare = torch.zeros(50_000, 2)
+    rare[:3] = torch.rand(3, 2, generator=generator) + 1
+    found = VoronoiDiagram.from_points(rare, 4, generator=generator).centres
+    assert torch.equal(found.unique(dim=0), rare[:4].unique(dim=0))
+    with pytest.raises(ValueError, match="k must be at most the number of distinct points, 4, got 5"):
+        VoronoiDiagram.from_points(rare, 5, generator=generator)
+
+
 def test_what_does_not_fit_is_refused(generator: torch.Generator) -> None:
     plane = VoronoiDiagram(torch.rand(4, 2, generator=generator))
     with pytest.raises(ValueError, match=r"centres must have shape \[k, d\], d = 1 to 4, got \[4, 5\]"):

@@ -100,7 +100,8 @@ def balance(
         v_i <- v_i + 0.05 * mean_{j in N(i)} (v_j - v_i) * (W_j - W_i) / norm_i,
 
     where N(i) are the 8 closest centres (all others if there are fewer), and `norm_i` is the largest W of i and N(i).
-    Light cells move towards heavy neighbours, and heavy cells away from light ones.
+    Light cells move towards heavy neighbours, and heavy cells away from light ones. Each update compares all pairs of
+    centres: balanced centres are for some hundreds of cells.
 
     Args:
         points: floating [m, d], finite.
@@ -115,7 +116,7 @@ def balance(
 
     Raises:
         ValueError: a wrong shape, an unknown choice, a value that is not finite, a negative importance, no importance
-            at all, k below 1, or more cells than distinct samples.
+            at all, k below 1, or more cells than distinct points.
         TypeError: points or importance that are not floating-point.
 
     Examples:
@@ -170,7 +171,7 @@ def first_centres(samples: Tensor, masses: Tensor, k: int, centres: str, generat
     """float32 [k, d] first centres from CPU samples float32 [m, d] of masses [m], which centroidal ones follow."""
     distinct, member = torch.unique(samples, dim=0, return_inverse=True)
     if k > distinct.shape[0]:
-        raise ValueError(f"balance: k must be at most the number of distinct samples, {distinct.shape[0]}, got {k}")
+        raise ValueError(f"balance: k must be at most the number of distinct points, {distinct.shape[0]}, got {k}")
     if centres == "uniform":
         return uniform_centres(torch.stack([samples.amin(0), samples.amax(0)]), k)
     # Sorting exponential variates divided by the weights draws without replacement in proportion to the weights
@@ -257,15 +258,16 @@ def lloyd(samples: Tensor, masses: Tensor, centres: Tensor, *, backend: str = "a
         costs = masses * (precise - centres.double()[cells]).square().sum(1)
         before, energy = energy, float(costs.sum())
         mass = torch.bincount(cells, weights=masses, minlength=k)
-        if before - energy <= _TOLERANCE * energy and bool((mass > 0).all()):
+        if energy == 0.0 or (before - energy <= _TOLERANCE * energy and bool((mass > 0).all())):
             break
         sums = torch.stack([torch.bincount(cells, weights=axis, minlength=k) for axis in weighted], 1)
         moved = torch.where(mass[:, None] > 0, sums / mass[:, None], centres.double())
         for empty in (mass == 0).nonzero().flatten().tolist():
             worst = int(costs.argmax())
-            if costs[worst] > 0:
-                moved[empty] = precise[worst]
-                costs = torch.minimum(costs, masses * (precise - precise[worst]).square().sum(1))
+            if costs[worst] == 0:
+                break
+            moved[empty] = precise[worst]
+            costs = torch.minimum(costs, masses * (precise - precise[worst]).square().sum(1))
         centres = moved.float()
     return centres
 

@@ -26,7 +26,7 @@ from voronerf.ops._core.checks import check_integer
 
 MANY_CELLS = 2048
 """Cells of a flat diagram from which it pays to keep an index."""
-_DECIDE = 20_000  # samples that place the centres of `from_points`
+_DECIDE, _DECIDE_CELL = 20_000, 4  # samples at least, and for each cell, that place the centres of `from_points`
 
 
 class VoronoiDiagram(nn.Module):
@@ -115,8 +115,8 @@ class VoronoiDiagram(nn.Module):
 
         Args:
             points: floating [..., d], finite, in the coordinates in which samples will be located: what the field is
-                given in a few batches of training. 20,000 of them, drawn at random, decide.
-            k: cells.
+                given in a few batches of training. 20,000 of them, drawn at random, decide, or four for each cell.
+            k: cells, at most as many as there are distinct points.
             importance: floating [...], >= 0, how much each of them counts; None for 1 each.
             centres: how they are placed, see `balance`.
             generator: CPU generator of the draws; None for torch's global one.
@@ -136,9 +136,11 @@ class VoronoiDiagram(nn.Module):
         """
         flat = points.detach().reshape(-1, points.shape[-1])
         weights = torch.ones_like(flat[:, 0]) if importance is None else importance.detach().reshape(-1)
-        if len(flat) > _DECIDE and len(weights) == len(flat):
-            drawn = torch.randperm(len(flat), generator=generator)[:_DECIDE].to(flat.device)
-            flat, weights = flat[drawn], weights[drawn]
+        count = max(_DECIDE, _DECIDE_CELL * k)
+        if len(flat) > count and len(weights) == len(flat):
+            drawn = torch.randperm(len(flat), generator=generator)[:count].to(flat.device)
+            if len(torch.unique(flat[drawn], dim=0)) >= k:  # else all of them are needed
+                flat, weights = flat[drawn], weights[drawn]
         return cls(balance(flat, weights, k, centres=centres, generator=generator).centres)
 
     @classmethod
