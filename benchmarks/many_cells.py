@@ -1,0 +1,112 @@
+"""Trainings of one scene with 1, 16 and very many cells, in the same time: PSNR, and what a step takes a sample.
+
+    python benchmarks/many_cells.py --data builtin-city:8x8 --cells 1 16 65536 --seconds 60 --json FILE
+
+All have the same field, rays and learning rate. After the coarse stage, a fifth of the time with one network, its
+samples place the centres (`VoronoiDiagram.from_points`), whose networks begin as copies of it; placing them counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from harness import Parser, metadata, threads
+
+from voronerf import OccupancyGrid, VoronoiDiagram, VoronoiRouter
+from voronerf.app.evaluate import evaluate, mean_scores
+from voronerf.app.files import write_text
+from voronerf.app.scenes import Scene, load_scene
+from voronerf.nerf import Adam, Occupancy, RayBatches, RayLoss, Renderer, TrainingStep
+from voronerf.nerf.fields import FIELDS
+from voronerf.nerf.schedule import GROUP, learning_rate
+
+COARSE = 0.2  # of the time
+
+
+def measure(scene: Scene, cells: int, options: argparse.Namespace) -> dict[str, Any]:
+    """Trains with so many cells."""
+    torch.manual_seed(0)
+    kind, generator, space = FIELDS[options.field], torch.Generator().manual_seed(0), scene.space()
+    field = kind.build(json.loads(options.options))
+    router = VoronoiRouter(field, torch.zeros(1, 3), coords="first3", way="fused", **kind.router_options)
+    grid = OccupancyGrid.for_training(scene.box, options.samples, contraction=space.contraction)
+    sampler = Occupancy(grid, options.samples, space=space)
+    renderer = Renderer({"field": router}, sampler).train()
+    optimizer = Adam.of({"field": router}, lr=options.lr, views=len(scene.train), sparse=kind.sparse_parameters)
+    where: dict[str, Any] = {
+        "near": scene.near,
+        "far": scene.far,
+        "box": scene.box,
+        "background": scene.background_colour(),
+    }
+    batches = RayBatches(scene.train.cameras, scene.train.images, masks=scene.train.masks, **where)
+    training_step = TrainingStep(batches, RayLoss(renderer), optimizer, generator=generator)
+    step = samples = since = 0
+    points, placed, spent, start = list[torch.Tensor](), 0.0, 0.0, time.process_time()
+    while (fraction := (time.process_time() - start) / options.seconds) < 1:
+        if router.num_cells < cells and fraction > COARSE and sum(map(len, points)) >= 4 * cells:
+            began = time.process_time()
+            diagram = VoronoiDiagram.from_points(torch.cat(points), cells, generator=generator)
+            router.subdivide(diagram, optimizer=optimizer)
+            placed = time.process_time() - began
+            points, samples, since, spent = [], 0, 0, 0.0
+        optimizer.set_learning_rate(learning_rate(options.lr, fraction, step + GROUP // 2, hold=0.25))
+        began = time.process_time()
+        made = training_step(options.rays, GROUP, at=step)
+        if since:  # the first is recorded
+            spent += time.process_time() - began
+            samples += GROUP * made.samples
+        step, since = step + GROUP, since + 1
+        if router.num_cells < cells and fraction > COARSE / 2:
+            points.append(made.output.samples.inputs.detach().clone())
+    with optimizer.averaged():
+        sampler.finish(router, seed=0)
+        psnr = mean_scores(evaluate(renderer, scene, views=options.views))["psnr"]
+    timed = (since - 1) * GROUP
+    return {
+        "cells": router.num_cells,
+        "psnr": psnr,
+        "steps": step,
+        "ms": 1e3 * spent / timed,
+        "samples": samples / timed,
+        "us_a_sample": 1e6 * spent / samples,
+        "placing_s": placed,
+        "parameters": sum(p.numel() for p in router.parameters()),
+    }
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Prints the results, and writes the JSON."""
+    parser = Parser("many_cells", description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--data", default="builtin-city:8x8")
+    parser.add_argument("--cells", type=int, nargs="+", default=[1, 16, 65_536])
+    parser.add_argument("--seconds", type=float, default=60.0, help="of processor time, for each")
+    parser.add_argument("--field", default="nerf")
+    parser.add_argument("--options", default='{"width": 16, "depth": 1, "position_octaves": 5}', help="of the field")
+    parser.add_argument("--rays", type=int, default=1024, help="of a step")
+    parser.add_argument("--samples", type=int, default=128, help="strata of a ray")
+    parser.add_argument("--lr", type=float, default=0.01)
+    parser.add_argument("--views", type=int, default=24, help="that are evaluated")
+    parser.add_argument("--downscale", type=int, default=2)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the results go as well")
+    options = parser.parse_args(arguments)
+    scene, results = load_scene(options.data, downscale=options.downscale), []
+    print("| cells | PSNR [dB] | steps | step [ms] | samples a step | a sample [us] |\n|---|---|---|---|---|---|")
+    for cells in options.cells:
+        with threads(1):
+            results.append(each := measure(scene, cells, options))
+        row = f"{each['psnr']:.2f} | {each['steps']} | {each['ms']:.1f} | {each['samples']:,.0f}"
+        print(f"| {each['cells']:,} | {row} | {each['us_a_sample']:.2f} |", flush=True)
+    if options.json is not None:
+        asked = {name: value for name, value in vars(options).items() if name != "json"}
+        known = metadata(command="python benchmarks/many_cells.py", benchmark="many_cells", seed=0, **asked)
+        write_text(options.json, json.dumps({"metadata": known, "results": results}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
