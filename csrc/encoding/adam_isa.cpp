@@ -1,8 +1,8 @@
 // A step reads the whole gradient, and of the other three arrays only the cache lines that have one: most of a large
 // table's lines have none. A line is 16 floats, whatever an entry's number of features. Its update has no branches: an
 // entry of the line without a gradient is written back as it was. A rule of all entries goes straight through the
-// arrays, which the processor foresees. Each operation is rounded on its own (the build has
-// contraction off), so that all instruction sets give the same bits.
+// arrays, which the processor foresees. Each operation is rounded on its own (the build has contraction off), so that
+// all instruction sets give the same bits.
 #include "encoding/adam_isa.h"
 
 #include "common/memory_tile.h"

@@ -61,8 +61,8 @@ void check(const ProgramInputs& in) {
 
 constexpr int64_t kMostFetched = 1 << 15;  // floats of a cell
 
-// Memory on its way to the cache, of which `code` floats in all are packed or summed: of many small cells, each would
-// be waited for. Large ones take so long to run that it does not show, and would push out what is in use.
+// Memory of a cell on its way to the cache: of many small cells, each would be waited for. Large ones take so long to
+// run that it does not show, and would push out what is in use.
 void fetch(const float* from, int64_t floats, bool writes) {
   constexpr int64_t kLine = 16;  // floats
   asm volatile("");              // GCC drops the calls of a function that does nothing but prefetch
@@ -94,6 +94,7 @@ void fetch_sums(const ProgramCall& call, int64_t cell) {
   if (call.code.partial > kMostFetched) return;
   for (int32_t s = 0; s < call.code.sum_count; ++s) {
     const ProgramSum& sum = call.code.sums[s];
+    if (sum.size > kMostFetched) continue;  // of a table
     if (s == 0 || call.code.sums[s - 1].sum != sum.sum) fetch(call.sums[sum.sum] + cell * sum.size, sum.size, true);
   }
 }
