@@ -6,7 +6,7 @@
 
 namespace voronerf {
 
-VN_STRUCT(SeeCells, centres, child_offsets, child, index, m, depth);
+VN_STRUCT(SeeCells, centres, child_offsets, child, centre_index, m, depth);
 VN_STRUCT(SeeRule, density_scale, activated, opaque, wave, background, background_per_ray);
 VN_STRUCT(SeeOutputs, colour, opacity, depth, light, heaviest);
 

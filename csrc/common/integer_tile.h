@@ -33,7 +33,8 @@ VN_INLINE I32 right(I32 a, int bits) { return _mm512_maskz_srl_epi32(0xffff, a, 
 VN_INLINE Mask less(I32 a, I32 b) { return _mm512_cmplt_epi32_mask(a, b); }
 VN_INLINE F32 divide(F32 a, F32 b) { return _mm512_div_ps(a, b); }
 VN_INLINE int32_t smallest(I32 a) {
-  const __m256i half = _mm256_min_epi32(_mm512_maskz_extracti64x4_epi64(0xf, a, 0), _mm512_maskz_extracti64x4_epi64(0xf, a, 1));
+  const __m256i half =
+      _mm256_min_epi32(_mm512_maskz_extracti64x4_epi64(0xf, a, 0), _mm512_maskz_extracti64x4_epi64(0xf, a, 1));
   return smallest_of_eight(half);
 }
 // Towards zero; of a number that an int32 holds.

@@ -36,14 +36,18 @@ bool is_before(const Centre<T, D>& centre, int axis, const Pivot<T>& pivot) {
 }
 
 // Moves centres before and behind the middle to its sides, as Floyd and Rivest's selection does ("Expected time bounds
-// for selection", 1975): a pivot from a sample, at the middle's place in it.
+// for selection", 1975): a pivot from a sample, at the middle's place in it. Its places are drawn, since centres may
+// come in any regular order.
 template <typename T, int D>
 void select_middle(Centre<T, D>* centres, int64_t begin, int64_t end, int64_t middle, int axis) {
+  uint64_t state = static_cast<uint64_t>(middle);
   while (end - begin > kFew) {
     Pivot<T> sample[kSample];
-    for (int i = 0; i < kSample; ++i) {
-      const Centre<T, D>& taken = centres[begin + (end - begin - 1) * i / (kSample - 1)];
-      sample[i] = {taken.at[axis], taken.number};
+    for (Pivot<T>& each : sample) {
+      state = 6364136223846793005u * state + 1442695040888963407u;  // Knuth's generator
+      const Centre<T, D>& taken =
+          centres[begin + static_cast<int64_t>((state >> 33) % static_cast<uint64_t>(end - begin))];
+      each = {taken.at[axis], taken.number};
     }
     std::sort(sample, sample + kSample, [](const Pivot<T>& a, const Pivot<T>& b) {
       return (a.value < b.value) | ((a.value == b.value) & (a.number < b.number));
@@ -77,6 +81,10 @@ class Builder {
       }
       centres_[i].number = static_cast<int32_t>(i);
     }
+    std::fill_n(index, kHead, 0);
+    index[0] = static_cast<int32_t>(k);
+    index[1] = D;
+    index[2] = sizeof(T);
     // Boxes of no children, beyond all bounds.
     T* const root = values(0, 0, shape_.node_words);
     for (int i = 0; i < D * kWide && shape_.levels > 0; ++i) {

@@ -3,8 +3,9 @@
 // 2^bits leaves of at most 16 centres, by bits splits at the median of the longest axis (Bentley, "Multidimensional
 // binary search trees", 1975), of which four at a time are one node: it holds the boxes of its 16 children, one axis
 // after another, as a leaf holds the coordinates of its centres and then their numbers. The root has the splits that
-// four do not divide. Where everything lies follows from k, so memory is the numbers alone: nodes level by level, then
-// leaves, of at most 64 bytes a centre with k = 2^i + 1 in three coordinates of float32, half of that with k = 2^i.
+// four do not divide. Where everything lies follows from k: a head that says what the index is of, nodes level by
+// level, leaves. In three coordinates of float32 that is 18 bytes a centre where k is a power of two, and 36 where it
+// is one more.
 #pragma once
 
 #include <cstdint>
@@ -14,9 +15,10 @@
 
 namespace voronerf {
 
-constexpr int kWide = 16;      // children of a node, centres of a leaf
+constexpr int kWide = 16;       // children of a node, centres of a leaf
 constexpr int kMostLevels = 7;  // of nodes, above 2^27 leaves
 constexpr int kMostAxes = 4;
+constexpr int kHead = 16;  // words
 
 struct CentreIndexShape {
   int64_t k, leaves, words;  // words: int32 of memory
@@ -35,7 +37,7 @@ VN_HD CentreIndexShape centre_index_shape(int64_t k, int d, int bytes) {
   shape.levels = (shape.bits + 3) / 4;
   shape.node_words = 2 * d * kWide * (bytes / 4);
   shape.leaf_words = kWide * (d * (bytes / 4) + 1);
-  int64_t nodes = 1, word = 0;
+  int64_t nodes = 1, word = kHead;
   for (int level = 0; level < shape.levels; ++level) {
     shape.level_word[level] = word;
     word += nodes * shape.node_words;
@@ -44,6 +46,11 @@ VN_HD CentreIndexShape centre_index_shape(int64_t k, int d, int bytes) {
   shape.level_word[shape.levels] = word;
   shape.words = word + shape.leaves * shape.leaf_words;
   return shape;
+}
+
+// Whether an index is of k centres of d coordinates of so many bytes.
+VN_HD bool is_index_of(const int32_t* index, int64_t k, int d, int bytes) {
+  return index[0] == static_cast<int32_t>(k) && index[1] == d && index[2] == bytes;
 }
 
 // int32 of memory for k centres of d coordinates of so many bytes.

@@ -1,5 +1,5 @@
-// Searching an index of centres, once for each instruction set: a point at a time, all children of a node or all centres
-// of a leaf in the lanes.
+// Searching an index of centres, once for each instruction set: a point at a time, all children of a node or all
+// centres of a leaf in the lanes.
 //
 // Nearest child first; a box that is farther than the best is left out, with all that it holds. The squared distance of
 // a box is computed by the operations of a centre's, each of which rounds in the order of its operands, so it is never
@@ -127,8 +127,8 @@ VN_INLINE F32 box_distance(const float* low, const F32* point) {
   return sum;
 }
 
-// The answer for one point, and where it lies in the index, if float32 decides; `bound` is a distance within which there
-// is a centre.
+// The answer for one point, and where it lies in the index, if float32 decides; `bound` is a distance within which
+// there is a centre.
 struct Found {
   const float* at;  // first coordinate of the centre; null where float32 does not decide
   int32_t cell;
@@ -218,7 +218,8 @@ void search_all(const float* points, const int32_t* index, int32_t* cells, int64
     float bound = kHuge;
     if (before != nullptr) {
       float v = 0.0f;
-      for (int axis = 0; axis < D; ++axis) v += (point[axis] - before[axis * kWide]) * (point[axis] - before[axis * kWide]);
+      for (int axis = 0; axis < D; ++axis)
+        v += (point[axis] - before[axis * kWide]) * (point[axis] - before[axis * kWide]);
       bound = v + 2.0f * (kMargin * v + kFloor);
       bound = bound < kHuge ? bound : kHuge;
     }
@@ -237,8 +238,8 @@ void search_all(const double* points, const int32_t* index, int32_t* cells, int6
 }
 
 template <typename T>
-VN_INLINE void search_in(const T* points, const int32_t* index, int32_t* cells, int64_t n, const CentreIndexShape& shape,
-                         int d) {
+VN_INLINE void search_in(const T* points, const int32_t* index, int32_t* cells, int64_t n,
+                         const CentreIndexShape& shape, int d) {
   switch (d) {
     case 1:
       return search_all<1>(points, index, cells, n, shape);

@@ -46,7 +46,8 @@ bool nearest_centre_cpu(const T* points, const T* centres, const int32_t* index,
                         int64_t d, int64_t words, Isa isa, int threads) {
   if (d < 1 || d > kMostAxes) return false;
   const CentreIndexShape shape = centre_index_shape(k, static_cast<int>(d), sizeof(T));
-  if (index != nullptr && words != shape.words) return false;
+  if (index != nullptr && (words != shape.words || !is_index_of(index, k, static_cast<int>(d), sizeof(T))))
+    return false;
   std::unique_ptr<int32_t[]> made;
   std::unique_ptr<T[]> padded;
   if (index == nullptr && index_pays(n, k, d)) {

@@ -1,8 +1,8 @@
-// Nearest centre on CUDA. By all centres: a thread has two points, centres come through shared memory in tiles that every
-// thread of the block reads at the same address (a broadcast), once for both points. By an index: half of a warp has a
-// point, each of its threads a child of a node or a centre of a leaf, as a lane of the CPU has (centre_index_isa.cpp).
-// Float32 input is screened and, rarely, decided again in float64 by nearest_centre_math.h, with the same answer as on
-// the CPU to the last index.
+// Nearest centre on CUDA. By all centres: a thread has two points, centres come through shared memory in tiles that
+// every thread of the block reads at the same address (a broadcast), once for both points. By an index: half of a warp
+// has a point, each of its threads a child of a node or a centre of a leaf, as a lane of the CPU has
+// (centre_index_isa.cpp). Float32 input is screened and, rarely, decided again in float64 by nearest_centre_math.h,
+// with the same answer as on the CPU to the last index.
 #include "common/cuda_wrappers.h"
 #include "geometry/nearest_centre.h"
 #include "geometry/nearest_centre_math.h"
@@ -43,7 +43,7 @@ __global__ void __launch_bounds__(kThreads, 4)
     }
     __syncthreads();
     const int32_t number = static_cast<int32_t>(start);
-#pragma unroll 4
+#pragma unroll(D < 3 ? 2 : 4)
     for (int j = 0; j < count; ++j) {
       const float4 c = tile[j];
 #pragma unroll
@@ -192,11 +192,12 @@ __global__ void __launch_bounds__(kThreads)
   const int lane = threadIdx.x % kWide, half = threadIdx.x % 32 / kWide * kWide;
   const int64_t counted = rows == nullptr ? n : *rows;
   const int64_t first = (static_cast<int64_t>(blockIdx.x) * (kThreads / kWide) + threadIdx.x / kWide) * kRun;
+  const bool fits = is_index_of(index, shape.k, D, sizeof(T));
   int32_t before = -1;  // the cell of the point before
   for (int64_t i = first; i < first + kRun; ++i) {
     float near[D];
     double exact[D];
-    bool wanted = i < n && i < counted;
+    bool wanted = fits && i < n && i < counted;
     for (int axis = 0; axis < D; ++axis) {
       exact[axis] = wanted ? static_cast<double>(points[D * i + axis]) : 0.0;
       near[axis] = static_cast<float>(exact[axis]);
@@ -213,8 +214,7 @@ __global__ void __launch_bounds__(kThreads)
         }
         bound = fminf(v + 2.0f * (kMargin * v + kFloor), bound);
       }
-      const Seen<float> seen =
-          search<D, float, int32_t, T>(near, wanted, bound, index, shape, own);
+      const Seen<float> seen = search<D, float, int32_t, T>(near, wanted, bound, index, shape, own);
       const float best = least_of_half(seen.best);
       const bool owns = seen.best == best;
       const unsigned owners = __ballot_sync(kAllLanes, owns) >> half & 0xffffu;
@@ -233,7 +233,7 @@ __global__ void __launch_bounds__(kThreads)
       if (!certain) cell = found;
     }
     before = wanted ? cell : -1;
-    if (lane == 0 && i < n) cells[i] = i < counted ? cell : -1;
+    if (lane == 0 && i < n) cells[i] = fits && i < counted ? cell : -1;
   }
 }
 

@@ -2,7 +2,8 @@
 // points to cell 0 (nearest_centre_math.h). k >= 1; n = 0 is legal.
 //
 // index: of these centres (centre_index.h), with `words` entries, or null. Without one the CPU makes one for the call
-// where that pays. False where d or `words` is wrong.
+// where that pays. False where d is wrong, or the index is of others: of as many words, a GPU finds out by itself, and
+// gives -1.
 #pragma once
 
 #include <cstdint>

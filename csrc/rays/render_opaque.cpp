@@ -165,17 +165,17 @@ class Pool {
       return true;
     }
     int32_t *cell = samples_.cell.data(), *order = samples_.order.data();
-    if (cells.index != nullptr) {
-      search_index_serial(positions, cells.index, cell, in.n, centre_index_shape(cells.m, 3, sizeof(float)), 3, call_.isa);
+    if (cells.centre_index != nullptr) {
+      search_index_serial(positions, cells.centre_index, cell, in.n, centre_index_shape(cells.m, 3, sizeof(float)), 3,
+                          call_.isa);
     } else if (cells.child == nullptr) {
       nearest_centre_serial(positions, cells.centres, cell, in.n, cells.m, call_.isa);
     } else if (!locate_cell_cpu(positions, cells.centres, cells.child_offsets, cells.child, cell, descent_.data(), in.n,
                                 cells.m, cells.depth, call_.isa, 1)) {
       return false;
     }
-    cell_sort_cpu(cell, order, cell_offsets_.data(), in.n, in.k, 1);
     in.order = order;
-    return true;
+    return cell_sort_cpu(cell, order, cell_offsets_.data(), in.n, in.k, 1);
   }
 
   // Rays that have ended.

@@ -15,7 +15,7 @@ namespace voronerf {
 struct SeeCells {
   const float* centres;
   const int32_t *child_offsets, *child;
-  const int32_t* index;  // of a flat diagram's centres (centre_index.h), or null
+  const int32_t* centre_index;  // of a flat diagram's centres (centre_index.h), or null
   int64_t m;
   int depth;
 };

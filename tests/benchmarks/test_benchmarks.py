@@ -184,6 +184,7 @@ def test_what_is_compared_is_right_in_every_small_case():
     lookup, sampling, marching = cases_lookup, cases_sampling, cases_marching
     works = {
         "nearest_centre": lookup._nearest_work(500, 7, torch.float32, CPU),
+        "by an index": lookup._nearest_work(500, 70, torch.float32, CPU, d=1, kind="heavy-tailed", way=lookup.MADE),
         "locate_cell": lookup._locate_work(500, (4, 3), CPU),
         "cell_sort": lookup._sort_work(500, 7, CPU),
         "resample": sampling._resample_work(512, CPU),

@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers import seeded
 
+from voronerf import ops
 from voronerf.diagram import VoronoiDiagram, balance, split_diagram
 from voronerf.diagram.balance import lloyd
 
@@ -76,8 +77,8 @@ def test_more_centres_than_samples_of_mass_end_at_once(monkeypatch):
     points, looks = torch.rand(60, 3, generator=seeded(0)), []
     masses = torch.zeros(60).double()
     masses[:5] = 1.0
-    find = balance_module.nearest_cell
-    monkeypatch.setattr(balance_module, "nearest_cell", lambda *given, **how: looks.append(1) or find(*given, **how))
+    find = ops.nearest_centre
+    monkeypatch.setattr(ops, "nearest_centre", lambda *given, **how: looks.append(1) or find(*given, **how))
     assert torch.equal(lloyd(points, masses, points[:30]), points[:30])
     assert len(looks) == 1
 

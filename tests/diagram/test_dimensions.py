@@ -50,9 +50,15 @@ def test_many_cells_have_an_index(d: int, generator: torch.Generator) -> None:
     index = diagram.index()
     assert diagram.index() is index  # kept
     assert is_right(copy.deepcopy(diagram)) and is_right(pickle.loads(pickle.dumps(diagram)))
-    with torch.no_grad():
-        diagram.centres.neg_()  # in place: the index is of what was there
+    diagram.centres.neg_()  # in place: the index is of what was there
     assert is_right(diagram)
+    diagram.centres.data.copy_(torch.rand(2500, d, generator=generator))  # no version tells of it
+    assert is_right(diagram)
+    assert torch.equal(diagram.locate(points.double()), diagram.locate(points))
+    compiled = torch.compile(diagram.locate, fullgraph=True, backend="eager")
+    assert torch.equal(compiled(points), diagram.locate(points))
+    assert diagram.to("meta").locate(points.to("meta")).shape == (200,)
+    diagram = VoronoiDiagram(torch.rand(2500, d, generator=generator))
     other = VoronoiDiagram(torch.rand(3000, d, generator=generator))
     diagram.load_state_dict(other.state_dict())
     assert is_right(diagram) and torch.equal(diagram.locate(points), other.locate(points))

@@ -39,12 +39,12 @@ def test_enumerations_have_the_names_that_users_write() -> None:
 def test_what_does_not_fit_a_signature_is_refused() -> None:
     compiled, cpu = native.compiled, native.cpu()
     points, cells = torch.rand(4, 3), torch.empty(4, dtype=torch.int32)
-    compiled.nearest_centre(points, points.clone(), cells, 4, 4, cpu)
+    compiled.nearest_centre(points, points.clone(), None, cells, 4, 4, 3, 0, cpu)
     for wrong in (points.half(), points.double(), points.tolist(), 0):
         with pytest.raises(TypeError, match="incompatible function arguments"):
-            compiled.nearest_centre(points, wrong, cells, 4, 4, cpu)
+            compiled.nearest_centre(points, wrong, None, cells, 4, 4, 3, 0, cpu)
     with pytest.raises(TypeError, match="incompatible function arguments"):  # a result that is not contiguous
-        compiled.nearest_centre(points, points, torch.empty(8, dtype=torch.int32)[::2], 4, 4, cpu)
+        compiled.nearest_centre(points, points, None, torch.empty(8, dtype=torch.int32)[::2], 4, 4, 3, 0, cpu)
     sizes = {"encoding": "frequency", "n": 4, "d": 3, "size": 1, "include_input": True, "width": 9}
     with pytest.raises(TypeError, match=r"^Encoding: x is no const float32\*$"):
         compiled.encode(compiled.Encoding(x=points.double(), variances=None, **sizes), torch.empty(4, 9), cpu)

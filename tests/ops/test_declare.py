@@ -27,7 +27,7 @@ def test_memory_follows_letters_arguments_and_dtypes():
     order, offsets = op.allocate(op.Inputs(torch.zeros(5, dtype=torch.int32), 3))
     assert order.shape == (5,) and offsets.shape == (4,) and offsets.dtype == torch.int32
     sort = declared("nearest_centre")
-    assert sort.allocate(sort.Inputs(torch.zeros(5, 3).double(), torch.zeros(2, 3).double())).dtype == torch.int32
+    assert sort.allocate(sort.Inputs(torch.zeros(5, 3).double(), torch.zeros(2, 3).double(), None)).dtype == torch.int32
 
 
 def test_letters_of_either_form():

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import time
+
 import pytest
 import torch
 from op_cases import FLOATS, HALVES, need, refusals
@@ -67,8 +69,11 @@ def test_is_not_differentiable(device, backend):
 
 
 def some_centres(kind, k, d, dtype):
-    """k centres: anywhere, on a lattice with many at one place, most of them close together, or all at one place."""
+    """k centres: anywhere, on a lattice with many at one place, most of them close together, all at one
+    place, or on a line that is gone along four times."""
     found = torch.randn(k, d, dtype=torch.float64)
+    if kind == "in turns":
+        found = torch.linspace(0, 1, k // 4 + 1, dtype=torch.float64).repeat(4)[:k, None].expand(k, d)
     if kind == "lattice":
         found = torch.randint(-4, 5, (k, d)).double()
     if kind == "heavy-tailed":
@@ -78,11 +83,13 @@ def some_centres(kind, k, d, dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("d", [1, 2, 3, 4])
-@pytest.mark.parametrize("kind", ["normal", "lattice", "heavy-tailed", "one place"])
+@pytest.mark.parametrize("kind", ["normal", "lattice", "heavy-tailed", "one place", "in turns"])
 def test_an_index_finds_the_same_centres(device, backend, kind, d, dtype):
     for k in (1, 16, 17, 33, 300, 4097):
         centres = some_centres(kind, k, d, dtype)
-        points = torch.cat([some_centres(kind, 150, d, dtype), torch.randint(-9, 10, (150, d)).to(dtype) / 2, centres[:9]])
+        points = torch.cat(
+            [some_centres(kind, 150, d, dtype), torch.randint(-9, 10, (150, d)).to(dtype) / 2, centres[:9]]
+        )
         points[7], points[70, 0], points[71, 0], points[72] = 1e30, torch.nan, -torch.inf, 1e-42
         expected = nearest_centre(points, centres, backend="reference")
         for index in (None, index_centres(centres.to(device))):
@@ -95,6 +102,16 @@ def test_many_centres_and_points_without_an_index(device, backend):
     points, centres = torch.rand(1500, 3), torch.rand(3000, 3)
     found = nearest_centre(points.to(device), centres.to(device), backend=backend)
     assert torch.equal(found.cpu(), nearest_centre(points, centres, backend="reference"))
+
+
+def test_centres_in_turns_take_as_long_as_others():
+    """A sample at equal distances would see one part of each turn alone."""
+    seconds = []
+    for centres in (torch.rand(200_000, 1), torch.linspace(0, 1, 20_000).repeat(10)[:, None]):
+        begin = time.process_time()
+        index_centres(centres)
+        seconds.append(time.process_time() - begin)
+    assert seconds[1] < 5 * seconds[0] + 0.1
 
 
 def test_an_index_of_centres_that_are_no_numbers_harms_nothing():
@@ -113,9 +130,12 @@ def test_errors():
     for backend in ("reference", "auto"):
         refuses("centres must have shape [k, d], d = 1 to 4, got [2, 5]", **many, backend=backend)
     if (other := index_centres(torch.rand(20, 3))) is not None:
-        refuses("index must be of these centres, int32 [64], got [224]", index=other)
+        refuses("index must be of these centres, float32 [2, 3], got int32 [240]", index=other)
+        refuses("index must be of these centres, float32 [2, 3], got int32 [0]", index=other[:0])
+        many = {"points": points, "centres": torch.rand(25, 3)}
+        refuses("index must be of these centres, float32 [25, 3], got one of float32 [20, 3]", index=other, **many)
         double = {"points": points.double(), "centres": centres.double()}
-        refuses("index must be of these centres, int32 [112], got [64]", index=other[:64], **double)
+        refuses("index must be of these centres, float64 [2, 3], got int32 [64]", index=other[:64], **double)
     for kind, given, message in (
         (ValueError, torch.rand(0, 3), "index_centres: centres must hold at least one centre, got none"),
         (ValueError, torch.rand(3), "index_centres: centres must have shape"),

@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.utils._python_dispatch import _disable_current_modes
 
 from voronerf import ops
 from voronerf.diagram.balance import balance, in_space, in_torch
@@ -25,7 +26,7 @@ from voronerf.diagram.drawing import draw_cell
 from voronerf.ops._core.checks import check_integer
 
 MANY_CELLS = 2048
-"""Cells of a flat diagram from which it pays to keep an index."""
+"""A flat diagram of as many cells keeps an index."""
 _DECIDE, _DECIDE_CELL = 20_000, 4  # samples at least, and for each cell, that place the centres of `from_points`
 
 
@@ -139,7 +140,8 @@ class VoronoiDiagram(nn.Module):
         count = max(_DECIDE, _DECIDE_CELL * k)
         if len(flat) > count and len(weights) == len(flat):
             drawn = torch.randperm(len(flat), generator=generator)[:count].to(flat.device)
-            if len(torch.unique(flat[drawn], dim=0)) >= k:  # else all of them are needed
+            enough = len(torch.unique(flat[drawn], dim=0)) >= k and bool((weights[drawn] > 0).any())
+            if enough:  # else all of them are needed
                 flat, weights = flat[drawn], weights[drawn]
         return cls(balance(flat, weights, k, centres=centres, generator=generator).centres)
 
@@ -239,17 +241,24 @@ class VoronoiDiagram(nn.Module):
         return cells.reshape(points.shape[:-1])
 
     def index(self) -> Tensor | None:
-        """The index of a flat diagram of `MANY_CELLS` (`voronerf.ops.index_centres`), which is kept for later calls.
+        """An index of the centres (`voronerf.ops.index_centres`), kept for later calls.
 
-        It is made anew where centres have been changed in place.
+        It is made anew where centres have changed: on the CPU they are compared, 12 bytes a centre; on a GPU, which
+        would be waited for, only their version counter and their address are.
+
+        Returns:
+            int32 [w]; None for a nested diagram, less than `MANY_CELLS` cells, or centres that are traced.
         """
         centres = self.centres
-        few = self.depth > 1 or self.num_cells < MANY_CELLS or centres.shape[1] == 0
-        if few or centres.is_inference() or torch.compiler.is_compiling():
+        if self.depth > 1 or self.num_cells < MANY_CELLS or centres.shape[1] == 0 or torch.compiler.is_compiling():
             return None
-        kept = self._indexed
-        if kept is None or kept[0].data_ptr() != centres.data_ptr() or kept[1] != centres._version:
-            kept = self._indexed = centres.detach(), centres._version, ops.index_centres(centres)
+        if type(centres) is not Tensor or centres.is_meta or torch._C._are_functorch_transforms_active():
+            return None
+        kept, version = self._indexed, 0 if centres.is_inference() or not centres.is_cuda else centres._version
+        if kept is None or not _is_same(*kept[:2], centres, version):
+            with _disable_current_modes():
+                seen = centres.detach() if centres.is_cuda else centres.detach().clone()
+                kept = self._indexed = seen, version, ops.index_centres(centres.float())
         return kept[2]
 
     def sample_cell(
@@ -409,6 +418,16 @@ class VoronoiDiagram(nn.Module):
             loaded = VoronoiDiagram.from_state(state_dict, prefix)
             self._set_tables(loaded.centres.to(device), loaded.child_offsets.to(device), loaded.child.to(device))
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _is_same(seen: Tensor, version: int, centres: Tensor, now: int) -> bool:
+    """Whether centres are those that an index was made of."""
+    if seen.device != centres.device or seen.dtype != centres.dtype:
+        return False
+    if centres.is_cuda:
+        return seen.data_ptr() == centres.data_ptr() and version == now
+    with _disable_current_modes():  # a recorded step has nothing to do with it
+        return torch.equal(seen, centres)
 
 
 def _check_centres(centres: Tensor, least: int = 1) -> None:

@@ -548,8 +548,6 @@ class TrainingStep:
         dictionaries += [*map(vars, known.router.module.modules()), optimizer.state, *optimizer.state.values()]
         for members in dictionaries:
             guard.contents(members)
-        if known.router.diagram.index() is not None:  # it is made anew where centres change in place
-            guard.attributes(known.router.diagram.centres, ["_version"])
         guard.contents(vars(optimizer), ["steps_done"])
         learning = list[nn.Parameter]()
         for group in optimizer.param_groups:
@@ -573,6 +571,7 @@ class TrainingStep:
             torch.is_grad_enabled,
             torch.are_deterministic_algorithms_enabled,
             self._scales,
+            known.router.diagram.index,  # another one where centres have changed in place
             functools.partial(torch.is_autocast_enabled, kind),
             functools.partial(torch.get_autocast_dtype, kind),
             self._precision,

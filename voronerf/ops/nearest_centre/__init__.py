@@ -35,15 +35,16 @@ def nearest_centre(
     Args:
         points: n < 2**31, d = 1 to 4. float16 and bfloat16 are compared in float32.
         centres: finite, k >= 1.
-        index: of these centres, as `index_centres` makes it, with which the time grows by log k; the cells are the same.
-            Without one, the CPU makes one for a call in which that pays: from 2,048 centres and 1,024 points on. Plain
+        index: what `index_centres` has made of these centres: the time then grows by log k, and cells are the same.
+            Without one, the CPU makes one for a call in which that pays, from 2,048 centres and 1,024 points on. Plain
             PyTorch and Warp do without.
 
     Returns:
         cells int32 [n], in 0 to k - 1.
 
     Raises:
-        ValueError: d above 4, or an index of another number or type of centres.
+        ValueError: d above 4, or an index of another number, size or dtype of centres, which a GPU does not look at:
+            there all cells are -1.
 
     Examples:
         >>> import torch
@@ -65,7 +66,7 @@ def index_centres(centres: Tensor) -> Tensor | None:
         centres: floating [k, d], d = 1 to 4, finite.
 
     Returns:
-        int32 [w], on the device of the centres; None without the compiled module.
+        int32 [w], on the device of the centres; None without the compiled module, and of a meta tensor.
 
     Raises:
         TypeError: not a floating-point tensor.
@@ -83,7 +84,7 @@ def index_centres(centres: Tensor) -> Tensor | None:
     given.tensor("centres", centres, FLOATING, "k", "d")
     check_sizes("index_centres", centres)
     native = backends.compiled()
-    if native is None:
+    if native is None or centres.is_meta:
         return None
     with _disable_current_modes():  # a recorded step has nothing to do with it
         taken = centres.detach().to("cpu", torch.promote_types(centres.dtype, torch.float32)).contiguous()

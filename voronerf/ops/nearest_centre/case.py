@@ -10,13 +10,10 @@ from voronerf.ops.nearest_centre import index_centres
 
 def _make(draw: Draw, n: int) -> Arguments:
     k, d = draw.among("k", 7, 1, 2, 9, 33, 300), draw.among("d", 3, 1, 2, 4)
-    points, centres = (
-        torch.cat([draw.points(rows, draw.dtype()) for _ in range(2)], 1)[:, :d] for rows in (n, k)
-    )
+    points, centres = (torch.cat([draw.points(rows, draw.dtype()) for _ in range(2)], 1)[:, :d] for rows in (n, k))
     compared = centres.to(torch.promote_types(points.dtype, centres.dtype))
     index = index_centres(compared) if draw.among("indexed", False, True) else None
     return {"points": points, "centres": centres, "index": index}
-
 
 
 CASE = Case(

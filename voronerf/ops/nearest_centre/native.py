@@ -18,10 +18,13 @@ def _check(centres: Tensor, index: Tensor | None) -> None:
 
 
 def check_index(op: str, centres: Tensor, index: Tensor) -> None:
-    """Raises ValueError for an index that is none of so many centres."""
-    words = native.compiled.centre_index_words(*centres.shape, centres.itemsize)
-    if len(index) != words:
-        raise ValueError(f"{op}: index must be of these centres, int32 [{words}], got {list(index.shape)}")
+    """Raises ValueError for an index of other centres, by their number, coordinates and dtype."""
+    (k, d), size, got = centres.shape, centres.itemsize, f"int32 {list(index.shape)}"
+    if len(index) == native.compiled.centre_index_words(k, d, size):
+        if index.is_cuda or (head := index[:3].tolist()) == [k, d, size]:
+            return
+        got = f"one of float{8 * head[2]} {head[:2]}"
+    raise ValueError(f"{op}: index must be of these centres, float{8 * size} [{k}, {d}], got {got}")
 
 
 nearest_centre = declared("nearest_centre").compiled_op(
@@ -38,11 +41,10 @@ def find(
 ) -> None:
     """Fills ``cells``, int32 [n]; coordinates are of one dtype. On CUDA with -1 from ``rows`` on."""
     compiled, machine = native.compiled, native.machine(points)
-    (k, d), words = centres.shape, 0 if index is None else len(index)
-    sizes = rows_of(points), k, d, words, machine
+    n, (k, d), words = rows_of(points), centres.shape, 0 if index is None else len(index)
     if isinstance(machine, compiled.Cuda):
-        fits = compiled.nearest_centre(points, centres, index, rows, cells, *sizes)
+        fits = compiled.nearest_centre(points, centres, index, rows, cells, n, k, d, words, machine)
     else:
-        fits = compiled.nearest_centre(points, centres, index, cells, *sizes)
+        fits = compiled.nearest_centre(points, centres, index, cells, n, k, d, words, machine)
     if not fits:
         _check(centres, index)

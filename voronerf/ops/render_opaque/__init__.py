@@ -16,7 +16,7 @@ from voronerf.ops.render_loss.reference import scaled
 from voronerf.ops.routed_program import routed_of
 
 #: Names of the arguments of `routed_program` that a network has; the others are of samples, or of the backward pass.
-NETWORK = ("program", "parameters", "centres", "child_offsets", "child", "depth", "index")
+NETWORK = ("program", "parameters", "centres", "child_offsets", "child", "depth", "centre_index")
 
 
 def _prepare(given: Any) -> Any:

@@ -24,7 +24,7 @@ def _make(draw: Draw, n: int) -> Arguments:
     network: Arguments = {"program": table.program(3, 3, None, (True, False, True), True)}
     network["centres"] = draw.uniform(k, 3) - 0.5
     if draw.among("indexed", False, True):
-        network["index"] = index_centres(network["centres"])
+        network["centre_index"] = index_centres(network["centres"])
     weights = [draw.normal(k, o, i) for o, i in table.weight_shapes(3, 3)]
     network["parameters"] = [*weights, draw.normal(k, 6), (4 if activated else 1) + draw.normal(k, 1)]
     if hashed:

@@ -60,7 +60,7 @@ def render_opaque(*flat: Any) -> RaysSeen:
             centres=centres,
             child_offsets=child_offsets,
             child=child,
-            index=index,
+            centre_index=index,
             m=0 if centres is None else len(centres),
             depth=depth,
         ),

@@ -33,7 +33,7 @@ def routed_mlp(
     features: Tensor | None = None,
     frozen: Tensor | None = None,
     rows: Tensor | None = None,
-    index: Tensor | None = None,
+    centre_index: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:
     """Evaluates every sample by the network of the cell it lies in; results are in the order of the samples.
@@ -66,7 +66,7 @@ def routed_mlp(
             the backward pass, unless positions or directions have gradients.
         rows: int32 [1], how many of the samples count; None for all. Those behind them have outputs of 0, no gradient
             and no cell: -1. On CUDA the host does not wait for the number, which `march_rays` with a capacity gives.
-        index: of the centres of a flat diagram, as `index_centres` makes it.
+        centre_index: what `index_centres` has made of the centres of a flat diagram, or None.
         backend: "auto", "reference", "native" or "warp". If there is no fused implementation, "auto" calls the separate
             operations, each on the backend it chooses.
 
@@ -91,7 +91,7 @@ def routed_mlp(
         >>> out.flatten().round(decimals=4)  # in the order of the positions
         tensor([90.0000,  0.1000, 80.0000])
     """
-    where = Where(centres, child_offsets, child, depth, cells, coords, rows, frozen, index)
+    where = Where(centres, child_offsets, child, depth, cells, coords, rows, frozen, centre_index)
     network = Layered(positions, weights, biases, layers, directions, direction_index, features)
     where = where.at(_OP, positions, network.check(_OP, last=where.to_check(_OP)))
     (out,), found = run(network.given(_OP), where, backend=backend, op=_OP)

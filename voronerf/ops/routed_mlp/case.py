@@ -16,9 +16,10 @@ def _make(draw: Draw, n: int) -> Arguments:
         tables, k = tree(draw)
         return {**network(draw, n, k), **tables}
     k = 1 if by == "one cell" else draw.among("k", 2, 1, 9)
-    where = {"cells": draw.integers(0, k, n)} if by == "cells" else {"centres": draw.uniform(k, 3)}
+    centres = draw.uniform(k, 3)
+    where: Arguments = {"cells": draw.integers(0, k, n)} if by == "cells" else {"centres": centres}
     if by == "an index":
-        where["index"] = index_centres(where["centres"])
+        where["centre_index"] = index_centres(centres)
     return {**network(draw, n, k), **({} if by == "one cell" else where)}
 
 

@@ -33,7 +33,7 @@ def routed_program(
     coords: Tensor | None = None,
     frozen: Tensor | None = None,
     rows: Tensor | None = None,
-    index: Tensor | None = None,
+    centre_index: Tensor | None = None,
     backend: str = "auto",
 ) -> tuple[list[Tensor], Tensor]:
     """Runs a program on every sample with the parameters of the cell it lies in.
@@ -55,7 +55,7 @@ def routed_program(
         coords: [n, 3], the locations of the samples.
         frozen: bool [k], the cells whose samples have no gradient to anything, or None.
         rows: int32 [1], how many of the samples count; None for all.
-        index: of the centres of a flat diagram, as `index_centres` makes it.
+        centre_index: what `index_centres` has made of the centres of a flat diagram, or None.
         backend: "auto", "reference", "native" or "warp".
 
     Returns:
@@ -76,7 +76,7 @@ def routed_program(
         >>> out.flatten(), cells
         (tensor([90.0000,  0.1000]), tensor([1, 0], dtype=torch.int32))
     """
-    where = Where(centres, child_offsets, child, depth, cells, coords, rows, frozen, index)
+    where = Where(centres, child_offsets, child, depth, cells, coords, rows, frozen, centre_index)
     routed = check_routed_program(_OP, False, program, inputs, parameters, ray_index, where)
     return run(routed.given(_OP), routed.where, backend=backend, op=_OP)
 

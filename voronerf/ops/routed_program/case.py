@@ -24,7 +24,7 @@ def _make(draw: Draw, n: int) -> Arguments:
     if by in ("centres", "an index"):
         where = {"centres": draw.uniform(k, 3)}
     if by == "an index":
-        where["index"] = index_centres(where["centres"])
+        where["centre_index"] = index_centres(where["centres"])
     if by == "cells":
         where = {"cells": draw.integers(0, k, n)}
     program, dtype, r = two_outputs(rays), draw.dtype(), draw.number("r", 4, 1, 9)
@@ -50,7 +50,10 @@ CASE = Case(
         "of cells, with shared ones": {"by": "cells", "shared": True},
     },
     refused={
-        "index must come with centres, got none that it is of": {"centres": None, "index": torch.zeros(1).int()},
+        "centre_index must come with centres, got none that it is of": {
+            "centres": None,
+            "centre_index": torch.zeros(1).int(),
+        },
         "centres must have shape [k, 3] with k = 2, got [1, 3]": {"centres": torch.zeros(1, 3)},
         "parameters must be 3 tensors (inputs at least one), got 0": {"parameters": []},
     },

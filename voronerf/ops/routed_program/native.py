@@ -54,7 +54,7 @@ def run_known(
     """The outputs for float32 inputs and parameters [k, ...] or [1, ...] that a router has checked before."""
     first, centres = inputs[0], places.get("centres")
     if centres is not None and "child" not in places and centres.is_cpu and not _is_seen(first):
-        cells, order, offsets = _in_two_calls(places["coords"], centres, places.get("index"), k)
+        cells, order, offsets = _in_two_calls(places["coords"], centres, places.get("centre_index"), k)
     elif "cells" in places and not _is_seen(first):
         cells = places["cells"]
         order, offsets = cell_sort(cells, k, backend="native")
@@ -64,7 +64,9 @@ def run_known(
         where = Where(**places)
         if where.coords is not None and centres is not None:
             coords, centres = of_one_dtype(where.coords, centres)
-            where = where._replace(coords=coords, centres=centres, index=where.index if centres is where.centres else None)
+            where = where._replace(
+                coords=coords, centres=centres, centre_index=where.centre_index if centres is where.centres else None
+            )
         cells, order, offsets = find(first, of_cells(where, k), k, how.caller)
     outputs = run_program(Rows(inputs, parameters, offsets, order, None), how)
     if frozen is not None:
@@ -102,6 +104,7 @@ def _is_seen(positions: Tensor) -> bool:
 
 def _in_two_calls(coords: Tensor, centres: Tensor, index: Tensor | None, k: int) -> Route:
     """Cells of a flat diagram: calls that the compiled module makes by itself take less time than one op in Python."""
+    index = index if coords.dtype is centres.dtype else None
     cells = nearest_centre(coords, centres, index=index, backend="native")
     order, offsets = cell_sort(cells, k, backend="native")
     return Route(cells, order if order.numel() else None, offsets)
@@ -118,7 +121,7 @@ class _Samples(NamedTuple):
     cells: Tensor | None
     coords: Tensor | None
     rows: Tensor | None
-    index: Tensor | None
+    centre_index: Tensor | None
     k: int
     caller: str
 

@@ -20,7 +20,7 @@ _ROWS = {
     "frozen": Row("frozen", (torch.bool,), ("k",)),
     "rows": Row("rows", INDEX, (1,)),
     "coords": Row("coords", FLOATING, ("n", 3)),
-    "index": Row("index", INDEX, ("w",)),
+    "centre_index": Row("centre_index", INDEX, ("w",)),
 }
 _ROWS_OF_A_TREE = {**_ROWS, "centres": Row("centres", FLOATING, ("m", 3))}
 
@@ -37,7 +37,7 @@ class Where(NamedTuple):
     coords: Tensor | None = None
     rows: Tensor | None = None
     frozen: Tensor | None = None
-    index: Tensor | None = None
+    centre_index: Tensor | None = None
 
     def to_check(self, op: str) -> Others:
         """The rows of the tensors, and these, once it is clear that they may come together."""
@@ -47,16 +47,16 @@ class Where(NamedTuple):
                     raise ValueError(f"{op}: {name} must come with centres, got no centres")
             if self.coords is not None:
                 raise ValueError(f"{op}: coords must come with centres, got none to compare them with")
-            if self.index is not None:
-                raise ValueError(f"{op}: index must come with centres, got none that it is of")
+            if self.centre_index is not None:
+                raise ValueError(f"{op}: centre_index must come with centres, got none that it is of")
         else:
             if self.cells is not None:
                 raise ValueError(f"{op}: centres must be None where cells are given, got both")
             if (self.child_offsets is None) != (self.child is None):
                 missing = "child_offsets" if self.child_offsets is None else "child"
                 raise ValueError(f"{op}: child_offsets and child must come together, got no {missing}")
-            if self.child is not None and self.index is not None:
-                raise ValueError(f"{op}: index must be None for the centres of a tree, got one")
+            if self.child is not None and self.centre_index is not None:
+                raise ValueError(f"{op}: centre_index must be None for the centres of a tree, got one")
             check_integer(op, "depth", self.depth, 1)
             if self.child is None and self.depth != 1:
                 raise ValueError(f"{op}: depth must be 1 for a flat diagram, got {self.depth}")
@@ -78,4 +78,5 @@ class Where(NamedTuple):
         if self.coords is None and p < 3:
             raise ValueError(f"{op}: coords must be given for positions of less than 3 features, got {p}")
         coords, centres = of_one_dtype(positions[:, :3] if self.coords is None else self.coords, self.centres)
-        return self._replace(coords=coords, centres=centres, index=self.index if centres is self.centres else None)
+        index = self.centre_index if centres is self.centres else None
+        return self._replace(coords=coords, centres=centres, centre_index=index)
