@@ -129,8 +129,8 @@ def test_a_module_with_an_argument_of_this_name_gets_it(generator: torch.Generat
     x, cells = torch.rand(30, 3, generator=generator), drawn(generator, 30)
     router = routed(Own(), "grouped", torch.rand(K, 3, generator=generator), coords="first3")
     torch.testing.assert_close(router(x, cells=cells), masked_loop(router, router.diagram.locate(x), [x, cells])[0][0])
-    with pytest.raises(ValueError, match="cells must be given"):
-        routed(Own(), "grouped")(x, cells=cells)
+    with pytest.raises(ValueError, match=r"Own.forward has an argument cells of its own, so labels cannot be told"):
+        routed(Own(), "grouped")
 
     class Coords(nn.Linear):
         def forward(self, coords: Tensor) -> Tensor:
@@ -138,6 +138,15 @@ def test_a_module_with_an_argument_of_this_name_gets_it(generator: torch.Generat
 
     router = routed(Coords(3, 2), "grouped")
     torch.testing.assert_close(router(coords=x, cells=cells), router(x, cells=cells))
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_one_row_for_all_members_of_an_ensemble(way: str, generator: torch.Generator) -> None:
+    router = routed(nn.Linear(3, 2), way)
+    for n in (5, 1):
+        x = torch.rand(n, 3, generator=generator)
+        found = router(x[:, None], cells=torch.arange(K).expand(n, K))
+        torch.testing.assert_close(found, torch.stack([router.cell(i)(x) for i in range(K)], 1))
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -169,7 +178,7 @@ def test_labels_are_checked(way: str) -> None:
         (3, TypeError, "cells must be an int32 or int64 tensor, got int"),
         (few[0], ValueError, "cells must have the leading shape of the samples, such as [n], got []"),
         (few.to("meta"), ValueError, "cells must be on the device of the parameters, cpu, got meta"),
-        (few[:7], ValueError, "cells must have the leading shape of the samples, got [7] beside [8, 3]"),
+        (few[:7], ValueError, "cells must have the leading shape of the samples, got [7] beside [20, 3]"),
         (None, ValueError, "cells must be given to each call of a router without centres"),
     ):
         with pytest.raises(kind, match=re.escape(f"VoronoiRouter: {message}")):
@@ -182,13 +191,17 @@ def test_labels_are_checked(way: str) -> None:
 
 def test_what_needs_centres_is_refused() -> None:
     net, router = nn.Linear(3, 2), VoronoiRouter(nn.Linear(3, 2), K)
+    placed = VoronoiRouter(net, torch.rand(K, 3), coords="first3")
     for make, kind, message in (
         (lambda: VoronoiRouter(net, 0), ValueError, "k must be at least 1, got 0"),
-        (lambda: VoronoiRouter(net, True), TypeError, "got bool"),
+        (lambda: VoronoiRouter(net, True), TypeError, "or a number of networks, got True"),
+        (lambda: VoronoiRouter(net, 2.5), TypeError, "or a number of networks, got 2.5"),
         (lambda: VoronoiRouter(net, K, coords="first3"), ValueError, "coords must be None without centres"),
         (lambda: VoronoiRouter(net, K, assignment="stochastic"), ValueError, "assignment must be 'nearest' without"),
         (lambda: router.subdivide(2, points=torch.rand(9, 3)), ValueError, "diagram must be VoronoiDiagram.without"),
         (lambda: router.subdivide(VoronoiDiagram.without_centres(9)), ValueError, "with parents"),
+        (lambda: router.subdivide(placed.diagram, torch.arange(K)), ValueError, "VoronoiDiagram.without_centres"),
+        (lambda: placed.subdivide(VoronoiDiagram.without_centres(K), torch.arange(K)), ValueError, "must have centres"),
         (lambda: router.diagram.locate(torch.rand(4, 3)), ValueError, "locate: a diagram without centres"),
         (lambda: router.diagram.sample_cell(torch.rand(4, 3), temperature=1), ValueError, "sample_cell: a diagram"),
         (lambda: VoronoiRouter.from_modules([net, net], 3), ValueError, "of 3 cells, got 2"),

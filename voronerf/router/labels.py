@@ -35,10 +35,10 @@ class Labels(NamedTuple):
         Args:
             cells: int32 or int64 [...], one for each sample, 0 to k - 1.
             k: Networks.
-            device: Of their parameters.
+            device: The one of their parameters.
 
         Raises:
-            TypeError: For what is no such tensor.
+            TypeError: For anything but such a tensor.
             ValueError: For a tensor without dimensions, on another device, or with other values.
         """
         if not isinstance(cells, Tensor) or cells.dtype not in (torch.int32, torch.int64):
@@ -59,11 +59,21 @@ class Labels(NamedTuple):
         if not self.checked:
             _check_values(self.cells, k)
 
-    def check_shape(self, first: Tensor | None) -> None:
-        """Raises ValueError for labels that cannot have the leading shape of the first argument."""
-        if first is not None and any(1 != a != b != 1 for a, b in zip(self.cells.shape[:-1], first.shape)):
-            got = f"{list(self.cells.shape[:-1])} beside {list(first.shape)}"
+    def widen(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Arguments whose first one has a row for each label, where it has one row for all.
+
+        Raises:
+            ValueError: For labels that cannot have the leading shape of the first argument.
+        """
+        first, lead = args[0] if args else None, self.cells.shape[:-1]
+        if not isinstance(first, Tensor) or first.dim() < len(lead):
+            return args
+        if any(1 != a != b != 1 for a, b in zip(lead, first.shape)):
+            got = f"{list(lead)} beside {list(first.shape)}"
             raise ValueError(f"{_RULE} have the leading shape of the samples, got {got}")
+        if any(size != 1 for size in first.shape[: len(lead)]) or all(size == 1 for size in lead):
+            return args
+        return (first.expand(*lead, *first.shape[len(lead) :]), *args[1:])
 
 
 def _check_values(cells: Tensor, k: int) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
+import numbers
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, cast
@@ -17,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.diagram import VoronoiDiagram
-from voronerf.diagram.voronoi import MANY_CELLS
 from voronerf.diagram.subdivision import finer_diagram
+from voronerf.diagram.voronoi import MANY_CELLS
 from voronerf.ops._core.backends import BACKENDS
 from voronerf.ops._core.compiler import not_compiled
 from voronerf.router.cells import (
@@ -189,6 +190,10 @@ class VoronoiRouter(nn.Module):
         self.shared, self.methods = tuple(shared), tuple(methods)
         self._names = tuple(name for name, _ in self.module.named_parameters())
         self._own = {name: argument_names(getattr(self.module, name)) for name in ("forward", *self.methods)}
+        taken = [name for name, arguments in self._own.items() if "cells" in arguments]
+        if taken and not cells.centres.shape[1]:
+            where = f"{type(module).__name__}.{taken[0]}"
+            raise ValueError(f"VoronoiRouter: {where} has an argument cells of its own, so labels cannot be told")
         self._dispatch = Dispatch()
         self._assigned: Assigned | None = None  # the last samples, if several methods are routed
         self._unseen = True  # no large batch has shown whether the centres fit the positions
@@ -427,11 +432,14 @@ class VoronoiRouter(nn.Module):
         split = {"backend": self.backend, "generator": self.generator, **split}
         check_optimizer(optimizer, self.module, "subdivide")
         k = self.num_cells
-        if not self._d and (isinstance(diagram, int) or parents is None):
+        placed = not isinstance(diagram, VoronoiDiagram) or diagram.centres.shape[1] > 0
+        if not self._d and (placed or parents is None):
             raise ValueError(
                 "VoronoiRouter.subdivide: diagram must be VoronoiDiagram.without_centres(k) for a router without "
                 "centres, with parents, the present label of each new one"
             )
+        if self._d and not placed:
+            raise ValueError("VoronoiRouter.subdivide: diagram must have centres, as the router's has, got none")
         finer, parents = finer_diagram(self.diagram, diagram, parents, points, weights, split)
         # Children of a cell that is split; the other cells go on as they were, with or without inheritance.
         new = torch.bincount(parents, minlength=k)[parents] > 1
@@ -605,7 +613,7 @@ class VoronoiRouter(nn.Module):
             return {"frozen": frozen, "cells": self.assign(coords.detach() if drawn else coords)}
         if diagram.depth == 1:
             flat = {"frozen": frozen, "centres": centres, "coords": coords}
-            return {**flat, "index": diagram.index()} if k >= MANY_CELLS else flat
+            return {**flat, "centre_index": diagram.index()} if k >= MANY_CELLS else flat
         tables = {"child_offsets": diagram.child_offsets, "child": diagram.child, "depth": diagram.depth}
         return {"frozen": frozen, "centres": centres, "coords": coords, **tables}
 
@@ -732,6 +740,7 @@ class VoronoiRouter(nn.Module):
                 raise ValueError("VoronoiRouter: coords must be None where cells are given, got both")
             else:
                 coords = Labels.of(cells, self.num_cells, self.diagram.centres.device)
+                args = args if self.shared or self.per_ray else coords.widen(args)
         if self._resized and not torch.compiler.is_compiling():
             self._check_wrapper()
         if method == "forward" and self._given is not None:
@@ -775,7 +784,6 @@ class VoronoiRouter(nn.Module):
         self._ask_doubts()
         if isinstance(coords, Labels):
             coords.ensure(self.num_cells)
-            coords.check_shape(None if self.shared or self.per_ray else first_tensor(args, kwargs))
         called, like = getattr(self.module, method), kind_of(method, self.module.training, args, kwargs, coords)
         field = method == "forward" and self._given is not None
         if field and (each := each_direction(args, kwargs)) is not None:
@@ -872,8 +880,12 @@ class VoronoiRouter(nn.Module):
 
 def _diagram_of(cells: Any) -> VoronoiDiagram:
     """A diagram of the router's own, of what it was given: a diagram, centres [k, d], or a number of cells."""
-    if isinstance(cells, int) and not isinstance(cells, bool):
-        return VoronoiDiagram.without_centres(cells)
+    count = None if isinstance(cells, bool) else cells
+    if isinstance(count, numbers.Integral):
+        return VoronoiDiagram.without_centres(int(count))
+    if not isinstance(cells, (Tensor, VoronoiDiagram)):
+        rule = "a VoronoiDiagram, centres [k, d] or a number of networks"
+        raise TypeError(f"VoronoiRouter: diagram must be {rule}, got {cells!r:.60}")
     return copy.deepcopy(cells) if isinstance(cells, VoronoiDiagram) else VoronoiDiagram(cells)
 
 
