@@ -10,7 +10,14 @@ from typing import Any
 
 CHECKED = (
     *("adam", "composite packed", "march_rays", "draw_pixels", "grouped_mlp hashed", "routed_mlp nested"),
-    *("spherical_harmonics", "hash_encode features=8", "locate_cell", "nearest_centre k=700", "nearest_centre k=700, indexed=True", "observe_occupancy"),
+    *(
+        "spherical_harmonics",
+        "hash_encode features=8",
+        "locate_cell",
+        "nearest_centre k=700",
+        "nearest_centre k=700, indexed=True",
+        "observe_occupancy",
+    ),
     *("pixel_rays", "render_loss", "resample", "cell_sort 5000 3 by counting", "cell_sort 20000 4096 by automatic"),
     *("grouped_mlp wide tf32", "grouped_mlp skips bfloat16 forward", "unaligned views"),
     "grouped_mlp of a hash grid for each cell bfloat16",

@@ -8,11 +8,11 @@ next ones'.
                     cases      gpu_parts.py: every operation, networks at 2^22 samples, steps in CUDA graphs, rows of
                                timings, a step by torch.profiler, two trainings
                     counters   ncu over six launches, where it is installed
-                    memcheck   compute-sanitizer over 20 of the small cases, where it is installed
+                    memcheck   compute-sanitizer over 21 of the small cases, where it is installed
     second, 240 s   build      as above
                     cases      those of --cases, such as the ones that were wrong, and the rows again
                     tests      tests/ops on CUDA, a process for each file
-                    racecheck, synccheck   compute-sanitizer over 13 of the small cases
+                    racecheck, synccheck   compute-sanitizer over 14 of the small cases
 
 DIR gets two files: summary-CALL.json, with the command, the outcome and the findings of every part, and
 parts-CALL.tar.gz, with what each said. The last lines printed are the verdict, fewer than 11,000 characters; the exit

@@ -13,6 +13,7 @@ from torch import Tensor
 from ops.case import FORWARD, Case, Contender, NotApplicable, Work, generator, optional, rotation, uniform_points
 from voronerf import ops
 from voronerf.diagram import VoronoiDiagram
+from voronerf.diagram.voronoi import MANY_CELLS
 
 CHUNK = 1 << 19
 """Distances that torch and numpy hold at a time: 2 MiB, what makes them fastest."""
@@ -86,11 +87,13 @@ def _nearest(
     quick: bool = False,
 ) -> Case:
     name = " ".join([f"n={n} k={k}", *[f"d={d}"] * (d != 3), *filter(None, (kind, way))])
-    work = functools.partial(_nearest_work, n, k, dtype, d, kind, way)
+    work = functools.partial(_nearest_work, n, k, dtype, d=d, kind=kind, way=way)
     return Case("nearest_centre", name, dtype, FORWARD, n, k, work, backends, quick)
 
 
-def _nearest_work(n: int, k: int, dtype: torch.dtype, d: int, kind: str, way: str, device: torch.device) -> Work:
+def _nearest_work(
+    n: int, k: int, dtype: torch.dtype, device: torch.device, *, d: int = 3, kind: str = "", way: str = ""
+) -> Work:
     def draw(count: int, seed: int) -> Tensor:
         uniform = torch.cat([uniform_points(count, seed + 100_000 * part, device, dtype) for part in range(2)], 1)
         return KINDS.get(kind, torch.clone)(uniform[:, :d]).contiguous()
@@ -98,8 +101,10 @@ def _nearest_work(n: int, k: int, dtype: torch.dtype, d: int, kind: str, way: st
     points, centres = [draw(n, seed) for seed in range(rotation(4 * d * n))], draw(k, 1000)
 
     def ours(backend: str) -> Contender:
-        index = ops.index_centres(centres) if way == KEPT else None
-        return Contender(lambda call: ops.nearest_centre(points[call % len(points)], centres, index=index, backend=backend))
+        index = ops.index_centres(centres) if way == KEPT and k >= MANY_CELLS else None
+        return Contender(
+            lambda call: ops.nearest_centre(points[call % len(points)], centres, index=index, backend=backend)
+        )
 
     def using(make: Callable[[Tensor], Lookup]) -> Callable[[], Contender]:
         def set_up() -> Contender:
