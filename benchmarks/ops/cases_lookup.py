@@ -19,7 +19,7 @@ CHUNK = 1 << 19
 """Distances that torch and numpy hold at a time: 2 MiB, what makes them fastest."""
 CHECKED = 1 << 14
 """Points whose answer is compared with float64."""
-PAIRS = 1 << 28
+PAIRS = 1 << 25
 """Of point and centre, that are compared with float64 at most."""
 FEW = 4096
 """Centres up to which all of them are an alternative."""

@@ -105,6 +105,11 @@ def test_the_claims_of_the_first_page() -> None:
         if row["op"] == "routed_mlp" and row["backend"] == "native"
     ]
     assert f"{min(routed):.0f} to {max(routed):.0f} times" in page
+    looked_up = [row for row in results("lookup.json")["results"] if row["backend"] == "native"]
+    few = [row["speedup_over_best"] for row in looked_up if row["op"] == "routed_mlp" and row["n"] <= 256]
+    assert f"with 1 to 256 samples {min(few):.1f} to {max(few):.1f} times" in " ".join(page.split())
+    (many,) = (row["speedup_over_best"] for row in looked_up if row["case"] == "n=10000 k=65536 uniform kept")
+    assert f"nearest of 65,536 centres is found {many:.1f} times" in " ".join(page.split())
     hashed = [
         row["alternatives"]["torch, indexing, sort + loop"] / row["median_ms"]
         for row in results("throughput_hash_and_step.json")["results"]
