@@ -20,9 +20,9 @@ CHUNK = 1 << 19
 CHECKED = 1 << 14
 """Points whose answer is compared with float64."""
 PAIRS = 1 << 25
-"""Of point and centre, that are compared with float64 at most."""
+"""Distances at most by which answers are checked in float64."""
 FEW = 4096
-"""Centres up to which all of them are an alternative."""
+"""Centres beyond which only trees are an alternative."""
 MANY = 10_000
 """Points of the rows with many centres."""
 DIAGRAM = 4096
@@ -191,7 +191,7 @@ def _flat_lookup(centres: Tensor) -> Lookup:
 
 
 def _sorted_lookup(centres: Tensor) -> Lookup:
-    """Of one coordinate: between which middles of neighbours a point lies."""
+    """A binary search between the middles of neighbours, in one coordinate."""
     ascending, order = centres[:, 0].sort(stable=True)
     middles = ((ascending[1:].double() + ascending[:-1].double()) / 2).float()
     return lambda points: order[torch.searchsorted(middles, points[:, 0])]
