@@ -17,7 +17,7 @@ constexpr int kPoints = 2;  // of a thread
 constexpr int kRun = 8;     // points of half a warp, one after another
 
 template <int D>
-__global__ void __launch_bounds__(kThreads, 4)
+__global__ void __launch_bounds__(kThreads, D < 3 ? 2 : 4)
     nearest_screened_kernel(const float* __restrict__ points, const float* __restrict__ centres,
                             const int32_t* __restrict__ rows, int32_t* __restrict__ cells, int64_t n, int64_t k) {
   VN_SHARED(tile, float4[kTile]);
@@ -43,7 +43,7 @@ __global__ void __launch_bounds__(kThreads, 4)
     }
     __syncthreads();
     const int32_t number = static_cast<int32_t>(start);
-#pragma unroll(D < 3 ? 2 : 4)
+#pragma unroll 4
     for (int j = 0; j < count; ++j) {
       const float4 c = tile[j];
 #pragma unroll
