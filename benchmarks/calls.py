@@ -69,7 +69,7 @@ def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
     points, centres, cells, cpu = torch.rand(8, 3), torch.rand(4, 3), torch.empty(8, dtype=torch.int32), native.cpu()
     found["nearest_centre, 8 points"] = {
         "public": lambda _: nearest_centre(points, centres),
-        "compiled": lambda _: native.compiled.nearest_centre(points, centres, cells, 8, 4, cpu),
+        "compiled": lambda _: native.compiled.nearest_centre(points, centres, None, cells, 8, 4, 3, 0, cpu),
     }
     loss, gradient, offsets = torch.zeros(()), torch.zeros(2, 4), torch.tensor([0, 2], dtype=torch.int32)
     along = torch.tensor([6.9, 1e3]), torch.tensor([1.0, 2]), torch.full((2,), 0.1), torch.full((2,), 0.5)

@@ -228,7 +228,7 @@ def region(cores: int) -> dict[str, Any]:
         with threads(count), Recording() as recording:
             n, machine = recording.count(lambda: len(points)), native.cpu()
             for _ in range(CALLS):
-                native.compiled.nearest_centre(points, centres, cells, n, k, machine)  # one run of points
+                native.compiled.nearest_centre(points, centres, None, cells, n, k, 3, 0, machine)  # one run of points
                 native.compiled.average(*pair, share, [1, 1], machine)  # two runs of one number
         if recording.obstacle is not None:
             raise RuntimeError(recording.obstacle)

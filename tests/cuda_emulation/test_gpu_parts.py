@@ -51,13 +51,13 @@ def test_the_first_call_on_the_emulated_device(tmp_path):
     names = [(row["part"], row["name"]) for row in found["cases"]]
     assert len(set(names)) == len(names)
     rows = [row for row in found["cases"] if "share" in row]
-    assert len(rows) == 24 and all(row["seconds"] > 0 and row["floor"] > 0 for row in rows)
+    assert len(rows) == 28 and all(row["seconds"] > 0 and row["floor"] > 0 for row in rows)
     assert any(row.get("graph", "").endswith("calls") for row in rows)
     counted = {row["name"]: row["most"] for row in rows if row["most"]}
     assert 0.30 < counted["nearest_centre k=512 n=128"] < 0.33 and 0.15 < counted["w64d4 bfloat16 k=16 n=128"] < 0.18
     counts = Counter(part for part, _ in names)
     assert counts.pop("small") > 90
-    assert counts == {"large": 6, "captured": 10, "rows": 25, "training": 2, "profile": 2}
+    assert counts == {"large": 6, "captured": 10, "rows": 29, "training": 2, "profile": 2}
     shown = result.stdout[result.stdout.index("gpu-check first on") :]
     assert len(shown) < 11_000 and all(len(line) <= 100 for line in shown.splitlines())
     for row in found["cases"]:
