@@ -37,7 +37,7 @@ class Options:
     seconds: float = 4.0
     """For each way of a row."""
     steps: int = 500
-    """Of the training on images."""
+    """The training on images has these settings."""
     json: Path | None = None
     """A file for the results; default: printed only."""
 
@@ -128,7 +128,7 @@ def call(run: Run, parameters: list[nn.Parameter], x: Tensor) -> Callable[[int],
 
 
 def row(options: Options, k: int, rows: int, images: Tensor | None = None) -> dict[str, Any]:
-    """What is measured of k networks with so many rows each; of steps with Adam on images."""
+    """Measures k networks with so many rows each, or steps with Adam on images."""
     contenders, x = ways(k), torch.rand(k, rows, 2) * 2 - 1
     expected = contenders["loop"][1](x)
     for _, run in contenders.values():

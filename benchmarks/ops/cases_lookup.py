@@ -211,7 +211,7 @@ KINDS: dict[str, Callable[[Tensor], Tensor]] = {
     "on a sphere": _on_a_sphere,
     "heavy-tailed": _heavy_tailed,
 }
-"""Where points and centres lie, of uniform numbers."""
+"""Places of points and centres, made of uniform numbers."""
 KEPT, MADE = "kept", "made"
 """An index or a tree is made once for all calls, or in each of them."""
 TREES: dict[str, Callable[[Tensor], Lookup]] = {"scipy cKDTree": _tree_lookup, "pykdtree": _fast_tree_lookup}
@@ -354,7 +354,7 @@ def _sort_work(n: int, k: int, device: torch.device) -> Work:
 
 
 def _counting_sort(cells: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """As one would write it; Numba compiles it."""
+    """The eight lines that one would write, which Numba compiles."""
     offsets = np.zeros(k + 1, np.int32)
     for cell in cells:
         offsets[cell + 1] += 1
