@@ -60,6 +60,9 @@ int64_t centre_index_words(int64_t k, int d, int bytes);
 template <typename T>
 void index_centres_cpu(const T* centres, int32_t* index, int64_t k, int d, int threads);
 
+// Whether two arrays hold the same bits.
+bool same_bits(const float* one, const float* other, int64_t count);
+
 // The cells of points [n,d], as nearest_centre gives them, on the calling thread.
 VN_DECLARE_FOR_ISA(void search_index(const float* points, const int32_t* index, int32_t* cells, int64_t n,
                                      const CentreIndexShape& shape, int d))

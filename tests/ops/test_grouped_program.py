@@ -278,7 +278,7 @@ def test_half_types(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("width", [1, 2, 33])
 def test_one_column_in_the_place_of_all_is_put_out(width: int, dtype: torch.dtype, backend: str) -> None:
-    """As an output, and as the gradient of a sum over all columns."""
+    """One column stands for all, in an output and in the gradient of a sum over columns."""
     b = Builder()
     x = b.input(width)
     program = b.program([x.part(width - 1, 1)._replace(width=width, spread=True), b.total(x, width)])

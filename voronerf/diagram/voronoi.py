@@ -23,6 +23,7 @@ from torch.utils._python_dispatch import _disable_current_modes
 from voronerf import ops
 from voronerf.diagram.balance import balance, in_space, in_torch
 from voronerf.diagram.drawing import draw_cell
+from voronerf.ops._core import backends
 from voronerf.ops._core.checks import check_integer
 
 MANY_CELLS = 2048
@@ -254,11 +255,11 @@ class VoronoiDiagram(nn.Module):
             return None
         if type(centres) is not Tensor or centres.is_meta or torch._C._are_functorch_transforms_active():
             return None
-        kept, version = self._indexed, 0 if centres.is_inference() or not centres.is_cuda else centres._version
-        if kept is None or not _is_same(*kept[:2], centres, version):
-            with _disable_current_modes():
-                seen = centres.detach() if centres.is_cuda else centres.detach().clone()
-                kept = self._indexed = seen, version, ops.index_centres(centres.float())
+        with _disable_current_modes():  # a recorded step has nothing to do with it
+            now, kept = centres.detach().float().contiguous(), self._indexed
+            version = centres._version if centres.is_cuda and not centres.is_inference() else 0
+            if kept is None or kept[1] != version or not _is_same(kept[0], now):
+                kept = self._indexed = now if now.is_cuda else now.clone(), version, ops.index_centres(now)
         return kept[2]
 
     def sample_cell(
@@ -420,14 +421,15 @@ class VoronoiDiagram(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
-def _is_same(seen: Tensor, version: int, centres: Tensor, now: int) -> bool:
-    """Whether centres are those that an index was made of."""
-    if seen.device != centres.device or seen.dtype != centres.dtype:
+def _is_same(seen: Tensor, now: Tensor) -> bool:
+    """Whether centres are those that an index was made of; on a GPU by their address."""
+    if seen.device != now.device or seen.shape != now.shape:
         return False
-    if centres.is_cuda:
-        return seen.data_ptr() == centres.data_ptr() and version == now
-    with _disable_current_modes():  # a recorded step has nothing to do with it
-        return torch.equal(seen, centres)
+    native = backends.compiled()
+    if seen.is_cuda or native is None:
+        return seen.data_ptr() == now.data_ptr()
+    same: bool = native.compiled.same_bits(seen, now, seen.numel())
+    return same
 
 
 def _check_centres(centres: Tensor, least: int = 1) -> None:
