@@ -355,13 +355,20 @@ def test_a_training_is_the_same_with_a_viewer(tmp_path, scene, monkeypatch) -> N
                 tab.read()
                 tab.set("Pause", True)
                 tab.until(lambda: training.paused)
-                threading.Timer(0.3, tab.set, ("Pause", True)).start()
-            if state.step == 39:
-                tab.read()
-                assert "3 cells" in str(tab.gui.values())
-            tab.look(scene.test.cameras, state.step % 2)
+                reader.start()
+            else:
+                tab.look(scene.test.cameras, state.step % 2)
 
+    def go_on_when_told():  # while the training waits, which leaves the tab alone
+        end = time.monotonic() + 20
+        while "3 cells" not in str(tab.gui.values()) and time.monotonic() < end:
+            tab.read()
+        tab.set("Pause", True)
+
+    reader = threading.Thread(target=go_on_when_told)
     run_training(watched, [same_scores, Visitor(), training])
+    reader.join()
+    assert "3 cells" in str(tab.gui.values())
     tab.until(lambda: "Pause" not in tab.gui)
     assert len(tab.pictures) > 5
     tab.close()
