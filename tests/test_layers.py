@@ -19,7 +19,7 @@ LAYERS = (
     {"diagram"},
     {"router"},
     {"nerf"},
-    {"app.files"},
+    {"app.files", "app.wording"},
     {"app.scenes"},
     {"app.render", "app.evaluate"},
     {"app.train"},

@@ -394,10 +394,16 @@ def test_the_commands(runs, tmp_path, capsys) -> None:
         f"join {one} --out X": "join needs two runs or more, got 1",
         f"join {one} {tmp_path / 'none'} --out X": "none: there is no such folder",
         f"cut {one} --out X": "cut needs one of --box, --sphere and --cells, got none",
-        f"cut {one} --out X --box 1 1 1 0 0 0": "--box: Solid: a box must have its second corner above the first",
+        f"cut {one} --out X --box 1 1 1 0 0 0": "--box must be x y z of a corner and of a larger one, got 1 1 1 0 0 0",
+        f"cut {one} --out X --box 0 0 nan 1 1 1": "of a larger one, got 0 0 nan 1 1 1\n",
+        f"cut {one} --out X --sphere 0 0.5 0 -1": "and a radius above 0, got 0 0.5 0 -1\n",
+        f"cut {one} --out X --cells 3 99": "at least one, got 3 99\n",
+        f"cut {one} --out X --cells": "at least one, got none\n",
         f"cut {one} --out X --sphere 9 9 9 0.1": "nothing is left",
-        f"place {one} {two} --out X --at 0 0 0 --scale 0": "scale must lie in 1e-9..1e9, got 0",
-        f"place {one} {two} --out X --at 0 0 0 --scale 1e30": "scale must lie in 1e-9..1e9, got 1e+30",
+        f"place {one} {two} --out X --at 0 0 nan": "--at must be three finite numbers, got 0 0 nan\n",
+        f"place {one} {two} --out X --at 0 0 0 --turn 0 inf 5": "--turn must be three finite numbers, got 0 inf 5\n",
+        f"place {one} {two} --out X --at 0 0 0 --scale 0": "--scale must be 1e-9 to 1e9, got 0\n",
+        f"place {one} {two} --out X --at 0 0 0 --scale 1e30": "--scale must be 1e-9 to 1e9, got 1e+30\n",
         f"place {one} {two} --out X --at 0 0 0 --scale 1e-5": "second: must be at least 0.0001 times as large as",
         f"place {one} {two} --out X --at 0 0 0 --scale 1e5": "first: must be at least 0.0001 times as large as",
         f"place {one} {two} --out X --at 0 0 1e30": "first: must be at least 0.0001 times as large as",
@@ -406,11 +412,13 @@ def test_the_commands(runs, tmp_path, capsys) -> None:
         told = capsys.readouterr().err
         assert said in told and told.count("\n") == 1, told
     for move, said in {
-        ("2", "1 0 0 0 0 0 0"): "--move 2: Similarity: scale must lie in 1e-9..1e9, got 0",
-        ("2", "1 0 0"): "seven numbers, got 3",
+        ("2", "1 0 0 0 0 0 0"): "--move 2 must be seven finite numbers tx ty tz rx ry rz s, the scale s 1e-9",
+        ("2", "1 0 0"): "got '1 0 0'\n",
         ("3", "1 0 0 0 0 0 1"): "--move 3: must be the number of a run, 1 to 2",
         ("2", "1 0 0 0 0 0 1", "--move", "2", "2 0 0 0 0 0 1"): "--move 2: must be given once",
-        ("2", "1 0 0 0 0 0 -1"): "got -1",
+        ("2", "1 0 0 0 0 0 -1"): "got '1 0 0 0 0 0 -1'\n",
+        ("2", "a,0,0 0 0 0 1"): "got 'a,0,0 0 0 0 1'\n",
+        ("2", "0 0 0 inf 0 0 1"): "got '0 0 0 inf 0 0 1'\n",
     }.items():
         assert main(["join", one, two, "--out", str(tmp_path / "x"), "--move", *move]) == 1
         assert said in capsys.readouterr().err

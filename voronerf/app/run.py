@@ -17,9 +17,10 @@ from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import Scene, load_scene
 from voronerf.app.train.build import make_picture_grid, make_renderer, present_device
 from voronerf.app.train.checkpoint import is_shown, last_checkpoint
-from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.train.config import ConfigError, TrainConfig, check_samples
 from voronerf.app.train.resume import open_routers, stored_values
 from voronerf.app.train.run_directory import check_folders, check_stored_paths
+from voronerf.app.wording import as_typed
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.occupancy import OccupancyGrid
@@ -28,6 +29,8 @@ from voronerf.nerf.samplers import Occupancy
 
 #: File of a run's crop: the lowest and the highest corner.
 CROP = "crop.json"
+#: The rule of a box.
+BOX = "x y z of a corner and of a larger one"
 
 
 class HasCells(Protocol):
@@ -151,7 +154,7 @@ def _box(value: Any, where: str) -> Tensor:
         box = torch.empty(0)
     if box.shape != (2, 3) or not bool(box.isfinite().all()) or not bool((box[0] < box[1]).all()):
         got = value.flatten().tolist() if isinstance(value, Tensor) else value
-        raise ConfigError(f"{where} must be x y z of a corner and of a larger one, got {got!r:.200}")
+        raise ConfigError(f"{where} must be {BOX}, got {as_typed(got):.200}")
     return box
 
 
@@ -237,6 +240,7 @@ def open_run(
     check_folders(path)
     checkpoint = last_checkpoint(path, keep=is_shown)
     config, _ = stored_values(checkpoint)
+    check_samples(replace(config, samples=samples))
     routers = open_routers(config, checkpoint, device, backend)
     config, scene = shown_scene(path, config, scene, data, downscale, allow_outside)
     renderer = make_renderer(config, scene, routers, samples=samples, backend=backend)

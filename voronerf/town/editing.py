@@ -23,6 +23,7 @@ from voronerf.app.scenes.scene import Split
 from voronerf.app.train.build import PICTURE_RESOLUTION, ask_everywhere, make_picture_grid, make_renderer
 from voronerf.app.train.checkpoint import checkpoint_paths, is_shown, last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.wording import as_typed
 from voronerf.nerf.cameras import Cameras
 from voronerf.nerf.contraction import Contraction, Perspective
 from voronerf.nerf.occupancy import OPACITY, OccupancyGrid
@@ -132,7 +133,7 @@ def cut(run: Path | str, kept: Solid | Sequence[int], out: Path | str, *, outsid
         return _write(cut_source(source, replace(kept, outside=kept.outside != outside)), Path(out))
     k = source.parts.num_cells
     if not kept or not 0 <= min(kept) <= max(kept) < k:
-        raise ConfigError(f"--cells must be numbers of 0..{k - 1}, at least one, got {[*kept][:20]}")
+        raise ConfigError(f"--cells must be numbers of 0..{k - 1}, at least one, got {as_typed([*kept][:20])}")
     chosen = torch.full((k,), outside)
     chosen[list(kept)] = not outside
     return _write(cut_source(source, chosen), Path(out))

@@ -29,7 +29,7 @@ from voronerf.app.train.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from voronerf.app.train.config import TrainConfig
+from voronerf.app.train.config import TrainConfig, check_samples
 from voronerf.app.train.run_directory import check_folders
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.contraction import Contraction
@@ -163,6 +163,7 @@ def open_run(
     check_folders(path)
     checkpoint = last_checkpoint(path, keep=is_shown)
     config = config_of(checkpoint)
+    check_samples(replace(config, samples=samples))
     config, scene = shown_scene(path, config, scene, data, downscale, allow_outside)
     scene = _in_place(scene, read_scene(path / "scene.json"))
     parts = open_parts(path, checkpoint, device, backend)

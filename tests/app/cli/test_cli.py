@@ -99,6 +99,11 @@ def test_videos_along_a_path(run, tmp_path, fails):
         video = imageio_ffmpeg.read_frames(str(run / "flight.mp4"))
         described = next(video)
         assert (described["size"], described["fps"], len(list(video))) == (size, 5, 3)
+    around = json.loads(file.read_text()) | {"camera_type": "equirectangular", "render_width": 24.0}
+    (tmp_path / "around.json").write_text(json.dumps(around))
+    for options, size in (("", (24, 20)), ("--size 48x24", (48, 24)), ("--panorama", (40, 20))):
+        succeeds("render", run, "--path", tmp_path / "around.json", options)
+        assert next(imageio_ffmpeg.read_frames(str(run / "around.mp4")))["size"] == size
     fails("flight.json", "render", run, "--path", tmp_path / "no" / "flight.json")
     fails("--fps must be 0.01 to 1000, got 0", "render", run, "--fps 0")
     file.write_text("{}")
@@ -233,6 +238,20 @@ def test_demo_shows_a_run_and_writes_over_none(tmp_path, capsys, monkeypatch, fa
     fails("budget must be a positive number", "demo --budget 0")
 
 
+@pytest.mark.parametrize(("stop", "status"), [(KeyboardInterrupt(), 130), (SystemExit(143), 143)])
+def test_an_interrupted_demo_says_where_its_run_is(tmp_path, capsys, monkeypatch, stop, status):
+    def interrupt(*_):
+        raise stop
+
+    monkeypatch.setattr("voronerf.app.cli.demo.SIZE", 16)
+    monkeypatch.setattr("voronerf.app.cli.demo.show", interrupt)
+    assert main(words("demo --budget 0.1 --out", tmp_path / "run")) == status
+    said = capsys.readouterr()
+    assert said.err == "" and "psnr" in said.out  # lines of the training, as nothing here is a terminal
+    (command,) = re.findall("stopped; the trained run is in .*: voronerf (.*) makes a video of it\n$", said.out)
+    assert main([*shlex.split(command), "--frames", "1"]) == 0 and (tmp_path / "run" / "video.mp4").is_file()
+
+
 def test_help_has_units(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["train", "--help"])
@@ -255,8 +274,10 @@ def test_bad_input_is_one_line(run, tmp_path, fails):
     fails(f"no run at {out}: there is no such folder", "render", out)
     fails("--frames must be at least 1, got 0", "render", run, "--frames 0")
     fails("a video must end in", "render", run, "--out", tmp_path / "turn")
+    fails(f"got the run {run}; voronerf train --resume --out {run} continues it", "train --data", run, *small)
     fails("--views must be at least 1, got 0", "eval", run, "--views 0")
-    fails("--samples must be at least 1, got 0", "eval", run, "--samples 0")
+    for samples, got in (("0", "0"), ("8 8", "8 8"), ("", "none")):
+        fails(f"--samples must be one number of at least 1, got {got}\n", "eval", run, "--samples", samples)
     fails("--panels must not be negative", "eval", run, "--panels -1")
     fails(
         "a checkpoint of another configuration: --lr ", "train --data builtin --out", run, "--resume", TINY, "--lr 0.1"

@@ -1,9 +1,10 @@
 import math
+import threading
 from types import SimpleNamespace
 
 import pytest
 
-from voronerf.app.cli.display import TrainingDisplay, console
+from voronerf.app.cli.display import TrainingDisplay, busy, console, tracked
 from voronerf.app.cli.process import StageDisplay
 from voronerf.app.train.callbacks import counted
 
@@ -68,6 +69,28 @@ def test_stages_of_a_process_fit_80_columns_and_say_the_time_left(monkeypatch):
     lines = shown()
     assert len(lines) == 3 and max(map(len, lines)) <= 80
     assert lines[2].startswith("global mapping: retriangulation and refinement") and "left" not in lines[2]
+
+
+def test_without_a_terminal_lines_tell_how_far_it_is(monkeypatch, capsys):
+    monkeypatch.setattr("voronerf.app.cli.display.EVERY", 0.0)
+    display = TrainingDisplay("run")
+    router = SimpleNamespace(num_cells=16)
+    display.after_step(SimpleNamespace(step=5, loss=0.1, router=router, fraction=0.5, rays_done=1e6, seconds=10.0))
+    assert list(tracked([5, 6], "the video")) == list(display.track([5, 6], "scores")) == [5, 6]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == [
+        *("  50%  step 5  16 cells  100.0 k rays/s  loss 0.10000", "the video: 0 of 2", "the video: 1 of 2"),
+        *("scores: 0 of 2", "scores: 1 of 2"),
+    ]
+    with busy("reading x"):
+        for thread in threading.enumerate():
+            if isinstance(thread, threading.Timer):  # which says it, and has gone where it is done
+                thread.join()
+    assert capsys.readouterr().out == "reading x\n"
+    monkeypatch.setattr("voronerf.app.cli.display.EVERY", 1000.0)
+    with busy("reading x"):
+        assert list(tracked([5, 6], "the video")) == [5, 6]
+    assert capsys.readouterr().out == ""
 
 
 def test_one_is_no_plural():

@@ -11,6 +11,7 @@ import pytest
 from cli_commands import TINY, words
 
 from voronerf.app.cli import info, main, train
+from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.run_directory import read_curve
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -53,6 +54,30 @@ def test_scores_of_parts_of_views_are_marked(tmp_path, capsys):
     assert read_curve(short) == [(1, 20.0)]
 
 
+def test_a_joined_run_shows_what_is_known(tmp_path, capsys):
+    one, joined = tmp_path / "one", tmp_path / "two runs"
+    assert main(words("train --data builtin --out", one, TINY)) == 0
+    assert main(words("join", one, one, "--out", joined)) == 0
+    capsys.readouterr()
+
+    def rows():
+        assert main(words("compare", one, joined)) == 0
+        shown = capsys.readouterr().out
+        cells = [line.strip("│").split("│") for line in shown.splitlines() if line.startswith("│")]
+        return {row[0].strip(): [value.strip() for value in row[1:]] for row in cells}, shown
+
+    figures, shown = rows()
+    count = json.loads((one / "summary.json").read_text())["parameters"]
+    assert figures["cells"] == ["3", "6"] and figures["parameters"] == [f"{count:,}"] * 2  # one network, twice in place
+    assert figures["PSNR [dB]"][1] == figures["scores of"][1] == figures["training [s]"][1] == "-"
+    assert f"{joined} has no scores: voronerf eval '{joined}' makes them" in shown and f"{one} has" not in shown
+    assert main(words("eval --views 3 --panels 0", joined)) == 0
+    psnr = json.loads((joined / "eval.json").read_text())["psnr"]
+    capsys.readouterr()
+    figures, shown = rows()
+    assert figures["PSNR [dB]"][1] == f"{psnr:.2f}" and figures["scores of"][1] == "3 views" and "makes" not in shown
+
+
 def test_what_is_not_compared(tmp_path, fails):
     run, broken = make_run(tmp_path / "run", 30.0, [16]), make_run(tmp_path / "broken", 30.0, [16])
     fails("compare needs at least two runs, got 1", "compare", run)
@@ -93,6 +118,15 @@ def test_a_training_without_options_says_what_to_try(monkeypatch, tmp_path, caps
     said = capsys.readouterr().out
     assert "trains the built-in scene for 480 s" in said and "voronerf train --data DIR" in said
     assert main(["train", "--steps", "1"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_warp_on_the_cpu_names_the_device(monkeypatch, capsys):
+    pytest.importorskip("warp", reason="warp is not installed")
+    monkeypatch.setattr("voronerf.kernels.loads", lambda *_: [])
+    train._compile_kernels(TrainConfig(backend="warp"))
+    assert capsys.readouterr().out.endswith("far slower than --backend auto; for a GPU add --device cuda\n")
+    train._compile_kernels(TrainConfig())
     assert capsys.readouterr().out == ""
 
 

@@ -3,15 +3,18 @@
 import os
 import re
 import select
+import shlex
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from cli_commands import TINY, words
 
 from voronerf import __version__
 from voronerf.app.cli import main
+from voronerf.app.cli.parsing import parse
 from voronerf.app.cli.program import COMMANDS
 from voronerf.app.files import read_json
 from voronerf.app.train.config import TrainConfig
@@ -26,6 +29,49 @@ from voronerf.app.train.config import TrainConfig
         ("train --sampling hierarchic", "got 'hierarchic'; did you mean hierarchical?"),
         ("train --backend nativ", "got 'nativ'; did you mean native?"),
         ("train --centres blanced", "got 'blanced'; did you mean balanced?"),
+        ("train --precision BF16", "got 'BF16'; did you mean bf16?"),
+        ("help train", "there is no command help; did you mean voronerf --help?"),
+        ("version", "there is no command version; did you mean voronerf --version?"),
+        ("--steps 5", "there is no command --steps; did you mean voronerf train --steps 5?"),
+        ("train --iterations 5", "did you mean --steps?"),
+        ("train --max_steps 5", "did you mean --steps?"),
+        ("train --Out-Dir x", "did you mean --out?"),
+        ("train --gpu", "did you mean --device?"),
+        ("train --zzz 5", "Unrecognized options: --zzz, 5; see voronerf train --help"),
+        ("train --epochs 5", "did you mean --steps?"),
+        ("train --input x", "did you mean --data?"),
+        ("train --source-path x", "did you mean --data?"),
+        ("train --model-path x", "did you mean --out?"),
+        ("train --batch-size 9", "did you mean --rays?"),
+        ("train --cuda", "did you mean --device?"),
+        ("train -data x", "did you mean --data?"),
+        ("train --hlep", "did you mean --help?"),
+        ("train --confg x", "did you mean --config?"),
+        ("eval --run", "see voronerf eval --help"),
+        ("eval r --no-occupanc", "did you mean --no-occupancy?"),
+        ("train --occupancy false", "Unrecognized options: false; see voronerf train --help"),
+        ("train --data my own photos", "Unrecognized options: own, photos; see voronerf train --help"),
+        ("train --steps abc --data x", "--steps must be a whole number, got 'abc'; see voronerf train --help"),
+        ("process --out y clip.mp4", "SOURCE needs a value; see voronerf process --help"),
+        ("info r s", "Unrecognized options: s; see voronerf info --help"),
+        ("photos", "there is no command photos; see voronerf --help"),
+        ("steps 5", "there is no command steps; see voronerf --help"),
+        ("--data=x", "did you mean voronerf train --data=x?"),
+        ("--device cuda", "there is no command --device; did you mean voronerf train --device cuda?"),
+        (
+            "train --backend cuda:1",
+            "native or warp, got 'cuda:1'; did you mean --device cuda:1?",
+        ),
+        ("train --backend GPU", "got 'GPU'; did you mean --device cuda?"),
+        ("eval r --backend cpu", "got 'cpu'; did you mean --device cpu?"),
+        (
+            "eval r --backend nativ",
+            "--backend must be auto, reference, native or warp, got 'nativ'; did",
+        ),
+        ("train --device gpu:1", "a GPU that is present, got 'gpu:1'; did you mean cuda:1?"),
+        ("train --device 0", "got '0'; did you mean cuda:0?"),
+        ("train --device mps", "--device must be auto, cpu or cuda, got 'mps'"),
+        ("train --data buildin", "buildin: there is no such folder; did you mean builtin?"),
         ("train --bugdet 5", "Unrecognized options: --bugdet, 5; did you mean --budget?"),
         ("cut run --out y --spher 0 0 0 1", "did you mean --sphere?"),
         ("export run --coordinates file", "--coordinates must be scene or files, got 'file'; did you mean files?"),
@@ -35,17 +81,32 @@ from voronerf.app.train.config import TrainConfig
         ("train --budget x", "--budget must be a number, got 'x'"),
         ("train --budget nan", "--budget must be a positive number of seconds, got nan"),
         ("train --cells 3 x", "--cells must be whole numbers, got '3 x'"),
+        ("train --cells 1 4", "on every level (none for one network), got 1 4"),
+        ("train --samples 0", "--samples must be one number of at least 1, got 0"),
+        ("train --samples", "--samples must be one number of at least 1, got none"),
         ("train --split-at 0.5 x", "--split-at must be numbers, got '0.5 x'"),
         ("cut run --out y --sphere 1 2 q 4", "--sphere must be 4 numbers, got '1 2 q 4'"),
-        ("export run --crop 1 2 3", "--crop must be FLOAT FLOAT FLOAT FLOAT FLOAT FLOAT or saved, got '1 2 3'"),
-        ("eval", "Missing from voronerf eval: RUN"),
-        ("eval run more", "Unrecognized options: more"),
-        ("train --out", "Missing value for argument '--out'"),
+        ("export run --crop 1 2 3", "--crop must be 6 numbers or saved, got '1 2 3'; see voronerf export --help"),
+        (
+            "render run --crop 1 2 3 4 5",
+            "--crop must be 6 numbers or saved, got '1 2 3 4 5'; see voronerf render --help",
+        ),
+        ("eval", "error: eval needs RUN; see voronerf eval --help"),
+        ("place", "error: place needs RUN, THING, --out PATH and --at FLOAT FLOAT FLOAT; see voronerf place --help"),
+        ("place run --at 0 0 0", "error: place needs THING and --out PATH; see voronerf place --help"),
+        ("cut run --box 0 0 0 1 1 1", "error: cut needs --out PATH; see voronerf cut --help"),
+        ("train --cells 4 4 --split-at 0.5 0.25", "or numbers of steps, got 0.5 0.25\n"),
+        ("train --samples 3 4", "--samples must be one number of at least 1, got 3 4\n"),
+        ("cut run --out y --sphere 1 2 3 x", "--sphere must be 4 numbers, got '1 2 3 x'"),
+        ("train --average 1", "--average must lie in [0, 1), got 1\n"),
+        ("eval run more", "Unrecognized options: more; did you mean --data or --lpips?"),
+        ("train --out", "--out needs a value; see voronerf train --help"),
+        ("cut run --box 1 2", "--box needs 6 values; see voronerf cut --help"),
         ("train --resume --out /nowhere/at/all", "no run at /nowhere/at/all: there is nothing to resume"),
         ("eval /nowhere/at/all", "no run at /nowhere/at/all: there is no such folder"),
         ("join /nowhere/a /nowhere/b --out y", "no run at /nowhere/a: there is no such folder"),
         ("render /nowhere/a --path /nowhere/b.json", "error: /nowhere/b.json: No such file or directory"),
-        ("place a b --out y --at 0 0 0 --scale -1", "--scale, --turn, --at: scale must lie in 1e-9..1e9, got -1.0"),
+        ("place a b --out y --at 0 0 0 --scale -1", "--scale must be 1e-9 to 1e9, got -1\n"),
         ("compare /nowhere/a /nowhere/b", "no run at /nowhere/a: there is no such folder"),
     ],
 )
@@ -53,11 +114,76 @@ def test_wrong_words_are_one_line(fails, command, said):
     fails(said, command)
 
 
+@pytest.mark.parametrize(
+    ("command", "meant"),
+    [
+        ("train R --steps 5", "train --data R --steps 5"),
+        ("train --steps 5 'my photos'", "train --steps 5 --data 'my photos'"),
+        ("train --data=R S", "train --data=R --out S"),
+        ("train-territories R --territories 2", "train-territories --data R --territories 2"),
+        ("train R --eval_views 3", "train --data R --eval_views 3"),
+        ("demo y", "demo --out y"),
+        ("eval R S --lpips x", "eval R --data S --lpips x"),
+        ("eval --run R", "eval R"),
+        ("eval --views 3 -run R", "eval --views 3 R"),
+        ("export --run=R --mesh x.glb", "export R --mesh x.glb"),
+        ("info --run R", "info R"),
+        ("compare --runs R S", "compare R S"),
+        ("join --run R --run S --out y", "join R S --out y"),
+        ("process --source clip.mp4 --out y", "process clip.mp4 y"),
+    ],
+)
+def test_a_command_that_was_meant_is_told_whole(fails, command, meant):
+    fails(f"; did you mean voronerf {meant}?", *map(Path, shlex.split(command)))
+    name, *rest = shlex.split(meant)
+    assert callable(parse(name, COMMANDS[name], rest))  # and it is one
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("runs", "there is no checkpoint in it; did you mean runs/fox?"),
+        ("runs/Fox", "there is no such folder; did you mean runs/fox?"),
+        ("runs/fox/checkpoints", "there is no checkpoint in it; did you mean runs/fox?"),
+        ("runs/fox/config.json", "it is a file; did you mean runs/fox?"),
+        ("clip.mp4", "it is a file"),
+    ],
+)
+def test_a_path_beside_a_run(fails, tmp_path, monkeypatch, path, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs/fox/checkpoints").mkdir(parents=True)
+    for file in ("runs/fox/config.json", "clip.mp4"):
+        (tmp_path / file).write_text("{}")
+    fails(f"no run at {path}: {said}", "eval", path)
+    fails("--out must be a folder, got the file clip.mp4", "train --data builtin:16 --steps 1 --out clip.mp4")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"cels": [3]}', "unknown cels; did you mean cells?"),
+        ('{"buget": 3, "stpes": 4, "zzz": 5}', "unknown buget, stpes, zzz; did you mean budget, steps?"),
+        ('{"split-at": [0.5]}', "unknown split-at; did you mean split_at?"),
+        ('{"max_num_iterations": 9}', "unknown max_num_iterations; did you mean steps?"),
+        ('{"zzz": 9}', "settings: unknown zzz\n"),
+        ('{"centres": "blanced"}', "got 'blanced'; did you mean balanced?"),
+        ('{"format": "COLMAP"}', "got 'COLMAP'; did you mean colmap?"),
+        ('{"field": "kilo_nerf"}', "got 'kilo_nerf'; did you mean kilonerf?"),
+        ('{"backend": "cuda"}', "got 'cuda'; did you mean --device cuda?"),
+    ],
+)
+def test_names_in_a_file_of_settings(fails, tmp_path, text, said):
+    file = tmp_path / "settings.json"
+    file.write_text(text)
+    fails(said, "train --config", file)
+
+
 @pytest.mark.parametrize("width", ["50", "200"])
 def test_a_box_is_one_line_on_every_terminal(fails, monkeypatch, width):
     monkeypatch.setenv("COLUMNS", width)
     fails("--steps must be a whole number, got 'abc'; see voronerf train --help", "train --steps abc")
     fails("Unrecognized options: --bugdet, 5; did you mean --budget?", "train --bugdet 5")
+    fails("error: place needs THING, --out PATH and --at FLOAT FLOAT FLOAT; see voronerf place --help", "place run")
 
 
 def test_the_version_and_the_list_of_commands(capsys):

@@ -91,7 +91,8 @@ def test_the_command_line(tmp_path, capsys):
     assert main(["render", folder, "--frames", "2", "--samples", "6", "4"]) == 0
     for options, message in (
         (["--views", "1", "--occupancy"], "--occupancy does not work with --field mipnerf, which takes cones"),
-        (["--samples", "6", "0"], "--samples must be at least 1, got 0"),
+        (["--samples", "6", "0"], "--samples must be 2 numbers, one for each pass, of at least 1, got 6 0\n"),
+        (["--samples", "6"], "--samples must be 2 numbers, one for each pass, of at least 1, got 6\n"),
     ):
         capsys.readouterr()
         assert main(["eval", folder, *options]) == 1 and message in capsys.readouterr().err

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
 
-from voronerf.app.cli.display import console, printable
+from voronerf.app.cli.display import console, printable, say
 from voronerf.app.files import read_json
 from voronerf.app.train.callbacks import views_of
+from voronerf.app.train.checkpoint import last_checkpoint, no_run
 from voronerf.app.train.config import ConfigError
 from voronerf.app.train.run_directory import check_folders, read_metrics
+from voronerf.town.run import is_town, open_parts
 
 #: Rows of the table: the name in summary.json, the heading, and the decimals.
 FIGURES = (
@@ -31,7 +34,8 @@ def compare(runs: tuple[Path, ...], /) -> int:
     A star marks scores of the middle of views, which are not to be compared with those of whole ones.
 
     Args:
-        runs: The run directories, at least two. A run that has not ended shows its last evaluation.
+        runs: The run directories, at least two. A run that has not ended shows its last evaluation, and one that was
+            made of others the scores of voronerf eval.
     """
     if len(runs) < 2:
         raise ConfigError(f"compare needs at least two runs, got {len(runs)}")
@@ -51,6 +55,9 @@ def compare(runs: tuple[Path, ...], /) -> int:
         if len(set(values)) > 1:
             table.add_row(escape(printable(name)), *values)
     console.print(table)
+    for run, (figures, _) in zip(runs, read, strict=True):
+        if "psnr" not in figures:
+            say(f"{run} has no scores: {shlex.join(['voronerf', 'eval', str(run)])} makes them")
     return 0
 
 
@@ -63,15 +70,28 @@ def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     check_folders(run)
     if not (run / "config.json").is_file():
-        raise ConfigError(f"no run at {run}: there is no {'config.json in it' if run.is_dir() else 'such folder'}")
+        raise ConfigError(no_run(run, "config.json"))
     metrics = read_metrics(run)
     ended = (run / "summary.json").is_file()
     figures = read_json(run / "summary.json") if ended else metrics[-1] if metrics else {}
     settings = read_json(run / "config.json")
-    for file, value in (("summary.json", figures), ("config.json", settings)):
+    scores = read_json(run / "eval.json") if (run / "eval.json").is_file() else {}
+    for file, value in (("summary.json", figures), ("config.json", settings), ("eval.json", scores)):
         if not isinstance(value, dict):
             raise ValueError(f"{run / file}: must be an object, got {value!r:.60}")
+    if not figures and is_town(run):
+        figures = count_parts(run)
+    if "psnr" not in figures and isinstance(views := scores.get("views"), list):
+        figures |= {**scores, "views": len(views)}
     return figures, settings
+
+
+def count_parts(run: Path) -> dict[str, Any]:
+    """Returns the numbers of cells and parameters of a run that was made of others."""
+    parts = open_parts(run, last_checkpoint(run))
+    networks = {id(network): network.checkpoint for part in parts for network in part.networks}
+    sizes = (value.numel() for network in networks.values() for value in network.group("router.module").values())
+    return {"cells": parts.num_cells, "parameters": sum(sizes)}
 
 
 def shown(value: object, places: int) -> str:

@@ -9,15 +9,16 @@ import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
-from voronerf.app.cli.display import say, tracked
+from voronerf.app.cli.display import console, say, tracked
 from voronerf.app.cli.train import run_training
 from voronerf.app.evaluate.panels import contact_sheet, picture_of_cells, picture_of_colour, save_picture
 from voronerf.app.render.video import check_video, write_video
 from voronerf.app.run import Run, open_run
-from voronerf.app.scenes import load_scene
+from voronerf.app.scenes import Scene, load_scene
 from voronerf.app.train.callbacks import counted
 from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.run_directory import choose_directory
@@ -47,9 +48,19 @@ def demo(out: Path | None = None, budget: float = 35.0) -> int:
     run = config.out
     assert run is not None
     check_video(run / "turn.mp4")
-    scores = run_training(config, scene, panels=0, quiet=True)
+    scores = run_training(config, scene, panels=0, quiet=console.is_terminal)
     if not scores["complete"]:
         return 130
+    try:
+        show(run, scene, scores, budget)
+    except (KeyboardInterrupt, SystemExit) as stop:  # Ctrl-C, SIGTERM
+        say(f"stopped; the trained run is in {run}: {shlex.join(['voronerf', 'render', str(run)])} makes a video of it")
+        return stop.code if isinstance(stop, SystemExit) and isinstance(stop.code, int) else 130
+    return 0
+
+
+def show(run: Path, scene: Scene, scores: dict[str, Any], budget: float) -> None:
+    """Writes pictures, video and page of a trained run into it, and says what they are."""
     opened, around = open_run(run, scene=scene), turn(FRAMES)
     score = f"{scores['psnr']:.1f} dB after {budget:g} s"
     save_picture(run / "turn.png", next(frames(opened, around, [FRAMES // 8], score)))
@@ -73,7 +84,6 @@ def demo(out: Path | None = None, budget: float = 35.0) -> int:
     has_viewer = importlib.util.find_spec("viser") is not None
     say(f"next: {program} {f'view {here}' if has_viewer else 'train --data DIR, with your pictures'}")
     say(f"open {run / 'scene.html'}")
-    return 0
 
 
 def turn(count: int, *, height: float = 0.0, away: float = 1.0) -> Cameras:

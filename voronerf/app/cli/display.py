@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
+import threading
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -29,6 +31,9 @@ LONGEST_LINE = 900
 BAR = 24
 BESIDE = BAR + len(" 100 %    0:00:00 ")
 
+#: Seconds between lines of a long task where there is no terminal.
+EVERY = 20.0
+
 #: The one of rich, so that a bar of another module can show below one of these.
 console = rich.get_console()
 console.soft_wrap = True
@@ -48,15 +53,36 @@ def say(line: str) -> None:
 
 
 def tracked(parts: Sequence[Any], name: str) -> Iterable[Any]:
-    """Yields the parts of a task, with a progress bar on a terminal."""
-    return track(parts, description=name, console=console, disable=not console.is_terminal)
+    """Yields the parts of a task, with a progress bar on a terminal, and a line now and then elsewhere."""
+    return track(parts, description=name, console=console) if console.is_terminal else told(parts, name)
+
+
+def told(parts: Sequence[Any], name: str) -> Iterator[Any]:
+    """Yields the parts of a task, with a line every `EVERY` seconds where there is no terminal."""
+    last = time.monotonic()
+    for number, part in enumerate(parts):
+        if not console.is_terminal and time.monotonic() - last >= EVERY:
+            last = time.monotonic()
+            say(f"{name}: {number} of {len(parts)}")
+        yield part
 
 
 @contextlib.contextmanager
 def busy(name: str) -> Iterator[None]:
-    """A context that shows a name and its seconds on a terminal, for what takes long and tells nothing on the way."""
+    """A context that shows a name and its seconds on a terminal, for what takes long and tells nothing on the way.
+
+    Elsewhere the name is a line after `EVERY` seconds.
+    """
+    if not console.is_terminal:
+        late = threading.Timer(EVERY, say, (name,))
+        late.start()
+        try:
+            yield
+        finally:
+            late.cancel()
+        return
     columns = TextColumn("{task.description}"), BarColumn(bar_width=BAR), TimeElapsedColumn()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         bar.add_task(escape(printable(name)), total=None)
         yield
 
@@ -84,6 +110,8 @@ def fitting(parts: Sequence[tuple[int, str]], room: int) -> str:
 class TrainingDisplay(Callback):
     """Shows step, stage, rays/s, loss, PSNR and the time left in a live line, while ``progress`` is entered.
 
+    Where there is no terminal, a line every `EVERY` seconds without another.
+
     Args:
         label: Name of the run.
         quiet: Leave out lines that stay.
@@ -106,6 +134,7 @@ class TrainingDisplay(Callback):
         self.task = self.progress.add_task(escape(printable(label)), total=1.0, text="")
         self.loss = math.nan  # until the first is read
         self.scores: Scores | None = None
+        self.told = time.monotonic()
 
     def following(self, scores: Scores) -> TrainingDisplay:
         """This display, which shows the last of these scores from now on."""
@@ -125,12 +154,14 @@ class TrainingDisplay(Callback):
         ]
         room = console.width - len(self.progress.tasks[0].description) - BESIDE
         self.progress.update(self.task, completed=state.fraction, text=fitting(shown, room))
+        if not console.is_terminal and time.monotonic() - self.told >= EVERY:
+            self.on_event("  ".join((f"{state.fraction:5.0%}", *(text for _, text in shown))))
 
     def track(self, parts: Sequence[Any], name: str) -> Iterable[Any]:
         """Yields the parts of a task beside the training, with a bar below its live line."""
         task = self.progress.add_task(name, total=len(parts), text="")
         try:
-            for number, part in enumerate(parts):
+            for number, part in enumerate(told(parts, name)):
                 self.progress.update(task, completed=number, text=f"{number} of {len(parts)}")
                 yield part
         finally:
@@ -138,5 +169,6 @@ class TrainingDisplay(Callback):
 
     def on_event(self, line: str) -> None:
         """Prints a line that stays, above the live one."""
+        self.told = time.monotonic()
         if not self.quiet:
             say(line)

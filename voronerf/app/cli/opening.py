@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from torch import Tensor, tensor
+from torch import Tensor, float64, tensor
 
 from voronerf.app.cli.display import busy
 from voronerf.app.run import Run, open_run, read_crop
 from voronerf.app.scenes import Scene
 from voronerf.app.scenes.record import read_scene
-from voronerf.app.train.config import ConfigError
+from voronerf.app.train.config import ConfigError, check_backend_name
 from voronerf.town.run import is_town
 from voronerf.town.run import open_run as open_parts
 
@@ -50,7 +50,8 @@ class Opening:
 
     def open(self, run: Path, *, scene: Scene | None = None) -> Run:
         """Opens a run of any kind."""
-        check_counts(samples=None if self.samples is None else min(self.samples), downscale=self.downscale)
+        check_counts(downscale=self.downscale)
+        check_backend_name(self.backend)
         opener: Callable[..., Run] = open_parts if is_town(run) else open_run
         kept = inspect.signature(opener).parameters
         with busy(f"opening {run}"):
@@ -74,7 +75,7 @@ def crop_box(run: Run, crop: Crop) -> Tensor | None:
         ConfigError: No crop was saved with the run.
     """
     if crop != "saved":
-        return None if crop is None else tensor(crop).view(2, 3)
+        return None if crop is None else tensor(crop, dtype=float64).view(2, 3)
     box = read_crop(run.path)
     if box is None:
         raise ConfigError(f"--crop saved needs a crop, which the viewer saves with the run: {run.path} has none")

@@ -25,7 +25,9 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from voronerf.app.train.config import ConfigError, TrainConfig, did_you_mean, either
+from voronerf.app.cli.meant import meant
+from voronerf.app.train.config import ConfigError, TrainConfig
+from voronerf.app.wording import did_you_mean, either
 
 RULES = ConstructorRegistry()
 #: Words for the kinds of numbers.
@@ -61,17 +63,25 @@ def parse(name: str, command: Callable[..., int], words: Sequence[str]) -> Calla
         if stop.code == 0:
             raise
         line = in_a_line(said.getvalue())
-        raise ConfigError(line if line.endswith("?") else f"{line}; see voronerf {name} --help") from None
+        end = "" if line.endswith("?") else meant(name, command, list(words), line) or f"; see voronerf {name} --help"
+        raise ConfigError(line + end) from None
 
 
 def in_a_line(box: str) -> str:
-    """The message in a box of tyro's, and options similar to those that it does not know."""
+    """The message in a box of tyro's."""
     _, *rows = (line[2:].rstrip(" │") for line in COLOURS.sub("", box).splitlines())
     parts = [[*part] for is_rule, part in itertools.groupby(rows, lambda row: row[:1] in ("─", "-")) if not is_rule]
+    if missing := re.fullmatch("Missing from voronerf (.*):", parts[0][0]):  # each argument, and its text further in
+        names = [row.strip() for row in parts[0][1:] if re.match(r" {4}\S", row)]
+        return f"{missing[1]} needs {' and '.join([', '.join(names[:-1]), names[-1]] if names[1:] else names)}"
     message = re.sub("^Error parsing ([^:]+):", r"\1", " ".join(" ".join(parts[0]).split())).rstrip(".")
-    similar = (row.split()[0].strip(",") for part in parts[1:] for row in part if row.startswith("    --"))
-    near = list(dict.fromkeys(similar)) if message.startswith("Unrecognized") else []
-    return message + (f"; did you mean {either(near)}?" if near else "")
+    return re.sub(r"^Missing value for argument '(-*)(.*)'\. Expected (\d+) values$", needed, message)
+
+
+def needed(match: re.Match[str]) -> str:
+    """The words for an argument that has too few values."""
+    dashes, name, count = match.groups()
+    return f"{dashes + name if dashes else name.upper()} needs {'a value' if count == '1' else f'{count} values'}"
 
 
 def _argument(hint: Any, default: Any) -> Any:
@@ -125,12 +135,9 @@ def values(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
             return None
         read = spec.instance_from_str
         if len(parts) > 2:
-            read = _spec(
-                spec.nargs,
-                spec.metavar,
-                spec.metavar.translate({ord(c): None for c in "{}"}).replace("|", " or "),
-                read,
-            ).instance_from_str
+            names = spec.metavar.translate({ord(c): None for c in "{}"}).replace("|", " or ")
+            rule = re.sub(r"(FLOAT|INT)( \1)+", lambda match: f"{len(match[0].split())} numbers", names)
+            read = _spec(spec.nargs, spec.metavar, rule, read).instance_from_str
         return replace(
             spec,
             instance_from_str=lambda words: None if words == ["None"] else read(words),

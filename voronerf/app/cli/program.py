@@ -7,6 +7,7 @@ import gc
 import os
 import re
 import select
+import shlex
 import signal
 import sys
 import threading
@@ -26,14 +27,16 @@ from voronerf.app.cli.display import console, one_line, say
 from voronerf.app.cli.eval import evaluate_run
 from voronerf.app.cli.export import export
 from voronerf.app.cli.info import info
+from voronerf.app.cli.meant import named
 from voronerf.app.cli.parsing import parse
 from voronerf.app.cli.process import process
 from voronerf.app.cli.render import render
 from voronerf.app.cli.town import cut, join, place, train_territories
 from voronerf.app.cli.train import WHAT_TO_TRY, train, with_stored_settings
 from voronerf.app.cli.view import view
-from voronerf.app.train.config import ConfigError, did_you_mean
+from voronerf.app.train.config import ConfigError
 from voronerf.app.train.loop import TrainingError
+from voronerf.app.wording import nearest
 from voronerf.ops._core.backends import BackendUnavailable
 
 #: Errors that a user can cause; they are printed as one line. ValueError includes SceneError and CheckpointError.
@@ -170,7 +173,14 @@ def chosen(name: str = "--help", *words: str) -> Callable[[], int]:
         print(f"voronerf {__version__}")
         return lambda: 0
     if name not in COMMANDS:
-        raise ConfigError(f"there is no command {name}{did_you_mean(name, COMMANDS) or '; see voronerf --help'}")
+        word = name.lstrip("-")
+        if name.startswith("--") and word.partition("=")[0] in named(train)[1]:
+            end = f"did you mean {shlex.join(['voronerf', 'train', name, *words])}?"
+        elif near := nearest(word, [*COMMANDS, "help", "version"]):
+            end = f"did you mean {near if near in COMMANDS else f'voronerf --{near}'}?"
+        else:
+            end = "see voronerf --help"
+        raise ConfigError(f"there is no command {name}; {end}")
     command = COMMANDS[name]
     return parse(name, with_stored_settings(command, list(words)) if name in TRAININGS else command, words)
 

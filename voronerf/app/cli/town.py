@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,6 +17,7 @@ from voronerf.app.cli.display import TrainingDisplay, busy, say, tracked
 from voronerf.app.cli.train import continuation, stopped_by_signals
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.files import json_text, write_text
+from voronerf.app.run import BOX
 from voronerf.app.scenes import BUILTIN, load_scene
 from voronerf.app.scenes.record import read_scene
 from voronerf.app.train.build import present_device
@@ -23,6 +25,7 @@ from voronerf.app.train.callbacks import CHECKPOINT_EVERY, counted
 from voronerf.app.train.checkpoint import checkpoint_paths
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.run_directory import choose_directory, held
+from voronerf.app.wording import as_typed
 from voronerf.town import editing, open_run
 from voronerf.town import train as territories_train
 from voronerf.town.editing import Source, check_out
@@ -30,8 +33,8 @@ from voronerf.town.geometry import Similarity, Solid
 from voronerf.town.group import Group, local_rank, restarts
 from voronerf.town.run import stored_territories
 
-#: Numbers of a transform on the command line.
-MOVE = "tx ty tz rx ry rz s"
+#: The rule of a transform on the command line.
+MOVE = "seven finite numbers tx ty tz rx ry rz s, the scale s 1e-9 to 1e9"
 
 
 def tell(out: Path, made: Source) -> int:
@@ -89,12 +92,10 @@ def given_frames(runs: int, move: Sequence[tuple[str, str]]) -> dict[int, Simila
         if int(number) - 1 in frames:
             raise ConfigError(f"--move {number}: must be given once")
         try:
-            numbers = [float(word) for word in text.replace(",", " ").split()]
-            if len(numbers) != 7:
-                raise ValueError(f"must be {MOVE}, seven numbers, got {len(numbers)}")
-            frames[int(number) - 1] = Similarity.of(numbers[:3], numbers[3:6], numbers[6])
-        except ValueError as error:
-            raise ConfigError(f"--move {number}: {error}") from None
+            tx, ty, tz, rx, ry, rz, s = map(float, text.replace(",", " ").split())
+            frames[int(number) - 1] = Similarity.of((tx, ty, tz), (rx, ry, rz), s)
+        except ValueError:
+            raise ConfigError(f"--move {number} must be {MOVE}, got {text!r}") from None
     return frames
 
 
@@ -118,14 +119,16 @@ def cut(
         outside: Keep what lies outside.
     """
     check_out(out)
-    named = [name for name, value in (("box", box), ("sphere", sphere), ("cells", cells)) if value is not None]
+    named = {name: value for name, value in (("box", box), ("sphere", sphere), ("cells", cells)) if value is not None}
     if len(named) != 1:
         came = " and ".join(f"--{name}" for name in named) or "none"
         raise ConfigError(f"cut needs one of --box, --sphere and --cells, got {came}")
     try:
         solid = Solid.box(box[:3], box[3:]) if box is not None else None if sphere is None else Solid(ball=sphere)
-    except ValueError as error:
-        raise ConfigError(f"--{named[0]}: {error}") from None
+    except ValueError:
+        rule = BOX if box is not None else "finite x y z of the centre and a radius above 0"
+        ((name, value),) = named.items()
+        raise ConfigError(f"--{name} must be {rule}, got {as_typed(value)}") from None
     kept = list(cells or ()) if solid is None else solid
     with busy("cutting"):
         made = editing.cut(run, kept, out, outside=outside)
@@ -152,10 +155,13 @@ def place(
         scale: Of the object's size.
     """
     check_out(out)
+    for name, value in (("at", at), ("turn", turn)):
+        if not all(map(math.isfinite, value)):
+            raise ConfigError(f"--{name} must be three finite numbers, got {as_typed(value)}")
     try:
-        Similarity.of(at, turn, scale)
-    except ValueError as error:
-        raise ConfigError(f"--scale, --turn, --at: {str(error).removeprefix('Similarity: ')}") from None
+        Similarity.of(scale=scale)
+    except ValueError:
+        raise ConfigError(f"--scale must be 1e-9 to 1e9, got {as_typed(scale)}") from None
     with busy("placing"):
         made = editing.place(run, thing, at, out, degrees=turn, scale=scale)
     return tell(out, made)

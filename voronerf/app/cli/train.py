@@ -36,7 +36,7 @@ from voronerf.app.train.callbacks import (
     TensorBoard,
     tensorboard_writer,
 )
-from voronerf.app.train.checkpoint import last_checkpoint
+from voronerf.app.train.checkpoint import checkpoint_paths, last_checkpoint
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.defaults import machine_speed, why_no_occupancy
 from voronerf.app.train.loop import Callback, run
@@ -110,8 +110,14 @@ def train(
         import_viewer().check_address(host, port)
     if tensorboard:
         tensorboard_writer()
-    with busy(f"reading {config.data}"):
-        scene = load_scene(config.data, **config.reading)
+    try:
+        with busy(f"reading {config.data}"):
+            scene = load_scene(config.data, **config.reading)
+    except SceneError:
+        if not checkpoint_paths(Path(config.data)):
+            raise
+        again = shlex.join(["voronerf", "train", "--resume", "--out", config.data])
+        raise ConfigError(f"--data must be a scene, got the run {config.data}; {again} continues it") from None
     if explain:
         state = build(config, scene)
         for line in (*state.ray_loss.explain().splitlines(), state.training_step.explain()):
@@ -168,6 +174,8 @@ def _compile_kernels(config: TrainConfig) -> None:
         say(f"operations run on {backends.automatic(device)}")
     if backends.chosen("grouped_mlp", device, dtype, backend=config.backend) != "warp":
         return
+    if device.type == "cpu":
+        say("--backend warp computes on the CPU here, far slower than --backend auto; for a GPU add --device cuda")
     kernels = importlib.import_module("voronerf.kernels")
     start = time.perf_counter()
     for compiled in tracked(kernels.loads(device, dtype), "compiling Warp kernels"):

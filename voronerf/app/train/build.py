@@ -17,6 +17,7 @@ from voronerf.app.scenes.store import Pages
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.defaults import resolve, unseen_move, unseen_share, why_no_occupancy
 from voronerf.app.train.state import State
+from voronerf.app.wording import device_of
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.adam import Adam
 from voronerf.nerf.batches import RayBatches
@@ -231,8 +232,12 @@ def space_before(scene: Scene, grid: OccupancyGrid, contraction: Contraction) ->
         width, height = cameras.size(image)
         apart = max(width, height, LOOKS) / LOOKS
         across, down = (torch.arange(0, side, apart, device=device) for side in (width, height))
-        y, x = torch.meshgrid(down, across, indexing="ij")
-        rays = cameras.rays(image, x.reshape(-1), y.reshape(-1))
+        y, x = (values.reshape(-1) for values in torch.meshgrid(down, across, indexing="ij"))
+        if (mask := scene.train.mask(image)) is not None:  # some pixels may have no ray
+            y, x = y.long(), x.long()
+            seen = mask[y.cpu(), x.cpu()].to(device)
+            y, x = y[seen], x[seen]
+        rays = cameras.rays(image, x, y)
         points = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]
         empty[grid.voxels(contraction.points(points.reshape(-1, 3))).long()] = True
     return empty.view(grid.occupied.shape)
@@ -365,6 +370,8 @@ def present_device(name: str) -> str:
             raise ConfigError(f"--device must be auto, cpu or cuda, got {name!r}")
         float(torch.zeros((), device=name))
     except (RuntimeError, AssertionError, NotImplementedError) as error:
+        device = device_of(name)
         reason = str(error).splitlines()[0].partition(": ")[0]
-        raise ConfigError(f"--device must be auto, cpu or a GPU that is present, got {name!r}: {reason}") from None
+        end = f": {reason}; leave it out for the CPU" if device == name else f"; did you mean {device or 'auto'}?"
+        raise ConfigError(f"--device must be auto, cpu or a GPU that is present, got {name!r}{end}") from None
     return name

@@ -23,6 +23,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from voronerf.app.files import parse_json, rename, write_bytes
+from voronerf.app.wording import similar_path
 
 FORMAT = "voronerf-checkpoint-2"
 #: The name of the checksum of the JSON, beside those of the tensors.
@@ -133,7 +134,7 @@ def last_checkpoint(run: Path, *, keep: Callable[[str], bool] = _all) -> Checkpo
     """
     paths = checkpoint_paths(run)
     if not paths:
-        raise CheckpointError(f"no run at {run}: there is no {'checkpoint in it' if run.is_dir() else 'such folder'}")
+        raise CheckpointError(no_run(run, "checkpoint"))
     errors = []
     for path in paths:
         try:
@@ -154,6 +155,17 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     sums[_VALUES] = zlib.crc32(values.encode())
     metadata = {"format": FORMAT, "values": values, "checksums": json.dumps(sums)}
     write_bytes(path, save(checkpoint.tensors, metadata))
+
+
+def no_run(path: Path, file: str) -> str:
+    """The message for a path without a run, whose folder lacks a file; names a run that the path lies in, holds, or is
+    like."""
+    reason = f"there is no {file} in it" if path.is_dir() else "it is a file" if path.is_file() else None
+    around = [folder for folder in path.parents if (folder / "config.json").is_file()]
+    near = around[:1] or sorted(config.parent for config in path.glob("*/config.json"))[:1]
+    similar = [config.parent for config in path.parent.glob("*/config.json")]
+    end = f"; did you mean {near[0]}?" if near else similar_path(path, similar)
+    return f"no run at {path}: {reason or 'there is no such folder'}{end}"
 
 
 def load_checkpoint(path: Path, *, keep: Callable[[str], bool] = _all) -> Checkpoint:

@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import difflib
 import itertools
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from voronerf.app.train.schema import check_types
+from voronerf.app.wording import as_typed, device_of, did_you_mean, either
 from voronerf.nerf.fields import FIELDS, FieldType
 from voronerf.nerf.samplers import SAMPLERS
 from voronerf.nerf.split import RESERVOIR, PlannedSplit, final_cells, plan_splits
@@ -36,11 +36,11 @@ class SceneSettings:
     """The scene that is learnt."""
 
     data: str = "builtin"
-    """Scene folder (--format says which there are), or a built-in scene: "builtin", "builtin:400" of so many
-    pixels, or "builtin-city:4x4", a city of so many blocks."""
+    """Scene folder (--format says which there are), that of one of its COLMAP models, or a built-in scene: "builtin",
+    "builtin:400" of so many pixels, or "builtin-city:4x4", a city of so many blocks."""
     format: Literal["auto", "blender", "colmap", "transforms", "llff"] = "auto"
     """What is read of a scene folder; auto is the first of them that it holds, in this order, but
-    transforms before the model in colmap/sparse/0 that nerfstudio made it of."""
+    transforms before a model in colmap/sparse (nerfstudio's), distorted/sparse or dense/sparse."""
     kind: Literal["auto", "object", "forward", "inside-out", "unbounded"] = "auto"
     """Kind of scene: an object on white; cameras that look the same way; that look outwards; or that look at one place
     with surroundings. auto tells it by transparent pixels and by the cameras."""
@@ -290,15 +290,13 @@ def parse_option(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def either(names: Sequence[str]) -> str:
-    """``a, b or c``."""
-    return " or ".join((", ".join(names[:-1]), names[-1])) if len(names) > 1 else names[0]
-
-
-def did_you_mean(word: object, words: Iterable[str]) -> str:
-    """``; did you mean nerf?`` for the most similar of some words; empty if none is similar."""
-    near = difflib.get_close_matches(str(word), list(words), 1)
-    return f"; did you mean {near[0]}?" if near else ""
+def check_backend_name(name: str) -> None:
+    """Raises ConfigError for a name that is no backend's, such as that of a device."""
+    names = ("auto", *BACKENDS)
+    if name not in names:
+        device = device_of(name)
+        end = f"; did you mean --device {device}?" if device else did_you_mean(name, names)
+        raise ConfigError(f"--backend must be {either(names)}, got {name!r}{end}")
 
 
 def check_config(config: TrainConfig) -> None:
@@ -307,7 +305,8 @@ def check_config(config: TrainConfig) -> None:
     def need(ok: bool, name: str, rule: str, words: Iterable[str] = ()) -> None:
         if not ok:
             value = getattr(config, name)
-            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {value!r}{did_you_mean(value, words)}")
+            end = did_you_mean(value, words)
+            raise ConfigError(f"--{name.replace('_', '-')} must {rule}, got {as_typed(value)}{end}")
 
     need(config.sampling in SAMPLERS, "sampling", f"be {either(list(SAMPLERS))}", SAMPLERS)
     more = "voronerf.nerf.fields.register_field adds others"
@@ -316,7 +315,7 @@ def check_config(config: TrainConfig) -> None:
         raise ConfigError("give --budget SECONDS or --steps N, not both")
     for name, words in CHOICES.items():
         need(getattr(config, name) in words, name, f"be {either(words)}", words)
-    need(config.backend in ("auto", *BACKENDS), "backend", f"be {either(['auto', *BACKENDS])}", ("auto", *BACKENDS))
+    check_backend_name(config.backend)
     need(config.budget is None or 0 < config.budget < float("inf"), "budget", "be a positive number of seconds")
     need(config.steps is None or 1 <= config.steps < 2**53, "steps", "lie in 1..2^53 - 1")
     for name in ("rays", "evaluations", "eval_views", "downscale", "parameters"):
@@ -329,10 +328,7 @@ def check_config(config: TrainConfig) -> None:
     need(0 <= config.seed < 2**63, "seed", "lie in 0..2^63 - 1")
     factor = config.sparse_depth
     need(factor is None or 0 <= factor < float("inf"), "sparse_depth", "be a factor of 0 or more")
-    passes = SAMPLERS[config.sampling].passes
-    if config.samples is not None:
-        count = "one number" if passes == 1 else f"{passes} numbers, one for each pass"
-        need(len(config.samples) == passes and min(config.samples) >= 1, "samples", f"be {count} of at least 1")
+    check_samples(config)
     _check_field_options(config)
     fits = all(2 <= k <= RESERVOIR for k in config.cells)
     need(fits, "cells", f"lie in 2..{RESERVOIR} on every level (none for one network)")
@@ -348,6 +344,14 @@ def check_config(config: TrainConfig) -> None:
         steps = all(1 <= at < (config.steps or float("inf")) for at in config.split_at)
         end = "" if config.steps is None else f" below --steps {config.steps}"
         need(rising and (fractions or steps), "split_at", f"be rising fractions of the run, or numbers of steps{end}")
+
+
+def check_samples(config: TrainConfig) -> None:
+    """Raises ConfigError for samples that are not one number for each pass of the sampler."""
+    passes = SAMPLERS[config.sampling].passes
+    if config.samples is not None and (len(config.samples) != passes or min(config.samples) < 1):
+        count = "one number" if passes == 1 else f"{passes} numbers, one for each pass,"
+        raise ConfigError(f"--samples must be {count} of at least 1, got {as_typed(config.samples)}")
 
 
 def _check_field_options(config: TrainConfig) -> None:

@@ -78,6 +78,8 @@ def choose_directory(config: TrainConfig, scene: Scene, *, resume: bool = False)
             raise ConfigError("--resume needs --out, the run directory to continue")
         names = (scene.name, *(f"{scene.name}-{i}" for i in range(2, 10_000)))
         out = next(folder for name in names if _made(folder := Path("runs") / name))
+    elif out.is_file():
+        raise ConfigError(f"--out must be a folder, got the file {out}")
     elif not resume and checkpoint_paths(out):
         raise ConfigError(f"--out must not hold a run already, got {out}: continue it with --resume or choose another")
     elif resume and not checkpoint_paths(out):

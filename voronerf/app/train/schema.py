@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from voronerf.app.wording import did_you_mean, nearest
+
 
 def check_types(source: str, kind: type, values: object, *, optional: bool = False) -> None:
     """Checks that values fit the fields of a dataclass.
@@ -21,12 +23,15 @@ def check_types(source: str, kind: type, values: object, *, optional: bool = Fal
         raise ValueError(f"{source}: must be an object, got {_short(values)}")
     hints = get_type_hints(kind)
     if unknown := sorted(values.keys() - hints.keys()):
-        raise ValueError(f"{source}: unknown {', '.join(unknown)}")
+        near = ", ".join(filter(None, (nearest(str(name), hints) for name in unknown)))
+        raise ValueError(f"{source}: unknown {', '.join(unknown)}" + (f"; did you mean {near}?" if near else ""))
     if not optional and (missing := sorted(hints.keys() - values.keys())):
         raise ValueError(f"{source}: {', '.join(missing)} missing")
     for name, value in values.items():
         if not _fits(value, hints[name]):
-            raise ValueError(f"{source}: {name} must be {_named(hints[name])}, got {_short(value)}")
+            words = get_args(hints[name]) if get_origin(hints[name]) is Literal else ()
+            end = did_you_mean(value, words)
+            raise ValueError(f"{source}: {name} must be {_named(hints[name])}, got {_short(value)}{end}")
 
 
 def _fits(value: object, hint: Any) -> bool:
